@@ -1,0 +1,40 @@
+# Two commands do it all: `make demo` and `make test`. Each sets itself up, on the first run only.
+PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
+BIN := .venv/bin
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check test-fast test-slow bench lock clean
+
+help: ## show this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+setup: ## the environment in .venv (done by the others when needed)
+	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
+	@$(PYTHON) tools/bootstrap.py
+
+demo: setup ## eight simulated frames through the whole daemon, and pictures of the last
+	@tools/demo
+
+test: check test-fast ## lint, types, layers, and the default tests
+
+check: setup ## lint, format, types, layers
+	@$(BIN)/ruff check -q .
+	@$(BIN)/ruff format -q --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+
+test-fast: setup
+	@$(BIN)/coverage erase
+	@$(BIN)/pytest -m "not slow" --cov --cov-report=term
+
+test-slow: setup ## the tests that take longer
+	@$(BIN)/pytest -m slow
+
+bench: setup ## what the performance claims are measured with
+	@for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
+
+lock: setup ## resolve requirements.lock anew from pyproject.toml
+	@uv=$$(command -v uv || echo .tools/bin/uv); $$uv pip compile -q --universal --python-version 3.11 --generate-hashes \
+	  --no-header --all-extras --group dev pyproject.toml -o requirements.lock
+
+clean: ## remove what set-up and tests made
+	rm -rf .venv .tools build .coverage* htmlcov .mypy_cache .ruff_cache .pytest_cache .hypothesis

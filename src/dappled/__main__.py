@@ -1,0 +1,7 @@
+"""`python -m dappled`."""
+
+import sys
+
+from dappled.cli import main
+
+sys.exit(main())

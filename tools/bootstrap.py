@@ -1,0 +1,107 @@
+#!/usr/bin/env python3
+"""Set up .venv from requirements.lock: with the uv on PATH, or one fetched into .tools/. Touches nothing else.
+
+Runs on a bare Python >= 3.11 (no pip, no venv module needed). Says nothing when all is in place.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import io
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tarfile
+import urllib.request
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+TOOLS = ROOT / ".tools"
+VENV = ROOT / ".venv"
+STAMP = VENV / "dappled-set-up"
+# uv's own releases, for machines whose Python has neither pip nor ensurepip. DAPPLED_UV_RELEASES names a mirror.
+RELEASES = "https://github.com/astral-sh/uv/releases/latest/download"
+
+
+def find_uv() -> str | None:
+    """uv on PATH, or the one fetched earlier."""
+    for place in (shutil.which("uv"), TOOLS / "bin" / "uv", TOOLS / "uv"):
+        if place and Path(place).is_file():
+            return str(place)
+    return None
+
+
+def fetch_uv() -> str:
+    """A uv in .tools/: by pip where Python has it, else from uv's releases."""
+    print("fetching uv into .tools/ …", file=sys.stderr)
+    TOOLS.mkdir(exist_ok=True)
+    if importlib.util.find_spec("pip"):
+        pip = [sys.executable, "-m", "pip", "install", "--quiet", "--target", str(TOOLS), "--upgrade", "uv"]
+        if subprocess.run(pip, check=False).returncode == 0 and (found := find_uv()):
+            return found
+    fetch_release(os.environ.get("DAPPLED_UV_RELEASES", RELEASES))
+    found = find_uv()
+    if not found:
+        raise SystemExit("uv could not be fetched: install it (https://docs.astral.sh/uv) and run make again")
+    return found
+
+
+def fetch_release(releases: str) -> None:
+    """Put uv's released binary for this machine into .tools/, its SHA-256 checked."""
+    archive = f"uv-{platform.machine()}-unknown-linux-gnu.tar.gz"
+    try:
+        with urllib.request.urlopen(f"{releases}/{archive}", timeout=120) as answer:  # noqa: S310  # https, or a mirror the user named
+            data = answer.read()
+        with urllib.request.urlopen(f"{releases}/{archive}.sha256", timeout=60) as answer:  # noqa: S310  # as above
+            wanted = answer.read().decode().split()[0]
+    except OSError as error:
+        advice = "connect to the network, or install uv, and run make again"
+        raise SystemExit(f"uv could not be fetched from {releases} ({error}): {advice}") from error
+    if hashlib.sha256(data).hexdigest() != wanted:
+        raise SystemExit(f"uv from {releases} does not match its SHA-256: nothing was installed")
+    with tarfile.open(fileobj=io.BytesIO(data)) as tar:
+        member = next(m for m in tar.getmembers() if m.isfile() and Path(m.name).name == "uv")
+        source = tar.extractfile(member)
+        if source is None:
+            raise SystemExit(f"{archive} holds no uv")
+        target = TOOLS / "uv"
+        target.write_bytes(source.read())
+        target.chmod(0o755)
+
+
+def wish() -> str:
+    """What the environment must have been made from."""
+    lock = (ROOT / "requirements.lock").read_bytes() + (ROOT / "pyproject.toml").read_bytes()
+    return hashlib.sha256(lock + sys.version.encode() + str(ROOT).encode()).hexdigest()
+
+
+def same_python(python: str) -> bool:
+    """Whether the environment is there and made from the interpreter that runs this."""
+    if not Path(python).exists():
+        return False
+    said = subprocess.run([python, "-c", "import sys; print(sys.version)"], capture_output=True, text=True, check=False)
+    return said.stdout.strip() == sys.version.strip()
+
+
+def main() -> None:
+    if STAMP.is_file() and STAMP.read_text() == wish():
+        return
+    uv = find_uv() or fetch_uv()
+    python = str(VENV / "bin" / "python")
+
+    def run(*arguments: str) -> None:
+        if subprocess.run([uv, *arguments], cwd=ROOT, check=False).returncode:
+            raise SystemExit(f"set-up stopped at: uv {' '.join(arguments)}")
+
+    if not same_python(python):
+        run("venv", "--quiet", "--clear", "--python", sys.executable, str(VENV))
+    run("pip", "sync", "--quiet", "--require-hashes", "--python", python, "requirements.lock")
+    run("pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--python", python, "--editable", ".")
+    STAMP.write_text(wish())
+
+
+if __name__ == "__main__":
+    main()
