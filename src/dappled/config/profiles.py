@@ -1,0 +1,163 @@
+"""Camera and mask profiles: shipped ones by name, a person's own by file, with the same validation."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from dappled.config.schema import ConfigError, Source, build, read_toml, setting
+from dappled.decode.carriers import LAWS, Sensor
+from dappled.decode.masks import Mask
+
+LENSLET = "lenslet"  # not a profile: the lattice is found in the frame itself
+
+
+@dataclass(frozen=True, slots=True)
+class RawShape:
+    """One raw shape that a camera is known to deliver, and where its samples stand on the chip."""
+
+    name: str
+    sensor: Sensor
+
+
+@dataclass(frozen=True, slots=True)
+class CameraProfile:
+    """What must be known of a body to predict carriers. `law` is a name in `dappled.decode.carriers.LAWS`."""
+
+    name: str
+    description: str
+    models: tuple[str, ...]
+    law: str
+    mask_distance_mm: float
+    focal_length_mm: tuple[float, float] | None
+    raw: tuple[RawShape, ...]
+
+    def sensor(self, shape: tuple[int, int]) -> Sensor:
+        """The sensor geometry of frames of this shape. Raises ConfigError for a shape the profile doesn't know."""
+        for known in self.raw:
+            if known.sensor.shape == shape:
+                return known.sensor
+        sizes = ", ".join(f"{h} × {w}" for h, w in (known.sensor.shape for known in self.raw))
+        raise ConfigError(
+            f"camera profile {self.name} knows frames of {sizes} px, this one has {shape[0]} × {shape[1]}; "
+            "choose another camera.profile, or add the shape to a profile of your own"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class MaskProfile:
+    """A mask by name."""
+
+    name: str
+    description: str
+    mask: Mask
+
+
+@dataclass(frozen=True, slots=True)
+class _CameraTable:
+    law: str = setting("fd", "carrier law", choices=tuple(LAWS))
+    mask_distance_mm: float = setting(1.0, "mask to sensor", unit="mm", low=1e-3, high=100)
+    raw: tuple[dict, ...] = setting((), "raw shapes")  # type: ignore[type-arg]  # each is built from a table of its own
+    description: str = setting("", "one line")
+    models: tuple[str, ...] = setting((), "model names as EXIF and libgphoto2 write them")
+    focal_length_mm: tuple[float, float] | None = setting(None, "shortest and longest", unit="mm", low=0.1, high=10_000)
+
+
+@dataclass(frozen=True, slots=True)
+class _RawTable:
+    shape: tuple[int, int] = setting((0, 0), "rows and columns", low=1, high=100_000)
+    row_mm: tuple[float, float] = setting((0.0, 0.0), "one row down, as (y, x)", unit="mm", low=-1, high=1)
+    column_mm: tuple[float, float] = setting((0.0, 0.0), "one column right, as (y, x)", unit="mm", low=-1, high=1)
+    name: str = setting("", "which shape this is")
+
+
+@dataclass(frozen=True, slots=True)
+class _MaskTable:
+    p: int = setting(2, "number of harmonics", low=1, high=20)
+    frequency_per_mm: float | None = setting(None, "fundamental", unit="1/mm", low=0.01, high=2000)
+    period_px: float | None = setting(None, "longest period on film", unit="px", low=0.1, high=100_000)
+    film_px_per_mm: float | None = setting(None, "printer's pixels", unit="px/mm", low=0.1, high=10_000)
+    pattern: str = setting("full", "Eq 11 or Fig 14", choices=("full", "diagonal"))
+    harmonics: str = setting("linear", "1, 2, 3 … or 1, 2, 4 …", choices=("linear", "octave"))
+    description: str = setting("", "one line")
+
+
+def camera(name: str) -> CameraProfile:
+    """A camera profile by shipped name or TOML file."""
+    tables, source = _read(name, "cameras")
+    table = build(_CameraTable, tables, source, "")
+    if not table.raw:
+        raise ConfigError(f"{source.name} has no [[raw]] table: name at least one raw shape with row_mm and column_mm")
+    shapes = []
+    for entry in table.raw:
+        raw = build(_RawTable, entry, source, "raw")
+        if not any(raw.row_mm) or not any(raw.column_mm) or not all(raw.shape):
+            raise ConfigError(f"{source.name}: [[raw]] {raw.name!r} needs shape, row_mm and column_mm")
+        shapes.append(RawShape(raw.name, Sensor(raw.shape, raw.row_mm, raw.column_mm)))
+    return CameraProfile(
+        _stem(name),
+        table.description,
+        table.models,
+        table.law,
+        table.mask_distance_mm,
+        table.focal_length_mm,
+        tuple(shapes),
+    )
+
+
+def mask(name: str) -> MaskProfile:
+    """A mask profile by shipped name or TOML file."""
+    tables, source = _read(name, "masks")
+    table = build(_MaskTable, tables, source, "")
+    if table.frequency_per_mm is not None:
+        frequency = table.frequency_per_mm
+    elif table.period_px is not None and table.film_px_per_mm is not None:
+        frequency = table.film_px_per_mm / table.period_px
+    else:
+        raise ConfigError(f"{source.name} needs frequency_per_mm, or period_px and film_px_per_mm")
+    return MaskProfile(
+        _stem(name),
+        table.description,
+        Mask(frequency, table.p, table.pattern, table.harmonics),  # type: ignore[arg-type]  # the schema checked the choices
+    )
+
+
+def shipped(kind: str) -> list[str]:
+    """Names of the shipped profiles: kind is "cameras" or "masks"."""
+    folder = resources.files("dappled.config") / "profiles" / kind
+    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def camera_for_model(model: str) -> CameraProfile | None:
+    """The shipped profile of a body by its model name, spaces and case aside; None where none knows it."""
+    wanted = _plain(model)
+    for name in shipped("cameras"):
+        profile = camera(name)
+        if wanted and wanted in {_plain(known) for known in profile.models}:
+            return profile
+    return None
+
+
+def _plain(model: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", model.lower())
+
+
+def _stem(name: str) -> str:
+    return Path(name).stem if name.endswith(".toml") else name
+
+
+def _read(name: str, kind: str) -> tuple[dict[str, Any], Source]:
+    if name.endswith(".toml"):
+        return read_toml(Path(name).expanduser())
+    names = shipped(kind)
+    if name not in names:
+        near = difflib.get_close_matches(name, names, 1, 0.4)
+        hint = f"did you mean {near[0]}?" if near else f"shipped: {', '.join(names)}"
+        raise ConfigError(f"no {kind[:-1]} profile {name!r}; {hint} A profile of your own is named by its .toml file")
+    text = (resources.files("dappled.config") / "profiles" / kind / f"{name}.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text), Source(f"profile {name}", text)

@@ -1,0 +1,139 @@
+"""From a TOML table to a typed, frozen record, with errors that name the file, the line, the key and what to do."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from types import UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from dappled.errors import DappledError
+
+Record = TypeVar("Record")
+
+
+class ConfigError(DappledError):
+    """Something configured is wrong; one sentence with the place, the value, and what to do."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Rule:
+    """What a setting means and which values it takes. `unit` is shown, `low` and `high` are inclusive."""
+
+    text: str
+    unit: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    choices: tuple[str, ...] = ()
+
+
+def setting(
+    default: Any,
+    text: str,
+    *,
+    unit: str = "",
+    low: float = -math.inf,
+    high: float = math.inf,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """A dataclass field with its meaning and range."""
+    return dataclasses.field(default=default, metadata={"rule": Rule(text, unit, low, high, choices)})
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Source:
+    """Where a table was read: for the errors only."""
+
+    name: str
+    text: str = ""
+
+    def where(self, table: str, key: str) -> str:
+        """ "flight.toml, line 7: [camera] port" as exactly as it can be told."""
+        line = self._line(table, key)
+        place = f"{self.name}, line {line}" if line else self.name
+        return f"{place}: [{table}] {key}" if table else f"{place}: {key}"
+
+    def _line(self, table: str, key: str) -> int | None:
+        inside = ""
+        for number, line in enumerate(self.text.splitlines(), 1):
+            if header := re.match(r"\s*\[+\s*([^\]]+?)\s*\]+", line):
+                inside = header[1]
+                if not table and inside == key:
+                    return number
+            elif inside == table and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*=", line):
+                return number
+        return None
+
+
+def read_toml(path: Path) -> tuple[dict[str, Any], Source]:
+    """A TOML file's tables and its source. Raises ConfigError when it can't be read or isn't TOML."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; check the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} can't be read: {error}") from None
+    try:
+        return tomllib.loads(text), Source(str(path), text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path} is not valid TOML: {error}") from None
+
+
+def build(cls: type[Record], table: Mapping[str, Any], source: Source, name: str) -> Record:
+    """The record `cls` from a table; unknown keys are errors with the nearest known key."""
+    hints = get_type_hints(cls)
+    fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]  # cls is a dataclass
+    for key in table:
+        if key not in fields:
+            near = difflib.get_close_matches(key, fields, 1, 0.4)
+            hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(fields)}"
+            raise ConfigError(f"{source.where(name, key)} is not a known key; {hint}")
+    values = {}
+    for key, field in fields.items():
+        if key not in table:
+            if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+                raise ConfigError(f"{source.where(name, key)} is missing; it has no default")
+            continue
+        rule = field.metadata.get("rule", Rule(""))
+        values[key] = _convert(table[key], hints[key], rule, f"{source.where(name, key)}")
+    return cls(**values)
+
+
+def _convert(value: Any, wanted: Any, rule: Rule, where: str) -> Any:
+    origin, arguments = get_origin(wanted), get_args(wanted)
+    if origin in (Union, UnionType):
+        inner = [a for a in arguments if a is not type(None)]
+        return _convert(value, inner[0], rule, where)
+    if origin is tuple:
+        return _convert_tuple(value, arguments, rule, where)
+    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
+        raise ConfigError(f"{where} = {value!r} must be {_kind(wanted)}")
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        unit = f" {rule.unit}" if rule.unit else ""
+        if not math.isfinite(value) or not rule.low <= value <= rule.high:
+            raise ConfigError(f"{where} = {value} must lie between {rule.low:g} and {rule.high:g}{unit}")
+    if rule.choices and value not in rule.choices:
+        raise ConfigError(f"{where} = {value!r} must be one of {', '.join(rule.choices)}")
+    return value
+
+
+def _convert_tuple(value: Any, arguments: tuple[Any, ...], rule: Rule, where: str) -> tuple[Any, ...]:
+    values = value if isinstance(value, list) else [value]
+    if arguments[-1] is Ellipsis:
+        return tuple(_convert(v, arguments[0], rule, where) for v in values)
+    if len(values) != len(arguments):
+        raise ConfigError(f"{where} = {value!r} must be a list of {len(arguments)} values")
+    return tuple(_convert(v, a, rule, where) for v, a in zip(values, arguments, strict=True))
+
+
+def _kind(wanted: type) -> str:
+    return {str: "text in quotes", int: "a whole number", float: "a number", bool: "true or false"}.get(
+        wanted, wanted.__name__
+    )
