@@ -1,0 +1,287 @@
+"""The one thread that owns the sockets: PUB for the stream, ROUTER for questions. It never makes anybody wait.
+
+Messages wait in one bounded queue. When it is full the oldest preview goes first, then the oldest slices, and the
+header's `dropped` says how many; `start`, `frame` and `end` are small and always sent. `seq` counts what was really
+sent, topic by topic, so a gap at a subscriber is that subscriber's own loss, and it can ask for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import select
+import socket
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from dappled.daemon import wire
+from dappled.daemon.wire import Message, WireError
+
+log = logging.getLogger(__name__)
+
+Reply = Callable[[Message], None]
+Answer = Callable[[Mapping[str, Any], Reply], None]
+DROP_ORDER = ("preview", "health", "slices")
+REMEMBERED = 4096  # slices whose frame number is known by sequence
+QUESTION_BYTES = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class PublisherStatistics:
+    """Counters so far, by topic; `questions` and `refused` of the ROUTER."""
+
+    sent: Mapping[str, int]
+    dropped: Mapping[str, int]
+    waiting: int
+    questions: int
+    refused: int
+
+
+class Publisher:
+    """Publishes messages and hands questions to `answer(request, reply)`, which replies from any thread, once.
+
+    Raises WireError when an endpoint can't be bound.
+    """
+
+    def __init__(
+        self,
+        slices: str,
+        ask: str,
+        *,
+        flight: str,
+        answer: Answer,
+        high_water_mark: int = 12,
+        capacity: int = 8,
+    ) -> None:
+        self._flight = flight
+        self._answer = answer
+        self._capacity = capacity
+        self._lock = threading.Lock()
+        self._waiting: deque[tuple[bytes, Message]] = deque()  # (peer of a reply, or b"" for everybody; message)
+        self._sent = dict.fromkeys(wire.TOPICS, 0)
+        self._dropped = dict.fromkeys(wire.TOPICS, 0)
+        self._frame_of: dict[int, int] = {}
+        self._questions = self._refused = self._open_questions = 0
+        self._grace_s = 0.0
+        self._start: Message | None = None
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._stopping = threading.Event()
+        self._context = zmq.Context()
+        try:
+            self._pub = _bind(self._context, zmq.PUB, slices, high_water_mark)
+            self._router = _bind(self._context, zmq.ROUTER, ask, high_water_mark) if ask else None
+        except WireError:
+            self._context.destroy(linger=0)
+            os.close(self._wake)
+            raise
+        self._thread = threading.Thread(target=self._run, name="publisher", daemon=True)
+
+    def start(self) -> None:
+        """Begin to send and to listen."""
+        self._thread.start()
+
+    def publish(self, topic: str, facts: Mapping[str, Any], body: Any = None) -> None:
+        """Hand over a message; `seq`, `dropped` and the envelope are added when it is sent. Never waits.
+
+        `body` must not be changed afterwards: it is sent without a copy.
+        """
+        with self._lock:
+            self._waiting.append((b"", Message(topic, facts, body)))
+            if sum(not peer for peer, _ in self._waiting) > self._capacity:
+                self._drop_one()
+        self._ring()
+
+    def statistics(self) -> PublisherStatistics:
+        """Counters, taken together."""
+        with self._lock:
+            return PublisherStatistics(
+                dict(self._sent), dict(self._dropped), len(self._waiting), self._questions, self._refused
+            )
+
+    def stop(self, grace_s: float = 2.0) -> None:
+        """Send what waits, go on answering until nobody has asked for half a second (at most `grace_s`), then close."""
+        self._grace_s = grace_s
+        self._stopping.set()
+        self._ring()
+        if self._thread.is_alive():
+            self._thread.join(grace_s + 3)
+        for one in (self._pub, self._router):
+            if one is not None:
+                one.close(linger=round(grace_s * 1000))
+        self._context.term()
+        os.close(self._wake)
+
+    def _ring(self) -> None:
+        os.eventfd_write(self._wake, 1)
+
+    def _drop_one(self) -> None:
+        for topic in DROP_ORDER:
+            for place, (peer, message) in enumerate(self._waiting):
+                if not peer and message.topic == topic:
+                    del self._waiting[place]
+                    self._dropped[topic] += 1
+                    return
+
+    def _run(self) -> None:
+        poller = select.poll()
+        poller.register(self._wake, select.POLLIN)
+        if self._router is not None:
+            poller.register(self._router.FD, select.POLLIN)
+        quiet_rounds = 0
+        while True:
+            self._send_waiting()
+            self._hear_questions()
+            if self._stopping.is_set():
+                quiet_rounds = 0 if self._open_questions or self._waiting else quiet_rounds + 1
+                if quiet_rounds > 5 or self._grace_s <= 0:
+                    return
+                self._grace_s -= 0.1
+            poller.poll(100)
+            with contextlib.suppress(BlockingIOError):
+                os.eventfd_read(self._wake)
+
+    def _send_waiting(self) -> None:
+        while True:
+            with self._lock:
+                if not self._waiting:
+                    return
+                peer, message = self._waiting.popleft()
+                header = dict(message.header)
+                if not peer:
+                    header = self._envelope(message, self._sent[message.topic])
+                    self._sent[message.topic] += 1
+                    self._remember(message, header)
+            parts = [message.topic.encode(), wire.encode(header)]
+            if message.body is not None:
+                parts.append(message.body)
+            if not peer:
+                self._pub.send_multipart(parts, copy=False)
+            else:
+                assert self._router is not None  # a reply can only be to a question
+                self._open_questions -= 1
+                try:
+                    self._router.send_multipart([peer, *parts], flags=zmq.NOBLOCK, copy=False)
+                except zmq.ZMQError as error:  # the asker is gone or does not read: its loss
+                    log.info("an answer found nobody: %s", error)
+
+    def _envelope(self, message: Message, seq: int | None) -> dict[str, Any]:
+        return {
+            "schema": f"dappled/{message.topic}",
+            "version": wire.VERSION,
+            "flight": self._flight,
+            "seq": seq,
+            "dropped": self._dropped.get(message.topic, 0),
+            **message.header,
+        }
+
+    def _remember(self, message: Message, header: Mapping[str, Any]) -> None:
+        if message.topic == "slices":
+            self._frame_of[header["seq"]] = header["frame"]
+            self._frame_of.pop(header["seq"] - REMEMBERED, None)
+        elif message.topic == "start":
+            self._start = Message("start", header)
+
+    def _hear_questions(self) -> None:
+        if self._router is None:
+            return
+        for _ in range(100):  # a flood is taken in portions, so that sending goes on
+            try:
+                parts = self._router.recv_multipart(flags=zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            peer = parts[0]
+            payload = [part for part in parts[1:] if part]
+            self._questions += 1
+            self._open_questions += 1
+            try:
+                request = _question(payload)
+            except WireError as error:
+                self._refused += 1
+                self._reply_to(peer, None)(Message("error", {"error": str(error)}))
+                continue
+            reply = self._reply_to(peer, request)
+            try:
+                if request["get"] == "start" and self._start is not None:
+                    reply(self._start)
+                else:
+                    self._answer(self._resolved(request), reply)
+            except WireError as error:
+                self._refused += 1
+                reply(Message("error", {"error": str(error)}))
+
+    def _resolved(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        if "frame" in request or "seq" not in request:
+            return request
+        frame = self._frame_of.get(request["seq"])
+        if frame is None:
+            raise WireError(f"seq {request['seq']} of slices was not sent, or too long ago: ask by frame")
+        return {**request, "frame": frame}
+
+    def _reply_to(self, peer: bytes, asked: Mapping[str, Any] | None) -> Reply:
+        def reply(message: Message) -> None:
+            header = {**self._envelope(message, None), "asked": asked}
+            with self._lock:
+                self._waiting.append((peer, Message(message.topic, header, message.body)))
+            self._ring()
+
+        return reply
+
+
+def _question(payload: list[bytes]) -> dict[str, Any]:
+    """One JSON object with `get` and, unless it asks for the start, `frame` or `seq`. Raises WireError."""
+    try:
+        request = json.loads(payload[0]) if len(payload) == 1 else None
+    except (ValueError, RecursionError):
+        request = None
+    topics = ("start", "frame", "slices")
+    if not isinstance(request, dict):
+        raise WireError('a question is one JSON object such as {"get": "slices", "frame": 42}')
+    if request.get("get") not in topics:
+        raise WireError(f'a question\'s "get" is one of {", ".join(topics)}')
+    if request["get"] != "start":
+        number = request.get("frame", request.get("seq"))
+        if not isinstance(number, int) or isinstance(number, bool) or number < 0:
+            raise WireError("a question names a frame (or, for slices, a seq) by a whole number from 0")
+    return request
+
+
+def _bind(context: zmq.Context[Any], kind: int, endpoint: str, high_water_mark: int) -> zmq.Socket[Any]:
+    wire.prepare_endpoint(endpoint)
+    if endpoint.startswith("ipc://") and _answers(endpoint.removeprefix("ipc://")):
+        raise WireError(f"{endpoint} is in use by another program; stop it, or choose another endpoint")
+    one: zmq.Socket[Any] = context.socket(kind)
+    one.setsockopt(zmq.LINGER, 0)
+    one.setsockopt(zmq.SNDHWM, high_water_mark)
+    one.setsockopt(zmq.RCVHWM, 100)
+    one.setsockopt(zmq.MAXMSGSIZE, QUESTION_BYTES)
+    if kind == zmq.ROUTER:
+        one.setsockopt(zmq.ROUTER_MANDATORY, 1)
+    try:
+        one.bind(endpoint)
+    except zmq.ZMQError as error:
+        one.close()
+        if error.errno == zmq.EADDRINUSE:
+            raise WireError(f"{endpoint} is in use by another program; stop it, or choose another endpoint") from None
+        raise WireError(f"{endpoint} can't be bound ({error.strerror}); choose another endpoint") from None
+    if endpoint.startswith("ipc://"):
+        Path(endpoint.removeprefix("ipc://")).chmod(0o660)
+    return one
+
+
+def _answers(path: str) -> bool:
+    """Whether somebody listens on a UNIX socket: ZeroMQ would take its place without a word."""
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(1)
+        try:
+            probe.connect(path)
+        except OSError:
+            return False
+        return True

@@ -1,0 +1,159 @@
+"""What goes over ZeroMQ: multipart [topic, header, body?], the header one JSON object, the body arrays end to end."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import stat
+import urllib.parse
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.errors import DappledError
+from dappled.flight.records import Tag
+
+VERSION = 1
+TOPICS = ("start", "frame", "slices", "preview", "health", "end")
+Topic = Literal["start", "frame", "slices", "preview", "health", "end"]
+
+
+class WireError(DappledError):
+    """An endpoint, a message or a request is not usable; one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message as it is sent or was received. `body` is bytes-like or None."""
+
+    topic: str
+    header: Mapping[str, Any]
+    body: Any = None
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The body's arrays by name, as views into the body. Raises WireError when header and body disagree."""
+        found: dict[str, NDArray[Any]] = {}
+        start = 0
+        data = memoryview(self.body or b"").cast("B")
+        for entry in self.header.get("arrays", []):
+            dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
+            size = dtype.itemsize * math.prod(shape)
+            if start + size > len(data):
+                raise WireError(f"the body of {self.topic} ends inside array {entry['name']!r}")
+            found[entry["name"]] = np.frombuffer(data[start : start + size], dtype).reshape(shape)
+            start += size
+        return found
+
+
+def describe_array(name: str, array: NDArray[Any], unit: str) -> dict[str, Any]:
+    """An entry of the header's `arrays`."""
+    return {"name": name, "dtype": array.dtype.newbyteorder("<").str, "shape": list(array.shape), "unit": unit}
+
+
+def frame_facts(tag: Tag, law: str | None) -> dict[str, Any]:
+    """What every header that speaks of one frame holds."""
+    return {
+        "frame": tag.index,
+        "utc_ns": tag.utc_ns,
+        "pose": pose_face(tag),
+        "focal_length_mm": tag.focal_length_mm,
+        "f_number": tag.f_number,
+        "camera": tag.camera,
+        "mask": tag.mask,
+        "law": law,
+        "sha256": tag.frame_sha256,
+    }
+
+
+def pose_face(tag: Tag) -> dict[str, Any]:
+    """The pose as people and maps read it: degrees, and roll, pitch, yaw of the vehicle beside the quaternion."""
+    pose = tag.pose
+
+    def degrees(value: float | None) -> float | None:
+        return None if value is None else math.degrees(value)
+
+    roll, pitch, yaw = euler(pose.attitude) if pose.attitude else (None, None, None)
+    return {
+        "source": pose.source,
+        "utc_ns": pose.utc_ns,
+        "utc_sigma_ns": tag.utc_sigma_ns,
+        "latitude_deg": degrees(pose.latitude_rad),
+        "longitude_deg": degrees(pose.longitude_rad),
+        "altitude_msl_m": pose.altitude_msl_m,
+        "height_above_home_m": pose.height_above_home_m,
+        "velocity_ned_m_s": list(pose.velocity_ned_m_s) if pose.velocity_ned_m_s else None,
+        "attitude": list(pose.attitude) if pose.attitude else None,
+        "roll_deg": degrees(roll),
+        "pitch_deg": degrees(pitch),
+        "yaw_deg": degrees(yaw),
+        "position_sigma_m": pose.position_sigma_m,
+        "attitude_sigma_deg": degrees(pose.attitude_sigma_rad),
+        "age_ms": pose.age_ms,
+    }
+
+
+def euler(q: Sequence[float]) -> tuple[float, float, float]:
+    """(roll, pitch, yaw) in radians of a body-to-NED quaternion (w, x, y, z); yaw from 0 to 2π."""
+    w, x, y, z = q
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return roll, pitch, yaw % (2 * math.pi)
+
+
+def encode(header: Mapping[str, Any]) -> bytes:
+    """A header's bytes. NaN has no place in JSON: unknown is null."""
+    return json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
+
+
+def decode(parts: Sequence[Any]) -> Message:
+    """A message from its parts. Raises WireError for anything else."""
+    try:
+        topic, header = bytes(parts[0]).decode(), json.loads(bytes(parts[1]))
+    except (IndexError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise WireError(f"not a dappled message: {error}") from None
+    if not isinstance(header, dict):
+        raise WireError("not a dappled message: the header is no JSON object")
+    return Message(topic, header, parts[2] if len(parts) > 2 else None)
+
+
+def schema(topic: str) -> dict[str, Any]:
+    """The JSON Schema of a topic's header."""
+    text = (resources.files("dappled.daemon") / "schemas" / f"{topic}.json").read_text(encoding="utf-8")
+    loaded: dict[str, Any] = json.loads(text)
+    return loaded
+
+
+def prepare_endpoint(endpoint: str) -> None:
+    """Make an endpoint safe to bind: ipc folders exist and are private; tcp stays on loopback. Raises WireError."""
+    url = urllib.parse.urlsplit(endpoint)
+    if url.scheme == "ipc":
+        path = Path(endpoint.removeprefix("ipc://"))
+        if not path.is_absolute() or len(str(path).encode()) > 107:
+            raise WireError(f"{endpoint} must be an absolute path of at most 107 bytes")
+        _prepare_folder(path.parent, endpoint)
+        if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
+            raise WireError(f"{endpoint}: a file that is no socket stands there; choose another endpoint")
+    elif url.scheme == "tcp":
+        if url.hostname not in ("127.0.0.1", "localhost", "::1"):
+            raise WireError(
+                f"{endpoint} would be open to the network without keys: dappled binds tcp on loopback only; "
+                "use ipc:// or tcp://127.0.0.1:PORT and a tunnel"
+            )
+    else:
+        raise WireError(f"{endpoint} is neither ipc:// nor tcp://")
+
+
+def _prepare_folder(folder: Path, endpoint: str) -> None:
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise WireError(f"{endpoint}: its folder can't be made ({error.strerror}); choose another endpoint") from None
+    if folder.stat().st_uid not in (0, os.getuid()):
+        raise WireError(f"{endpoint}: {folder} belongs to another user; choose another endpoint")

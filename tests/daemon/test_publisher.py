@@ -1,0 +1,221 @@
+"""The stream and its questions, over real ZeroMQ sockets."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+import zmq
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dappled.daemon import publisher as publisher_module
+from dappled.daemon import wire
+from dappled.daemon.publisher import Publisher, Reply
+from dappled.daemon.subscriber import Subscriber, subscribe
+from dappled.daemon.wire import Message, WireError
+
+STACK = np.arange(24, dtype=np.complex64).reshape(2, 3, 4)
+
+
+def no_answer(_: Mapping[str, Any], reply: Reply) -> None:
+    reply(Message("error", {"error": "nothing here"}))
+
+
+@pytest.fixture
+def endpoint(tmp_path: Path) -> str:
+    return f"ipc://{tmp_path}/s"
+
+
+@pytest.fixture
+def started(endpoint: str) -> Iterator[Publisher]:
+    one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=no_answer)
+    one.start()
+    yield one
+    one.stop(0.2)
+
+
+def receive(subscriber: Subscriber, topic: str, deadline_s: float = 10) -> Message:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        message = subscriber.receive(0.5)
+        if message is not None and message.topic == topic:
+            return message
+    raise AssertionError(f"no {topic} within {deadline_s} s")
+
+
+def connected(publisher: Publisher, subscriber: Subscriber) -> None:
+    """A subscription takes effect some time after connect: publish until something comes."""
+    end = time.monotonic() + 10
+    while time.monotonic() < end:
+        publisher.publish("health", {"utc_ns": 0})
+        if subscriber.receive(0.05) is not None:
+            return
+    raise AssertionError("the subscription never took effect")
+
+
+def test_arrays_arrive_as_sent(started: Publisher, endpoint: str) -> None:
+    with Subscriber(endpoint, endpoint + ".ask") as subscriber:
+        connected(started, subscriber)
+        facts = {"frame": 7, "arrays": [wire.describe_array("slices", STACK, "1")]}
+        started.publish("slices", facts, STACK.tobytes())
+        message = receive(subscriber, "slices")
+        np.testing.assert_array_equal(message.arrays()["slices"], STACK)
+        assert (message.header["schema"], message.header["version"]) == ("dappled/slices", 1)
+        assert (message.header["seq"], message.header["dropped"], message.header["frame"]) == (0, 0, 7)
+
+
+def test_seq_counts_each_topic_by_itself(started: Publisher, endpoint: str) -> None:
+    with Subscriber(endpoint) as subscriber:
+        connected(started, subscriber)
+        for frame in range(3):
+            started.publish("frame", {"frame": frame})
+        assert [receive(subscriber, "frame").header["seq"] for _ in range(3)] == [0, 1, 2]
+
+
+def test_a_full_queue_drops_previews_before_slices_and_never_frames(endpoint: str) -> None:
+    one = Publisher(endpoint, "", flight="f", answer=no_answer, capacity=3)
+    for topic in ("preview", "slices", "frame", "slices", "frame", "end"):  # not started: all of it waits
+        one.publish(topic, {"frame": 0, "utc_ns": 0}, b"x")
+    statistics = one.statistics()
+    assert dict(statistics.dropped) == {"start": 0, "frame": 0, "slices": 2, "preview": 1, "health": 0, "end": 0}
+    assert statistics.waiting == 3
+    one.start()
+    one.stop(0.2)
+
+
+def test_a_lost_message_is_asked_for_and_had(endpoint: str) -> None:
+    asked: list[int] = []
+
+    def answer(request: Mapping[str, Any], reply: Reply) -> None:
+        asked.append(request["frame"])
+        facts = {"frame": request["frame"], "arrays": [wire.describe_array("slices", STACK, "1")]}
+        threading.Thread(target=reply, args=[Message("slices", facts, STACK.tobytes())]).start()
+
+    one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer, capacity=100)
+    one.start()
+    with Subscriber(endpoint, endpoint + ".ask") as subscriber:
+        connected(one, subscriber)
+        one.publish("slices", {"frame": 40, "arrays": []}, b"")
+        assert receive(subscriber, "slices").header["frame"] == 40
+        subscriber._next["slices"] = 0  # as if the first had been number 0 and lost on the way
+        one.publish("slices", {"frame": 41, "arrays": []}, b"")
+        assert receive(subscriber, "slices").header["frame"] == 41
+        answer_ = receive(subscriber, "slices")
+        assert answer_.header["frame"] == 40
+        np.testing.assert_array_equal(answer_.arrays()["slices"], STACK)
+        assert (asked, subscriber.gaps, subscriber.recovered, subscriber.lost) == ([40], 1, 1, 0)
+    one.stop(0.2)
+
+
+def test_the_start_can_be_asked_for_later(started: Publisher, endpoint: str) -> None:
+    started.publish("start", {"utc_ns": 1, "software": "x"})
+    with Subscriber(endpoint, endpoint + ".ask", topics=["end"]) as subscriber:
+        end = time.monotonic() + 10
+        while time.monotonic() < end:
+            subscriber.ask({"get": "start"})
+            message = subscriber.receive(5)
+            assert message is not None
+            if message.topic == "start":
+                assert message.header["software"] == "x"
+                return
+    raise AssertionError("start was never answered")
+
+
+@pytest.mark.parametrize(
+    "question",
+    [b"", b"{", b"[]", b'{"get": "fish"}', b'{"get": "slices"}', b'{"get": "slices", "frame": "4"}', b"[" * 4000,
+     b'{"get": "slices", "frame": -1}', b'{"get": "slices", "seq": 99}', b'{"get": "slices", "frame": true}'],
+)  # fmt: skip
+def test_a_bad_question_gets_one_sentence(started: Publisher, endpoint: str, question: bytes) -> None:
+    context = zmq.Context()
+    dealer = context.socket(zmq.DEALER)
+    dealer.connect(endpoint + ".ask")
+    dealer.send(question)
+    assert dealer.poll(5000)
+    answer = wire.decode(dealer.recv_multipart())
+    assert answer.topic == "error"
+    jsonschema.validate(answer.header, wire.schema("error"))
+    assert started.statistics().refused == 1
+    context.destroy(linger=0)
+
+
+def test_subscribe_ends_after_end(started: Publisher, endpoint: str) -> None:
+    got: list[str] = []
+    reader = threading.Thread(target=lambda: got.extend(m.topic for m in subscribe(endpoint, topics=["frame", "end"])))
+    reader.start()
+    end = time.monotonic() + 10
+    while not got and time.monotonic() < end:
+        started.publish("frame", {"frame": 0})
+        reader.join(0.05)
+    started.publish("end", {"utc_ns": 0})
+    reader.join(10)
+    assert not reader.is_alive()
+    assert got[-1] == "end"
+
+
+def test_an_endpoint_in_use_is_refused_and_stays_whole(started: Publisher, endpoint: str) -> None:
+    with pytest.raises(WireError, match="in use by another program"):
+        Publisher(endpoint, "", flight="g", answer=no_answer)
+    with Subscriber(endpoint) as subscriber:
+        connected(started, subscriber)
+
+
+def test_a_tcp_port_in_use_is_refused() -> None:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as taken,
+        pytest.raises(WireError, match="in use by another program"),
+    ):
+        Publisher(f"tcp://127.0.0.1:{taken.getsockname()[1]}", "", flight="g", answer=no_answer)
+
+
+@pytest.mark.parametrize("endpoint", ["tcp://0.0.0.0:5555", "tcp://192.0.2.1:5555", "tcp://*:5555"])
+def test_tcp_off_loopback_is_refused_without_keys(endpoint: str) -> None:
+    with pytest.raises(WireError, match="open to the network"):
+        wire.prepare_endpoint(endpoint)
+
+
+@pytest.mark.parametrize("endpoint", ["inproc://x", "ipc://relative", "ipc:///" + "x" * 200, "fish"])
+def test_strange_endpoints_are_refused(endpoint: str) -> None:
+    with pytest.raises(WireError):
+        wire.prepare_endpoint(endpoint)
+
+
+def test_a_file_is_not_taken_for_a_socket(tmp_path: Path) -> None:
+    (tmp_path / "s").write_text("precious")
+    with pytest.raises(WireError, match="no socket"):
+        wire.prepare_endpoint(f"ipc://{tmp_path}/s")
+    assert (tmp_path / "s").read_text() == "precious"
+
+
+@given(st.lists(st.binary(max_size=64), max_size=4))
+def test_any_parts_are_a_message_or_an_error(parts: list[bytes]) -> None:
+    try:
+        message = wire.decode(parts)
+    except WireError:
+        return
+    assert isinstance(message.header, dict)
+
+
+@given(st.binary(max_size=200))
+def test_any_question_is_understood_or_refused(data: bytes) -> None:
+    question: Callable[[list[bytes]], dict[str, Any]] = publisher_module._question
+    try:
+        assert question([data])["get"] in ("start", "frame", "slices")
+    except WireError:
+        return
+    assert json.loads(data)
+
+
+def test_a_body_that_is_too_short_is_named() -> None:
+    header = {"arrays": [wire.describe_array("slices", STACK, "1")]}
+    with pytest.raises(WireError, match="ends inside"):
+        Message("slices", header, STACK.tobytes()[:-1]).arrays()
