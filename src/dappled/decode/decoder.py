@@ -1,0 +1,328 @@
+"""From a plane to slices and views, for a masked camera and for lenslets: what carriers were used, and why.
+
+A decoder is a value: it holds what all frames of a camera share and no memory of the frames. The same plane gives the
+same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.decode.calibration import Calibration, at_corner, origin_of, relative_transfer
+from dappled.decode.carriers import LAWS, Carrier, Lattice, Sensor
+from dappled.decode.errors import DecodeError
+from dappled.decode.lattice import fit, residual_bins
+from dappled.decode.lightfield import LightField
+from dappled.decode.masks import Mask, Order
+from dappled.decode.peaks import Measured, measure
+from dappled.decode.plane import Plane
+from dappled.decode.slices import Slices, default_size, extract
+from dappled.decode.spectrum import Spectrum, padded_shape
+from dappled.decode.views import Aperture, Views, angular_frequencies, from_slices, kappa, transfer
+
+CarriersFrom = Literal["measured", "calibrated", "predicted", "found"]
+ViewsFrom = Literal["calibration", "frame", "white", "none"]
+_ENOUGH = 4  # peaks of a half plane, in both directions, before a frame's own lattice is believed
+_STRONG = 0.02  # of the mean; at the ideal aperture parallax alone leaves up to a thousandth
+_STRONGER = 0.1  # what it takes against a calibration: weak peaks are pulled aside by parallax
+_ALIKE_BINS = 0.5  # rms from their lattice
+_ROTATION = 0.04  # of a carrier's frequency: the search without a calibration allows for 2.3°
+_LEAST_THROUGH = 0.1  # a carrier of which the aperture leaves less doesn't tell the mask's transfer
+
+
+@dataclass(frozen=True, slots=True)
+class DecodeReport:
+    """Which carriers a frame was decoded at, and why.
+
+    `predicted` are the half plane's carriers on the sensor as predicted, (0, 0) first, `measured` what was seen near
+    each (None: nothing there), `used` those that the slices were cut at. `carriers_from`: "measured" in this frame;
+    "calibrated": predicted by the calibration, as too little was to be seen; "predicted": by the law alone; "found":
+    a lattice that nobody had named. `views_from`: whose phases and transfer made the views. `noise_rms` is the
+    plane's white noise, 1.0 = sensor white.
+    """
+
+    predicted: tuple[Carrier, ...]
+    measured: tuple[Measured | None, ...]
+    used: tuple[Carrier, ...]
+    carriers_from: CarriersFrom
+    views_from: ViewsFrom
+    noise_rms: float
+
+    @property
+    def found(self) -> int:
+        """How many carriers were seen, the mean (0, 0) included."""
+        return sum(m is not None for m in self.measured)
+
+
+class Decoder(Protocol):
+    """What decodes the planes of one camera."""
+
+    def decode(
+        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None
+    ) -> LightField:
+        """The light field of a plane float32 (H, W). Raises DecodeError."""
+
+    def decode_reported(
+        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None
+    ) -> tuple[LightField, DecodeReport]:
+        """`decode`, and which carriers it used."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MaskDecoder:
+    """Decodes frames from behind a printed mask.
+
+    The carriers are predicted by the calibration, or else by the law from `mask_distance_mm`. Where enough of them
+    are to be seen near the prediction, the frame's own lattice is used. `focal_sigma_mm` is what the focal length is
+    known to (half of the EXIF rounding): it widens the search. `size` of the slices in bins of the padded transform;
+    None: as large as the spacing allows. Views need a calibration, or a frame that shows its carriers; else only the
+    slices are there, and `views` has the shape (0, 0, h, w).
+    """
+
+    sensor: Sensor
+    mask: Mask
+    law: str
+    mask_distance_mm: float
+    calibration: Calibration | None = None
+    size: tuple[int, int] | None = None
+    aperture: Aperture | None = None
+    focal_sigma_mm: float = 0.05
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        """Raises DecodeError for an unknown law, or another camera's calibration."""
+        if self.law not in LAWS:
+            raise DecodeError(f"unknown law {self.law!r}; known are {', '.join(LAWS)}")
+        known = self.calibration
+        if known is not None and (known.mask != self.mask or known.law != self.law):
+            raise DecodeError("the calibration was made with another mask or law: calibrate anew, or name its own")
+        if known is not None and known.shape != self.sensor.shape:
+            raise DecodeError(f"the calibration is for frames of {known.shape}, this camera's are {self.sensor.shape}")
+
+    def lattice_at(self, focal_length_mm: float) -> Lattice:
+        """The predicted lattice."""
+        if self.calibration is not None:
+            return self.calibration.lattice_at(focal_length_mm)
+        return LAWS[self.law](self.mask, self.sensor, self.mask_distance_mm, focal_length_mm)
+
+    def predict(self, focal_length_mm: float) -> list[Carrier]:
+        """The half plane's carriers that lie on the sensor, (0, 0) first."""
+        return [c for c in self.lattice_at(focal_length_mm).carriers(self.mask.half_orders()) if c.on_sensor]
+
+    def decode(
+        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None
+    ) -> LightField:
+        """The light field of a plane float32 (H, W) of the sensor's shape, 1.0 = sensor white."""
+        return self.decode_reported(plane, focal_length_mm=focal_length_mm, f_number=f_number)[0]
+
+    def decode_reported(
+        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None
+    ) -> tuple[LightField, DecodeReport]:
+        """`decode`, and which carriers it used. Without an f-number only the slices are made."""
+        if focal_length_mm is None:
+            raise DecodeError("the frame's focal length is unknown: give it with --focal-length")
+        if not (focal_length_mm > 0 and (f_number is None or f_number > 0)):
+            raise DecodeError(f"focal length {focal_length_mm} mm and f-number {f_number} must be above 0")
+        if plane.shape != self.sensor.shape:
+            raise DecodeError(f"the frame is {plane.shape} px, this camera's are {self.sensor.shape}: another profile?")
+        predicted = self.predict(focal_length_mm)
+        if len(predicted) < 2:
+            raise DecodeError(
+                f"all carriers but the mean fall off the sensor at {focal_length_mm} mm: wrong mask, law or length?"
+            )
+        spectrum = self.transform(plane, focal_length_mm)
+        lattice, measured, carriers_from = self.locate(spectrum, focal_length_mm, predicted)
+        used = [c for c in lattice.carriers([(c.ky, c.kx) for c in predicted]) if c.on_sensor]
+        slices = self.cut(spectrum, lattice, used)
+        noise = spectrum.noise_rms()
+        views, offsets, views_from = self._views(
+            slices, lattice, carriers_from, focal_length_mm=focal_length_mm, f_number=f_number, noise_rms=noise
+        )
+        report = DecodeReport(tuple(predicted), tuple(measured), tuple(used), carriers_from, views_from, noise)
+        facts: dict[str, Any] = {
+            "law": self.law,
+            "focal_length_mm": focal_length_mm,
+            "f_number": f_number,
+            "mask_distance_mm": self._distance(focal_length_mm),
+            "calibrated": self.calibration is not None,
+        }
+        return light_field(slices, views, offsets, plane=plane, report=report, facts=facts), report
+
+    def transform(self, plane: Plane, focal_length_mm: float) -> Spectrum:
+        """The spectrum as far out as this focal length's slices and searches need it."""
+        predicted = self.predict(focal_length_mm)
+        reach = max(abs(c.fx) for c in predicted) * (1 + _ROTATION)
+        width = self.slice_size(self.lattice_at(focal_length_mm))[1]
+        wide = padded_shape(self.sensor.shape)[1]
+        largest = reach + max(width / 2, max(self._radii(predicted, focal_length_mm)) + 8) / wide
+        return Spectrum.of(plane, workers=self.workers, largest_fx=min(0.5, largest))
+
+    def slice_size(self, lattice: Lattice) -> tuple[int, int]:
+        """(height, width) of the bands in bins of the padded transform."""
+        return self.size or default_size(lattice, padded_shape(self.sensor.shape))
+
+    def locate(
+        self, spectrum: Spectrum, focal_length_mm: float, predicted: Sequence[Carrier]
+    ) -> tuple[Lattice, list[Measured | None], CarriersFrom]:
+        """The lattice to use, what was seen near each predicted carrier, and which of the two it came from."""
+        lattice = self.lattice_at(focal_length_mm)
+        measured = measure(spectrum, predicted, self._radii(predicted, focal_length_mm))
+        least = _STRONGER if self.calibration is not None else _STRONG
+        own = _own_lattice(spectrum, predicted, measured, least)
+        if own is None:
+            if self.calibration is not None:
+                return lattice, measured, "calibrated"
+            return lattice, measured, "predicted"
+        at_own = measure(spectrum, own.carriers([(c.ky, c.kx) for c in predicted]), 2.0)
+        return own, at_own, "measured"
+
+    def cut(self, spectrum: Spectrum, lattice: Lattice, carriers: Sequence[Carrier]) -> Slices:
+        """The slices at these carriers, cut at Nyquist."""
+        return extract(spectrum, carriers, self.slice_size(lattice), workers=self.workers)
+
+    def _radii(self, carriers: Sequence[Carrier], focal_length_mm: float) -> list[float]:
+        """How far from each prediction a carrier may lie, in bins: rotation, rounding of the focal length, 1.5 bins."""
+        high, wide = padded_shape(self.sensor.shape)
+        orders = [(c.ky, c.kx) for c in carriers]
+        longer = self.lattice_at(focal_length_mm + self.focal_sigma_mm).carriers(orders)
+        spacing = min(math.hypot(v[0] * high, v[1] * wide) for v in self.lattice_at(focal_length_mm).matrix())
+        turned = 0.0 if self.calibration is not None else _ROTATION
+        return [
+            min(
+                1.5
+                + math.hypot((a.fy - b.fy) * high, (a.fx - b.fx) * wide)
+                + turned * math.hypot(a.fy * high, a.fx * wide),
+                0.4 * spacing,
+            )
+            for a, b in zip(carriers, longer, strict=True)
+        ]
+
+    def _distance(self, focal_length_mm: float) -> float:
+        if self.calibration is not None:
+            return self.calibration.nearest(focal_length_mm).mask_distance_mm
+        return self.mask_distance_mm
+
+    def _views(
+        self,
+        slices: Slices,
+        lattice: Lattice,
+        carriers_from: CarriersFrom,
+        *,
+        focal_length_mm: float,
+        f_number: float | None,
+        noise_rms: float,
+    ) -> tuple[Views, NDArray[np.float64], ViewsFrom]:
+        none = np.zeros((0, 0, *slices.values.shape[1:]), dtype=np.float32), np.zeros((0, 0, 2))
+        if f_number is None:
+            return *none, "none"
+        orders = [(c.ky, c.kx) for c in slices.carriers]
+        aperture = self.aperture or Aperture(self.mask.views_per_axis)
+        cycles = kappa(self.mask.frequency_per_mm, self._distance(focal_length_mm), focal_length_mm, f_number)
+        keep = np.ones(len(orders), dtype=bool)
+        if self.calibration is not None:
+            known = self.calibration.nearest(focal_length_mm)
+            magnitudes = dict(zip(self.mask.half_orders(), known.transfer, strict=True))
+            origin = at_corner(known.origin, lattice, self.sensor.shape)
+            transfers = transfer(orders, [magnitudes[order] for order in orders], origin)
+            rotation = known.rotation_rad
+            views_from: ViewsFrom = "calibration"
+        elif carriers_from == "measured":
+            rotation = _rotation(lattice, self.lattice_at(focal_length_mm))
+            through = aperture.transform(angular_frequencies(orders, cycles, rotation)).real
+            keep = np.abs(through) > _LEAST_THROUGH
+            if np.linalg.matrix_rank([order for order, usable in zip(orders, keep, strict=True) if usable]) < 2:
+                return *none, "none"
+            transfers = _own_transfer(slices.values, orders, through, keep)
+            views_from = "frame"
+        else:
+            return *none, "none"
+        keep &= np.abs(transfers) > 1e-3  # a carrier that the mask doesn't make tells nothing
+        views, offsets = from_slices(
+            slices.values if keep.all() else slices.values[keep],
+            [order for order, usable in zip(orders, keep, strict=True) if usable],
+            transfers[keep],
+            kappa_cycles=cycles,
+            rotation_rad=rotation,
+            aperture=aperture,
+            noise_variance=noise_rms**2 * slices.band,
+        )
+        return views, offsets, views_from
+
+
+def _own_lattice(
+    spectrum: Spectrum, predicted: Sequence[Carrier], measured: Sequence[Measured | None], least: float
+) -> Lattice | None:
+    """The lattice that this frame's own peaks show, or None where they are too few, too weak or not on a lattice."""
+    pairs = _believed(predicted, measured, least)
+    for radius in (3.0, 2.0):
+        if len(pairs) < _ENOUGH or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in pairs]) < 2:
+            return None
+        lattice = fit(pairs)
+        looked = lattice.carriers([(c.ky, c.kx) for c in predicted])
+        pairs = _believed(looked, measure(spectrum, looked, radius), least)
+    if len(pairs) < _ENOUGH or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in pairs]) < 2:
+        return None
+    lattice = fit(pairs)
+    carriers = lattice.carriers([(c.ky, c.kx) for c, _ in pairs])
+    if residual_bins(carriers, [m for _, m in pairs], spectrum) > _ALIKE_BINS:
+        return None
+    return lattice
+
+
+def _believed(
+    carriers: Sequence[Carrier], measured: Sequence[Measured | None], least: float
+) -> list[tuple[Carrier, Measured]]:
+    return [
+        (c, m)
+        for c, m in zip(carriers, measured, strict=True)
+        if m is not None and not m.suspect and m.strength >= least and (c.ky, c.kx) != (0, 0)
+    ]
+
+
+def _rotation(lattice: Lattice, predicted: Lattice) -> float:
+    """The turn from one lattice to another, mean of both vectors', as `Lattice.rotated` counts."""
+    turns = []
+    for (ay, ax), (by, bx) in zip((lattice.ky, lattice.kx), (predicted.ky, predicted.kx), strict=True):
+        turns.append(math.atan2(by * ax - bx * ay, by * ay + bx * ax))
+    return sum(turns) / 2
+
+
+def _own_transfer(
+    slices: NDArray[np.complex64], orders: Sequence[Order], through: NDArray[np.float64], keep: NDArray[np.bool_]
+) -> NDArray[np.complex128]:
+    """T_k from the frame's own slices, lattice-linear, the aperture divided out."""
+    seen = relative_transfer(slices) / np.where(keep, through, 1.0)
+    used = keep.copy()
+    used[0] = False
+    origin, _ = origin_of([order for order, usable in zip(orders, used, strict=True) if usable], seen[used])
+    turns = transfer(orders, np.ones(len(orders)), origin)
+    return np.where(keep, (seen * np.conj(turns)).real, 0.0) * turns
+
+
+def light_field(
+    slices: Slices,
+    views: Views,
+    offsets: NDArray[np.float64],
+    *,
+    plane: Plane,
+    report: DecodeReport,
+    facts: Mapping[str, Any],
+) -> LightField:
+    """The light field's value, its attributes the facts and what the report says in numbers and words."""
+    rows = np.array([(c.ky, c.kx, c.fy, c.fx) for c in slices.carriers], dtype=np.float64)
+    attributes = {
+        "shape": [int(side) for side in plane.shape],
+        **facts,
+        "carriers_from": report.carriers_from,
+        "views_from": report.views_from,
+        "carriers_predicted": len(report.predicted),
+        "carriers_found": report.found,
+        "noise_rms": report.noise_rms,
+    }
+    return LightField(slices.values, rows, views, offsets, slices.grid, attributes)

@@ -1,0 +1,11 @@
+"""What the decoder says when it can't."""
+
+from __future__ import annotations
+
+
+class DecodeError(ValueError):
+    """A frame can't be decoded as asked; one clear sentence: what, where, what to do."""
+
+
+class NoLattice(DecodeError):  # noqa: N818 - said as a finding: the frame is fine, there is no lattice in it
+    """The spectrum of a frame shows no lattice of carriers."""

@@ -1,0 +1,180 @@
+"""Slices: the band around each carrier, brought to baseband and transformed back (Eq 12, with fractional carriers)."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from dappled.decode.carriers import Carrier, Lattice
+from dappled.decode.errors import DecodeError
+from dappled.decode.spectrum import Complex, Spectrum
+
+Window = Literal["box", "cell"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Slices:
+    """`values` complex64 (K, h, w), one slice a carrier; `grid` float64 (2, 3), from (y, x, 1) to sensor (row, column).
+
+    `band` is the share of the plane's white noise power that one slice takes up: variance of a slice pixel over
+    variance of a plane pixel.
+    """
+
+    values: Complex
+    carriers: tuple[Carrier, ...]
+    grid: NDArray[np.float64]
+    band: float
+
+
+def default_size(lattice: Lattice, padded: tuple[int, int], window: Window = "box") -> tuple[int, int]:
+    """(height, width) in bins of the padded transform: as large as the lattice's spacing allows, cut at Nyquist.
+
+    For "box" the largest rectangle that overlaps none of its neighbours on the lattice, for "cell" the smallest one
+    around the lattice's own cell (the points nearer to one carrier than to any other). Both sides have small prime
+    factors; the box's are even.
+    """
+    steps = [
+        (y * padded[0], x * padded[1])
+        for y, x in (
+            np.array([(a, b) for a, b in itertools.product(range(-3, 4), repeat=2) if (a, b) != (0, 0)])
+            @ lattice.matrix()
+        )
+    ]
+    if window == "cell":
+        corners = _cell_corners(lattice) * np.array(padded)
+        height, width = (2 * math.ceil(abs(corners[:, axis]).max()) + 1 for axis in (0, 1))
+        return min(_fast_up(height), padded[0]), min(_fast_up(width), padded[1])
+    best = (0, 0)
+    for height in {abs(dy) for dy, _ in steps if abs(dy) > 1}:
+        width = min((abs(dx) for dy, dx in steps if abs(dy) < height * (1 - 1e-9)), default=float(padded[1]))
+        if height * width > best[0] * best[1]:
+            best = (math.floor(height + 1e-6), math.floor(width + 1e-6))
+    if min(best) < 2:
+        raise DecodeError("the carriers lie too close together to cut slices: is this the right mask and focal length?")
+    return _fast_down(min(best[0], padded[0])), _fast_down(min(best[1], padded[1]))
+
+
+def extract(
+    spectrum: Spectrum,
+    carriers: Sequence[Carrier],
+    size: tuple[int, int] | None = None,
+    *,
+    lattice: Lattice | None = None,
+    window: Window = "box",
+    wrap: bool = False,
+    workers: int = 1,
+) -> Slices:
+    """The slices of these carriers.
+
+    `size` is (height, width) of the band in bins; by default `default_size` of `lattice`, which is otherwise only
+    needed for the window "cell". `wrap` lets a band go on cyclically past the edge of the spectrum (sampled lenslet
+    arrays); else what lies beyond Nyquist is 0. Scaled so that the slice of (0, 0) has the plane's local mean; phases
+    are those at pixel (0, 0), the fraction of a bin compensated exactly. The slices end where the frame ends.
+    """
+    if not carriers:
+        raise DecodeError("no carriers to cut slices at")
+    if size is None or window == "cell":
+        if lattice is None:
+            raise DecodeError("slices need a size, or a lattice to take it from")
+        size = size or default_size(lattice, spectrum.padded, window)
+    height, width = size
+    if not (2 <= height <= spectrum.padded[0] and 2 <= width <= spectrum.padded[1]):
+        raise DecodeError(f"a slice of {height}×{width} bins doesn't fit a spectrum of {spectrum.padded}")
+    scale = np.float32(1 / (spectrum.padded[0] * spectrum.padded[1]))
+    bands = np.empty((len(carriers), height, width), dtype=np.complex64)
+    share = height * width / (spectrum.padded[0] * spectrum.padded[1])
+    cell = None
+    if window == "cell" and lattice is not None:
+        cell = _cell_weights(lattice, spectrum.padded, size)
+        share *= float(np.mean(cell**2))
+    fractions = np.empty((len(carriers), 2))
+    top_left = (height // 2, width // 2)
+    buffer = np.empty((height, width), dtype=np.complex64)
+    for band, carrier, fraction in zip(bands, carriers, fractions, strict=True):
+        row, column = spectrum.bins(carrier.fy, carrier.fx)
+        whole = round(row), round(column)
+        fraction[:] = row - whole[0], column - whole[1]
+        spectrum.block_into(buffer, whole[0] - top_left[0], whole[1] - top_left[1], wrap=wrap)
+        if cell is not None:
+            buffer *= cell
+        _unshift(band, buffer, scale)
+    images = fft.ifft2(bands, axes=(1, 2), norm="forward", overwrite_x=True, workers=workers)
+    rows = _samples(spectrum.shape[0], spectrum.padded[0], height)
+    columns = _samples(spectrum.shape[1], spectrum.padded[1], width)
+    values = np.empty((len(carriers), rows, columns), dtype=np.complex64)
+    for k, (image, (dy, dx), carrier) in enumerate(zip(images, fractions, carriers, strict=True)):
+        turn_y = np.exp(-2j * np.pi * dy * np.arange(rows) / height).astype(np.complex64)
+        turn_x = np.exp(-2j * np.pi * dx * np.arange(columns) / width).astype(np.complex64)
+        np.multiply(image[:rows, :columns], turn_y[:, None], out=values[k])
+        values[k] *= turn_x
+        if carrier.ky == 0 and carrier.kx == 0:
+            values[k] += np.float32(spectrum.mean)
+    grid = np.array([[spectrum.padded[0] / height, 0.0, 0.0], [0.0, spectrum.padded[1] / width, 0.0]])
+    return Slices(values, tuple(carriers), grid, share)
+
+
+def _unshift(out: Complex, block: Complex, scale: np.float32) -> None:
+    """ifftshift times `scale`, without a temporary: the block's middle bin goes to (0, 0)."""
+    y, x = block.shape[0] // 2, block.shape[1] // 2
+    down, right = block.shape[0] - y, block.shape[1] - x
+    np.multiply(block[y:, x:], scale, out=out[:down, :right])
+    np.multiply(block[:y, x:], scale, out=out[down:, :right])
+    np.multiply(block[y:, :x], scale, out=out[:down, right:])
+    np.multiply(block[:y, :x], scale, out=out[down:, right:])
+
+
+def _samples(side: int, padded: int, size: int) -> int:
+    """How many samples of a transform of `size` over `padded` pixels stand on the frame's own pixels."""
+    return min(size, (side - 1) * size // padded + 1)
+
+
+def _cell_weights(lattice: Lattice, padded: tuple[int, int], size: tuple[int, int]) -> NDArray[np.float32]:
+    """(h, w), DC at h//2, w//2: 1 where a bin is nearest to the middle carrier, 0 nearer to another, ½ between two."""
+    y = (np.arange(size[0]) - size[0] // 2)[:, None] / padded[0]
+    x = (np.arange(size[1]) - size[1] // 2)[None, :] / padded[1]
+    bin_width = 1 / min(padded)
+    weights = np.ones(size)
+    for vector in _neighbours(lattice):
+        length = math.hypot(*vector)
+        beyond = (y * vector[0] + x * vector[1]) / length - length / 2  # distance past the bisector, cycles/pixel
+        weights *= np.clip(0.5 - beyond / bin_width, 0, 1)
+    return weights.astype(np.float32)
+
+
+def _neighbours(lattice: Lattice) -> NDArray[np.float64]:
+    orders = np.array([order for order in itertools.product(range(-2, 3), repeat=2) if order != (0, 0)])
+    vectors: NDArray[np.float64] = orders @ lattice.matrix()
+    lengths = np.hypot(vectors[:, 0], vectors[:, 1])
+    return vectors[np.argsort(lengths, kind="stable")][:8]
+
+
+def _cell_corners(lattice: Lattice) -> NDArray[np.float64]:
+    """The corners (fy, fx) of the lattice's cell around DC."""
+    vectors = _neighbours(lattice)
+    corners = []
+    for a, b in itertools.combinations(vectors, 2):
+        matrix = np.array([a, b])
+        if abs(np.linalg.det(matrix)) < 1e-12:
+            continue
+        point = np.linalg.solve(matrix, np.array([a @ a, b @ b]) / 2)
+        if np.all(vectors @ point <= (vectors * vectors).sum(axis=1) / 2 + 1e-12):
+            corners.append(point)
+    return np.array(corners)
+
+
+def _fast_up(n: int) -> int:
+    return int(fft.next_fast_len(n))
+
+
+def _fast_down(n: int) -> int:
+    size = n
+    while size > 2 and (size % 2 or int(fft.next_fast_len(size)) != size):
+        size -= 1
+    return size

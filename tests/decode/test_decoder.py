@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dappled.decode.calibration import Calibration, CalibrationFrame, calibrate
+from dappled.decode.decoder import MaskDecoder
+from dappled.decode.errors import DecodeError
+from dappled.decode.masks import Mask
+from tests.decode.rays import (
+    FOCAL_MM,
+    FULL_F,
+    MASK,
+    SENSOR,
+    STATED_DISTANCE_MM,
+    STOPPED_F,
+    Camera,
+    Plane,
+    Texture,
+    psnr,
+)
+
+
+def _calibration(camera: Camera, noise: float = 0.0) -> Calibration:
+    rng = np.random.default_rng(77)
+    plane = camera.expose([(Texture.random(rng), 1.0)], STOPPED_F)
+    plane = (plane + rng.normal(0, noise, plane.shape)).astype(np.float32)
+    return calibrate(
+        [CalibrationFrame(plane, FOCAL_MM, STOPPED_F)],
+        sensor=SENSOR,
+        mask=camera.mask,
+        law="geometric",
+        mask_distance_mm=STATED_DISTANCE_MM,
+    )
+
+
+def _decoder(calibration: Calibration | None = None, mask: Mask = MASK, workers: int = 1) -> MaskDecoder:
+    return MaskDecoder(SENSOR, mask, "geometric", STATED_DISTANCE_MM, calibration, workers=workers)
+
+
+def _scene(seed: int) -> list[tuple[Texture, float]]:
+    """Two depths, one of them three pixels from view to view."""
+    rng = np.random.default_rng(seed)
+    return [
+        (Texture.random(rng, mean=0.2, rms=0.08), 3.0),
+        (Texture.random(rng, mean=0.2, rms=0.08), 3.0 if seed % 2 else -1.0),
+    ]
+
+
+@pytest.mark.parametrize("stops", [2, 4, 8])
+def test_a_smaller_aperture_never_gives_worse_views_than_its_one_image(stops: int) -> None:
+    camera, scene = Camera.hidden(3), _scene(0)
+    f_number = stops * FULL_F
+    field = _decoder(_calibration(camera)).decode(
+        camera.expose(scene, f_number), focal_length_mm=FOCAL_MM, f_number=f_number
+    )
+    truth = camera.truth(scene, field.grid, field.views.shape[2:4], f_number)
+    assert psnr(field.views, truth) > psnr(np.broadcast_to(field.slices[0].real, truth.shape), truth) - 0.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_views_of_a_hidden_camera_meet_the_truth(seed: int) -> None:
+    camera, scene = Camera.hidden(seed), _scene(seed)
+    field, report = _decoder(_calibration(camera)).decode_reported(
+        camera.expose(scene), focal_length_mm=FOCAL_MM, f_number=FULL_F
+    )
+    truth = camera.truth(scene, field.grid, field.views.shape[2:4])
+    mean = np.broadcast_to(truth.mean(axis=(0, 1)), truth.shape)
+    assert report.carriers_from == "calibrated"
+    assert report.views_from == "calibration"
+    assert psnr(field.views, truth) > 40
+    assert psnr(field.views, truth) > 12 + psnr(mean, truth)
+
+
+def test_views_at_a_raw_signal_to_noise_of_100() -> None:
+    camera, scene = Camera.hidden(7), _scene(1)
+    frame = camera.expose(scene)
+    noisy = (frame + np.random.default_rng(0).normal(0, frame.mean() / 100, frame.shape)).astype(np.float32)
+    field = _decoder(_calibration(camera, noise=0.004)).decode(noisy, focal_length_mm=FOCAL_MM, f_number=FULL_F)
+    truth = camera.truth(scene, field.grid, field.views.shape[2:4])
+    mean = np.broadcast_to(truth.mean(axis=(0, 1)), truth.shape)
+    assert psnr(field.views, truth) > 30
+    assert psnr(field.views, truth) > 4 + psnr(mean, truth)
+
+
+@pytest.fixture(scope="module")
+def stopped() -> tuple[Camera, Plane]:
+    camera = Camera.hidden(11)
+    return camera, camera.expose(_scene(0), STOPPED_F)
+
+
+def test_a_stopped_down_frame_is_decoded_at_its_own_carriers(stopped: tuple[Camera, Plane]) -> None:
+    camera, plane = stopped
+    field, report = _decoder().decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=STOPPED_F)
+    assert (report.carriers_from, report.views_from, report.found) == ("measured", "frame", 13)
+    expected = np.array([(c.fy, c.fx) for c in camera.lattice.carriers(MASK.half_orders())])
+    off = (field.carriers[:, 2:] - expected) * SENSOR.shape
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.05
+    assert field.attributes["carriers_from"] == "measured"
+    assert field.slices.shape[0] == len(field.carriers) == 13
+    truth = camera.truth(_scene(0), field.grid, field.views.shape[2:4], STOPPED_F)
+    assert psnr(field.views, truth) > 30  # hardly any parallax is there, and none is made up
+
+
+def test_without_calibration_a_full_aperture_frame_has_slices_and_no_views() -> None:
+    camera = Camera(STATED_DISTANCE_MM, 0.0, (0.004, 0.007))
+    field, report = _decoder().decode_reported(camera.expose(_scene(3)), focal_length_mm=FOCAL_MM, f_number=FULL_F)
+    assert (report.carriers_from, report.views_from) == ("predicted", "none")
+    assert field.views.shape[:2] == (0, 0)
+    assert field.slices.shape[0] == 13
+    assert field.slices[0].real.mean() == pytest.approx(0.4, abs=0.02)
+
+
+def test_unknown_f_number_leaves_slices(stopped: tuple[Camera, Plane]) -> None:
+    field, report = _decoder().decode_reported(stopped[1], focal_length_mm=FOCAL_MM)
+    assert report.views_from == "none"
+    assert field.attributes["f_number"] is None
+    assert field.view_offsets.shape == (0, 0, 2)
+
+
+def test_a_diagonal_mask_decodes(stopped: tuple[Camera, Plane]) -> None:
+    mask = Mask(15.5, 2, "diagonal")
+    camera = Camera(0.47, 0.012, (0.01, 0.02), mask=mask)
+    field, report = _decoder(mask=mask).decode_reported(
+        camera.expose(_scene(0), STOPPED_F), focal_length_mm=FOCAL_MM, f_number=STOPPED_F
+    )
+    assert report.found == len(mask.half_orders()) == 5
+    assert field.views.shape[:2] == (5, 5)
+
+
+def test_the_same_frame_gives_the_same_bytes_for_any_workers(stopped: tuple[Camera, Plane]) -> None:
+    fields = [_decoder(workers=n).decode(stopped[1], focal_length_mm=FOCAL_MM, f_number=STOPPED_F) for n in (1, 1, 3)]
+    assert len({field.slices.tobytes() for field in fields}) == 1
+    assert len({field.views.tobytes() for field in fields}) == 1
+
+
+def test_bad_calls_are_refused_in_words(stopped: tuple[Camera, Plane]) -> None:
+    decoder = _decoder()
+    with pytest.raises(DecodeError, match="--focal-length"):
+        decoder.decode(stopped[1], f_number=8.0)
+    with pytest.raises(DecodeError, match="another profile"):
+        decoder.decode(stopped[1][:200], focal_length_mm=50.0)
+    with pytest.raises(DecodeError, match="above 0"):
+        decoder.decode(stopped[1], focal_length_mm=-50.0)
+    with pytest.raises(DecodeError, match="fall off the sensor"):
+        _decoder(mask=Mask(80.0, 1)).decode(stopped[1], focal_length_mm=50.0)
+    with pytest.raises(DecodeError, match="unknown law"):
+        MaskDecoder(SENSOR, MASK, "none", 1.0)
+    with pytest.raises(DecodeError, match="another mask"):
+        _decoder(_calibration(stopped[0]), mask=Mask(14.0, 2))
