@@ -1,0 +1,220 @@
+"""A camera over USB or PTP/IP through libgphoto2, which lives in a process of its own.
+
+This side never blocks: it passes commands to the process, hands its events on, kills it when it stops answering and
+starts it again, at most five times a minute.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from dappled.drivers.camera import Arrival, CameraError, Event, ShotFailed, StateChanged
+from dappled.drivers.camera_channel import Channel, ChannelError, message_event
+from dappled.drivers.gphoto2_settings import GPhoto2Settings, parse_settings
+
+_PING_S = 1.0
+_STOP_S = 1.2
+_KILL_S = 0.6
+
+Spawn = Callable[[GPhoto2Settings], tuple["subprocess.Popen[bytes]", Channel]]
+
+
+def open_camera(settings: Mapping[str, Any]) -> GPhoto2Camera:
+    """The driver for these settings (see `GPhoto2Settings`); `start` it. Raises CameraError for a wrong setting."""
+    return GPhoto2Camera(parse_settings(settings))
+
+
+class RestartBudget:
+    """At most `limit` starts in any `window_s`. Not thread-safe: one owner."""
+
+    def __init__(self, limit: int, window_s: float) -> None:
+        self._limit = limit
+        self._window_ns = round(window_s * 1e9)
+        self._spent_ns: deque[int] = deque()
+
+    def wait_ns(self, now_ns: int) -> int:
+        """How long until the next start is allowed; 0: now."""
+        while self._spent_ns and now_ns - self._spent_ns[0] >= self._window_ns:
+            self._spent_ns.popleft()
+        if len(self._spent_ns) < self._limit:
+            return 0
+        return self._spent_ns[0] + self._window_ns - now_ns
+
+    def spend(self, now_ns: int) -> None:
+        """A start was made."""
+        self._spent_ns.append(now_ns)
+
+
+def spawn_process(settings: GPhoto2Settings) -> tuple[subprocess.Popen[bytes], Channel]:
+    """Start the camera's process; it dies with the calling thread."""
+    channel, other = Channel.pair()
+    with other:
+        process = subprocess.Popen(
+            [
+                sys.executable,
+                "-m",
+                "dappled.drivers.gphoto2_process",
+                str(other.fileno()),
+                str(os.getpid()),
+                json.dumps(settings.to_json()),
+            ],
+            pass_fds=(other.fileno(),),
+            stdin=subprocess.DEVNULL,
+            # libgphoto2 keeps settings (capture target, ...) under HOME and would let one run change the next.
+            env={**os.environ, "HOME": "/nonexistent"},
+        )
+    return process, channel
+
+
+class GPhoto2Camera:
+    """The driver (`drivers.camera.Camera`). `fire`, `release`, `next_event` and `stop` from any thread."""
+
+    def __init__(
+        self,
+        settings: GPhoto2Settings,
+        *,
+        spawn: Spawn = spawn_process,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        budget: RestartBudget | None = None,
+    ) -> None:
+        self._settings = settings
+        self._spawn = spawn
+        self._clock_ns = clock_ns
+        self._budget = budget or RestartBudget(limit=5, window_s=60.0)
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._supervise, name="gphoto2", daemon=True)
+        self._lock = threading.Lock()  # guards the three below
+        self._channel: Channel | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._pending: dict[int, None] = {}  # the shots that the process has, in order
+
+    def start(self) -> None:
+        """Start the camera's process. Raises CameraError when called twice."""
+        if self._thread.ident is not None:
+            raise CameraError("this camera was started before: open another one")
+        self._thread.start()
+
+    def fire(self, shot: int) -> None:
+        """Pass the shot to the process; one socket write in the caller's own thread."""
+        with self._lock:
+            if shot in self._pending:
+                raise CameraError(f"shot {shot} was fired before and has not ended")
+            if self._channel is not None:
+                try:
+                    self._channel.send({"do": "fire", "shot": shot})
+                except ChannelError as error:
+                    reason = f"the camera's process did not take the shot: {error}"
+                else:
+                    self._pending[shot] = None
+                    return
+            else:
+                reason = "the camera's process is not running"
+        self._events.put(ShotFailed(shot, reason, self._clock_ns()))
+
+    def next_event(self, timeout_s: float) -> Event | None:
+        """The next event; also after `stop`, until there are none."""
+        try:
+            return self._events.get(timeout=timeout_s) if timeout_s > 0 else self._events.get_nowait()
+        except queue.Empty:
+            return None
+
+    def release(self, arrival: Arrival) -> None:
+        """Delete the file from the card where the settings say so."""
+        folder = arrival.facts.get("folder")
+        if not self._settings.delete_after_download or folder in (None, "/"):
+            return
+        with self._lock, contextlib.suppress(ChannelError):  # the file then stays on the card, which harms nobody
+            if self._channel is not None:
+                self._channel.send({"do": "delete", "folder": folder, "name": arrival.facts["name"]})
+
+    def stop(self) -> None:
+        """End the process, politely for 1.2 s. What had not ended ends as failed."""
+        self._stopping.set()
+        with self._lock, contextlib.suppress(ChannelError):  # then it is ended below
+            if self._channel is not None:
+                self._channel.send({"do": "stop"})
+        if self._thread.ident is None:
+            return
+        self._thread.join(_STOP_S)
+        with self._lock:
+            if self._process is not None:
+                self._process.kill()
+        self._thread.join(_KILL_S)
+
+    # --- the supervising thread
+
+    def _supervise(self) -> None:
+        while not self._stopping.is_set():
+            process, channel = self._spawn(self._settings)
+            with self._lock:
+                self._process, self._channel = process, channel
+            reason = self._serve(process, channel)
+            with self._lock:
+                self._process = self._channel = None
+                pending, self._pending = list(self._pending), {}
+            channel.close()
+            _end(process)
+            stopped = self._stopping.is_set()
+            for shot in pending:
+                self._events.put(ShotFailed(shot, "the camera was stopped" if stopped else reason, self._clock_ns()))
+            if not stopped:
+                self._events.put(StateChanged("faulted", reason, self._clock_ns()))
+                self._await_budget()
+        self._events.put(StateChanged("absent", "the camera was stopped", self._clock_ns()))
+
+    def _serve(self, process: subprocess.Popen[bytes], channel: Channel) -> str:
+        """Hand events on until the process ends; returns why, as a sentence."""
+        heard_ns = asked_ns = self._clock_ns()
+        answer_s = self._settings.timeouts.answer_s
+        try:
+            while True:
+                if self._stopping.is_set():
+                    channel.send({"do": "stop"})  # again: the process may have begun after `stop` spoke
+                message = channel.receive(_PING_S)
+                now_ns = self._clock_ns()
+                if message is not None:
+                    heard_ns = now_ns
+                    if message.body.get("is") != "pong":
+                        self._pass_on(message_event(message))
+                elif now_ns - heard_ns > answer_s * 1e9:
+                    process.kill()
+                    return f"the camera's process did not answer for {answer_s:g} s and was killed; it starts again"
+                if now_ns - asked_ns > _PING_S * 1e9:
+                    asked_ns = now_ns
+                    channel.send({"do": "ping"})
+        except ChannelError as error:
+            return f"the camera's process ended unexpectedly ({error}); it starts again"
+
+    def _pass_on(self, event: Event) -> None:
+        if isinstance(event, ShotFailed) or (isinstance(event, Arrival) and event.shot is not None):
+            with self._lock:
+                self._pending.pop(event.shot, None)  # type: ignore[arg-type]  # an Arrival's None is excluded above
+        self._events.put(event)
+
+    def _await_budget(self) -> None:
+        now_ns = self._clock_ns()
+        wait_ns = self._budget.wait_ns(now_ns)
+        if wait_ns:
+            reason = f"the camera's process ended too often; the next attempt is in {wait_ns / 1e9:.0f} s"
+            self._events.put(StateChanged("faulted", reason, now_ns))
+            self._stopping.wait(wait_ns / 1e9)
+        self._budget.spend(self._clock_ns())
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(0.2)
+        return
+    process.kill()
+    process.wait()

@@ -1,0 +1,370 @@
+"""libgphoto2's face: find a body, open it, fire it, drain its events, read its files. Only the camera's own process
+imports this; every call may block for as long as libgphoto2 waits for a silent camera (up to 10 s), with the GIL held.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import os
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gphoto2 as gp
+
+from dappled.drivers.camera import Blob, Identity
+from dappled.drivers.gphoto2_settings import CaptureTarget, GPhoto2Settings
+
+_CHUNK_BYTES = 1 << 20
+_MEMORY_FOLDER = "/"
+_FOLDERS = 256
+"""More folders than a card has; a bound for the walk."""
+
+
+class SessionError(Exception):
+    """A call to the camera failed; one sentence."""
+
+
+class AbsentError(SessionError):
+    """No camera to open."""
+
+
+class HeldError(SessionError):
+    """The camera is there and can't be opened."""
+
+
+class LostError(SessionError):
+    """The session is unusable: close it and open another."""
+
+
+class BusyError(SessionError):
+    """The camera is at work; the same call may succeed later."""
+
+
+class RefusedError(SessionError):
+    """The camera said no to this call; the session goes on."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFile:
+    """Where a file lies at the camera. Files in the camera's memory have the folder "/"."""
+
+    folder: str
+    name: str
+
+    @property
+    def in_memory(self) -> bool:
+        """Whether the file is in the camera's memory and not on its card."""
+        return self.folder == _MEMORY_FOLDER
+
+
+@dataclass(frozen=True, slots=True)
+class FileAdded:
+    """The camera announced a file."""
+
+    file: CameraFile
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureComplete:
+    """The camera has finished a capture."""
+
+
+CameraNews = FileAdded | CaptureComplete
+
+
+class Session(Protocol):
+    """What the camera's process needs of an open camera."""
+
+    @property
+    def identity(self) -> Identity:
+        """Who the camera is."""
+
+    @property
+    def keeps_files(self) -> bool:
+        """Whether pictures go to a card, where they outlive the session."""
+
+    def trigger(self) -> None:
+        """Release the shutter. Raises BusyError, RefusedError, LostError."""
+
+    def news(self) -> list[CameraNews]:
+        """All that happened since the last call. Raises LostError."""
+
+    def fetch(self, file: CameraFile) -> Blob:
+        """A file's bytes. Raises RefusedError, LostError."""
+
+    def delete(self, file: CameraFile) -> None:
+        """Delete a file at the camera. Raises RefusedError, LostError."""
+
+    def files(self) -> frozenset[CameraFile]:
+        """All files on the card, as they were when the session was opened or later. Raises LostError."""
+
+    def close(self) -> None:
+        """End the session; never raises."""
+
+
+_HELD = {gp.GP_ERROR_IO_USB_CLAIM, gp.GP_ERROR_IO_LOCK, gp.GP_ERROR_CAMERA_BUSY, gp.GP_ERROR}
+_GONE = {gp.GP_ERROR_IO, gp.GP_ERROR_IO_USB_FIND, gp.GP_ERROR_MODEL_NOT_FOUND, gp.GP_ERROR_UNKNOWN_PORT}
+_LOST = {gp.GP_ERROR_IO, gp.GP_ERROR_TIMEOUT, gp.GP_ERROR_IO_INIT, gp.GP_ERROR_IO_READ, gp.GP_ERROR_IO_WRITE} | {
+    gp.GP_ERROR_IO_USB_CLEAR_HALT,
+    gp.GP_ERROR_IO_USB_FIND,
+    gp.GP_ERROR_IO_USB_CLAIM,
+    gp.GP_ERROR_OS_FAILURE,
+    gp.GP_ERROR_LIBRARY,
+}
+_DNG_VERSION = 50706
+_DRAIN = 64
+"""Events taken at one go, so that a chattering camera can't keep the process from its commands."""
+
+
+def open_session(settings: GPhoto2Settings) -> GPhoto2Session:
+    """The camera that the settings name, ready to fire. Raises AbsentError, HeldError, LostError."""
+    wrong: list[str] = []
+    candidates = list(_candidates(settings.port))
+    for model, port in candidates:
+        camera = _opened(model, port)
+        session = None
+        try:
+            session = GPhoto2Session(camera, port, settings.capture_target)
+            if settings.serial is None or settings.serial in session.serials:
+                return session
+            wrong.append(f"{session.identity.model} {session.identity.serial}")
+        except gp.GPhoto2Error as error:
+            _exit(camera)
+            raise _translated(error, "set up") from error
+        _exit(camera)
+    if wrong:
+        raise AbsentError(f"no camera with serial number {settings.serial} is here, only {', '.join(wrong)}")
+    raise AbsentError("no camera is on USB: connect it, switch it on, and set its USB mode to PTP or PC connection")
+
+
+def _candidates(port: str | None) -> Iterator[tuple[str, str]]:
+    if port is not None and port.startswith("ptpip:"):
+        yield "PTP/IP Camera", port
+        return
+    found = gp.Camera.autodetect()
+    for index in range(found.count()):
+        where = found.get_value(index)
+        if port in (None, "usb:", where):
+            yield found.get_name(index), where
+
+
+def _opened(model: str, port: str) -> Any:
+    ports = gp.PortInfoList()
+    ports.load()
+    abilities = gp.CameraAbilitiesList()
+    abilities.load()
+    camera = gp.Camera()
+    try:
+        camera.set_port_info(ports[ports.lookup_path(port)])
+        camera.set_abilities(abilities[abilities.lookup_model(model)])
+        camera.init()
+    except gp.GPhoto2Error as error:
+        if error.code in _HELD:
+            raise HeldError(
+                f"the camera at {port} can't be opened ({error.string}): another program holds it, often the desktop's "
+                "gvfs-gphoto2-volume-monitor; end that program"
+            ) from error
+        if error.code in _GONE:
+            raise AbsentError(f"no camera answers at {port} ({error.string}): connect it and switch it on") from error
+        raise HeldError(f"the camera at {port} can't be opened: {error.string}; switch it off and on") from error
+    return camera
+
+
+class GPhoto2Session:
+    """An open camera."""
+
+    def __init__(self, camera: Any, port: str, target: CaptureTarget) -> None:
+        self._camera = camera
+        printed = self._text("eosserialnumber")  # what stands on the body; the PTP number is another
+        reported = self._text("serialnumber")
+        self.serials = {text for text in (printed, reported, reported.lstrip("0")) if text}
+        self.identity = Identity(
+            make=self._text("manufacturer"),
+            model=self._text("cameramodel"),
+            serial=printed or reported,
+            port=port,
+        )
+        self._in_pieces = True
+        self.keeps_files = not (self._set_target(target) and target == "ram")
+
+    def trigger(self) -> None:
+        """Release the shutter."""
+        try:
+            self._camera.trigger_capture()
+        except gp.GPhoto2Error as error:
+            raise _translated(error, "release the shutter") from error
+
+    def news(self) -> list[CameraNews]:
+        """All that happened since the last call, at most 64 events of it."""
+        news: list[CameraNews] = []
+        try:
+            for _ in range(_DRAIN):
+                kind, data = self._camera.wait_for_event(0)
+                if kind == gp.GP_EVENT_TIMEOUT:
+                    break
+                if kind == gp.GP_EVENT_FILE_ADDED:
+                    news.append(FileAdded(CameraFile(data.folder, data.name)))
+                elif kind == gp.GP_EVENT_CAPTURE_COMPLETE:
+                    news.append(CaptureComplete())
+        except gp.GPhoto2Error as error:
+            if not news:
+                raise LostError(_sentence(error, "report what happens")) from error
+        return news
+
+    def fetch(self, file: CameraFile) -> Blob:
+        """A file's bytes; from the card in pieces of 1 MiB straight into a memory file."""
+        fd = os.memfd_create(file.name, os.MFD_CLOEXEC)
+        try:
+            size = self._fill(fd, file)
+        except gp.GPhoto2Error as error:
+            os.close(fd)
+            raise _translated(error, f"send {file.name}") from error
+        except SessionError:
+            os.close(fd)
+            raise
+        return Blob(fd, size)
+
+    def _fill(self, fd: int, file: CameraFile) -> int:
+        if file.in_memory:
+            # libgphoto2 fetched it whole with the event, and keeps it until it is deleted.
+            size = self._whole(fd, file)
+            self._camera.file_delete(file.folder, file.name)
+            return size
+        announced: int = self._camera.file_get_info(file.folder, file.name).file.size
+        got = self._pieces(fd, file, announced) if self._in_pieces else None
+        if got is None:
+            self._in_pieces = False
+            got = self._whole(fd, file)
+        if got != announced or not got:
+            raise RefusedError(f"the camera announced {announced} bytes of {file.name} and sent {got}")
+        return got
+
+    def _pieces(self, fd: int, file: CameraFile, size: int) -> int | None:
+        """Read piece by piece; None where the body can't."""
+        os.ftruncate(fd, size)
+        offset = 0
+        with mmap.mmap(fd, size) as whole, memoryview(whole) as view:
+            while offset < size:
+                with view[offset : offset + _CHUNK_BYTES] as piece:
+                    wanted = len(piece)
+                    try:
+                        got = self._camera.file_read(file.folder, file.name, gp.GP_FILE_TYPE_NORMAL, offset, piece)
+                    except gp.GPhoto2Error as error:
+                        if error.code == gp.GP_ERROR_NOT_SUPPORTED and offset == 0:
+                            return None
+                        raise
+                offset += got
+                if got != wanted:
+                    break
+        return offset
+
+    def _whole(self, fd: int, file: CameraFile) -> int:
+        held = self._camera.file_get(file.folder, file.name, gp.GP_FILE_TYPE_NORMAL)
+        with memoryview(held.get_data_and_size()) as view:
+            offset = 0
+            while offset < len(view):
+                offset += os.pwrite(fd, view[offset:], offset)
+            return len(view)
+
+    def delete(self, file: CameraFile) -> None:
+        """Delete a file on the card."""
+        try:
+            self._camera.file_delete(file.folder, file.name)
+        except gp.GPhoto2Error as error:
+            raise _translated(error, f"delete {file.name}") from error
+
+    def files(self) -> frozenset[CameraFile]:
+        """All files on the card, from libgphoto2's memory where it has them."""
+        found: set[CameraFile] = set()
+        folders = ["/"]
+        try:
+            for folder in folders:
+                found.update(CameraFile(folder, name) for name in _names(self._camera.folder_list_files(folder)))
+                inner = _names(self._camera.folder_list_folders(folder))
+                folders.extend(f"{folder.rstrip('/')}/{name}" for name in inner[: _FOLDERS - len(folders)])
+        except gp.GPhoto2Error as error:
+            raise LostError(_sentence(error, "list its card")) from error
+        return frozenset(file for file in found if not file.in_memory)
+
+    def close(self) -> None:
+        """End the session."""
+        _exit(self._camera)
+
+    def _text(self, name: str) -> str:
+        try:
+            return str(self._camera.get_single_config(name).get_value() or "").strip()
+        except gp.GPhoto2Error as error:
+            if error.code in _LOST:
+                raise
+            return ""  # this body has no such setting
+
+    def _set_target(self, target: CaptureTarget) -> bool:
+        """Bodies forget this between sessions. False where the body has no choice."""
+        word = "ram" if target == "ram" else "card"
+        try:
+            widget = self._camera.get_single_config("capturetarget")
+            choice = next((each for each in widget.get_choices() if word in each.lower()), None)
+            if choice is None:
+                return False
+            widget.set_value(choice)
+            self._camera.set_single_config("capturetarget", widget)
+        except gp.GPhoto2Error as error:
+            if error.code in _LOST:
+                raise
+            return False
+        return True
+
+
+def _names(found: Any) -> list[str]:
+    return [found.get_name(index) for index in range(found.count())]
+
+
+def _exit(camera: Any) -> None:
+    with contextlib.suppress(gp.GPhoto2Error):  # it is being let go; a broken link can't be closed properly
+        camera.exit()
+
+
+def _sentence(error: gp.GPhoto2Error, what: str) -> str:
+    return f"the camera could not {what}: {error.string} ({error.code})"
+
+
+def _translated(error: gp.GPhoto2Error, what: str) -> SessionError:
+    if error.code == gp.GP_ERROR_CAMERA_BUSY:
+        return BusyError(f"the camera is too busy to {what}")
+    if error.code in _LOST:
+        return LostError(_sentence(error, what))
+    return RefusedError(_sentence(error, what))
+
+
+def true_name(name: str, head: bytes) -> str:
+    """The file's name with the extension that its first bytes call for.
+
+    For pictures from the camera's memory libgphoto2 makes the name up, from a format code that knows no DNG.
+    """
+    suffix = _suffix(head)
+    stem, dot, given = name.rpartition(".")
+    if suffix is None or not dot or given.lower() == suffix:
+        return name
+    return f"{stem}.{suffix.upper() if given.isupper() else suffix}"
+
+
+def _suffix(head: bytes) -> str | None:
+    if head.startswith(b"\xff\xd8\xff"):
+        return "jpg"
+    if head.startswith(b"FUJIFILMCCD-RAW"):
+        return "raf"
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(head[:4])
+    if order is None or len(head) < 16:
+        return None
+    if head[8:10] == b"CR":
+        return "cr2"
+    (first,) = struct.unpack_from(order + "I", head, 4)
+    if first + 2 > len(head):
+        return None
+    (count,) = struct.unpack_from(order + "H", head, first)
+    last = min(first + 2 + 12 * count, len(head) - 1)
+    tags = {struct.unpack_from(order + "H", head, at)[0] for at in range(first + 2, last, 12)}
+    return "dng" if _DNG_VERSION in tags else None

@@ -1,0 +1,79 @@
+"""What can be set about a camera that libgphoto2 drives. Shared by the driver and its process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Literal
+
+from dappled.drivers.camera import CameraError
+
+CaptureTarget = Literal["card", "ram"]
+
+
+@dataclass(frozen=True, slots=True)
+class Timeouts:
+    """How long to wait for what, in seconds; all above 0.
+
+    `busy_s`: for a busy camera to take the release. `complete_s`: for the file after the camera said that the capture
+    is complete, before its card is searched. `look_s`: the same where it said nothing. `file_s`: for the file, from
+    the release, before the shot has failed. `answer_s`: for the camera's process to answer, before it is killed
+    (libgphoto2 needs up to 10 s to give up on a silent camera). `retry_s`: between attempts to find the camera.
+    """
+
+    busy_s: float = 5.0
+    complete_s: float = 2.5
+    look_s: float = 10.0
+    file_s: float = 20.0
+    answer_s: float = 12.0
+    retry_s: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class GPhoto2Settings:
+    """`port`: a libgphoto2 port; None or "usb:" take the first camera on USB. `serial`: only the body with this
+    number; None takes any. `capture_target`: where the body puts its pictures; with "card" a file outlives a broken
+    link. `delete_after_download`: delete from the card what the receiver has released."""
+
+    port: str | None = None
+    serial: str | None = None
+    capture_target: CaptureTarget = "card"
+    delete_after_download: bool = False
+    timeouts: Timeouts = field(default_factory=Timeouts)
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain values; `parse_settings` reads them back."""
+        return asdict(self)
+
+
+def parse_settings(settings: Mapping[str, Any]) -> GPhoto2Settings:
+    """Settings from a table of a configuration file. Raises CameraError naming the key and what it may be."""
+    known = [each.name for each in fields(GPhoto2Settings)]
+    _only(settings, known, "camera")
+    port, serial = settings.get("port"), settings.get("serial")
+    for name, value in (("port", port), ("serial", serial)):
+        if not (value is None or isinstance(value, str)):
+            raise CameraError(f"camera.{name} must be text, not {value!r}")
+    target = settings.get("capture_target", "card")
+    if target not in ("card", "ram"):
+        raise CameraError(f'camera.capture_target must be "card" or "ram", not {target!r}')
+    delete = settings.get("delete_after_download", False)
+    if not isinstance(delete, bool):
+        raise CameraError(f"camera.delete_after_download must be true or false, not {delete!r}")
+    return GPhoto2Settings(port or None, serial or None, target, delete, _timeouts(settings.get("timeouts", {})))
+
+
+def _timeouts(given: object) -> Timeouts:
+    if not isinstance(given, Mapping):
+        raise CameraError(f"camera.timeouts must be a table, not {given!r}")
+    _only(given, [each.name for each in fields(Timeouts)], "camera.timeouts")
+    for name, value in given.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+            raise CameraError(f"camera.timeouts.{name} must be a number of seconds above 0, not {value!r}")
+    return Timeouts(**given)
+
+
+def _only(given: Mapping[str, Any], known: list[str], where: str) -> None:
+    unknown = [name for name in given if name not in known]
+    if unknown:
+        raise CameraError(f"{where} has no setting {unknown[0]!r}; it knows {', '.join(known)}")

@@ -1,0 +1,73 @@
+"""A camera that is a recording: each shot brings again the file that it brought, byte for byte."""
+
+from __future__ import annotations
+
+import os
+import queue
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from dappled.drivers.camera import Arrival, Blob, Event, Fired, Identity, ShotFailed, StateChanged
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """One recorded shot: its file and the camera's name for it, or the reason why there is none.
+
+    The fired times bracket the recorded trigger call; None where it was never seen, as is the file's arrival.
+    """
+
+    shot: int
+    path: Path | None
+    camera_name: str
+    fired_monotonic_ns: tuple[int, int] | None
+    arrived_monotonic_ns: int | None = None
+    reason: str = ""
+
+
+class ReplayCamera:
+    """A Camera (see `drivers.camera`) that plays recorded shots. Files are only ever opened for reading."""
+
+    def __init__(self, shots: Iterable[Recorded], identity: Identity) -> None:
+        self._shots = {recorded.shot: recorded for recorded in shots}
+        self._identity = identity
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+
+    def start(self) -> None:
+        """See Camera."""
+        self._events.put(StateChanged("ready", "", time.monotonic_ns(), self._identity))
+
+    def fire(self, shot: int) -> None:
+        """See Camera: the recorded events of this shot follow at once."""
+        now_ns = time.monotonic_ns()
+        recorded = self._shots.get(shot)
+        if recorded is None:
+            self._events.put(ShotFailed(shot, f"shot {shot} is not in the recording", now_ns))
+            return
+        if recorded.fired_monotonic_ns is not None:
+            self._events.put(Fired(shot, *recorded.fired_monotonic_ns))
+        if recorded.path is None:
+            self._events.put(ShotFailed(shot, recorded.reason, now_ns))
+            return
+        try:
+            fd = os.open(recorded.path, os.O_RDONLY | os.O_CLOEXEC)
+        except OSError as error:
+            self._events.put(ShotFailed(shot, f"{recorded.path} can't be read: {error.strerror}", now_ns))
+            return
+        arrived_ns = recorded.arrived_monotonic_ns or now_ns
+        self._events.put(Arrival(shot, recorded.camera_name, Blob(fd, os.fstat(fd).st_size), arrived_ns))
+
+    def next_event(self, timeout_s: float) -> Event | None:
+        """See Camera."""
+        try:
+            return self._events.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+    def release(self, arrival: Arrival) -> None:
+        """See Camera: a recording keeps its files."""
+
+    def stop(self) -> None:
+        """See Camera."""

@@ -1,0 +1,294 @@
+"""A camera body in a process of its own: a PTP/IP Canon EOS 450D whose pictures come from a simulated camera.
+
+    python -m dappled.mocks.body --seed 1 --scale 0.25
+
+prints `port N` once it listens, then obeys lines on its standard input: a fault of `mocks.faults` ("busy 2"), or
+"releases", "card". Every line is answered by one line, `ok …` or `error …`. The end of its input is its own end, so it
+never outlives the process that started it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dappled.mocks.eos450d import CARD_BYTES, SERIAL, Eos450d, Expose
+from dappled.mocks.faults import Faults
+from dappled.mocks.ptpip import Responder
+
+_START_S = 30.0
+_ANSWER_S = 5.0
+
+
+class BodyError(Exception):
+    """The body's process didn't start or doesn't answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class BodyOptions:
+    """What a body is and shows.
+
+    `picture`: "simulated" (the reference camera's raw files), "pattern:SIZE:EXTENSION" (bytes that `pattern` makes),
+    or a file's path (its bytes, every time). `start_monotonic_ns`: when the simulation's time began (None: when the
+    body starts). `scale`: share of the reference sensor that is rendered. `scene`, `law`: as
+    `reference_camera` has them. `truth`: a folder for what the simulated camera knows of each shot (000001.npz, and its
+    times in seconds since the simulation's start in 000001.json). `delay_s`: how long a pattern or
+    file takes to expose. `card_bytes`: the card's size; a full one refuses to shoot.
+    """
+
+    picture: str = "simulated"
+    seed: int = 1
+    scale: float = 1.0
+    scene: str = "terrain"
+    law: str = "geometric"
+    f_number: float | None = None
+    start_monotonic_ns: int | None = None
+    truth: Path | None = None
+    delay_s: float = 0.0
+    serial: str = SERIAL
+    card_bytes: int = CARD_BYTES
+    faults: tuple[str, ...] = ()
+
+    def arguments(self) -> list[str]:
+        """These options as command-line arguments."""
+        named = {
+            "--picture": self.picture,
+            "--seed": self.seed,
+            "--scale": self.scale,
+            "--scene": self.scene,
+            "--law": self.law,
+            "--f-number": self.f_number,
+            "--start-monotonic-ns": self.start_monotonic_ns,
+            "--truth": self.truth,
+            "--delay": self.delay_s,
+            "--serial": self.serial,
+            "--card-bytes": self.card_bytes,
+        }
+        given = [text for name, value in named.items() if value is not None for text in (name, str(value))]
+        return [*given, *(text for fault in self.faults for text in ("--fault", fault))]
+
+
+class Body:
+    """A running body. `start` returns once it listens; use it as a context manager or call `stop`."""
+
+    def __init__(self, process: subprocess.Popen[bytes], lines: _Lines, port: int) -> None:
+        self._process = process
+        self._lines = lines
+        self.tcp_port = port
+
+    @classmethod
+    def start(cls, options: BodyOptions | None = None) -> Body:
+        """Start a body's process. Raises BodyError where it doesn't listen within 30 s."""
+        command = [sys.executable, "-m", "dappled.mocks.body", *(options or BodyOptions()).arguments()]
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        assert process.stdout is not None  # asked for above
+        lines = _Lines(process.stdout.fileno())
+        try:
+            port = int(lines.next(_START_S).removeprefix("port "))
+        except (BodyError, ValueError) as error:
+            _end(process)
+            raise BodyError(f"the simulated body did not start: {error}") from error
+        return cls(process, lines, port)
+
+    @property
+    def port(self) -> str:
+        """The body's port as libgphoto2 names it."""
+        return f"ptpip:127.0.0.1:{self.tcp_port}:{self.tcp_port}"
+
+    @property
+    def releases(self) -> int:
+        """How many exposures the body has begun."""
+        return int(self.ask("releases"))
+
+    @property
+    def card(self) -> list[str]:
+        """The names of the files on the body's card."""
+        return self.ask("card").split()
+
+    def fault(self, line: str) -> None:
+        """Put a fault in force ("busy 2", "error", "drop", "clear", …). Raises BodyError for an unknown one."""
+        self.ask(line)
+
+    def ask(self, line: str) -> str:
+        """One line to the body, its answer without the "ok". Raises BodyError."""
+        assert self._process.stdin is not None  # a pipe by construction
+        try:
+            self._process.stdin.write(line.encode() + b"\n")
+            self._process.stdin.flush()
+        except (OSError, ValueError) as error:  # ValueError: stopped by us
+            raise BodyError("the simulated body's process has ended") from error
+        state, _, rest = self._lines.next(_ANSWER_S).partition(" ")
+        if state != "ok":
+            raise BodyError(rest)
+        return rest
+
+    def stop(self) -> None:
+        """End the process; returns when it is gone."""
+        _end(self._process)
+
+    def __enter__(self) -> Body:
+        return self
+
+    def __exit__(self, *_exc: object) -> None:
+        self.stop()
+
+
+class _Lines:
+    """Lines from a pipe, each with a deadline."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._poll = select.poll()
+        self._poll.register(fd, select.POLLIN)
+        self._buffer = b""
+
+    def next(self, timeout_s: float) -> str:
+        deadline = time.monotonic() + timeout_s
+        while b"\n" not in self._buffer:
+            if not self._poll.poll(max(deadline - time.monotonic(), 0) * 1e3):
+                raise BodyError(f"the simulated body said nothing for {timeout_s:.0f} s")
+            piece = os.read(self._fd, 65536)
+            if not piece:
+                raise BodyError("the simulated body's process has ended")
+            self._buffer += piece
+        line, _, self._buffer = self._buffer.partition(b"\n")
+        return line.decode()
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            pipe.close()
+    try:
+        process.wait(2)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait(5)
+
+
+# --- the process ----------------------------------------------------------------------------------------------------
+
+
+def pattern(shot_number: int, size: int) -> bytes:
+    """Bytes that differ from shot to shot and from page to page, so that nothing lost or swapped goes unseen."""
+    page = bytes(range(256)) * 16
+    stamps = (f"shot {shot_number:06d} page {number:08d} ".encode() for number in range(size // len(page) + 1))
+    return b"".join(stamp + page[len(stamp) :] for stamp in stamps)[:size]
+
+
+def exposer(options: BodyOptions) -> Expose:
+    """The source of pictures that the options name. Raises ValueError for one that isn't there."""
+    if options.picture == "simulated":
+        return _simulated(options)
+    if options.picture.startswith("pattern:"):
+        _, size, extension = options.picture.split(":")
+        return _delayed(options.delay_s, lambda number: pattern(number, int(size)), extension)
+    path = Path(options.picture)
+    if not path.is_file():
+        raise ValueError(f"picture {options.picture!r} is neither simulated, nor pattern:SIZE:EXT, nor a file")
+    data = path.read_bytes()
+    return _delayed(options.delay_s, lambda _number: data, path.suffix[1:])
+
+
+def _delayed(delay_s: float, make: Callable[[int], bytes], extension: str) -> Expose:
+    def expose(_trigger_monotonic_ns: int, shot_number: int) -> tuple[bytes, str]:
+        data = make(shot_number)
+        time.sleep(delay_s)
+        return data, extension
+
+    return expose
+
+
+def _simulated(options: BodyOptions) -> Expose:
+    # Imported here: it brings the whole renderer, which a body that shows patterns doesn't need.
+    from dappled.mocks.masked_camera import reference_camera  # noqa: PLC0415  # reason above
+
+    start_ns = time.monotonic_ns() if options.start_monotonic_ns is None else options.start_monotonic_ns
+    camera = reference_camera(
+        options.seed,
+        scale=options.scale,
+        scene=options.scene,
+        law=options.law,
+        epoch_utc_s=time.time() - (time.monotonic_ns() - start_ns) / 1e9,
+    )
+
+    def expose(trigger_monotonic_ns: int, shot_number: int) -> tuple[bytes, str]:
+        trigger_t_s = (trigger_monotonic_ns - start_ns) / 1e9
+        made = camera.expose(trigger_t_s, shot_number, f_number=options.f_number)
+        if options.truth is not None:
+            made.truth.save(options.truth / f"{shot_number:06d}.npz")
+            times = {"trigger_t_s": trigger_t_s, "mid_exposure_t_s": made.mid_exposure_t_s, "latency_s": made.latency_s}
+            (options.truth / f"{shot_number:06d}.json").write_text(json.dumps(times), encoding="utf-8")
+        return made.file, made.name_suffix.lstrip(".")
+
+    return expose
+
+
+def _obey(line: str, eos: Eos450d, faults: Faults) -> str:
+    if line == "releases":
+        return f"ok {eos.releases}"
+    if line == "card":
+        return f"ok {' '.join(eos.names)}"
+    try:
+        faults.command(line)
+    except ValueError as error:
+        return f"error {error}"
+    return "ok"
+
+
+def _options(arguments: Sequence[str] | None) -> BodyOptions:
+    parser = argparse.ArgumentParser(prog="python -m dappled.mocks.body", description=__doc__.partition("\n")[0])
+    parser.add_argument("--picture", default="simulated", help="simulated, pattern:SIZE:EXT, or a file")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--scale", type=float, default=1.0, help="share of the reference sensor's side")
+    parser.add_argument("--scene", default="terrain", help="terrain, bench, white, or a folder of views")
+    parser.add_argument("--law", default="geometric", help="geometric or fd: where the carriers stand")
+    parser.add_argument("--f-number", type=float, help="the simulated lens' aperture; open without it")
+    parser.add_argument("--start-monotonic-ns", type=int, help="CLOCK_MONOTONIC at the simulation's start")
+    parser.add_argument("--truth", type=Path, help="folder for what the simulation knows of each shot")
+    parser.add_argument("--delay", dest="delay_s", type=float, default=0.0, help="seconds that a pattern or file takes")
+    parser.add_argument("--serial", default=SERIAL)
+    parser.add_argument("--card-bytes", type=int, default=CARD_BYTES, help="the card lies in memory")
+    parser.add_argument("--fault", dest="faults", action="append", default=[], help='in force from the start: "busy 2"')
+    found = vars(parser.parse_args(arguments))
+    return BodyOptions(**{**found, "faults": tuple(found["faults"])})
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def serve(options: BodyOptions, lines: Iterable[str]) -> None:
+    """Be a body until the lines end."""
+    faults = Faults(time.monotonic_ns)
+    for fault in options.faults:
+        faults.command(fault)
+    eos = Eos450d(exposer(options), faults, serial=options.serial, card_bytes=options.card_bytes)
+    responder = Responder(eos, faults)
+    _say(f"port {responder.port}")
+    for line in lines:
+        _say(_obey(line.strip(), eos, faults))
+    responder.close()
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The process' entry point."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C reaches the whole group; the starter ends us by our input
+    try:
+        serve(_options(arguments), sys.stdin)
+    except ValueError as error:
+        sys.exit(f"body: {error}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""What goes wrong with a simulated body, said in words while it runs.
+
+Lasting faults take seconds ("busy 2.5"; without a number: until "clear"), counted ones a number of times ("error 3";
+without a number: once), and "drop" happens at once.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+
+LASTING = ("busy", "silence", "refuse")
+"""busy: a release is answered DeviceBusy. silence: nothing is answered. refuse: no new connection is accepted, as if
+another program held the body."""
+
+COUNTED = ("error", "no-event", "short", "drop-transfer")
+"""error: a release is answered GeneralError. no-event: a new object isn't announced. short: an object's data end one
+kilobyte early. drop-transfer: the link is cut in the middle of an object's data."""
+
+
+class Faults:
+    """The faults in force. All methods may be called from any thread. `drop` is called to cut the links."""
+
+    def __init__(self, clock_ns: Callable[[], int]) -> None:
+        self._clock_ns = clock_ns
+        self._lock = threading.Lock()
+        self._until_ns: dict[str, float] = {}
+        self._left: dict[str, int] = {}
+        self.drop: Callable[[], None] = lambda: None
+
+    def command(self, line: str) -> None:
+        """Put one fault in force. Raises ValueError with a sentence where the words aren't known."""
+        name, *rest = line.split() or [""]
+        if name == "clear":
+            with self._lock:
+                self._until_ns.clear()
+                self._left.clear()
+        elif name == "drop":
+            self.drop()
+        elif name in LASTING:
+            seconds = float(rest[0]) if rest else math.inf
+            with self._lock:
+                self._until_ns[name] = self._clock_ns() + seconds * 1e9
+        elif name in COUNTED:
+            with self._lock:
+                self._left[name] = int(rest[0]) if rest else 1
+        else:
+            known = ", ".join((*LASTING, *COUNTED, "drop", "clear"))
+            raise ValueError(f"there is no fault {name!r}; the body knows {known}")
+
+    def lasts(self, name: str) -> bool:
+        """Whether a lasting fault is in force now."""
+        with self._lock:
+            return self._clock_ns() < self._until_ns.get(name, -math.inf)
+
+    def take(self, name: str) -> bool:
+        """Whether a counted fault strikes now; uses one up."""
+        with self._lock:
+            left = self._left.get(name, 0)
+            if left:
+                self._left[name] = left - 1
+            return left > 0

@@ -1,0 +1,145 @@
+"""What every camera driver must do. A driver's test module inherits `CameraContract` and gives it a `rig`.
+
+The helpers look only at events and descriptors, so that they can't share a fault with the driver.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import pytest
+
+from dappled.drivers.camera import Arrival, Camera, Event, Fired, ShotFailed, StateChanged
+
+PATIENCE_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """A driver that was not started, and what its camera's n-th exposure (from 1) looks like as a file."""
+
+    camera: Camera
+    picture: Callable[[int], bytes]
+
+
+def until(camera: Camera, wanted: Callable[[Event], bool], patience_s: float = PATIENCE_S) -> list[Event]:
+    """All events up to and with the first wanted one. Fails when it doesn't come."""
+    events: list[Event] = []
+    deadline = time.monotonic() + patience_s
+    while time.monotonic() < deadline:
+        event = camera.next_event(deadline - time.monotonic())
+        if event is not None:
+            events.append(event)
+            if wanted(event):
+                return events
+    pytest.fail(f"what was waited for never came; there came {events}")
+
+
+def until_state(camera: Camera, state: str) -> StateChanged:
+    """The first change into this state."""
+    found = until(camera, lambda event: isinstance(event, StateChanged) and event.state == state)[-1]
+    assert isinstance(found, StateChanged)
+    return found
+
+
+def until_shot_ends(camera: Camera, shot: int) -> list[Event]:
+    """All events up to and with the one that ends this shot."""
+    return until(camera, lambda event: isinstance(event, Arrival | ShotFailed) and event.shot == shot)
+
+
+def content(arrival: Arrival) -> bytes:
+    """The bytes behind an arrival's descriptor, read with pread; the descriptor is closed."""
+    data = os.pread(arrival.blob.fd, arrival.blob.size + 1, 0)
+    arrival.blob.close()
+    return data
+
+
+def of_shots(events: list[Event]) -> list[tuple[type[Event], int | None]]:
+    """What the events say of shots: kind and shot."""
+    return [(type(event), event.shot) for event in events if not isinstance(event, StateChanged)]
+
+
+class CameraContract:
+    """Inherit, and give a `rig` fixture of the driver."""
+
+    @pytest.fixture
+    def rig(self) -> Iterator[Rig]:
+        """The driver under test; whoever inherits stops it."""
+        raise NotImplementedError
+
+    def test_becomes_ready_and_says_who_it_is(self, rig: Rig) -> None:
+        rig.camera.start()
+        ready = until_state(rig.camera, "ready")
+        assert ready.identity is not None
+        assert ready.identity.make
+        assert ready.identity.model
+
+    def test_a_shot_is_fired_and_its_file_arrives(self, rig: Rig) -> None:
+        rig.camera.start()
+        until_state(rig.camera, "ready")
+        before_ns = time.monotonic_ns()
+        rig.camera.fire(7)
+        events = until_shot_ends(rig.camera, 7)
+        fired, arrival = [event for event in events if not isinstance(event, StateChanged)]
+        assert isinstance(fired, Fired)
+        assert isinstance(arrival, Arrival)
+        assert fired.shot == arrival.shot == 7
+        assert before_ns <= fired.called_monotonic_ns <= fired.returned_monotonic_ns <= arrival.monotonic_ns
+        assert arrival.monotonic_ns <= time.monotonic_ns()
+        assert arrival.name
+        assert content(arrival) == rig.picture(1)
+
+    def test_shots_asked_for_at_once_come_one_by_one_in_order(self, rig: Rig) -> None:
+        rig.camera.start()
+        until_state(rig.camera, "ready")
+        for shot in (3, 4, 5):
+            rig.camera.fire(shot)
+        events = until_shot_ends(rig.camera, 5)
+        assert of_shots(events) == [(kind, shot) for shot in (3, 4, 5) for kind in (Fired, Arrival)]
+        arrivals = [event for event in events if isinstance(event, Arrival)]
+        assert [content(each) for each in arrivals] == [rig.picture(number) for number in (1, 2, 3)]
+        assert len({each.name for each in arrivals}) == 3
+
+    def test_a_map_outlives_blob_release_and_camera(self, rig: Rig) -> None:
+        rig.camera.start()
+        until_state(rig.camera, "ready")
+        rig.camera.fire(1)
+        arrival = until_shot_ends(rig.camera, 1)[-1]
+        assert isinstance(arrival, Arrival)
+        whole = arrival.blob.map()
+        arrival.blob.close()
+        rig.camera.release(arrival)
+        rig.camera.stop()
+        assert whole[:] == rig.picture(1)
+
+    def test_an_idle_camera_has_no_events(self, rig: Rig) -> None:
+        rig.camera.start()
+        until_state(rig.camera, "ready")
+        assert rig.camera.next_event(0.3) is None
+        assert rig.camera.next_event(0.0) is None
+
+    def test_a_shot_without_a_camera_fails_with_a_sentence(self, rig: Rig) -> None:
+        rig.camera.fire(1)  # not started
+        (failed,) = until_shot_ends(rig.camera, 1)
+        assert isinstance(failed, ShotFailed)
+        assert failed.reason
+
+    def test_stop_ends_every_shot_and_may_be_repeated(self, rig: Rig) -> None:
+        rig.camera.start()
+        until_state(rig.camera, "ready")
+        for shot in range(3):
+            rig.camera.fire(shot)
+        rig.camera.stop()
+        rig.camera.stop()
+        rig.camera.fire(9)
+        events: list[Event] = []
+        while (event := rig.camera.next_event(0.0)) is not None:
+            events.append(event)
+        ends = [event for event in events if isinstance(event, Arrival | ShotFailed)]
+        assert [event.shot for event in ends] == [0, 1, 2, 9]
+        for event in ends:
+            if isinstance(event, Arrival):
+                event.blob.close()
