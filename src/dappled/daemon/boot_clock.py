@@ -1,0 +1,109 @@
+"""The autopilot's time since boot against our UTC: from TIMESYNC answers, or from when packets arrived.
+
+Both are pure functions of what was observed, so a replay gets the same numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+DRIFT_SIGMA = 50e-6  # crystals of autopilots: some tens of ppm between two machines
+_TIMESYNC_FLOOR_NS = 50_000.0
+_TIMESYNC_ASYMMETRY = 0.05  # share of the least round trip by which the two ways may differ; not observable
+_ARRIVAL_FLOOR_NS = 5e6  # the shortest way through radio, UART and scheduler; not observable from one side
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One answer to our TIMESYNC request: the autopilot's clock between our sending and our receiving."""
+
+    number: int
+    sent_utc_ns: int
+    received_utc_ns: int
+    boot_ns: int
+
+    @property
+    def delay_ns(self) -> int:
+        """Round trip."""
+        return self.received_utc_ns - self.sent_utc_ns
+
+    @property
+    def offset_ns(self) -> int:
+        """UTC minus boot time, if both ways took equally long."""
+        return (self.sent_utc_ns + self.received_utc_ns) // 2 - self.boot_ns
+
+
+@dataclass(frozen=True, slots=True)
+class BootClock:
+    """UTC = boot time + offset + drift × (boot time − reference). Sigma is one standard deviation of UTC."""
+
+    source: Literal["timesync", "arrival"]
+    reference_boot_ns: int
+    offset_ns: int
+    drift: float
+    sigma_ns: float
+
+    def utc_ns(self, boot_ns: int) -> int:
+        """UTC at a boot time."""
+        return boot_ns + self.offset_ns + round(self.drift * (boot_ns - self.reference_boot_ns))
+
+    def boot_ns(self, utc_ns: int) -> int:
+        """Boot time at a UTC."""
+        near = utc_ns - self.offset_ns
+        return near - round(self.drift / (1 + self.drift) * (near - self.reference_boot_ns))
+
+
+def from_timesync(answers: Sequence[Answer]) -> BootClock | None:
+    """A line through the answers, quick ones weighing most; None from fewer than three.
+
+    An answer that took `e` longer than the quickest one is wrong by at most e/2, all of it on one way: its weight is
+    1 / (s² + (e/2)²). `s` is half the lower quartile of e, so that on a link where delays spread evenly (no answer is
+    much better than the next) all answers share the work. The slope has a prior of 0 ± 50 ppm.
+    """
+    if len(answers) < 3:
+        return None
+    reference = answers[-1]
+    least = min(a.delay_ns for a in answers)
+    excess = [float(a.delay_ns - least) for a in answers]
+    floor_ns = max(_TIMESYNC_FLOOR_NS, sorted(excess)[len(excess) // 4] / 2)
+    s_w = s_x = s_y = s_xy = 0.0
+    s_xx = 1 / (DRIFT_SIGMA * 1e9) ** 2
+    rows = []
+    for answer, e in zip(answers, excess, strict=True):
+        w = 1 / (floor_ns**2 + (e / 2) ** 2)
+        x = (answer.boot_ns - reference.boot_ns) / 1e9
+        y = float(answer.offset_ns - reference.offset_ns)
+        rows.append((w, x, y))
+        s_w += w
+        s_x += w * x
+        s_y += w * y
+        s_xx += w * x * x
+        s_xy += w * x * y
+    determinant = s_w * s_xx - s_x * s_x
+    level = (s_xx * s_y - s_x * s_xy) / determinant
+    slope = (s_w * s_xy - s_x * s_y) / determinant
+    spread = sum(w * (y - level - slope * x) ** 2 for w, x, y in rows) / max(1, len(rows) - 2)
+    fit_variance = s_xx / determinant * max(spread, 0.01)
+    return BootClock(
+        "timesync",
+        reference.boot_ns,
+        reference.offset_ns + round(level),
+        slope / 1e9,
+        math.sqrt(fit_variance + (_TIMESYNC_ASYMMETRY * least) ** 2),
+    )
+
+
+def from_arrivals(arrivals: Sequence[tuple[int, int]]) -> BootClock | None:
+    """The least of (arrival − boot time) over `arrivals`, pairs (boot_ns, received_utc_ns); None from none.
+
+    Late by the quickest way's own delay, which nothing here can see: sigma allows 5 ms for it, and a tenth of the
+    median excess.
+    """
+    if not arrivals:
+        return None
+    offsets = sorted(received - boot for boot, received in arrivals)
+    median_excess = offsets[len(offsets) // 2] - offsets[0]
+    return BootClock("arrival", arrivals[-1][0], offsets[0], 0.0, math.hypot(_ARRIVAL_FLOOR_NS, 0.1 * median_excess))

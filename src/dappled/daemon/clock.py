@@ -1,0 +1,103 @@
+"""Clocks: what time it is, and waiting for it. Every part is handed one; tests and replays bring their own."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Two times that run at the same rate, and waits against them. All times are integer nanoseconds."""
+
+    def monotonic_ns(self) -> int:
+        """Time that never steps, the same in every process of this machine (CLOCK_MONOTONIC)."""
+
+    def utc_ns(self) -> int:
+        """Time since 1970 as far as this machine knows it."""
+
+    def wait(self, event: threading.Event, timeout_s: float) -> bool:
+        """Until the event is set (True) or this clock has gone on by `timeout_s` (False)."""
+
+
+class SystemClock:
+    """The machine's clock. UTC is the monotonic time plus an offset that is read once, at the flight's start.
+
+    A step of the system's time of day (NTP, a person) does not reach it, so intervals between stamps are exact.
+    """
+
+    def __init__(self, utc_minus_monotonic_ns: int | None = None) -> None:
+        if utc_minus_monotonic_ns is None:
+            utc_minus_monotonic_ns = _offset_now_ns()
+        self.utc_minus_monotonic_ns = utc_minus_monotonic_ns
+
+    def monotonic_ns(self) -> int:
+        """See Clock."""
+        return time.monotonic_ns()
+
+    def utc_ns(self) -> int:
+        """See Clock."""
+        return time.monotonic_ns() + self.utc_minus_monotonic_ns
+
+    def wait(self, event: threading.Event, timeout_s: float) -> bool:
+        """See Clock."""
+        return event.wait(max(0.0, timeout_s))
+
+
+class RecordedClock:
+    """A clock that stands still until it is told the time: for replays, and for tests.
+
+    `advance_to` moves it (never backwards). `close` ends every wait, so that nobody outlives the record.
+    """
+
+    def __init__(self, utc_ns: int, utc_minus_monotonic_ns: int = 0) -> None:
+        self.utc_minus_monotonic_ns = utc_minus_monotonic_ns
+        self._utc_ns = utc_ns
+        self._closed = False
+        self._changed = threading.Condition()
+
+    def monotonic_ns(self) -> int:
+        """See Clock."""
+        return self.utc_ns() - self.utc_minus_monotonic_ns
+
+    def utc_ns(self) -> int:
+        """See Clock."""
+        with self._changed:
+            return self._utc_ns
+
+    def advance_to(self, utc_ns: int) -> None:
+        """It is now `utc_ns`; an earlier time is ignored."""
+        with self._changed:
+            self._utc_ns = max(self._utc_ns, utc_ns)
+            self._changed.notify_all()
+
+    def advance(self, seconds: float) -> None:
+        """Some time has passed."""
+        self.advance_to(self.utc_ns() + round(seconds * 1e9))
+
+    def close(self) -> None:
+        """The record is over: waits return at once."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def wait(self, event: threading.Event, timeout_s: float) -> bool:
+        """See Clock. The event is looked at every 10 ms of real time, the clock as soon as it moves."""
+        with self._changed:
+            until_ns = self._utc_ns + round(timeout_s * 1e9)
+            while not (event.is_set() or self._closed or self._utc_ns >= until_ns):
+                self._changed.wait(0.01)
+        return event.is_set()
+
+
+def _offset_now_ns() -> int:
+    """UTC minus monotonic, from the tightest of a few readings (an interrupted one would be late)."""
+    best: tuple[int, int] | None = None
+    for _ in range(5):
+        before_ns = time.monotonic_ns()
+        utc_ns = time.time_ns()
+        after_ns = time.monotonic_ns()
+        reading = (after_ns - before_ns, utc_ns - (before_ns + after_ns) // 2)
+        best = reading if best is None else min(best, reading)
+    assert best is not None
+    return best[1]

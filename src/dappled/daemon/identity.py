@@ -1,0 +1,46 @@
+"""Which system this camera belongs to: that of the only autopilot on its links."""
+
+from __future__ import annotations
+
+from dappled.drivers.mavlink import Message, mavlink
+
+LISTEN_NS = 3 * 10**9
+ALONE_NS = 1_200_000_000  # heartbeats come every second: a second autopilot would have shown by now
+
+
+class Identity:
+    """Decides once, three seconds after the start at the latest: the sole autopilot's system id, or, where there are
+    several or none, the configured one. Decides sooner when one autopilot was heard alone for 1.2 s."""
+
+    def __init__(self, configured_system_id: int, start_ns: int) -> None:
+        self.system_id = configured_system_id
+        self.settled = False
+        self.autopilots: dict[int, int] = {}  # system id: link it was last heard on
+        self._start_ns = start_ns
+        self._first_heard_ns: int | None = None
+
+    def heard(self, message: Message, link: int, now_ns: int) -> None:
+        """A HEARTBEAT came in. Times are monotonic."""
+        if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID or message.type == mavlink.MAV_TYPE_GCS:
+            return
+        if len(self.autopilots) < 32 or message.get_srcSystem() in self.autopilots:
+            self.autopilots[message.get_srcSystem()] = link
+        if self._first_heard_ns is None:
+            self._first_heard_ns = now_ns
+
+    def decide(self, now_ns: int) -> bool:
+        """Whether it is known by now who we are."""
+        if self.settled:
+            return True
+        alone = len(self.autopilots) == 1
+        waited = self._first_heard_ns is not None and now_ns - self._first_heard_ns >= ALONE_NS
+        if now_ns - self._start_ns >= LISTEN_NS or (alone and waited):
+            self.settled = True
+            if alone:
+                self.system_id = next(iter(self.autopilots))
+        return self.settled
+
+    def autopilot(self) -> tuple[int, int] | None:
+        """(system id, link) of our own autopilot; None while it was not heard."""
+        link = self.autopilots.get(self.system_id)
+        return None if link is None else (self.system_id, link)

@@ -1,0 +1,67 @@
+"""Between two samples: cubic Hermite for positions, slerp for attitudes."""
+
+from __future__ import annotations
+
+import math
+
+from dappled.flight.records import Quaternion, Vector3
+
+_WGS84_A_M = 6378137.0
+_WGS84_E2 = 6.69437999014e-3
+
+
+def hermite(ends: tuple[float, float], slopes: tuple[float, float], span_s: float, share: float) -> float:
+    """The cubic with these values and slopes (per second) at the ends of `span_s`, at `share` in 0..1 of it."""
+    (p0, p1), (v0, v1), u = ends, slopes, share
+    return (
+        (2 * u**3 - 3 * u**2 + 1) * p0
+        + (u**3 - 2 * u**2 + u) * span_s * v0
+        + (3 * u**2 - 2 * u**3) * p1
+        + (u**3 - u**2) * span_s * v1
+    )
+
+
+def slerp(a: Quaternion, b: Quaternion, share: float) -> Quaternion:
+    """The unit quaternion at `share` of the shorter turn from `a` to `b` (both unit)."""
+    dot = sum(x * y for x, y in zip(a, b, strict=True))
+    if dot < 0:
+        b, dot = (-b[0], -b[1], -b[2], -b[3]), -dot
+    if dot > 0.9999:  # sin(angle) loses digits; the chord is as good as the arc here, once normalised
+        return normalised((1 - share) * a[0] + share * b[0], (1 - share) * a[1] + share * b[1],
+                          (1 - share) * a[2] + share * b[2], (1 - share) * a[3] + share * b[3])  # fmt: skip
+    angle = math.acos(dot)
+    wa, wb = math.sin((1 - share) * angle) / math.sin(angle), math.sin(share * angle) / math.sin(angle)
+    return normalised(*(wa * x + wb * y for x, y in zip(a, b, strict=True)))
+
+
+def normalised(*parts: float) -> Quaternion:
+    """Four numbers as a unit quaternion. Raises ValueError where they are none (zero length, not finite)."""
+    w, x, y, z = parts
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    if not (math.isfinite(length) and length > 1e-6):
+        raise ValueError("not a quaternion")
+    return w / length, x / length, y / length, z / length
+
+
+def turn_rad(a: Quaternion, b: Quaternion) -> float:
+    """The angle between two attitudes."""
+    cross = (
+        a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2],
+        a[0] * b[2] - a[2] * b[0] - a[3] * b[1] + a[1] * b[3],
+        a[0] * b[3] - a[3] * b[0] - a[1] * b[2] + a[2] * b[1],
+    )
+    dot = sum(x * y for x, y in zip(a, b, strict=True))
+    return 2 * math.atan2(math.hypot(*cross), abs(dot))
+
+
+def metres_per_radian(latitude_rad: float, altitude_m: float) -> tuple[float, float]:
+    """North and east metres for one radian of latitude and of longitude, on WGS 84."""
+    curvature = 1 - _WGS84_E2 * math.sin(latitude_rad) ** 2
+    north = _WGS84_A_M * (1 - _WGS84_E2) / curvature**1.5 + altitude_m
+    east = (_WGS84_A_M / math.sqrt(curvature) + altitude_m) * math.cos(latitude_rad)
+    return north, east
+
+
+def norm(vector: Vector3) -> float:
+    """Length."""
+    return math.hypot(*vector)

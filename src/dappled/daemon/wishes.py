@@ -1,0 +1,97 @@
+"""Which messages are the same wish. The rules, with their numbers; a wish that none of them matches is a new one.
+
+1. Retry. The same source, kind and sequence within 1.2 s of the last such message, and within 2.4 s of the first, is
+   a retry of it. With `confirmation` above 0 (the sender says itself that it repeats) 10 s instead of both. Holds for
+   messages that are acknowledged (their sender repeats when it misses the answer) or that carry a sequence.
+2. One trigger, several messages. PX4 says CAMERA_TRIGGER, IMAGE_START_CAPTURE and DO_DIGICAM_CONTROL for one
+   trigger, and a vehicle on two links says each of them twice. Within 0.3 s of a shot's first message, a message of
+   the same source belongs to that shot if the shot has none of this kind from this link yet; the oldest such shot
+   takes it.
+
+So a second press with the same sequence (most ground stations: always 0) inside 1.2 s is lost; and triggers from one
+source less than 0.3 s apart may be joined if some of their messages were lost on the way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+RETRY_NS = 1_200_000_000
+RETRY_LIMIT_NS = 2_400_000_000
+CONFIRMED_RETRY_NS = 10 * 10**9
+TRIGGER_NS = 300_000_000
+_REMEMBERED = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """Somebody wants a shot: one message, or one act.
+
+    `source` is "mavlink:255/190", "console" …; `kind` the message or command; `sequence` the sender's own number,
+    None where the kind has none; `acknowledged`: the sender gets an answer, and repeats when it misses it.
+    """
+
+    source: str
+    kind: str
+    sequence: int | None = None
+    confirmation: int = 0
+    link: int | None = None
+    acknowledged: bool = True
+
+
+@dataclass(slots=True)
+class _Remembered:
+    index: int
+    source: str
+    kind: str
+    sequence: int | None
+    first_ns: int
+    last_ns: int
+    parts: set[tuple[str, int | None]]
+
+
+class Recent:
+    """The wishes of the last ten seconds (at most 256), and the image index that each one got."""
+
+    def __init__(self) -> None:
+        self._wishes: list[_Remembered] = []
+
+    def same(self, wish: Wish, now_ns: int) -> int | None:
+        """The image index of the shot that this wish already has; None for a new wish. Times are monotonic."""
+        self._wishes = [w for w in self._wishes if now_ns - w.last_ns <= CONFIRMED_RETRY_NS][-_REMEMBERED:]
+        found = self._retry(wish, now_ns) or self._part(wish, now_ns)
+        if found is None:
+            return None
+        found.parts.add((wish.kind, wish.link))
+        if (wish.kind, wish.sequence) == (found.kind, found.sequence):
+            found.last_ns = max(found.last_ns, now_ns)
+        else:  # a part that may itself be retried: remembered under its own name
+            self._wishes.append(
+                _Remembered(found.index, wish.source, wish.kind, wish.sequence, now_ns, now_ns, found.parts)
+            )
+        return found.index
+
+    def add(self, wish: Wish, now_ns: int, index: int) -> None:
+        """A new wish became shot `index`."""
+        part = (wish.kind, wish.link)
+        self._wishes.append(_Remembered(index, wish.source, wish.kind, wish.sequence, now_ns, now_ns, {part}))
+
+    def _retry(self, wish: Wish, now_ns: int) -> _Remembered | None:
+        if not wish.acknowledged and wish.sequence is None:
+            return None
+        key = (wish.source, wish.kind, wish.sequence)
+        for known in reversed(self._wishes):
+            if (known.source, known.kind, known.sequence) != key:
+                continue
+            if wish.confirmation > 0:
+                return known if now_ns - known.last_ns <= CONFIRMED_RETRY_NS else None
+            recent = now_ns - known.last_ns <= RETRY_NS and now_ns - known.first_ns <= RETRY_LIMIT_NS
+            return known if recent else None
+        return None
+
+    def _part(self, wish: Wish, now_ns: int) -> _Remembered | None:
+        part = (wish.kind, wish.link)
+        for known in self._wishes:
+            if known.source == wish.source and now_ns - known.first_ns <= TRIGGER_NS and part not in known.parts:
+                return known
+        return None

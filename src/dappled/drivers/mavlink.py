@@ -1,0 +1,263 @@
+"""MAVLink links: several at once, one receiving thread each, every packet logged before it is acted on."""
+
+from __future__ import annotations
+
+import logging
+import select
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from dappled.drivers.mavlink_address import Address, LinkError, parse
+from dappled.drivers.mavlink_channel import Channel, open_channel
+from dappled.drivers.mavlink_framing import Decoder, Framed, Framer, Message, mavlink, pack
+
+__all__ = ["Decoder", "LinkError", "LinkStatistics", "MavlinkLinks", "Message", "Packet", "mavlink"]
+
+log = logging.getLogger(__name__)
+_REOPEN_S = 1.0
+_LOOK_S = 0.2
+
+
+class Clock(Protocol):
+    """The two times that a link stamps with."""
+
+    def utc_ns(self) -> int: ...
+
+    def monotonic_ns(self) -> int: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One packet, in or (`sent`) out. `number` is its place in the telemetry log, None if it could not be logged."""
+
+    number: int | None
+    stamp_us: int
+    link: int
+    message: Message
+    raw: bytes
+    sent: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class LinkStatistics:
+    """What went over a link so far. `error` says why it is down, None when it is up."""
+
+    url: str
+    packets_in: int
+    packets_out: int
+    packets_bad: int
+    packets_unsent: int
+    packets_unlogged: int
+    failures: int
+    last_heard_monotonic_ns: int | None
+    error: str | None
+
+
+class MavlinkLinks:
+    """All links of one MAVLink component.
+
+    `tap(stamp_us, raw)` writes a packet to the telemetry log and returns its number there; then `on_packet` is called,
+    for received packets and for sent ones, in the order of their numbers over all links (one lock sees to that), in
+    the thread that received or sent. It must be quick, and may call `send`. Stamps are UTC microseconds from `clock`.
+
+    `system_id` may be set while running: a camera takes its autopilot's.
+    """
+
+    def __init__(
+        self,
+        urls: Sequence[str],
+        *,
+        system_id: int,
+        component_id: int,
+        tap: Callable[[int, bytes], int],
+        on_packet: Callable[[Packet], None],
+        clock: Clock,
+    ) -> None:
+        self.component_id = component_id
+        self.system_id = system_id
+        self._tap = tap
+        self._on_packet = on_packet
+        self._clock = clock
+        self._order = threading.RLock()
+        self._stop = threading.Event()
+        self._opened = False
+        self._links = [_Link(number, parse(url)) for number, url in enumerate(urls)]
+        self._threads: list[threading.Thread] = []
+
+    def open(self) -> None:
+        """Open all links, without receiving yet. Raises LinkError for what would not get better by waiting: a port in
+        use, a missing device. A TCP server that isn't there yet is looked for every second."""
+        if self._opened:
+            return
+        try:
+            for link in self._links:
+                try:
+                    link.channel = open_channel(link.address)
+                except LinkError as error:
+                    if link.address.kind != "tcp":
+                        raise
+                    link.error = str(error)
+        except LinkError:
+            self._close_channels()
+            raise
+        self._opened = True
+
+    def start(self) -> None:
+        """Begin to receive; opens the links if `open` did not. Raises LinkError as `open` does."""
+        self.open()
+        for link in self._links:
+            thread = threading.Thread(target=self._receive, args=(link,), name=f"mavlink {link.number}", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+
+    def stop(self) -> None:
+        """End the threads (within half a second each) and close the links."""
+        self._stop.set()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(2.0)
+        with self._order:
+            self._close_channels()
+
+    def port(self, link: int) -> int:
+        """The local UDP or TCP port of a link: what the system chose where the url said 0."""
+        channel = self._links[link].channel
+        return channel.port() if channel else 0
+
+    def send(self, message: Message, link: int | None = None) -> bool:
+        """Send on one link, or on all. False where no link took it. Never blocks, never raises for a lost link."""
+        taken = False
+        for each in self._links if link is None else self._links[link : link + 1]:
+            with self._order:
+                taken = self._send_on(each, message) or taken
+        return taken
+
+    def statistics(self) -> tuple[LinkStatistics, ...]:
+        """Counters of every link, in the order of the urls."""
+        return tuple(link.statistics() for link in self._links)
+
+    def _send_on(self, link: _Link, message: Message) -> bool:
+        channel = link.channel
+        if channel is None:
+            link.packets_unsent += 1
+            return False
+        link.packer.srcSystem, link.packer.srcComponent = self.system_id, self.component_id
+        raw = pack(message, link.packer, version_1=link.heard_1 and not link.heard_2)
+        stamp_us = self._clock.utc_ns() // 1000
+        try:
+            taken = channel.write(raw)
+        except OSError as error:
+            link.error = f"MAVLink link {link.address.url}: {error.strerror or error}"
+            taken = False
+        if not taken:
+            link.packets_unsent += 1
+            return False
+        link.packets_out += 1
+        self._deliver(link, stamp_us, raw, message, sent=True)
+        return True
+
+    def _deliver(self, link: _Link, stamp_us: int, raw: bytes, message: Message, *, sent: bool) -> None:
+        number: int | None = None
+        try:
+            number = self._tap(stamp_us, raw)
+        except Exception:  # a full disk must not stop the commands of a flying machine
+            if link.packets_unlogged == 0:
+                log.exception("A MAVLink packet could not be written to the telemetry log")
+            link.packets_unlogged += 1
+        try:
+            self._on_packet(Packet(number, stamp_us, link.number, message, raw, sent))
+        except Exception:  # one packet that nobody foresaw must not end the link
+            link.failures += 1
+            log.exception("A MAVLink packet (%s) could not be handled", message.get_type())
+
+    def _receive(self, link: _Link) -> None:
+        framer = Framer()
+        while not self._stop.is_set():
+            channel = link.channel
+            if channel is None or link.error is not None:
+                self._reopen(link)
+                framer = Framer()
+                continue
+            try:
+                readable, writable, _ = select.select(
+                    [channel], [channel] if channel.wants_write() else [], [], _LOOK_S
+                )
+                if writable:
+                    with self._order:
+                        channel.flush()
+                if not readable:
+                    continue
+                data = channel.read()
+                stamp_us = self._clock.utc_ns() // 1000
+            except (OSError, ValueError) as error:  # ValueError: select on a descriptor that another thread closed
+                link.error = f"MAVLink link {link.address.url}: {error}"
+                continue
+            if data is None:
+                link.error = f"MAVLink link {link.address.url}: the other side closed it"
+                continue
+            if not data:
+                continue
+            bad = framer.bad
+            packets = framer.datagram(data) if channel.datagrams else framer.feed(data)
+            for framed in packets:
+                self._received(link, stamp_us, framed)
+            link.packets_bad += framer.bad - bad
+
+    def _received(self, link: _Link, stamp_us: int, framed: Framed) -> None:
+        with self._order:
+            link.packets_in += 1
+            link.last_heard_monotonic_ns = self._clock.monotonic_ns()
+            link.heard_1 |= framed.version == 1
+            link.heard_2 |= framed.version == 2
+            self._deliver(link, stamp_us, framed.raw, framed.message, sent=False)
+
+    def _reopen(self, link: _Link) -> None:
+        with self._order:
+            if link.channel is not None:
+                link.channel.close()
+                link.channel = None
+        if self._stop.wait(_REOPEN_S):
+            return
+        try:
+            channel = open_channel(link.address)
+        except LinkError as error:
+            link.error = str(error)
+            return
+        with self._order:
+            link.channel, link.error = channel, None
+
+    def _close_channels(self) -> None:
+        for link in self._links:
+            if link.channel is not None:
+                link.channel.close()
+                link.channel = None
+
+
+class _Link:
+    """One link's state; its receiving thread and, under the order lock, the senders write it."""
+
+    def __init__(self, number: int, address: Address) -> None:
+        self.number = number
+        self.address = address
+        self.channel: Channel | None = None
+        self.error: str | None = None
+        self.packer = mavlink.MAVLink(None)
+        self.heard_1 = self.heard_2 = False
+        self.packets_in = self.packets_out = self.packets_bad = 0
+        self.packets_unsent = self.packets_unlogged = self.failures = 0
+        self.last_heard_monotonic_ns: int | None = None
+
+    def statistics(self) -> LinkStatistics:
+        return LinkStatistics(
+            self.address.url,
+            self.packets_in,
+            self.packets_out,
+            self.packets_bad,
+            self.packets_unsent,
+            self.packets_unlogged,
+            self.failures,
+            self.last_heard_monotonic_ns,
+            self.error,
+        )

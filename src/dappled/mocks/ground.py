@@ -1,0 +1,77 @@
+"""A simulated ground station in a process of its own: asks for photographs, prints how each one ended.
+
+`python -m dappled.mocks.ground --url udpout:127.0.0.1:14550 --count 8` ends with 0 if all were had.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+
+from dappled.daemon.ground_client import GroundClient, GroundError, Outcome
+from dappled.drivers.mavlink import LinkError
+
+
+class GroundStation:
+    """The ground station as a process; `wait` tells how it went."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    @classmethod
+    def start(cls, url: str, count: int, interval_s: float = 0.0, timeout_s: float = 60.0) -> GroundStation:
+        """Start one that asks for `count` photographs; its lines (JSON) are read by `wait`."""
+        command = [sys.executable, "-m", "dappled.mocks.ground", "--url", url, "--count", str(count)]
+        command += ["--interval", str(interval_s), "--timeout", str(timeout_s)]
+        return cls(subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True))
+
+    def running(self) -> bool:
+        """Whether it is still asking."""
+        return self._process.poll() is None
+
+    def wait(self, timeout_s: float) -> tuple[int, list[dict[str, object]]]:
+        """Exit code, and one mapping a photograph. Raises subprocess.TimeoutExpired."""
+        out, _ = self._process.communicate(timeout=timeout_s)
+        return self._process.returncode, [json.loads(line) for line in out.splitlines()]
+
+    def stop(self) -> None:
+        """End it now."""
+        if self.running():
+            self._process.terminate()
+        self._process.communicate(timeout=5)
+
+
+def _line(outcome: Outcome) -> str:
+    facts = {"sequence": outcome.sequence, "index": outcome.index, "ok": outcome.ok}
+    return json.dumps(facts | {"reason": outcome.reason, "ack_ms": outcome.ack_ms})
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The process."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--url", required=True)
+    parser.add_argument("--count", type=int, required=True)
+    parser.add_argument("--interval", type=float, default=0.0, help="seconds between requests, at least")
+    parser.add_argument(
+        "--timeout", type=float, default=60.0, help="seconds to wait for the camera, and for each photo"
+    )
+    wanted = parser.parse_args(arguments)
+    try:
+        with GroundClient(wanted.url) as client:
+            client.find_camera(wanted.timeout)
+            outcomes = client.capture(
+                wanted.count,
+                wanted.interval,
+                timeout_s=wanted.timeout,
+                on_outcome=lambda outcome: print(_line(outcome), flush=True),  # noqa: T201 (a process that prints)
+            )
+    except (GroundError, LinkError) as error:
+        print(f"ground station: {error}", file=sys.stderr)  # noqa: T201 (as above)
+        return 1
+    return 0 if all(outcome.ok for outcome in outcomes) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
