@@ -1,0 +1,155 @@
+"""Is every byte of a flight intact, and do files, ledger, journal and telemetry agree?"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from dappled.flight import durable, layout, lock, telemetry_log, wishes
+from dappled.flight.entries import Stray
+from dappled.flight.errors import FlightError
+from dappled.flight.layout import FlightFolder
+from dappled.flight.ledger import LedgerReader
+from dappled.flight.records import Frame
+from dappled.flight.recovery import SIDECAR
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What was looked at and what is wrong, in sentences. `notes` are no faults."""
+
+    flight: str
+    files: int
+    size: int
+    telemetry_packets: int
+    problems: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def intact(self) -> bool:
+        return not self.problems
+
+
+def check(path: Path) -> Report:
+    """Read a whole flight and compare everything with everything. Raises FlightError when it is no flight."""
+    folder = layout.open_folder(path)
+    problems: list[str] = []
+    notes: list[str] = []
+    files = size = packets = 0
+    try:
+        layout.read_facts(folder)
+    except FlightError as error:
+        problems.append(str(error))
+    try:
+        with LedgerReader.open(folder.ledger) as ledger:
+            problems += [f"the ledger is damaged: {text}" for text in ledger.damage()]
+            closed = "closed_utc_ns" in ledger.facts()
+            if not closed:
+                (notes if lock.is_held(path.parent) else problems).append(
+                    "the flight is still recorded, or was never closed: the next `dappled run` puts it in order"
+                )
+            for file_size, problem in _files(folder, ledger):
+                files, size = files + 1, size + file_size
+                problems += [problem] if problem else []
+            problems += _names(folder, ledger, closed)
+            problems += _shots(folder, ledger, notes)
+            problems += _records(ledger)
+            packets = _telemetry(folder, ledger, problems, notes)
+    except FlightError as error:
+        problems.append(str(error))
+    return Report(folder.name, files, size, packets, tuple(problems), tuple(notes))
+
+
+def _acknowledged(ledger: LedgerReader) -> list[Frame | Stray]:
+    return [*ledger.frames(), *ledger.strays()]
+
+
+def _files(folder: FlightFolder, ledger: LedgerReader) -> Iterator[tuple[int, str | None]]:
+    """(bytes read, problem) for every file that the ledger acknowledges."""
+    for row in _acknowledged(ledger):
+        path = folder.path / row.name
+        try:
+            size = path.stat().st_size
+            if size != row.size:
+                yield size, f"{row.name} has {size} bytes, the ledger says {row.size}"
+            elif durable.hash_file(path) != row.sha256:
+                yield size, f"{row.name} was changed: its SHA-256 is not the ledger's"
+            else:
+                yield size, None
+        except FileNotFoundError:
+            yield 0, f"{row.name} is in the ledger, but the file is missing"
+        except OSError as error:
+            yield 0, f"{row.name} can't be read: {error.strerror}"
+
+
+def _names(folder: FlightFolder, ledger: LedgerReader, closed: bool) -> Iterator[str]:
+    """Files that no row acknowledges. While a flight is recorded, one may be on its way."""
+    known = {row.name for row in _acknowledged(ledger)}
+    try:
+        names = sorted(os.listdir(folder.frames))
+    except OSError as error:
+        yield f"the folder frames can't be read: {error.strerror}"
+        return
+    for name in names:
+        if durable.is_temporary(name):
+            if closed:
+                yield f"frames/{name} is a half-written file"
+        elif f"frames/{name}" not in known and not name.endswith(SIDECAR) and closed:
+            yield f"frames/{name} is in no row of the ledger"
+
+
+def _shots(folder: FlightFolder, ledger: LedgerReader, notes: list[str]) -> Iterator[str]:
+    journal = wishes.read(folder.journal)
+    notes.extend(journal.problems)  # a torn line; where it hid a shot, that is a problem below
+    rows = {row.shot.index: row for row in ledger.shots()}
+    noted = {shot.index: shot for shot in journal.shots}
+    framed = {frame.index for frame in ledger.frames()}
+    for index in sorted(rows.keys() | noted.keys()):
+        row = rows.get(index)
+        if row is None:
+            yield f"shot {index} is in shots.jsonl, but not in the ledger"
+        elif index not in noted:
+            yield f"shot {index} is in the ledger, but not in shots.jsonl"
+        elif noted[index] != row.shot:
+            yield f"shot {index} is told differently in shots.jsonl and in the ledger"
+        if row is not None and (row.state == "safe") != (index in framed):
+            yield f"shot {index} is {row.state}, but the ledger has {'a' if index in framed else 'no'} frame for it"
+
+
+def _records(ledger: LedgerReader) -> Iterator[str]:
+    """Poses and tags against their digests, and tags against frames."""
+    for table in ("poses", "tags"):
+        for index, (sha256, text) in ledger.digests(table).items():
+            if hashlib.sha256(text.encode()).hexdigest() != sha256:
+                yield f"the {table[:-1]} of frame {index} was changed: its SHA-256 is not the one noted"
+    frames = {frame.index: frame.sha256 for frame in ledger.frames()}
+    try:
+        tags = ledger.tags()
+    except FlightError as error:
+        yield str(error)
+        return
+    for index, tag in tags.items():
+        if frames.get(index) != tag.frame_sha256:
+            yield f"the tag of frame {index} is about other bytes than the frame's"
+
+
+def _telemetry(folder: FlightFolder, ledger: LedgerReader, problems: list[str], notes: list[str]) -> int:
+    facts = ledger.facts()
+    if not folder.telemetry.exists():
+        if "telemetry_sha256" in facts:
+            problems.append("telemetry.tlog is missing")
+        else:
+            notes.append("the flight has no telemetry")
+        return 0
+    gaps: list[str] = []
+    found = telemetry_log.summarise(folder.telemetry, gaps.append)
+    noted = facts.get("telemetry_sha256")
+    if noted is not None and noted != found.sha256:
+        problems.append("telemetry.tlog was changed: its SHA-256 is not the ledger's")
+        problems.extend(gaps)
+    else:
+        notes.extend(gaps)  # so it was when the flight was closed
+    return found.packets

@@ -1,0 +1,197 @@
+"""The index over all flights: which flight and frame an image index stands for.
+
+The camera's image index goes on over restarts. The index is made from the flights' own ledgers and can be made anew
+from them at any time.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self, cast
+
+from dappled.flight import layout, wishes
+from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.layout import FlightFolder
+from dappled.flight.ledger import LedgerReader
+from dappled.flight.records import ShotState
+
+FILE_NAME = "index.sqlite"
+_APPLICATION_ID = 0x44505049  # "DPPI"
+_VERSION = 1
+_SCHEMA = f"""
+BEGIN IMMEDIATE;
+PRAGMA application_id={_APPLICATION_ID};
+PRAGMA user_version={_VERSION};
+CREATE TABLE flights (
+    number INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, start_utc_ns INTEGER, sealed INTEGER NOT NULL DEFAULT 0,
+    highest INTEGER                    -- image index that anything in a sealed flight mentions, strays too
+) STRICT;
+CREATE TABLE images (
+    idx INTEGER PRIMARY KEY, flight TEXT NOT NULL REFERENCES flights (name), frame TEXT, state TEXT NOT NULL
+) STRICT;
+COMMIT;
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Where an image index leads: the flight's name, the frame's name in it (None without one), the shot's state."""
+
+    index: int
+    flight: str
+    frame: str | None
+    state: ShotState
+
+
+class ImageIndex:
+    """`<flights>/index.sqlite`, open for reading and writing by the one daemon that holds the flights' lock."""
+
+    def __init__(self, root: Path) -> None:
+        """Open or make the index. Raises FlightError when it is damaged or foreign: see `open_or_rebuild`."""
+        self.root = root
+        self.path = root / FILE_NAME
+        self._lock = threading.Lock()
+        try:
+            self._db = sqlite3.connect(self.path, timeout=10.0, isolation_level=None, check_same_thread=False)
+        except sqlite3.Error as error:
+            raise FlightError(f"cannot open the index {self.path}: {error}; check its folder") from error
+        try:
+            with self._speaking():
+                self._identify()
+        except BaseException:
+            self._db.close()
+            raise
+
+    def _identify(self) -> None:
+        application = self._db.execute("PRAGMA application_id").fetchone()[0]
+        version = self._db.execute("PRAGMA user_version").fetchone()[0]
+        empty = self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+        if not (empty and application == 0) and (application, version) != (_APPLICATION_ID, _VERSION):
+            raise FlightError(f"{self.path} is not an index of this dappled; move it away, it is made anew")
+        self._db.execute("PRAGMA journal_mode=WAL")
+        self._db.execute("PRAGMA synchronous=NORMAL")  # the ledgers are the truth: a lost row is found again there
+        if empty:
+            self._db.executescript(_SCHEMA)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        with self._lock:
+            self._db.close()
+
+    def add_flight(self, name: str, start_utc_ns: int | None) -> None:
+        """A flight begins. A start that is not known is told later by calling this again."""
+        self._execute(
+            "INSERT INTO flights (name, start_utc_ns) VALUES (?, ?) ON CONFLICT (name) DO UPDATE "
+            "SET start_utc_ns = coalesce(excluded.start_utc_ns, start_utc_ns)",
+            name,
+            start_utc_ns,
+        )
+
+    def put(self, entry: Entry) -> None:
+        """What an image index leads to now. Raises FlightError when it belongs to another flight."""
+        held = self.lookup(entry.index)
+        if held is not None and held.flight != entry.flight:
+            raise FlightError(
+                f"image {entry.index} is in flight {held.flight} and again in {entry.flight}: the first counts"
+            )
+        values = (entry.index, entry.flight, entry.frame, entry.state)
+        self._execute("INSERT OR REPLACE INTO images VALUES (?, ?, ?, ?)", *values)
+
+    def lookup(self, index: int) -> Entry | None:
+        """Where an image index leads; None when no flight has it."""
+        rows = self._execute("SELECT idx, flight, frame, state FROM images WHERE idx = ?", index)
+        return None if not rows else Entry(rows[0][0], rows[0][1], rows[0][2], cast(ShotState, rows[0][3]))
+
+    def highest(self) -> int | None:
+        """The highest image index that is indexed, or that a sealed flight mentions."""
+        rows = self._execute("SELECT max(idx) FROM images UNION ALL SELECT max(highest) FROM flights")
+        return max((row[0] for row in rows if row[0] is not None), default=None)
+
+    def flights(self) -> dict[str, int | None]:
+        """The flights in the order they were flown, with their start in UTC nanoseconds where known."""
+        return dict(self._execute("SELECT name, start_utc_ns FROM flights ORDER BY number"))
+
+    def sealed(self) -> set[str]:
+        """Flights that are closed and wholly indexed."""
+        return {row[0] for row in self._execute("SELECT name FROM flights WHERE sealed")}
+
+    def take_in(self, folder: FlightFolder, *, seal: bool) -> list[str]:
+        """Index all shots of a flight from its ledger; `seal` says that no more will come. Returns problems."""
+        self.add_flight(folder.name, None)
+        problems: list[str] = []
+        with LedgerReader.open(folder.ledger) as ledger:
+            frames = {frame.index: frame.name for frame in ledger.frames()}
+            for row in ledger.shots():
+                index = row.shot.index
+                try:
+                    self.put(Entry(index, folder.name, frames.get(index), row.state))
+                except FlightError as error:
+                    problems.append(str(error))
+        if seal:
+            highest = highest_in(folder)
+            self._execute("UPDATE flights SET sealed = 1, highest = ? WHERE name = ?", highest, folder.name)
+        return problems
+
+    def next_index(self) -> int:
+        """The image index for the next shot, from 0: beyond everything indexed, and beyond every ledger, journal and
+        frame of a flight that is not sealed."""
+        sealed = self.sealed()
+        open_flights = [folder for folder in layout.flights(self.root) if folder.name not in sealed]
+        known = [self.highest(), *(highest_in(folder) for folder in open_flights)]
+        return max((index for index in known if index is not None), default=-1) + 1
+
+    def _execute(self, sql: str, *values: object) -> list[Any]:
+        with self._lock, self._speaking():
+            return self._db.execute(sql, values).fetchall()
+
+    @contextmanager
+    def _speaking(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise FlightError(f"cannot use the index {self.path}: {error}; move it away, it is made anew") from error
+
+
+def open_or_rebuild(root: Path) -> tuple[ImageIndex, list[str]]:
+    """The index; a damaged one is moved aside and an empty one made, to be filled from the ledgers. With a report.
+
+    Raises FlightError when there can be none.
+    """
+    try:
+        return ImageIndex(root), []
+    except FlightError as error:
+        path = root / FILE_NAME
+        if not path.is_file():
+            raise
+        aside = path.with_name(FILE_NAME + ".damaged")
+        try:
+            os.replace(path, aside)
+            for suffix in ("-wal", "-shm"):
+                path.with_name(FILE_NAME + suffix).unlink(missing_ok=True)
+        except OSError as second:
+            raise disk_error("move away the damaged index", path, second) from second
+        return ImageIndex(root), [f"{error}; it was moved to {aside.name} and made anew from the flights"]
+
+
+def highest_in(folder: FlightFolder) -> int | None:
+    """The highest image index that a flight's journal, ledger or frames mention; a damaged ledger is passed over."""
+    found = [shot.index for shot in wishes.read(folder.journal).shots]
+    try:
+        with LedgerReader.open(folder.ledger) as ledger:
+            found += [row.shot.index for row in ledger.shots()]
+    except FlightError:  # recovery has reported it; the journal and the frames' names say enough here
+        pass
+    if folder.frames.is_dir():
+        found += [index for name in os.listdir(folder.frames) if (index := layout.index_of(name)) is not None]
+    return max(found, default=None)

@@ -1,0 +1,167 @@
+"""The flight folder: what stands where, and how a new one is made.
+
+`<flights>/<UTC start as 20261121T101503Z>-<8 hex>/` holds flight.toml, flight.sqlite, shots.jsonl, telemetry.tlog,
+frames/ and, where asked for, lightfields/. A machine that does not know UTC yet names its flight by boot.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from dappled.flight import durable
+from dappled.flight.errors import FlightError, disk_error
+
+_FLIGHT_NAME = re.compile(r"(\d{8}T\d{6}Z|boot[0-9a-f]{8})-[0-9a-f]{8}")
+_FRAME_NAME = re.compile(r"(\d{6,})\.([a-z0-9]{1,8})")
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+
+@dataclass(frozen=True, slots=True)
+class FlightFolder:
+    """A recorded flight on disk, by its path. Names are relative to it where they are kept."""
+
+    path: Path
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    @property
+    def settings(self) -> Path:
+        """flight.toml: resolved settings, software versions, camera identity."""
+        return self.path / "flight.toml"
+
+    @property
+    def ledger(self) -> Path:
+        return self.path / "flight.sqlite"
+
+    @property
+    def journal(self) -> Path:
+        """shots.jsonl: every wish, noted before the camera is touched."""
+        return self.path / "shots.jsonl"
+
+    @property
+    def telemetry(self) -> Path:
+        return self.path / "telemetry.tlog"
+
+    @property
+    def frames(self) -> Path:
+        return self.path / "frames"
+
+    @property
+    def lightfields(self) -> Path:
+        return self.path / "lightfields"
+
+
+def extension(camera_name: str) -> str:
+    """The extension to store a camera's file under: its own, lower case, letters and digits only, else "raw".
+
+    >>> extension("IMG_0042.CR2"), extension("../../etc/passwd"), extension("a.j/../p g")
+    ('cr2', 'raw', 'raw')
+    """
+    _, dot, last = camera_name.rpartition(".")
+    last = last.lower()
+    return last if dot and re.fullmatch(r"[a-z0-9]{1,8}", last) else "raw"
+
+
+def frame_name(index: int, camera_name: str) -> str:
+    """Where the frame of an image index stands, relative to the flight: "frames/000042.cr2"."""
+    if index < 0:
+        raise ValueError(f"an image index is 0 or more, not {index}")
+    return f"frames/{index:06d}.{extension(camera_name)}"
+
+
+def index_of(file_name: str) -> int | None:
+    """The image index that a file's name in frames/ says, or None when it is not a frame's name."""
+    match = _FRAME_NAME.fullmatch(file_name)
+    return int(match[1]) if match else None
+
+
+def create(root: Path, utc_ns: int | None, facts: Mapping[str, Any] | None = None) -> FlightFolder:
+    """A new, empty flight under `root` (made if missing), durable with its flight.toml when this returns.
+
+    `utc_ns` is the start, or None when UTC is not known. `facts` goes to flight.toml. Raises FlightError.
+    """
+    if utc_ns is None:
+        start = "boot" + _BOOT_ID.read_text().strip().replace("-", "")[:8]
+    else:
+        start = datetime.fromtimestamp(utc_ns // 1_000_000_000, UTC).strftime("%Y%m%dT%H%M%SZ")
+    folder = FlightFolder(root / f"{start}-{secrets.token_hex(4)}")
+    try:
+        durable.make_folder(root)
+        folder.path.mkdir()
+        durable.make_folder(folder.frames)
+        write_facts(folder, facts or {})
+        durable.sync_folder(root)
+    except OSError as error:
+        raise disk_error("make the flight folder", folder.path, error) from error
+    return folder
+
+
+def open_folder(path: Path) -> FlightFolder:
+    """A recorded flight. Raises FlightError when `path` is not one."""
+    folder = FlightFolder(path)
+    try:
+        found = path.is_dir() and (folder.ledger.is_file() or folder.settings.is_file())
+    except OSError as error:
+        raise disk_error("open the flight", path, error) from error
+    if not found:
+        what = "does not exist" if not path.exists() else "is a file" if path.is_file() else "holds no flight.sqlite"
+        raise FlightError(f"{path} is not a flight folder (it {what}); give the folder that holds flight.sqlite")
+    return folder
+
+
+def flights(root: Path) -> list[FlightFolder]:
+    """All flights under `root`, by name; an empty list when there is no such folder. Raises FlightError."""
+    try:
+        names = sorted(entry.name for entry in os.scandir(root) if entry.is_dir(follow_symlinks=False))
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise disk_error("list the flights in", root, error) from error
+    return [FlightFolder(root / name) for name in names if _FLIGHT_NAME.fullmatch(name)]
+
+
+def free_bytes(path: Path) -> int:
+    """What this user may still write on the disk of `path`, in bytes. Raises FlightError."""
+    try:
+        stat = os.statvfs(path)
+    except OSError as error:
+        raise disk_error("ask for the free space of", path, error) from error
+    return stat.f_bavail * stat.f_frsize
+
+
+def write_facts(folder: FlightFolder, facts: Mapping[str, Any]) -> None:
+    """Write flight.toml anew, whole or not at all. TOML has no null: unknown (None) values are left out.
+
+    Raises OSError, and TypeError for a value that TOML can't hold.
+    """
+    durable.write_file(folder.settings, tomli_w.dumps(_plain(facts)).encode())
+
+
+def read_facts(folder: FlightFolder) -> dict[str, Any]:
+    """What flight.toml says. Raises FlightError."""
+    try:
+        return tomllib.loads(folder.settings.read_text("utf-8"))
+    except OSError as error:
+        raise disk_error("read", folder.settings, error) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise FlightError(f"{folder.settings} is not readable as TOML: {error}") from error
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items() if item is not None}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value if item is not None]
+    return str(value) if isinstance(value, os.PathLike) else value

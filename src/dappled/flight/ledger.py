@@ -1,0 +1,358 @@
+"""The ledger: one SQLite file that says what became of every wish. A row in it is the acknowledgement.
+
+WAL with synchronous=FULL: a committed row survives a power cut. Poses, tags and results are kept as the canonical JSON
+that was hashed, so that anybody can check `sha256(record)` with SQLite and sha256sum alone.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Self, TypeVar, cast
+
+from dappled.flight.entries import Event, Result, ShotRow, Stray
+from dappled.flight.errors import FlightError
+from dappled.flight.records import Cause, Frame, Pose, Shot, ShotState, Tag, canonical, digest
+from dappled.flight.states import advance
+
+_Record = TypeVar("_Record")
+
+APPLICATION_ID = 0x4450504C  # "DPPL"
+SCHEMA_VERSION = 1
+
+_SCHEMA = """
+CREATE TABLE shots (
+    idx INTEGER PRIMARY KEY,           -- the image index, going on over flights
+    source TEXT NOT NULL, kind TEXT NOT NULL, sequence INTEGER,
+    wished_utc_ns INTEGER NOT NULL, wished_monotonic_ns INTEGER NOT NULL,
+    state TEXT NOT NULL CHECK (state IN ('wished', 'fired', 'safe', 'failed')),
+    reason TEXT,
+    fired_called_monotonic_ns INTEGER, fired_returned_monotonic_ns INTEGER
+) STRICT;
+CREATE TABLE frames (
+    idx INTEGER PRIMARY KEY REFERENCES shots (idx),
+    name TEXT NOT NULL UNIQUE,         -- relative to the flight folder
+    camera_name TEXT NOT NULL, size INTEGER NOT NULL, sha256 TEXT NOT NULL, arrived_utc_ns INTEGER NOT NULL
+) STRICT;
+CREATE TABLE strays (
+    name TEXT PRIMARY KEY, camera_name TEXT NOT NULL, size INTEGER NOT NULL, sha256 TEXT NOT NULL,
+    arrived_utc_ns INTEGER NOT NULL, reason TEXT NOT NULL
+) STRICT;
+CREATE TABLE poses (idx INTEGER PRIMARY KEY REFERENCES frames (idx), sha256 TEXT NOT NULL, record TEXT NOT NULL) STRICT;
+CREATE TABLE tags (idx INTEGER PRIMARY KEY REFERENCES frames (idx), sha256 TEXT NOT NULL, record TEXT NOT NULL) STRICT;
+CREATE TABLE results (
+    idx INTEGER NOT NULL REFERENCES frames (idx), run TEXT NOT NULL,
+    slices_sha256 TEXT NOT NULL, record TEXT NOT NULL,
+    PRIMARY KEY (idx, run)
+) STRICT;
+CREATE TABLE events (
+    number INTEGER PRIMARY KEY, utc_ns INTEGER NOT NULL, kind TEXT NOT NULL, idx INTEGER, text TEXT NOT NULL
+) STRICT;
+CREATE TABLE facts (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
+"""
+
+
+class LedgerReader:
+    """Everything that a ledger says, as records. One connection, behind a lock: threads may share it."""
+
+    def __init__(self, path: Path, *, uri: str, create: bool = False) -> None:
+        self.path = path
+        self._lock = threading.RLock()
+        try:
+            self._db = sqlite3.connect(uri, uri=True, timeout=10.0, isolation_level=None, check_same_thread=False)
+        except sqlite3.Error as error:
+            raise self._sentence(error) from error
+        try:
+            self._identify(create)
+        except BaseException:
+            self._db.close()
+            raise
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """A ledger to read only, also while it is written, also on a read-only disk. Raises FlightError."""
+        if not path.is_file():
+            raise FlightError(f"there is no ledger at {path}; give a flight folder that dappled recorded")
+        try:
+            # Not mode=ro: such a connection, when it is the last, would leave -wal and -shm behind. Nothing is changed.
+            reader = cls(path, uri=f"{path.absolute().as_uri()}?mode=rw")
+        except FlightError:
+            # In a folder that can't be written a WAL database opens only as immutable, and only when closed well.
+            wal = path.with_name(path.name + "-wal")
+            if wal.exists() and wal.stat().st_size > 0:
+                raise
+            reader = cls(path, uri=f"{path.absolute().as_uri()}?mode=ro&immutable=1")
+        reader._rows("PRAGMA query_only=ON")
+        return reader
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection; the last one to close folds the WAL into the file."""
+        with self._lock:
+            self._db.close()
+
+    def shots(self) -> list[ShotRow]:
+        """All shots, by index."""
+        return [_shot_row(row) for row in self._rows("SELECT * FROM shots ORDER BY idx")]
+
+    def shot(self, index: int) -> ShotRow | None:
+        rows = self._rows("SELECT * FROM shots WHERE idx = ?", index)
+        return _shot_row(rows[0]) if rows else None
+
+    def frames(self) -> list[Frame]:
+        """All safe frames, by index."""
+        return [Frame(*row) for row in self._rows("SELECT * FROM frames ORDER BY idx")]
+
+    def frame(self, index: int) -> Frame | None:
+        rows = self._rows("SELECT * FROM frames WHERE idx = ?", index)
+        return Frame(*rows[0]) if rows else None
+
+    def strays(self) -> list[Stray]:
+        return [Stray(*row) for row in self._rows("SELECT * FROM strays ORDER BY name")]
+
+    def poses(self) -> dict[int, Pose]:
+        return {index: self._load(_pose, text) for index, text in self._rows("SELECT idx, record FROM poses")}
+
+    def pose(self, index: int) -> Pose | None:
+        rows = self._rows("SELECT record FROM poses WHERE idx = ?", index)
+        return self._load(_pose, rows[0][0]) if rows else None
+
+    def tags(self) -> dict[int, Tag]:
+        return {index: self._load(_tag, text) for index, text in self._rows("SELECT idx, record FROM tags")}
+
+    def tag(self, index: int) -> Tag | None:
+        rows = self._rows("SELECT record FROM tags WHERE idx = ?", index)
+        return self._load(_tag, rows[0][0]) if rows else None
+
+    def results(self, run: str = "live") -> dict[int, Result]:
+        """What decoding made of each frame in one run."""
+        rows = self._rows("SELECT record FROM results WHERE run = ? ORDER BY idx", run)
+        return {result.index: result for result in (self._load(_result, row[0]) for row in rows)}
+
+    def result(self, index: int, run: str = "live") -> Result | None:
+        rows = self._rows("SELECT record FROM results WHERE idx = ? AND run = ?", index, run)
+        return self._load(_result, rows[0][0]) if rows else None
+
+    def digests(self, table: str) -> dict[int, tuple[str, str]]:
+        """(sha256 as noted, record text) by index, of "poses" or "tags"."""
+        if table not in ("poses", "tags"):
+            raise ValueError(f"no digests are kept of {table}")
+        rows = self._rows(f"SELECT idx, sha256, record FROM {table} ORDER BY idx")  # noqa: S608  one of two words
+        return {index: (sha256, text) for index, sha256, text in rows}
+
+    def events(self) -> list[Event]:
+        return [Event(*row) for row in self._rows("SELECT * FROM events ORDER BY number")]
+
+    def facts(self) -> dict[str, Any]:
+        """What holds for the whole flight: telemetry_sha256, closed_utc_ns …"""
+        return {key: json.loads(value) for key, value in self._rows("SELECT key, value FROM facts")}
+
+    def damage(self) -> list[str]:
+        """What SQLite finds wrong with the file; empty when it is whole."""
+        try:
+            found = [str(row[0]) for row in self._rows("PRAGMA integrity_check(10)")]
+            return [] if found == ["ok"] else found
+        except FlightError as error:
+            return [str(error)]
+
+    def _load(self, build: Callable[[dict[str, Any]], _Record], text: str) -> _Record:
+        try:
+            return build(json.loads(text))
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise FlightError(f"a record in the ledger {self.path} can't be read: {error}") from error
+
+    def _rows(self, sql: str, *values: object) -> list[Any]:
+        with self._lock, self._speaking():
+            return self._db.execute(sql, values).fetchall()
+
+    @contextmanager
+    def _speaking(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise self._sentence(error) from error
+
+    def _sentence(self, error: sqlite3.Error) -> FlightError:
+        code = getattr(error, "sqlite_errorname", "") or ""
+        if isinstance(error, sqlite3.ProgrammingError):
+            return FlightError(f"the ledger {self.path} was used after it was closed or in a wrong way: {error}")
+        if code.startswith("SQLITE_CONSTRAINT"):
+            return FlightError(f"the ledger {self.path} refuses a row that contradicts the others: {error}")
+        for start, why in _REASONS.items():
+            if code.startswith(start):
+                return FlightError(f"cannot use the ledger {self.path}: {why}")
+        return FlightError(f"cannot use the ledger {self.path}: {error}; check the disk and the file")
+
+    def _identify(self, create: bool) -> None:
+        with self._speaking():
+            empty = self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+            application = self._db.execute("PRAGMA application_id").fetchone()[0]
+            version = self._db.execute("PRAGMA user_version").fetchone()[0]
+        if empty and create and application == 0:
+            return
+        if application != APPLICATION_ID:
+            raise FlightError(f"{self.path} is not a dappled ledger; give a flight folder that dappled recorded")
+        if version != SCHEMA_VERSION:
+            raise FlightError(
+                f"the ledger {self.path} has version {version}, this dappled reads version {SCHEMA_VERSION}; "
+                "use the dappled that recorded it, or a newer one"
+            )
+
+
+_REASONS = {
+    "SQLITE_NOTADB": "it is damaged, or no SQLite file; move it away, the frames and shots.jsonl beside it are intact",
+    "SQLITE_CORRUPT": "it is damaged; move it away, the frames and shots.jsonl beside it are intact",
+    "SQLITE_FULL": "the disk is full; free some space or set record.directory to another disk",
+    "SQLITE_READONLY": "the disk or the file is read-only; make it writable or set record.directory elsewhere",
+    "SQLITE_CANTOPEN": "it can't be opened; check that its folder exists and is accessible",
+    "SQLITE_BUSY": "another program holds it; close that program",
+    "SQLITE_IOERR": "the disk reports an input/output error, or is full; check the disk (df, dmesg)",
+}
+
+
+class Ledger(LedgerReader):
+    """The ledger's one writer. Every method is one short transaction, durable when it returns.
+
+    All raise FlightError with a sentence when the ledger can't take it.
+    """
+
+    def __init__(self, path: Path, utc_ns: Callable[[], int]) -> None:
+        """Open a flight's ledger, or make it. `utc_ns` stamps the events."""
+        self._utc_ns = utc_ns
+        super().__init__(path, uri=f"{path.absolute().as_uri()}?mode=rwc", create=True)
+        try:
+            with self._speaking():
+                self._db.execute("PRAGMA journal_mode=WAL")
+                self._db.execute("PRAGMA synchronous=FULL")
+                self._db.execute("PRAGMA foreign_keys=ON")
+                if self._db.execute("PRAGMA application_id").fetchone()[0] == 0:
+                    self._db.executescript(
+                        f"BEGIN IMMEDIATE; PRAGMA application_id={APPLICATION_ID};"
+                        f"PRAGMA user_version={SCHEMA_VERSION};{_SCHEMA}COMMIT;"
+                    )
+        except BaseException:
+            self._db.close()
+            raise
+
+    def reader(self) -> LedgerReader:
+        """A connection of its own for another thread."""
+        return LedgerReader.open(self.path)
+
+    def add_shot(self, shot: Shot) -> None:
+        """A wish, from the journal."""
+        with self._transaction():
+            if self.shot(shot.index) is not None:
+                raise FlightError(f"shot {shot.index} is in the ledger {self.path} already")
+            cause = shot.cause
+            self._db.execute(
+                "INSERT INTO shots VALUES (?, ?, ?, ?, ?, ?, 'wished', NULL, NULL, NULL)",
+                (shot.index, cause.source, cause.kind, cause.sequence, shot.wished_utc_ns, shot.wished_monotonic_ns),
+            )
+
+    def fired(self, index: int, called_monotonic_ns: int, returned_monotonic_ns: int) -> None:
+        """The trigger call was made, between these times."""
+        with self._transaction():
+            self._advance(index, "fired")
+            self._db.execute(
+                "UPDATE shots SET fired_called_monotonic_ns = ?, fired_returned_monotonic_ns = ? WHERE idx = ?",
+                (called_monotonic_ns, returned_monotonic_ns, index),
+            )
+
+    def failed(self, index: int, reason: str) -> None:
+        """The shot brings no frame. `reason` is a sentence."""
+        with self._transaction():
+            self._advance(index, "failed", reason)
+            self._event("failed", reason, index)
+
+    def safe(self, frame: Frame) -> None:
+        """The frame's bytes and name are durable: this row acknowledges them."""
+        with self._transaction():
+            before = self._advance(frame.index, "safe")
+            values = (frame.index, frame.name, frame.camera_name, frame.size, frame.sha256, frame.arrived_utc_ns)
+            self._db.execute("INSERT INTO frames VALUES (?, ?, ?, ?, ?, ?)", values)
+            if before == "failed":
+                self._event("late", f"the file {frame.camera_name} came after the shot had been given up", frame.index)
+
+    def add_stray(self, stray: Stray) -> None:
+        """A file that belongs to no shot, or is one too many, durable under its name."""
+        with self._transaction():
+            values = (stray.name, stray.camera_name, stray.size, stray.sha256, stray.arrived_utc_ns, stray.reason)
+            self._db.execute("INSERT INTO strays VALUES (?, ?, ?, ?, ?, ?)", values)
+            self._event("stray", stray.reason, None)
+
+    def add_tag(self, tag: Tag) -> None:
+        """A frame's tag and, with a digest of its own, the pose in it."""
+        with self._transaction():
+            for table, record in (("poses", tag.pose), ("tags", tag)):
+                self._db.execute(
+                    f"INSERT INTO {table} VALUES (?, ?, ?)",  # noqa: S608  one of two words
+                    (tag.index, digest(record), canonical(asdict(record)).decode()),
+                )
+
+    def add_result(self, result: Result) -> None:
+        """What decoding made of a frame; once for each run."""
+        with self._transaction():
+            values = (result.index, result.run, result.slices_sha256, canonical(asdict(result)).decode())
+            self._db.execute("INSERT INTO results VALUES (?, ?, ?, ?)", values)
+
+    def add_event(self, kind: str, text: str, index: int | None = None) -> None:
+        with self._transaction():
+            self._event(kind, text, index)
+
+    def set_fact(self, key: str, value: object) -> None:
+        """Something that holds for the whole flight; replaces what was noted before."""
+        with self._transaction():
+            self._db.execute("INSERT OR REPLACE INTO facts VALUES (?, ?)", (key, canonical(value).decode()))
+
+    def _event(self, kind: str, text: str, index: int | None) -> None:
+        values = (self._utc_ns(), kind, index, text)
+        self._db.execute("INSERT INTO events (utc_ns, kind, idx, text) VALUES (?, ?, ?, ?)", values)
+
+    def _advance(self, index: int, new: ShotState, reason: str | None = None) -> ShotState:
+        row = self.shot(index)
+        if row is None:
+            raise FlightError(f"no shot {index} is in the ledger {self.path}: it was never wished for")
+        advance(index, row.state, new)
+        self._db.execute("UPDATE shots SET state = ?, reason = ? WHERE idx = ?", (new, reason, index))
+        return row.state
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        with self._lock, self._speaking():
+            self._db.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._db.execute("COMMIT")
+            except BaseException:
+                if self._db.in_transaction:
+                    self._db.execute("ROLLBACK")
+                raise
+
+
+def _shot_row(row: Sequence[Any]) -> ShotRow:
+    index, source, kind, sequence, utc_ns, monotonic_ns, state, reason, called, returned = row
+    shot = Shot(index, Cause(source, kind, sequence), utc_ns, monotonic_ns)
+    return ShotRow(shot, cast(ShotState, state), reason, called, returned)
+
+
+def _pose(value: dict[str, Any]) -> Pose:
+    lists = {key: tuple(item) for key, item in value.items() if isinstance(item, list)}
+    return Pose(**{**value, **lists})
+
+
+def _tag(value: dict[str, Any]) -> Tag:
+    return Tag(**{**value, "pose": _pose(value["pose"])})
+
+
+def _result(value: dict[str, Any]) -> Result:
+    return Result(**value)

@@ -1,0 +1,109 @@
+"""The recording of one flight, from its first to its last line: what the daemon opens and closes."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dappled.flight import layout, recovery
+from dappled.flight.errors import disk_error
+from dappled.flight.index import Entry, ImageIndex, open_or_rebuild
+from dappled.flight.layout import FlightFolder
+from dappled.flight.ledger import Ledger
+from dappled.flight.lock import FlightsLock
+from dappled.flight.recorder import Recorder
+from dappled.flight.telemetry_log import TelemetryLog
+from dappled.flight.wishes import WishJournal
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """The open parts of a flight. Each has one owner; `close` ends them all.
+
+    `next_index` is the image index of the first shot. `recovered` says what was put in order in earlier flights.
+    """
+
+    folder: FlightFolder
+    journal: WishJournal
+    ledger: Ledger
+    recorder: Recorder
+    telemetry: TelemetryLog
+    index: ImageIndex
+    next_index: int
+    recovered: tuple[str, ...]
+    _lock: FlightsLock
+    _utc_ns: Callable[[], int]
+    _ended: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def closed(self) -> bool:
+        """Whether `close` was called."""
+        return self._ended.is_set()
+
+    def note_image(self, index: int) -> None:
+        """Bring the index over flights up to date for one shot. Raises FlightError."""
+        row = self.ledger.shot(index)
+        if row is not None:
+            frame = self.ledger.frame(index)
+            self.index.put(Entry(index, self.folder.name, None if frame is None else frame.name, row.state))
+
+    def add_facts(self, facts: Mapping[str, Any]) -> None:
+        """Add to flight.toml what was learnt since the start, such as the camera's identity. Raises FlightError."""
+        try:
+            layout.write_facts(self.folder, {**layout.read_facts(self.folder), **facts})
+        except OSError as error:
+            raise disk_error("write", self.folder.settings, error) from error
+
+    def close(self) -> list[str]:
+        """End the flight: nobody notes, records or logs any more. Shots still open are failed; returns sentences.
+
+        Raises FlightError when the ledger can't be closed properly; the next flight's recovery does it then.
+        """
+        self._ended.set()
+        with ExitStack() as stack:
+            stack.callback(self._lock.close)
+            stack.callback(self.index.close)
+            stack.callback(self.ledger.close)
+            self.journal.close()
+            telemetry = self.telemetry.close()
+            report = [text for text in (self.journal.problem, self.telemetry.problem) if text is not None]
+            recovery.close_ledger(self.folder, self.ledger, self._utc_ns(), telemetry, report)
+            report += recovery.recover_flight(self.folder, self._utc_ns)
+            report += self.index.take_in(self.folder, seal=True)
+        return report
+
+
+def begin(
+    root: Path, utc_ns: Callable[[], int], facts: Mapping[str, Any] | None = None, *, utc_known: bool = True
+) -> Recording:
+    """Lock the flights folder, put earlier flights in order, and begin a new one.
+
+    `facts` goes to flight.toml. Raises FlightError when another daemon records there, or the disk refuses.
+    """
+    with ExitStack() as stack:
+        lock = FlightsLock(root)
+        stack.callback(lock.close)
+        index, recovered = open_or_rebuild(root)
+        stack.callback(index.close)
+        recovered += recovery.recover(root, index, utc_ns)
+        next_index = index.next_index()
+        start_utc_ns = utc_ns() if utc_known else None
+        folder = layout.create(root, start_utc_ns, facts)
+        ledger = Ledger(folder.ledger, utc_ns)
+        stack.callback(ledger.close)
+        index.add_flight(folder.name, start_utc_ns)
+        journal = WishJournal(folder.journal)
+        stack.callback(journal.close)
+        telemetry = TelemetryLog(folder.telemetry)
+        for text in recovered:
+            ledger.add_event("recovery", text)
+        recorder = Recorder(folder, ledger)
+        opened = Recording(
+            folder, journal, ledger, recorder, telemetry, index, next_index, tuple(recovered), lock, utc_ns
+        )
+        stack.pop_all()
+    return opened

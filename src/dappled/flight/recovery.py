@@ -1,0 +1,140 @@
+"""What a flight that ended without a goodbye left behind is put in order before the next one begins.
+
+Half-written files go, whole files without a row are adopted, noted wishes without a row are entered, and whatever was
+still open is failed with a reason. Nothing that was acknowledged is touched. All of it is reported.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from dappled.flight import durable, layout, telemetry_log, wishes
+from dappled.flight.entries import Stray
+from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.index import ImageIndex
+from dappled.flight.layout import FlightFolder
+from dappled.flight.ledger import Ledger
+from dappled.flight.records import Frame
+from dappled.flight.wishes import WishJournal
+
+SIDECAR = ".xmp"
+LOST = "the recording ended before its file came"
+
+
+def recover(root: Path, index: ImageIndex, utc_ns: Callable[[], int]) -> list[str]:
+    """Put all flights that were not closed in order, and index them. The caller holds the flights' lock.
+
+    A flight that can't be put in order is reported and left as it is; the next flight can begin all the same.
+    Returns sentences.
+    """
+    report: list[str] = []
+    sealed = index.sealed()
+    for folder in layout.flights(root):
+        if folder.name in sealed:
+            continue
+        try:
+            report += [f"flight {folder.name}: {text}" for text in recover_flight(folder, utc_ns)]
+            report += index.take_in(folder, seal=True)
+        except (FlightError, OSError) as error:
+            report.append(f"flight {folder.name} could not be put in order: {error}")
+    return report
+
+
+def recover_flight(folder: FlightFolder, utc_ns: Callable[[], int]) -> list[str]:
+    """Put one flight in order and close it; doing so again finds nothing to do. Returns sentences.
+
+    Raises FlightError or OSError when ledger or disk don't allow it.
+    """
+    report = _remove_parts(folder)
+    with Ledger(folder.ledger, utc_ns) as ledger:
+        report += _enter_wishes(folder, ledger)
+        report += _adopt(folder, ledger)
+        for row in ledger.shots():
+            if row.state in ("wished", "fired"):
+                ledger.failed(row.shot.index, f"shot {row.shot.index} is lost: {LOST}")
+                report.append(f"shot {row.shot.index} was {row.state}, and is lost: {LOST}")
+        if "closed_utc_ns" not in ledger.facts():
+            close_ledger(folder, ledger, utc_ns(), None, report)
+            report.append("it was not closed; it is now")
+        for text in report:
+            ledger.add_event("recovery", text)
+    return report
+
+
+def close_ledger(
+    folder: FlightFolder,
+    ledger: Ledger,
+    utc_ns: int,
+    telemetry: telemetry_log.Summary | None,
+    report: list[str],
+) -> None:
+    """Note in the ledger what the telemetry is (read from the file when not given) and that the flight is over."""
+    if telemetry is None and folder.telemetry.exists():
+        telemetry = telemetry_log.summarise(folder.telemetry, report.append)
+    if telemetry is not None:
+        ledger.set_fact("telemetry_packets", telemetry.packets)
+        ledger.set_fact("telemetry_bytes", telemetry.size)
+        ledger.set_fact("telemetry_sha256", telemetry.sha256)
+    ledger.set_fact("closed_utc_ns", utc_ns)
+
+
+def _remove_parts(folder: FlightFolder) -> list[str]:
+    report = []
+    for place in (folder.path, folder.frames):
+        if not place.is_dir():
+            continue
+        for name in sorted(os.listdir(place)):
+            if durable.is_temporary(name):
+                (place / name).unlink()
+                report.append(f"the half-written file {name} was removed")
+    return report
+
+
+def _enter_wishes(folder: FlightFolder, ledger: Ledger) -> list[str]:
+    journal = wishes.read(folder.journal)
+    report = [*journal.problems]
+    for shot in journal.shots:
+        if ledger.shot(shot.index) is None:
+            ledger.add_shot(shot)
+            report.append(f"shot {shot.index} was noted in the journal only; it is in the ledger now")
+    noted = {shot.index for shot in journal.shots}
+    missing = [row.shot for row in ledger.shots() if row.shot.index not in noted]
+    if missing:
+        writer = WishJournal(folder.journal)
+        try:
+            for shot in missing:
+                writer.note(shot)
+                report.append(f"shot {shot.index} was missing from the journal; it is noted again")
+        finally:
+            writer.close()
+    return report
+
+
+def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
+    """Files under a final name are whole: the rename came after their fsync."""
+    if not folder.frames.is_dir():
+        return []
+    known = {frame.name for frame in ledger.frames()} | {stray.name for stray in ledger.strays()}
+    report = []
+    for file_name in sorted(os.listdir(folder.frames)):
+        name = f"frames/{file_name}"
+        if name in known or file_name.endswith(SIDECAR):
+            continue
+        path = folder.frames / file_name
+        try:
+            stat = path.stat()
+            sha256 = durable.hash_file(path)
+        except OSError as error:
+            raise disk_error("adopt", path, error) from error
+        number = layout.index_of(file_name)
+        row = None if number is None else ledger.shot(number)
+        if number is not None and row is not None and row.state != "safe":
+            ledger.safe(Frame(number, name, file_name, stat.st_size, sha256, stat.st_mtime_ns))
+            report.append(f"{name} was whole but without a row; it is adopted as the frame of shot {number}")
+        else:
+            reason = f"{name} belongs to no shot that waits for a file; it is kept as a stray"
+            ledger.add_stray(Stray(name, file_name, stat.st_size, sha256, stat.st_mtime_ns, reason))
+            report.append(reason)
+    return report

@@ -1,0 +1,127 @@
+"""What is in a flight, and which shots became frames: values for the command line."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dappled.flight import layout
+from dappled.flight.entries import Event, Result, ShotRow, Stray
+from dappled.flight.errors import FlightError
+from dappled.flight.ledger import LedgerReader
+from dappled.flight.records import Frame, Tag
+
+
+@dataclass(frozen=True, slots=True)
+class Balance:
+    """The books of a flight: every wish is safe, failed or still open. `by_source` counts wishes."""
+
+    flight: str
+    wishes: int
+    safe: int
+    failed: int
+    open: int
+    frames: int
+    tagged: int
+    decoded: int
+    strays: int
+    size: int
+    by_source: Mapping[str, int]
+    closed: bool
+
+    @property
+    def balanced(self) -> bool:
+        """Whether the numbers add up; in a closed flight nothing is open."""
+        settled = self.wishes == self.safe + self.failed + self.open and self.frames == self.safe
+        within = self.tagged <= self.frames and self.decoded <= self.frames
+        return settled and within and (not self.closed or self.open == 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """All that is known of one shot."""
+
+    row: ShotRow
+    frame: Frame | None
+    tag: Tag | None
+    result: Result | None
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """A flight, whole: settings, facts, a line for every shot, strays and events."""
+
+    name: str
+    settings: Mapping[str, Any]
+    facts: Mapping[str, Any]
+    lines: tuple[Line, ...]
+    strays: tuple[Stray, ...]
+    events: tuple[Event, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """One flight of a list: its balance, or the sentence why there is none."""
+
+    name: str
+    path: Path
+    balance: Balance | None
+    problem: str | None
+
+
+def report(path: Path) -> Balance:
+    """The balance of a flight, also while it is recorded. Raises FlightError."""
+    folder = layout.open_folder(path)
+    with LedgerReader.open(folder.ledger) as ledger:
+        shots, frames = ledger.shots(), ledger.frames()
+        states = Counter(row.state for row in shots)
+        return Balance(
+            flight=folder.name,
+            wishes=len(shots),
+            safe=states["safe"],
+            failed=states["failed"],
+            open=states["wished"] + states["fired"],
+            frames=len(frames),
+            tagged=len(ledger.tags()),
+            decoded=len(ledger.results()),
+            strays=len(ledger.strays()),
+            size=sum(frame.size for frame in frames),
+            by_source=dict(sorted(Counter(row.shot.cause.source for row in shots).items())),
+            closed="closed_utc_ns" in ledger.facts(),
+        )
+
+
+def show(path: Path) -> Flight:
+    """Everything that a flight's ledger says. Raises FlightError."""
+    folder = layout.open_folder(path)
+    with LedgerReader.open(folder.ledger) as ledger:
+        frames = {frame.index: frame for frame in ledger.frames()}
+        tags, results = ledger.tags(), ledger.results()
+        lines = tuple(
+            Line(row, frames.get(row.shot.index), tags.get(row.shot.index), results.get(row.shot.index))
+            for row in ledger.shots()
+        )
+        return Flight(
+            name=folder.name,
+            settings=layout.read_facts(folder),
+            facts=ledger.facts(),
+            lines=lines,
+            strays=tuple(ledger.strays()),
+            events=tuple(ledger.events()),
+        )
+
+
+def list_flights(root: Path) -> list[Listed]:
+    """All flights under `root`; one that can't be read is listed with the reason. Raises FlightError for no folder."""
+    if not root.is_dir():
+        raise FlightError(f"there is no flights folder {root}; check record.directory")
+    listed = []
+    for folder in layout.flights(root):
+        try:
+            listed.append(Listed(folder.name, folder.path, report(folder.path), None))
+        except FlightError as error:
+            listed.append(Listed(folder.name, folder.path, None, str(error)))
+    return listed

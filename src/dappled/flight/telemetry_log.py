@@ -1,0 +1,159 @@
+"""telemetry.tlog: every MAVLink packet received and sent, in the common format of ground stations.
+
+A record is an 8-byte big-endian count of microseconds UTC and the packet. Packets are split by MAVLink's own framing
+(MAVLink 1: 0xFE, 8 bytes around the payload; MAVLink 2: 0xFD, 12 bytes, 13 more with a signature); no dialect needed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import mmap
+import os
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.flusher import Flusher
+
+_MAVLINK_1, _MAVLINK_2 = 0xFE, 0xFD
+_SIGNED = 0x01
+_LATEST_US = 1 << 53  # stamps beyond (year 2255) are damage
+_Bytes = bytes | mmap.mmap | memoryview
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a closed telemetry log is."""
+
+    packets: int
+    size: int
+    sha256: str
+
+
+def packet_length(data: _Bytes, at: int = 0) -> int | None:
+    """Bytes of the MAVLink packet that begins at `at`, or None where none begins or it isn't all there."""
+    left = len(data) - at
+    if left >= 8 and data[at] == _MAVLINK_1:
+        length = data[at + 1] + 8
+    elif left >= 12 and data[at] == _MAVLINK_2:
+        length = data[at + 1] + 12 + (13 if data[at + 2] & _SIGNED else 0)
+    else:
+        return None
+    return length if length <= left else None
+
+
+class TelemetryLog:
+    """The open log of one flight; owns its descriptor and its flusher. `append` may be called by any thread."""
+
+    def __init__(self, path: Path, flush_interval_s: float = 0.5) -> None:
+        """Make the log. Raises FlightError, also when there is one already."""
+        self.path = path
+        self._lock = threading.Lock()
+        self._sha = hashlib.sha256()
+        self._packets = self._size = 0
+        try:
+            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise disk_error("make the telemetry log", path, error) from error
+        self._flusher = Flusher(self._fd, flush_interval_s)
+
+    def append(self, stamp_us: int, raw: bytes) -> int:
+        """Log one packet; returns its running number, from 0. On disk within a second.
+
+        Raises FlightError when the disk doesn't take it (no number is used up), ValueError when `raw` is not exactly
+        one MAVLink packet.
+        """
+        if packet_length(raw) != len(raw):
+            raise ValueError(f"{len(raw)} bytes that are not one MAVLink packet can't be logged")
+        record = stamp_us.to_bytes(8, "big") + raw
+        with self._lock:
+            try:
+                written = os.write(self._fd, record)
+                if written != len(record):
+                    os.ftruncate(self._fd, self._size)
+                    raise FlightError(f"cannot log telemetry in {self.path}: the disk is full; free some space")
+            except OSError as error:
+                raise disk_error("log telemetry in", self.path, error) from error
+            self._sha.update(record)
+            self._size += written
+            number = self._packets
+            self._packets += 1
+        self._flusher.poke()
+        return number
+
+    @property
+    def problem(self) -> str | None:
+        """Why logged packets may not survive a power cut, if so."""
+        error = self._flusher.error
+        return None if error is None else str(disk_error("flush the telemetry log", self.path, error))
+
+    def close(self) -> Summary:
+        """Flush and close; says what the file now is."""
+        self._flusher.close()
+        os.close(self._fd)
+        return Summary(self._packets, self._size, self._sha.hexdigest())
+
+
+def read(path: Path, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, int, bytes]]:
+    """(running number, stamp in µs UTC, packet) of a .tlog, in the file's order.
+
+    Bytes that are no packet are skipped up to the next place where two records follow each other (or one ends the
+    file); `report` gets a sentence for each such gap. Raises FlightError when the file can't be read.
+    """
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            data = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) if size else None
+    except OSError as error:
+        raise disk_error("read the telemetry", path, error) from error
+    if data is not None:
+        with data:
+            for number, (stamp_us, raw) in enumerate(split(data, lambda text: report(f"{path}: {text}"))):
+                yield number, stamp_us, raw
+
+
+def split(data: bytes | mmap.mmap, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, bytes]]:
+    """(stamp in µs UTC, packet) of each record in a log's bytes; see `read`."""
+    at, size = 0, len(data)
+    while at < size:
+        end = _record_end(data, at)
+        if end is None:
+            found = _resynchronise(data, at + 1)
+            skipped = (size if found is None else found) - at
+            where = "at the end" if found is None else f"before byte {found}"
+            report(f"{skipped} bytes {where} are no telemetry and were skipped")
+            if found is None:
+                return
+            at = found
+            continue
+        yield int.from_bytes(data[at : at + 8], "big"), bytes(data[at + 8 : end])
+        at = end
+
+
+def summarise(path: Path, report: Callable[[str], object] = lambda _: None) -> Summary:
+    """Read a whole log and say what it is. Raises FlightError."""
+    packets = sum(1 for _ in read(path, report))
+    try:
+        with path.open("rb") as file:
+            return Summary(packets, os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest())
+    except OSError as error:
+        raise disk_error("read the telemetry", path, error) from error
+
+
+def _record_end(data: bytes | mmap.mmap, at: int) -> int | None:
+    length = packet_length(data, at + 8)
+    if length is None or int.from_bytes(data[at : at + 8], "big") >= _LATEST_US:
+        return None
+    return at + 8 + length
+
+
+def _resynchronise(data: bytes | mmap.mmap, start: int) -> int | None:
+    """The first offset from which two whole records follow each other, or one that ends the file."""
+    for at in range(start, len(data) - 15):
+        if data[at + 8] in (_MAVLINK_1, _MAVLINK_2):
+            end = _record_end(data, at)
+            if end is not None and (end == len(data) or _record_end(data, end) is not None):
+                return at
+    return None

@@ -1,0 +1,29 @@
+"""Flights to try things on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dappled.flight import recording
+from dappled.flight.recording import Recording
+
+
+@pytest.fixture
+def flights(tmp_path: Path) -> Path:
+    """A flights folder that does not exist yet."""
+    return tmp_path / "flights"
+
+
+@pytest.fixture
+def flight(flights: Path) -> Iterator[Recording]:
+    """A flight being recorded; closed at the end if the test did not."""
+    begun = recording.begin(flights, lambda: START_UTC_NS, {"camera": {"driver": "none"}})
+    yield begun
+    if not begun.closed:
+        begun.close()
+
+
+START_UTC_NS = 1_795_256_103_000_000_000  # 2026-11-21T10:15:03Z

@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from dappled.flight import summary
+from dappled.flight.check import check
+from dappled.flight.entries import Result
+from dappled.flight.errors import FlightError
+from dappled.flight.layout import FlightFolder
+from dappled.flight.recording import Recording
+from tests.flight.makers import deliver, flip, mavlink_2, shot, tag, wish
+
+
+@pytest.fixture
+def recorded(flight: Recording) -> FlightFolder:
+    """A closed flight: shots 0 and 1 safe, tagged and (0) decoded, shot 2 failed."""
+    for index in range(3):
+        wish(flight, index)
+    for index in range(2):
+        frame = deliver(flight, index, bytes(1000))
+        flight.ledger.add_tag(tag(frame))
+    flight.ledger.add_result(Result(0, "ab", 12, 13, "geometric", "predicted"))
+    flight.ledger.failed(2, "no file came")
+    for number in range(20):
+        flight.telemetry.append(number, mavlink_2(b"payload"))
+    flight.close()
+    return flight.folder
+
+
+def alter(folder: FlightFolder, sql: str) -> None:
+    db = sqlite3.connect(folder.ledger)
+    db.execute(sql)
+    db.commit()
+    db.close()
+
+
+def drop_line(path: Path, number: int) -> None:
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[:number] + lines[number + 1 :]))
+
+
+@dataclass(frozen=True)
+class Fault:
+    name: str
+    do: Callable[[FlightFolder], object]
+    words: str
+
+
+FAULTS = [
+    Fault("a byte of a frame", lambda f: flip(f.frames / "000001.cr2", 500), "000001.cr2 was changed"),
+    Fault(
+        "a shorter frame", lambda f: (f.frames / "000001.cr2").write_bytes(b"x"), "has 1 bytes, the ledger says 1000"
+    ),
+    Fault("no frame", lambda f: (f.frames / "000001.cr2").unlink(), "the file is missing"),
+    Fault("one file more", lambda f: (f.frames / "000009.cr2").write_bytes(b"x"), "in no row"),
+    Fault("half a file", lambda f: (f.frames / ".a.part").write_bytes(b"x"), "half-written"),
+    Fault("a byte of telemetry", lambda f: flip(f.telemetry, 20), "telemetry.tlog was changed"),
+    Fault("no telemetry", lambda f: f.telemetry.unlink(), "telemetry.tlog is missing"),
+    Fault("no journal", lambda f: f.journal.unlink(), "not in shots.jsonl"),
+    Fault(
+        "a line of the journal", lambda f: drop_line(f.journal, 1), "shot 1 is in the ledger, but not in shots.jsonl"
+    ),
+    Fault(
+        "another wish",
+        lambda f: f.journal.write_bytes(f.journal.read_bytes().replace(b"mavlink:255/190", b"mavlink:255/191")),
+        "told differently",
+    ),
+    Fault("no flight.toml", lambda f: f.settings.unlink(), "flight.toml"),
+    Fault("no ledger", lambda f: f.ledger.unlink(), "there is no ledger"),
+    Fault("garbage for a ledger", lambda f: f.ledger.write_bytes(b"garbage" * 999), "damaged"),
+    Fault(
+        "a shot less", lambda f: alter(f, "DELETE FROM shots WHERE idx = 2"), "in shots.jsonl, but not in the ledger"
+    ),
+    Fault("a state", lambda f: alter(f, "UPDATE shots SET state = 'failed' WHERE idx = 1"), "has a frame for it"),
+    Fault("a frame's row", lambda f: alter(f, "UPDATE shots SET state = 'safe' WHERE idx = 2"), "has no frame for it"),
+    Fault("a pose", lambda f: alter(f, "UPDATE poses SET record = record || ' '"), "the pose of frame 0 was changed"),
+    Fault("a tag", lambda f: alter(f, "UPDATE tags SET record = record || ' '"), "the tag of frame 1 was changed"),
+    Fault("a tag's text", lambda f: alter(f, "UPDATE tags SET record = '[]'"), "can't be read"),
+    Fault("a hash", lambda f: alter(f, "UPDATE frames SET sha256 = 'x' WHERE idx = 0"), "about other bytes"),
+    Fault("its end", lambda f: alter(f, "DELETE FROM facts WHERE key = 'closed_utc_ns'"), "never closed"),
+]
+
+
+def test_a_flight_as_it_was_recorded_is_intact(recorded: FlightFolder) -> None:
+    report = check(recorded.path)
+    assert report.intact
+    assert (report.files, report.size, report.telemetry_packets, report.notes) == (2, 2000, 20, ())
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_one_fault_is_found(recorded: FlightFolder, fault: Fault) -> None:
+    fault.do(recorded)
+    report = check(recorded.path)
+    assert not report.intact
+    assert any(fault.words in problem for problem in report.problems), report.problems
+
+
+def test_a_flight_that_is_being_recorded_is_no_fault(flight: Recording) -> None:
+    wish(flight, 0)
+    report = check(flight.folder.path)
+    assert report.intact
+    assert "still recorded" in report.notes[0]
+
+
+def test_what_is_no_flight_is_told(tmp_path: Path) -> None:
+    for ask in (check, summary.report, summary.show):
+        with pytest.raises(FlightError, match="not a flight folder"):
+            ask(tmp_path)
+
+
+def test_the_books_balance(recorded: FlightFolder) -> None:
+    books = summary.report(recorded.path)
+    assert (books.wishes, books.safe, books.failed, books.open) == (3, 2, 1, 0)
+    assert (books.frames, books.tagged, books.decoded, books.strays, books.size) == (2, 2, 1, 0, 2000)
+    assert books.by_source == {"mavlink:255/190": 3}
+    assert books.closed
+    assert books.balanced
+    alter(recorded, "UPDATE shots SET state = 'fired' WHERE idx = 2")
+    assert not summary.report(recorded.path).balanced
+
+
+def test_a_flight_is_shown_line_by_line(recorded: FlightFolder) -> None:
+    shown = summary.show(recorded.path)
+    assert [line.row.shot for line in shown.lines] == [shot(0), shot(1), shot(2)]
+    assert [line.row.state for line in shown.lines] == ["safe", "safe", "failed"]
+    assert [line.result is not None for line in shown.lines] == [True, False, False]
+    assert shown.lines[2].frame is None
+    assert shown.settings["camera"] == {"driver": "none"}
+    assert shown.facts["telemetry_packets"] == 20
+
+
+def test_flights_are_listed_with_what_is_wrong(recorded: FlightFolder) -> None:
+    (other := recorded.path.with_name("20260101T000000Z-00000000")).mkdir()
+    listed = summary.list_flights(recorded.path.parent)
+    assert [each.name for each in listed] == [other.name, recorded.name]
+    assert listed[0].problem is not None
+    assert listed[0].balance is None
+    assert listed[1].balance == summary.report(recorded.path)
+    with pytest.raises(FlightError, match="no flights folder"):
+        summary.list_flights(recorded.path / "missing")

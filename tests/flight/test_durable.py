@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dappled.flight import durable
+from tests.flight.makers import held
+
+
+def test_bytes_come_in_with_their_hash(tmp_path: Path) -> None:
+    data = os.urandom(9_000_001)  # more than two chunks
+    with held(data) as blob:
+        assert durable.copy_in(blob.fd, blob.size, tmp_path / "a") == hashlib.sha256(data).hexdigest()
+    assert (tmp_path / "a").read_bytes() == data
+    assert os.listdir(tmp_path) == ["a"]
+    assert durable.hash_file(tmp_path / "a") == hashlib.sha256(data).hexdigest()
+
+
+def test_a_source_that_ends_early_leaves_nothing(tmp_path: Path) -> None:
+    with held(b"abc", size=4) as blob, pytest.raises(EOFError, match="only 3 of 4 bytes"):
+        durable.copy_in(blob.fd, blob.size, tmp_path / "a")
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("call", ["write", "fsync", "rename"])
+def test_a_fault_before_the_rename_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "no space")
+
+    with held(b"abc") as blob:
+        monkeypatch.setattr(os, call, refuse)
+        with pytest.raises(OSError, match="no space"):
+            durable.copy_in(blob.fd, blob.size, tmp_path / "a")
+        monkeypatch.undo()
+    assert os.listdir(tmp_path) == []
+
+
+def test_the_order_is_file_then_name_then_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[str] = []
+    fsync, rename = os.fsync, os.rename
+
+    def watched_fsync(fd: int) -> None:
+        seen.append(f"fsync {Path(os.readlink(f'/proc/self/fd/{fd}')).name}")
+        fsync(fd)
+
+    def watched_rename(old: Any, new: Any) -> None:
+        seen.append(f"rename {Path(old).name} {Path(new).name}")
+        rename(old, new)
+
+    monkeypatch.setattr(os, "fsync", watched_fsync)
+    monkeypatch.setattr(os, "rename", watched_rename)
+    with held(b"abc") as blob:
+        durable.copy_in(blob.fd, blob.size, tmp_path / "a")
+    assert seen == ["fsync .a.part", "rename .a.part a", f"fsync {tmp_path.name}"]
+
+
+def test_writing_replaces_whole(tmp_path: Path) -> None:
+    durable.write_file(tmp_path / "a", b"old")
+    durable.write_file(tmp_path / "a", b"new")
+    assert (tmp_path / "a").read_bytes() == b"new"
+
+
+def test_temporary_names_are_told_apart(tmp_path: Path) -> None:
+    assert durable.is_temporary(durable.temporary(tmp_path / "000001.dng").name)
+    assert not durable.is_temporary("000001.part")
+    assert not durable.is_temporary(".lock")

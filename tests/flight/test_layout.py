@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+import errno
+import os
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dappled.flight import layout
+from dappled.flight.errors import FlightError
+from tests.flight.conftest import START_UTC_NS
+
+
+def test_a_new_flight_is_named_by_utc_and_holds_its_facts(flights: Path) -> None:
+    folder = layout.create(
+        flights, START_UTC_NS, {"camera": {"serial": None, "port": "usb:"}, "path": flights, "n": (1, 2)}
+    )
+    assert re.fullmatch(r"20261121T101503Z-[0-9a-f]{8}", folder.name)
+    assert folder.frames.is_dir()
+    assert layout.read_facts(folder) == {"camera": {"port": "usb:"}, "path": str(flights), "n": [1, 2]}
+    assert [other.path for other in layout.flights(flights)] == [folder.path]
+    assert layout.open_folder(folder.path) == folder
+
+
+def test_without_a_clock_the_flight_is_named_by_boot(flights: Path) -> None:
+    folder = layout.create(flights, None)
+    assert re.fullmatch(r"boot[0-9a-f]{8}-[0-9a-f]{8}", folder.name)
+    assert layout.flights(flights) == [folder]
+
+
+def test_other_folders_are_no_flights(flights: Path) -> None:
+    flights.mkdir()
+    (flights / "notes").mkdir()
+    (flights / "20261121T101503Z-00000000").write_text("a file")
+    assert layout.flights(flights) == []
+    assert layout.flights(flights / "missing") == []
+    for path in (flights / "notes", flights / "missing", flights / "20261121T101503Z-00000000"):
+        with pytest.raises(FlightError, match="not a flight folder"):
+            layout.open_folder(path)
+
+
+@pytest.mark.parametrize(
+    ("camera_name", "name"),
+    [
+        ("IMG_0042.CR2", "frames/000042.cr2"),
+        ("DSCF0001.RAF", "frames/000042.raf"),
+        ("../../../etc/passwd", "frames/000042.raw"),
+        ("x.d/../../n", "frames/000042.raw"),
+        ("x.\u0663\u0664", "frames/000042.raw"),
+        ("", "frames/000042.raw"),
+        (".part", "frames/000042.part"),
+        ("a.dng\0", "frames/000042.raw"),
+        ("a.dng\n", "frames/000042.raw"),
+    ],
+)
+def test_a_frame_is_named_by_its_index(camera_name: str, name: str) -> None:
+    assert layout.frame_name(42, camera_name) == name
+
+
+@given(st.integers(0, 2**31 - 1), st.text())
+def test_no_camera_name_leaves_the_folder(index: int, camera_name: str) -> None:
+    folder, _, file = layout.frame_name(index, camera_name).rpartition("/")
+    assert folder == "frames"
+    assert re.fullmatch(r"[0-9]{6,10}\.[a-z0-9]{1,8}", file)
+    assert layout.index_of(file) == index
+
+
+def test_a_negative_index_is_refused() -> None:
+    with pytest.raises(ValueError, match="0 or more"):
+        layout.frame_name(-1, "a.dng")
+
+
+def test_a_file_in_place_of_the_folder_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FlightError, match=r"cannot make the flight folder .*/file/.*not a folder"):
+        layout.create(tmp_path / "file", START_UTC_NS)
+
+
+@pytest.mark.parametrize(
+    ("number", "words"), [(errno.ENOSPC, "full"), (errno.EROFS, "read-only"), (errno.EIO, "dmesg")]
+)
+def test_a_disk_that_refuses_is_told(flights: Path, monkeypatch: pytest.MonkeyPatch, number: int, words: str) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    flights.mkdir()
+    monkeypatch.setattr(os, "mkdir", refuse)
+    with pytest.raises(FlightError, match=words):
+        layout.create(flights, START_UTC_NS)
+
+
+def test_free_space_is_a_number_or_a_sentence(tmp_path: Path) -> None:
+    assert layout.free_bytes(tmp_path) > 0
+    with pytest.raises(FlightError, match="does not exist"):
+        layout.free_bytes(tmp_path / "missing")
+
+
+def test_unreadable_facts_are_told(flights: Path) -> None:
+    folder = layout.create(flights, START_UTC_NS)
+    folder.settings.write_text("a = = 1")
+    with pytest.raises(FlightError, match=r"flight\.toml is not readable as TOML"):
+        layout.read_facts(folder)
+    folder.settings.unlink()
+    with pytest.raises(FlightError, match="does not exist"):
+        layout.read_facts(folder)

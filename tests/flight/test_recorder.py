@@ -1,0 +1,211 @@
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dappled.flight import durable
+from dappled.flight.check import check
+from dappled.flight.errors import FlightError
+from dappled.flight.ledger import Ledger
+from dappled.flight.recorder import StrayFileError
+from dappled.flight.recording import Recording
+from dappled.flight.records import Frame
+from tests.flight.makers import deliver, held, wish
+
+DATA = b"raw bytes" * 1000
+
+
+def files(flight: Recording) -> list[str]:
+    return sorted(os.listdir(flight.folder.frames))
+
+
+def test_a_frame_is_safe_when_record_returns(flight: Recording) -> None:
+    wish(flight, 0)
+    frame = deliver(flight, 0, DATA)
+    assert frame.name == "frames/000000.cr2"
+    assert (frame.camera_name, frame.size, frame.arrived_utc_ns) == ("IMG_0001.CR2", len(DATA), 5)
+    assert frame.sha256 == hashlib.sha256(DATA).hexdigest()
+    assert (flight.folder.path / frame.name).read_bytes() == DATA
+    with flight.ledger.reader() as reader:
+        assert reader.frames() == [frame]
+
+
+def test_the_row_comes_after_the_file(flight: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+    sync, safe = durable.sync_folder, flight.ledger.safe
+
+    def watched_sync(path: Path) -> None:
+        sync(path)
+        order.append(f"sync {path.name}")
+
+    def watched_safe(_: Ledger, frame: Frame) -> None:
+        order.append("row")
+        safe(frame)
+
+    monkeypatch.setattr(durable, "sync_folder", watched_sync)
+    monkeypatch.setattr(Ledger, "safe", watched_safe)
+    wish(flight, 0)
+    deliver(flight, 0, DATA)
+    assert order == ["sync frames", "row"]
+
+
+def test_the_same_file_twice_is_one_frame(flight: Recording) -> None:
+    wish(flight, 0)
+    first = deliver(flight, 0, DATA)
+    assert deliver(flight, 0, DATA) == first
+    assert files(flight) == ["000000.cr2"]
+    assert [event.kind for event in flight.ledger.events()] == ["double"]
+
+
+def test_a_second_file_for_a_shot_is_kept_as_a_stray(flight: Recording) -> None:
+    wish(flight, 0)
+    first = deliver(flight, 0, DATA)
+    with pytest.raises(StrayFileError, match=r"IMG_0001.JPG is a second file for shot 0") as told:
+        deliver(flight, 0, b"jpeg", "IMG_0001.JPG")
+    assert told.value.stray.name == "frames/stray-000000.jpg"
+    with pytest.raises(StrayFileError):
+        deliver(flight, 0, b"other", "IMG_0001.JPG")
+    assert files(flight) == ["000000.cr2", "stray-000000.jpg", "stray-000001.jpg"]
+    assert flight.ledger.frame(0) == first
+
+
+def test_a_file_for_an_unknown_shot_is_kept_as_a_stray(flight: Recording) -> None:
+    with pytest.raises(StrayFileError, match="never wished for"):
+        deliver(flight, 9, DATA, "../../IMG.CR2")
+    assert files(flight) == ["stray-000000.cr2"]
+    assert flight.ledger.shot(9) is None
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EIO])
+@pytest.mark.parametrize("call", ["open", "write", "fsync", "rename"])
+def test_a_disk_fault_fails_the_shot_and_leaves_no_file(
+    flight: Recording, monkeypatch: pytest.MonkeyPatch, call: str, number: int
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    wish(flight, 0)
+    with held(DATA) as blob:
+        monkeypatch.setattr(os, call, refuse)
+        with pytest.raises(FlightError, match=r"cannot record A.CR2 as .*000000\.cr2: the disk") as told:
+            flight.recorder.record(0, "A.CR2", blob, arrived_utc_ns=5)
+        monkeypatch.undo()
+    assert files(flight) == []
+    row = flight.ledger.shot(0)
+    assert row is not None
+    assert (row.state, row.reason) == ("failed", str(told.value))
+    assert deliver(flight, 0, DATA).name == "frames/000000.cr2"  # the disk is well again and the file comes once more
+
+
+def test_a_full_disk_in_the_middle_of_a_frame(flight: Recording) -> None:
+    """The kernel itself refuses, after some bytes: a file size limit stands for the full disk."""
+    wish(flight, 0)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        with held(b"x" * 3_000_000) as blob:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, before[1]))
+            with pytest.raises(FlightError, match="cannot record"):
+                flight.recorder.record(0, "A.CR2", blob, arrived_utc_ns=5)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert files(flight) == []
+    row = flight.ledger.shot(0)
+    assert row is not None
+    assert row.state == "failed"
+
+
+def test_a_disk_that_takes_no_note_either_is_told(flight: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise FlightError("cannot use the ledger")
+
+    wish(flight, 0)
+    monkeypatch.setattr(type(flight.ledger), "failed", refuse)
+    with held(b"abc", size=5) as blob, pytest.raises(FlightError, match=r"ended early .* nor can that be noted"):
+        flight.recorder.record(0, "A.CR2", blob, arrived_utc_ns=5)
+
+
+@pytest.mark.parametrize(("data", "size", "words"), [(b"", 0, "is empty"), (b"abc", 5, "only 3 of 5 bytes")])
+def test_a_file_without_its_bytes_fails_the_shot(flight: Recording, data: bytes, size: int, words: str) -> None:
+    wish(flight, 0)
+    with held(data, size) as blob, pytest.raises(FlightError, match=words):
+        flight.recorder.record(0, "A.CR2", blob, arrived_utc_ns=5)
+    assert files(flight) == []
+    row = flight.ledger.shot(0)
+    assert row is not None
+    assert row.state == "failed"
+
+
+def test_nothing_is_written_over(flight: Recording) -> None:
+    wish(flight, 0)
+    (flight.folder.frames / "000000.cr2").write_bytes(b"older")
+    with pytest.raises(FlightError, match="stands there already"):
+        deliver(flight, 0, DATA)
+    assert (flight.folder.frames / "000000.cr2").read_bytes() == b"older"
+
+
+def test_the_blob_stays_open_and_its_offset_stays(flight: Recording) -> None:
+    wish(flight, 0)
+    with held(DATA) as blob:
+        place = os.lseek(blob.fd, 7, os.SEEK_SET)
+        flight.recorder.record(0, "A.CR2", blob, arrived_utc_ns=5)
+        assert os.lseek(blob.fd, 0, os.SEEK_CUR) == place
+
+
+WRITER = """
+import sys, itertools
+from pathlib import Path
+from dappled.flight import recording
+from tests.flight.makers import deliver, mavlink_2, shot
+flight = recording.begin(Path(sys.argv[1]), lambda: 1795256103000000000)
+for index in itertools.count(flight.next_index):
+    flight.journal.note(shot(index))
+    print("noted", index, flush=True)
+    flight.telemetry.append(index, mavlink_2(b"x"))
+    flight.ledger.add_shot(shot(index))
+    flight.ledger.fired(index, 1, 2)
+    frame = deliver(flight, index, bytes([index % 251]) * 300_000)
+    flight.note_image(index)
+    print("safe", index, frame.sha256, flush=True)
+"""
+
+
+def killed_after(flights: Path, lines: int) -> list[list[str]]:
+    """Run the writer, kill it -9 after so many lines; return all whole lines that it said."""
+    command = [sys.executable, "-c", WRITER, str(flights)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=Path(__file__).parents[2]) as writer:
+        assert writer.stdout is not None
+        said = [writer.stdout.readline() for _ in range(lines)]
+        writer.kill()
+        said += writer.stdout.readlines()
+    return [line.decode().split() for line in said if line.endswith(b"\n")]
+
+
+@pytest.mark.parametrize("moments", [(1, 2, 5), pytest.param(tuple(range(1, 61)), marks=pytest.mark.slow)])
+def test_kill_9_loses_nothing_that_was_acknowledged(flights: Path, moments: tuple[int, ...]) -> None:
+    from dappled.flight import layout, recording  # noqa: PLC0415  only what the check afterwards needs
+
+    said = [line for lines in moments for line in killed_after(flights, lines)]
+    ended = recording.begin(flights, lambda: 1_795_256_104_000_000_000)
+    indices = [int(line[1]) for line in said if line[0] == "noted"]
+    assert indices == sorted(set(indices))
+    assert ended.next_index > max(indices)
+    for index in indices:
+        assert ended.index.lookup(index) is not None
+    for _, number, sha256 in (line for line in said if line[0] == "safe"):
+        entry = ended.index.lookup(int(number))
+        assert entry is not None
+        assert entry.frame is not None
+        assert durable.hash_file(flights / entry.flight / entry.frame) == sha256
+    ended.close()
+    for folder in layout.flights(flights):
+        assert check(folder.path).problems == ()

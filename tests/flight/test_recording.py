@@ -1,0 +1,250 @@
+"""A flight's beginning and end, what a crash leaves behind, the index over flights, and the lock."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from dappled.flight import layout, lock, recording, recovery, wishes
+from dappled.flight.check import check
+from dappled.flight.entries import Stray
+from dappled.flight.errors import FlightError
+from dappled.flight.index import Entry, ImageIndex
+from dappled.flight.ledger import LedgerReader
+from dappled.flight.recording import Recording
+from tests.flight.conftest import START_UTC_NS
+from tests.flight.makers import deliver, logged, mavlink_1, mavlink_2, shot, wish
+
+LATER_UTC_NS = START_UTC_NS + 60_000_000_000
+
+
+def crash(flight: Recording) -> None:
+    """Leave the flight as a killed process leaves it: descriptors closed by the system, nothing said."""
+    flight._ended.set()
+    flight.journal.close()
+    flight.telemetry.close()
+    flight.ledger.close()
+    flight.index.close()
+    flight._lock.close()
+
+
+def begin_later(flights: Path) -> Recording:
+    return recording.begin(flights, lambda: LATER_UTC_NS)
+
+
+def test_a_flight_from_first_to_last(flights: Path, flight: Recording) -> None:
+    assert (flight.next_index, flight.recovered) == (0, ())
+    wish(flight, 0)
+    frame = deliver(flight, 0, b"raw")
+    flight.note_image(0)
+    flight.note_image(99)  # a shot that nobody wished for has no entry
+    assert flight.index.lookup(0) == Entry(0, flight.folder.name, frame.name, "safe")
+    assert flight.index.lookup(99) is None
+    flight.telemetry.append(1, mavlink_1(b"a"))
+    flight.add_facts({"identity": {"model": "450D"}})
+    assert layout.read_facts(flight.folder) == {"camera": {"driver": "none"}, "identity": {"model": "450D"}}
+    assert flight.close() == []
+    with LedgerReader.open(flight.folder.ledger) as ledger:
+        assert ledger.facts()["telemetry_packets"] == 1
+        assert ledger.facts()["closed_utc_ns"] == START_UTC_NS
+    assert sorted(os.listdir(flight.folder.path)) == [
+        "flight.sqlite",
+        "flight.toml",
+        "frames",
+        "shots.jsonl",
+        "telemetry.tlog",
+    ]
+    report = check(flight.folder.path)
+    assert (report.intact, report.files, report.size, report.telemetry_packets) == (True, 1, 3, 1)
+
+    second = begin_later(flights)
+    assert (second.next_index, second.recovered) == (1, ())
+    assert second.index.lookup(0) == Entry(0, flight.folder.name, frame.name, "safe")
+    assert list(second.index.flights().values()) == [START_UTC_NS, LATER_UTC_NS]
+    second.close()
+
+
+def test_closing_fails_what_is_open(flight: Recording) -> None:
+    wish(flight, 0)
+    flight.journal.note(shot(1))
+    assert flight.close() == [
+        "shot 1 was noted in the journal only; it is in the ledger now",
+        "shot 0 was fired, and is lost: the recording ended before its file came",
+        "shot 1 was wished, and is lost: the recording ended before its file came",
+    ]
+    assert check(flight.folder.path).problems == ()
+
+
+def test_a_crash_is_put_in_order_before_the_next_flight(flights: Path, flight: Recording) -> None:
+    for index in range(3):
+        wish(flight, index)
+    deliver(flight, 0, b"safe")
+    frames = flight.folder.frames
+    (frames / "000001.cr2").write_bytes(b"whole, but the row was never written")
+    (frames / ".000002.cr2.part").write_bytes(b"half")
+    (frames / "000007.cr2").write_bytes(b"nobody's")
+    (frames / "000000.cr2.xmp").write_text("a sidecar")
+    flight.journal.note(shot(3))
+    flight.telemetry.append(1, mavlink_2(b"a"))
+    crash(flight)
+    with flight.folder.journal.open("ab") as file:
+        file.write(b'{"cause"')
+    with flight.folder.telemetry.open("ab") as file:
+        file.write(logged(2, mavlink_2(b"b"))[:-3])
+
+    second = begin_later(flights)
+    told = "\n".join(second.recovered)
+    for words in (
+        "the half-written file .000002.cr2.part was removed",
+        "the last line of",
+        "shot 3 was noted in the journal only",
+        "frames/000001.cr2 was whole but without a row; it is adopted as the frame of shot 1",
+        "frames/000007.cr2 belongs to no shot",
+        "shot 2 was fired, and is lost",
+        "shot 3 was wished, and is lost",
+        "18 bytes at the end are no telemetry",
+        "it was not closed; it is now",
+    ):
+        assert words in told
+    assert second.next_index == 8  # beyond the stray's number
+    assert [event.text for event in second.ledger.events()] == list(second.recovered)
+    with LedgerReader.open(flight.folder.ledger) as ledger:
+        assert [row.state for row in ledger.shots()] == ["safe", "safe", "failed", "failed"]
+        assert [frame.name for frame in ledger.frames()] == ["frames/000000.cr2", "frames/000001.cr2"]
+        assert [stray.name for stray in ledger.strays()] == ["frames/000007.cr2"]
+    assert check(flight.folder.path).problems == ()
+    again = recovery.recover_flight(flight.folder, lambda: LATER_UTC_NS)
+    assert again == [f"the last line of {flight.folder.journal} is torn (8 bytes)"]
+    second.close()
+    third = begin_later(flights)
+    assert third.recovered == ()
+    third.close()
+
+
+def test_a_wish_that_only_the_ledger_kept_is_noted_again(flights: Path, flight: Recording) -> None:
+    wish(flight, 0)
+    crash(flight)
+    flight.folder.journal.write_bytes(b'{"torn')  # a power cut took what was not flushed
+    begin_later(flights).close()
+    assert wishes.read(flight.folder.journal).shots == (shot(0),)
+    assert check(flight.folder.path).problems == ()
+
+
+def test_a_flight_that_died_while_it_was_made(flights: Path) -> None:
+    folder = layout.create(flights, START_UTC_NS)
+    second = begin_later(flights)
+    assert second.recovered == (f"flight {folder.name}: it was not closed; it is now",)
+    assert check(folder.path).problems == ()
+    second.close()
+
+
+def test_a_damaged_ledger_does_not_keep_the_next_flight_down(flights: Path, flight: Recording) -> None:
+    wish(flight, 4)
+    deliver(flight, 4, b"raw")
+    flight.close()
+    (flights / "index.sqlite").unlink()
+    flight.folder.ledger.write_bytes(b"damage" * 1000)
+    second = begin_later(flights)
+    assert second.next_index == 5  # the journal and the frame's name say so
+    assert "could not be put in order" in second.recovered[0]
+    assert (flight.folder.path / "frames/000004.cr2").read_bytes() == b"raw"
+    second.close()
+
+
+@pytest.mark.parametrize("harm", ["garbage", "foreign", "gone"])
+def test_the_index_is_made_anew_from_the_flights(flights: Path, flight: Recording, harm: str) -> None:
+    wish(flight, 0)
+    frame = deliver(flight, 0, b"raw")
+    flight.close()
+    path = flights / "index.sqlite"
+    if harm == "garbage":
+        path.write_bytes(b"garbage" * 1000)
+    else:
+        path.unlink()
+        if harm == "foreign":
+            db = sqlite3.connect(path)
+            db.execute("CREATE TABLE other (a)")
+            db.close()
+    second = begin_later(flights)
+    assert ("index.sqlite.damaged" in " ".join(second.recovered)) == (harm != "gone")
+    assert second.index.lookup(0) == Entry(0, flight.folder.name, frame.name, "safe")
+    assert second.next_index == 1
+    second.close()
+
+
+def test_an_image_index_in_two_flights_is_told_and_the_first_counts(flights: Path) -> None:
+    flights.mkdir()
+    with ImageIndex(flights) as index:
+        for name in ("a", "b"):
+            index.add_flight(name, None)
+        index.put(Entry(1, "a", None, "failed"))
+        with pytest.raises(FlightError, match="image 1 is in flight a and again in b"):
+            index.put(Entry(1, "b", None, "failed"))
+        index.add_flight("a", 5)  # UTC was learnt
+        index.add_flight("a", None)
+        assert index.flights() == {"a": 5, "b": None}
+
+
+def test_the_next_index_is_beyond_all_that_an_unindexed_flight_mentions(flights: Path) -> None:
+    flights.mkdir()
+    with ImageIndex(flights) as index:
+        assert index.next_index() == 0
+        index.add_flight("a", None)
+        index.put(Entry(10, "a", None, "failed"))
+        assert index.next_index() == 11
+        folder = layout.create(flights, START_UTC_NS)
+        journal = wishes.WishJournal(folder.journal)
+        journal.note(shot(20))
+        journal.close()
+        assert index.next_index() == 21
+        (folder.frames / "000030.dng").write_bytes(b"x")
+        assert index.next_index() == 31
+
+
+def test_two_daemons_in_one_folder(flights: Path, flight: Recording) -> None:
+    with pytest.raises(FlightError, match=rf"another dappled \(process {os.getpid()}\) records into .*; stop it"):
+        begin_later(flights)
+    assert lock.is_held(flights)
+    code = (
+        f"from dappled.flight import recording; from pathlib import Path; recording.begin(Path({str(flights)!r}), int)"
+    )
+    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    assert "another dappled" in other.stderr
+    flight.close()
+    assert not lock.is_held(flights)
+    assert not lock.is_held(flights / "missing")
+    begin_later(flights).close()
+
+
+def test_a_beginning_that_fails_leaves_no_lock(flights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise FlightError("no")
+
+    monkeypatch.setattr(layout, "create", refuse)
+    threads = threading.active_count()
+    with pytest.raises(FlightError, match="no"):
+        recording.begin(flights, lambda: START_UTC_NS)
+    assert not lock.is_held(flights)
+    assert threading.active_count() == threads
+
+
+def test_a_file_in_place_of_the_flights_folder_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FlightError, match=r"not a folder|in the way"):
+        recording.begin(tmp_path / "file", lambda: START_UTC_NS)
+
+
+def test_strays_are_told_apart_from_what_is_adopted(flights: Path, flight: Recording) -> None:
+    (flight.folder.frames / "stray-000000.jpg").write_bytes(b"ab")
+    crash(flight)
+    begin_later(flights).close()
+    with LedgerReader.open(flight.folder.ledger) as ledger:
+        (stray,) = ledger.strays()
+        assert isinstance(stray, Stray)
+        assert stray.size == 2

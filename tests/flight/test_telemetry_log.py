@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import threading
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dappled.flight import telemetry_log
+from dappled.flight.errors import FlightError
+from dappled.flight.telemetry_log import TelemetryLog, packet_length, split
+from tests.flight.makers import logged, mavlink_1, mavlink_2
+
+PACKETS = st.builds(mavlink_1, st.binary(max_size=255), st.integers(0, 255)) | st.builds(
+    mavlink_2, st.binary(max_size=255), st.integers(0, 255), signed=st.booleans()
+)
+RECORDS = st.lists(st.tuples(st.integers(0, 2**53 - 1), PACKETS), max_size=8)
+
+
+@given(RECORDS)
+def test_what_is_logged_is_read(tmp_path_factory: pytest.TempPathFactory, records: list[tuple[int, bytes]]) -> None:
+    path = tmp_path_factory.mktemp("log") / "telemetry.tlog"
+    log = TelemetryLog(path)
+    assert [log.append(*record) for record in records] == list(range(len(records)))
+    summary = log.close()
+    problems: list[str] = []
+    assert list(telemetry_log.read(path, problems.append)) == [(n, *record) for n, record in enumerate(records)]
+    assert problems == []
+    assert summary == telemetry_log.summarise(path)
+    assert summary.sha256 == hashlib.sha256(b"".join(logged(*record) for record in records)).hexdigest()
+
+
+@given(RECORDS, st.tuples(st.integers(0, 2**53 - 1), PACKETS), st.data())
+def test_a_torn_end_costs_the_last_record_only(
+    records: list[tuple[int, bytes]], last: tuple[int, bytes], data: st.DataObject
+) -> None:
+    torn = logged(*last)[: data.draw(st.integers(1, len(logged(*last)) - 1))]
+    problems: list[str] = []
+    found = list(split(b"".join(logged(*record) for record in records) + torn, problems.append))
+    assert found[: len(records)] == records
+    assert len(problems) == 1
+
+
+@given(RECORDS, st.binary(max_size=60), RECORDS)
+def test_reading_goes_on_behind_garbage(
+    before: list[tuple[int, bytes]], garbage: bytes, after: list[tuple[int, bytes]]
+) -> None:
+    """Garbage without a packet's first byte costs nothing but itself."""
+    garbage = garbage.replace(b"\xfe", b"").replace(b"\xfd", b"")
+    start = 1_795_256_103_000_000  # a stamp of the real size holds no first byte either
+    after = [(start + n, mavlink_2(b"payload")) for n, _ in enumerate(after)]
+    problems: list[str] = []
+    found = list(
+        split(b"".join(logged(*r) for r in before) + garbage + b"".join(logged(*r) for r in after), problems.append)
+    )
+    assert found == before + after
+    assert len(problems) == (1 if garbage else 0)
+
+
+@given(st.binary(max_size=400))
+def test_any_bytes_are_read_without_a_crash(data: bytes) -> None:
+    problems: list[str] = []
+    total = sum(len(logged(stamp, raw)) for stamp, raw in split(data, problems.append))
+    assert total <= len(data)
+    assert (total == len(data)) == (not problems)
+
+
+def test_framing_is_that_of_mavlink() -> None:
+    assert packet_length(mavlink_1(b"123")) == 11
+    assert packet_length(mavlink_2(b"123")) == 15
+    assert packet_length(mavlink_2(b"123", signed=True)) == 28
+    assert packet_length(mavlink_2(b"123")[:-1]) is None
+    assert packet_length(b"") is None
+    assert packet_length(b"\x00" * 20) is None
+
+
+@pytest.mark.parametrize("raw", [b"", b"hello", mavlink_1(b"1") + b"x", mavlink_2(b"1")[:-1]])
+def test_what_is_no_packet_is_not_logged(tmp_path: Path, raw: bytes) -> None:
+    log = TelemetryLog(tmp_path / "telemetry.tlog")
+    with pytest.raises(ValueError, match="not one MAVLink packet"):
+        log.append(0, raw)
+    assert log.append(0, mavlink_1(b"")) == 0
+    assert log.close().packets == 1
+
+
+def test_threads_share_the_log(tmp_path: Path) -> None:
+    log = TelemetryLog(tmp_path / "telemetry.tlog")
+    numbers: list[int] = []
+
+    def write() -> None:
+        numbers.extend(log.append(n, mavlink_2(bytes(n))) for n in range(200))
+
+    threads = [threading.Thread(target=write) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(numbers) == list(range(600))
+    summary = log.close()
+    assert telemetry_log.summarise(log.path) == summary
+
+
+@pytest.mark.parametrize("fault", ["ENOSPC", "short"])
+def test_a_full_disk_uses_up_no_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
+    write = os.write
+
+    def refuse(fd: int, data: bytes) -> int:
+        if fault == "short":
+            return write(fd, data[:5])
+        raise OSError(errno.ENOSPC, "full")
+
+    log = TelemetryLog(tmp_path / "telemetry.tlog")
+    assert log.append(1, mavlink_1(b"a")) == 0
+    monkeypatch.setattr(os, "write", refuse)
+    with pytest.raises(FlightError, match="the disk is full"):
+        log.append(2, mavlink_1(b"b"))
+    monkeypatch.undo()
+    assert log.append(3, mavlink_1(b"c")) == 1
+    summary = log.close()
+    problems: list[str] = []
+    assert [stamp for _, stamp, _ in telemetry_log.read(log.path, problems.append)] == [1, 3]
+    assert problems == []
+    assert telemetry_log.summarise(log.path) == summary
+
+
+def test_faults_of_the_file_are_told(tmp_path: Path) -> None:
+    log = TelemetryLog(tmp_path / "telemetry.tlog")
+    log.close()
+    assert list(telemetry_log.read(log.path)) == []
+    with pytest.raises(FlightError, match="in the way"):
+        TelemetryLog(log.path)
+    with pytest.raises(FlightError, match="does not exist"):
+        list(telemetry_log.read(tmp_path / "missing"))
+    with pytest.raises(FlightError, match="is a folder"):
+        list(telemetry_log.read(tmp_path))
+
+
+def test_a_real_flight_reads_but_for_its_torn_end(shared_data: Path) -> None:
+    problems: list[str] = []
+    path = shared_data / "telemetry" / "dronekit-flight.tlog"
+    stamps = [stamp for _, stamp, _ in telemetry_log.read(path, problems.append)]
+    assert problems == [f"{path}: 19 bytes at the end are no telemetry and were skipped"]
+    assert len(stamps) > 10_000
+    assert round((stamps[-1] - stamps[0]) / 1e6) == 1377
