@@ -1,0 +1,236 @@
+"""From a raw file to a light field: profiles, raw reading and decoder put together, for daemon and commands alike."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.config import profiles
+from dappled.config.profiles import CameraProfile
+from dappled.config.schema import read_toml
+from dappled.decode import plane as planes
+from dappled.decode.calibration import Calibration
+from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
+from dappled.decode.errors import DecodeError
+from dappled.decode.lenslets import LensletDecoder
+from dappled.decode.lightfield import LightField
+from dappled.decode.plane import Plane
+from dappled.drivers import rawfile
+from dappled.drivers.rawfile import RawFile
+from dappled.errors import DappledError
+
+
+class DarkroomError(DappledError):
+    """A frame or a recipe can't be decoded; one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What decoding needs to know, as a person names it; see the configuration's [camera], [mask] and [decode].
+
+    `camera` a profile, a TOML file or "auto" (by the frame's model); `mask` a profile, a TOML file or "lenslet";
+    `law` "" takes the camera's; the files are "" where there are none.
+    """
+
+    camera: str
+    mask: str
+    law: str = ""
+    calibration: str = ""
+    white: str = ""
+    dark: str = ""
+    workers: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Development:
+    """A decoded frame, what was decided on the way, and what took how many milliseconds."""
+
+    light_field: LightField
+    report: DecodeReport
+    raw: RawFile
+    ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def carriers_found(self) -> int:
+        """Carriers seen in the whole plane: those of the half plane, their conjugates, and the mean."""
+        return 2 * self.report.found - 1
+
+    @property
+    def carriers_predicted(self) -> int:
+        """Carriers predicted on the sensor, counted likewise."""
+        return 2 * len(self.report.predicted) - 1
+
+
+class Darkroom:
+    """Decodes frames by one recipe. Decoders are made once for each raw shape and camera, and kept."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe = recipe
+        self._decoders: dict[tuple[tuple[int, int], str], Decoder] = {}
+        self._dark: NDArray[Any] | None = None
+        self._gains: dict[tuple[int, int], Plane] = {}
+
+    def check(self) -> None:
+        """Raises DappledError when the recipe names something that isn't there or isn't right."""
+        if self.recipe.camera != "auto":
+            profiles.camera(self.recipe.camera)
+        if self.recipe.mask != profiles.LENSLET:
+            profiles.mask(self.recipe.mask)
+        if self.recipe.calibration:
+            self._calibration()
+        for path in (self.recipe.white, self.recipe.dark):
+            if path:
+                rawfile.read_metadata(Path(path))
+
+    def develop(
+        self,
+        path: Path | str,
+        *,
+        focal_length_mm: float | None = None,
+        f_number: float | None = None,
+        views: bool = True,
+    ) -> Development:
+        """Decode a frame; what is not given is taken from its file. Without `views` only the slices are made.
+
+        Raises DappledError with the file's name and what is wrong.
+        """
+        ms: dict[str, float] = {}
+        with _timed(ms, "read"):
+            raw = rawfile.read(Path(path))
+        with _named(path):
+            with _timed(ms, "plane"):
+                plane = self.plane(raw)
+            decoder = self.decoder(plane.shape, raw.camera_model or "")
+            focal_length_mm = focal_length_mm or raw.focal_length_mm
+            f_number = f_number or raw.f_number
+            with _timed(ms, "slices and views" if views else "slices"):
+                light_field, report = decoder.decode_reported(
+                    plane, focal_length_mm=focal_length_mm, f_number=f_number if views else None
+                )
+        attributes = {**light_field.attributes, "camera": self.camera_name(raw.camera_model), "mask": self.recipe.mask}
+        return Development(replace(light_field, attributes=attributes), report, raw, ms)
+
+    def plane(self, raw: RawFile) -> Plane:
+        """The linear plane of a frame: black, white, dark frame; for masks also colours evened out, and white frame."""
+        cfa, black = _one_index_a_colour(raw)
+        made = planes.to_plane(raw.mosaic, black=black, white=raw.white, cfa=cfa, dark=self._dark_frame())
+        if cfa is not None and self.recipe.mask != profiles.LENSLET:
+            planes.even_colours(made, cfa, [raw.colour_names.index("G")] if "G" in raw.colour_names else [0])
+        if self.recipe.white and self.recipe.mask != profiles.LENSLET:
+            made = planes.divide(made, self._gain((made.shape[0], made.shape[1])))
+        return made
+
+    def decoder(self, shape: tuple[int, ...], model: str) -> Decoder:
+        """The decoder for frames of this shape from this camera."""
+        size = (shape[0], shape[1])
+        if (size, model) not in self._decoders:
+            self._decoders[size, model] = self._make(size, model)
+        return self._decoders[size, model]
+
+    def mask_decoder(self, shape: tuple[int, int], model: str) -> MaskDecoder:
+        """The decoder of a camera with a printed mask. Raises DarkroomError for lenslets."""
+        decoder = self.decoder(shape, model)
+        if not isinstance(decoder, MaskDecoder):
+            raise DarkroomError("lenslets have no mask to predict carriers of")
+        return decoder
+
+    def naming(self, path: Path | str) -> AbstractContextManager[None]:
+        """Around mathematics on a frame: its errors get the file's name."""
+        return _named(path)
+
+    def camera(self, model: str) -> CameraProfile:
+        """The camera's profile: the recipe's, or by model."""
+        if self.recipe.camera != "auto":
+            return profiles.camera(self.recipe.camera)
+        found = profiles.camera_for_model(model)
+        if found is None:
+            said = f"the frame says {model!r}" if model else "the frame names no camera"
+            raise DarkroomError(f"which camera? {said}, and no profile knows it: name one with --camera")
+        return found
+
+    def camera_name(self, model: str | None) -> str:
+        """The profile's name, or the model, or "unknown": what tags and headers call the camera."""
+        return camera_name(self.recipe.camera, model)
+
+    def _make(self, shape: tuple[int, int], model: str) -> Decoder:
+        recipe = self.recipe
+        if recipe.mask == profiles.LENSLET:
+            if not recipe.white:
+                return LensletDecoder(shape, workers=recipe.workers)
+            white = rawfile.read(Path(recipe.white))
+            with _named(recipe.white):
+                return LensletDecoder.with_white(self.plane(white), workers=recipe.workers)
+        camera = self.camera(model)
+        return MaskDecoder(
+            camera.sensor(shape),
+            profiles.mask(recipe.mask).mask,
+            recipe.law or camera.law,
+            camera.mask_distance_mm,
+            calibration=self._calibration() if recipe.calibration else None,
+            workers=recipe.workers,
+        )
+
+    def _calibration(self) -> Calibration:
+        tables, _ = read_toml(Path(self.recipe.calibration))
+        with _named(self.recipe.calibration):
+            return Calibration.from_dict(tables)
+
+    def _dark_frame(self) -> NDArray[Any] | None:
+        if self.recipe.dark and self._dark is None:
+            self._dark = rawfile.read(Path(self.recipe.dark)).mosaic
+        return self._dark
+
+    def _gain(self, shape: tuple[int, int]) -> Plane:
+        if shape not in self._gains:
+            raw = rawfile.read(Path(self.recipe.white))
+            with _named(self.recipe.white):
+                cfa, black = _one_index_a_colour(raw)
+                white = planes.to_plane(raw.mosaic, black=black, white=raw.white, cfa=cfa)
+                self._gains[shape] = planes.white_gain(white, cell_px=math.sqrt(white.size) / 32)
+        return self._gains[shape]
+
+
+def _one_index_a_colour(raw: RawFile) -> tuple[NDArray[np.int64] | None, float | tuple[float, ...]]:
+    """The colour pattern and black levels with both greens as one colour, where their black levels agree.
+
+    LibRaw gives a Bayer pattern's second green an index of its own; it is then no longer the commonest colour.
+    """
+    if raw.cfa is None:
+        return None, raw.black
+    levels = raw.black if isinstance(raw.black, tuple) else (raw.black,) * len(raw.colour_names)
+    first = [raw.colour_names.index(name) for name in raw.colour_names]
+    if any(levels[index] != levels[one] for index, one in enumerate(first)):
+        return raw.cfa, raw.black
+    return np.array(first, dtype=np.int64)[raw.cfa], raw.black
+
+
+def camera_name(camera: str, model: str | None) -> str:
+    """What a camera is called: its profile, by name or by model; else the model, or "unknown"."""
+    if camera != "auto":
+        return Path(camera).stem if camera.endswith(".toml") else camera
+    found = profiles.camera_for_model(model or "")
+    return found.name if found else model or "unknown"
+
+
+@contextmanager
+def _named(path: Path | str) -> Iterator[None]:
+    """Errors of the mathematics, with the file's name."""
+    try:
+        yield
+    except DecodeError as error:
+        raise DarkroomError(f"{path}: {error}") from error
+
+
+@contextmanager
+def _timed(ms: dict[str, float], what: str) -> Iterator[None]:
+    began = time.perf_counter()
+    yield
+    ms[what] = (time.perf_counter() - began) * 1e3

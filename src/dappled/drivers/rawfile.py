@@ -1,0 +1,291 @@
+"""A frame's file as numbers: the sensor's values as they were stored, and what they mean.
+
+What the bytes are decides, not the name: camera raws (RAF, CR2, DNG …) through LibRaw, TIFF, PNG, JPEG and NPY by
+their own readers. Values are not made linear, scaled or balanced here. A colour image has no mosaic; its values become
+(R + 2G + B)/4, the mean of a Bayer cell.
+"""
+
+from __future__ import annotations
+
+import io
+import mmap
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import rawpy
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from dappled.drivers import exif
+from dappled.drivers.exif import Exposure, positive
+from dappled.errors import DappledError
+
+Source = Path | str | bytes | memoryview | mmap.mmap
+Values = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.float64]
+
+_TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_DNG_VERSION, _MAX_SAMPLE = 50706, 281
+
+
+class RawFileError(DappledError):
+    """A file can't be read as a frame; one sentence with its name."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawFile:
+    """A frame's values and what its file says about them; unknown is None.
+
+    `mosaic` (H, W), uint8, uint16 or float, the visible part of the sensor, a copy. `black` and `white` in the same
+    units; `black` is one number, or one for each colour index. `cfa` is an int array (a, b) of colour indices that
+    repeats over the mosaic from its pixel (0, 0), or None for a single colour; `colour_names[i]` names index i.
+    `balance` are the file's own white balance gains by colour index, green 1. `taken` is the camera's local time
+    without a zone, ISO 8601.
+    """
+
+    mosaic: Values
+    black: float | tuple[float, ...]
+    white: float
+    cfa: NDArray[np.int64] | None
+    colour_names: tuple[str, ...]
+    camera_make: str | None
+    camera_model: str | None
+    focal_length_mm: float | None
+    f_number: float | None
+    exposure_s: float | None
+    iso: float | None
+    taken: str | None
+    balance: tuple[float, ...] | None
+
+
+def read(source: Source, name: str | None = None) -> RawFile:
+    """Read a frame from a path, or from bytes (`name` stands for the file in error sentences).
+
+    Raises RawFileError when it is missing, empty, truncated, damaged or of a kind that holds no frame.
+    """
+    label = _label(source, name)
+    with _open(source, label) as file, _sentences(label):
+        start = file.read(16)
+        file.seek(0)
+        if start.startswith(b"\x93NUMPY"):
+            return _plain(np.load(file, allow_pickle=False), Exposure())
+        if start.startswith((b"\x89PNG", b"\xff\xd8\xff")):
+            return _picture(file)
+        if start.startswith(_TIFF_STARTS) and _is_plain_tiff(file, label):
+            return _tiff(file)
+        return _raw(file)
+
+
+def read_metadata(source: Source, name: str | None = None) -> Exposure:
+    """Camera and exposure alone, without unpacking the pixels (milliseconds). Raises RawFileError as `read` does for
+    a file that can't be opened; a file of a kind that has no metadata gives None throughout."""
+    label = _label(source, name)
+    with _open(source, label) as file, _sentences(label):
+        start = file.read(16)
+        file.seek(0)
+        if start.startswith(b"\x93NUMPY"):
+            return Exposure()
+        if start.startswith((b"\x89PNG", b"\xff\xd8\xff")):
+            Image.open(file)  # refuses what is no picture
+            file.seek(0)
+            return exif.read(file)
+        if start.startswith(_TIFF_STARTS) and _is_plain_tiff(file, label):
+            return exif.read(file)
+        told = exif.read(file)
+        if told.make is not None:
+            return told
+        file.seek(0)
+        with rawpy.imread(file) as raw:
+            return _exposure(file, raw)
+
+
+def _raw(file: BinaryIO) -> RawFile:
+    with rawpy.imread(file) as raw:
+        if raw.raw_type != rawpy.RawType.Flat:
+            raise ValueError("it holds no mosaic (linear or demosaiced raws have no masked light field to decode)")
+        mosaic = np.array(raw.raw_image_visible)
+        cfa = None if raw.num_colors == 1 or raw.raw_pattern is None else _visible_pattern(raw)
+        count = 1 if cfa is None else int(cfa.max()) + 1
+        blacks = tuple(float(level) for level in raw.black_level_per_channel[:count])
+        names = "W" if cfa is None else raw.color_desc.decode("ascii", "replace")[:count]
+        return _with(
+            _exposure(file, raw),
+            mosaic,
+            black=blacks[0] if len(set(blacks)) == 1 else blacks,
+            white=float(raw.white_level),
+            cfa=cfa,
+            colour_names=tuple(names),
+            balance=None if cfa is None else _balance(raw.camera_whitebalance, names),
+        )
+
+
+def _exposure(file: BinaryIO, raw: Any) -> Exposure:
+    """EXIF first; LibRaw's own reading where EXIF is silent (CRW, ORF variants …)."""
+    file.seek(0)
+    told = exif.read(file)
+    other = raw.other
+    stamp = other.timestamp
+    taken = stamp.isoformat() if isinstance(stamp, datetime) and stamp.year > 1970 else None
+    return replace(
+        told,
+        focal_length_mm=told.focal_length_mm or _short(other.focal_length),
+        f_number=told.f_number or _short(other.aperture),
+        exposure_s=told.exposure_s or _short(other.shutter_speed),
+        iso=told.iso or _short(other.iso_speed),
+        taken=told.taken or taken,
+    )
+
+
+def _short(value: float) -> float | None:
+    """LibRaw's single-precision numbers as the decimal that was meant: 14.8, not 14.800000190734863."""
+    return positive(str(np.float32(value)))
+
+
+def _visible_pattern(raw: Any) -> NDArray[np.int64]:
+    """LibRaw's pattern, which starts at the first masked pixel, as the smallest block that repeats over the mosaic."""
+    pattern = np.asarray(raw.raw_pattern, dtype=np.int64)
+    visible = np.roll(pattern, (-raw.sizes.top_margin, -raw.sizes.left_margin), axis=(0, 1))
+
+    def period(lines: NDArray[np.int64]) -> int:
+        count = len(lines)
+        return next(n for n in range(1, count + 1) if count % n == 0 and np.array_equal(lines, np.roll(lines, n, 0)))
+
+    return visible[: period(visible), : period(visible.T)].copy()
+
+
+def _balance(gains: list[float], names: str) -> tuple[float, ...] | None:
+    """By colour index, green 1; LibRaw gives 0 for a second green that is as the first."""
+    known = [float(gain) for gain in gains[: len(names)]]
+    green = names.find("G")
+    if green < 0 or positive(known[green]) is None:
+        return None
+    filled = [known[green] if name == "G" and gain == 0 else gain for name, gain in zip(names, known, strict=True)]
+    if any(positive(gain) is None for gain in filled):
+        return None
+    return tuple(gain / known[green] for gain in filled)
+
+
+def _picture(file: BinaryIO) -> RawFile:
+    image: Image.Image = Image.open(file)
+    if image.format == "PNG" and image.mode != "I;16" and _png_is_deep_colour(file):
+        raise ValueError("it is a colour PNG of 16 bits, which would lose its lower 8; save it as TIFF or as grey PNG")
+    if image.mode in ("P", "PA", "CMYK", "YCbCr", "LAB", "HSV"):
+        image = image.convert("RGB")
+    elif image.mode in ("1", "LA"):
+        image = image.convert("L")
+    values = np.asarray(image)
+    if values.dtype == np.int32:  # Pillow's mode "I": a 16-bit PNG in some versions
+        values = values.astype(np.uint16)
+    file.seek(0)
+    return _plain(values, exif.read(file))
+
+
+def _png_is_deep_colour(file: BinaryIO) -> bool:
+    place = file.tell()
+    file.seek(24)  # IHDR: bit depth, colour type
+    depth, colour_type = file.read(2)
+    file.seek(place)
+    return depth == 16 and colour_type in (2, 6)
+
+
+def _is_plain_tiff(file: BinaryIO, label: str) -> bool:
+    """Whether tifffile should read it: named a TIFF, and no DNG. Other files that begin as TIFF are camera raws."""
+    if not label.lower().endswith((".tif", ".tiff")):
+        return False
+    try:
+        with tifffile.TiffFile(file) as tiff:
+            if len(tiff.pages) == 0:
+                raise ValueError("it has no pages")
+            return _DNG_VERSION not in tiff.pages.first.tags
+    finally:
+        file.seek(0)
+
+
+def _tiff(file: BinaryIO) -> RawFile:
+    """The first page."""
+    with tifffile.TiffFile(file) as tiff:
+        page = tiff.pages.first
+        values = page.asarray()
+        tag = page.tags.get(_MAX_SAMPLE)
+        limit = positive(None if tag is None else tag.value)
+        if page.planarconfig == 2 and values.ndim == 3:
+            values = np.moveaxis(values, 0, -1)
+    file.seek(0)
+    frame = _plain(values, exif.read(file))
+    return frame if limit is None or values.dtype.kind != "u" else replace(frame, white=limit)
+
+
+def _plain(values: NDArray[Any], exposure: Exposure) -> RawFile:
+    """An array without a mosaic: whole numbers reach to their type's largest, floats to 1."""
+    if values.dtype.kind == "b":
+        values = values.astype(np.uint8) * np.uint8(255)
+    if values.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
+        raise ValueError(f"its values are {values.dtype}; a frame has 8 or 16 bits unsigned, or floats")
+    white = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
+    if values.ndim == 3 and values.shape[2] in (3, 4):
+        values = values[..., :3].astype(np.float32) @ np.array([0.25, 0.5, 0.25], dtype=np.float32)
+    if values.ndim != 2 or 0 in values.shape:
+        raise ValueError(f"its shape is {values.shape}; a frame has rows and columns, and 3 colours at most")
+    return _with(exposure, np.array(values), black=0.0, white=white, cfa=None, colour_names=("W",), balance=None)
+
+
+def _with(exposure: Exposure, mosaic: Values, **known: Any) -> RawFile:
+    return RawFile(
+        mosaic=mosaic,
+        camera_make=exposure.make,
+        camera_model=exposure.model,
+        focal_length_mm=exposure.focal_length_mm,
+        f_number=exposure.f_number,
+        exposure_s=exposure.exposure_s,
+        iso=exposure.iso,
+        taken=exposure.taken,
+        **known,
+    )
+
+
+def _label(source: Source, name: str | None) -> str:
+    return name or (str(source) if isinstance(source, Path | str) else "the frame")
+
+
+@contextmanager
+def _open(source: Source, label: str) -> Iterator[BinaryIO]:
+    try:
+        if isinstance(source, Path | str):
+            file: BinaryIO = open(source, "rb")  # noqa: SIM115  closed by the with below
+            size = os.fstat(file.fileno()).st_size
+        else:
+            file = io.BytesIO(source)
+            size = len(source)
+    except OSError as error:
+        raise RawFileError(f"cannot open the frame {label}: {error.strerror}; check the path") from error
+    with file:
+        if size == 0:
+            raise RawFileError(f"the frame {label} is empty; fetch it from the camera again")
+        yield file
+
+
+@contextmanager
+def _sentences(label: str) -> Iterator[None]:
+    try:
+        yield
+    except (rawpy.LibRawFileUnsupportedError, UnidentifiedImageError) as error:
+        raise RawFileError(
+            f"{label} is not a frame that can be read (camera raw, DNG, TIFF, PNG, JPEG or NPY), or is cut short"
+        ) from error
+    except Image.DecompressionBombError as error:
+        raise RawFileError(f"{label} claims to be larger than any frame: {error}") from error
+    except Exception as error:  # the readers raise whatever damaged bytes lead them into
+        raise RawFileError(
+            f"{label} can't be read as a frame, it may be damaged or cut short: {_words(error)}"
+        ) from error
+
+
+def _words(error: BaseException) -> str:
+    text = error.args[0] if error.args else type(error).__name__
+    return text.decode("ascii", "replace") if isinstance(text, bytes) else str(text)

@@ -1,0 +1,1 @@
+"""What is made from frames and flights on the ground: light-field files, pictures."""
