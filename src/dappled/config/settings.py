@@ -20,6 +20,7 @@ class CameraSettings:
     serial: str = setting("", "Only the body with this serial number; empty takes the first found")
     port: str = setting("", "libgphoto2 port, such as usb: or ptpip:127.0.0.1:15740:15740; empty takes the first found")
     capture_target: str = setting("card", "Where the body keeps the file before it is fetched", choices=("card", "ram"))
+    delete_after_download: bool = setting(False, "Delete from the card what is safe on disk; the card is a second copy")
     latency_ms: float = setting(60.0, "From the trigger call to the start of the exposure", unit="ms", low=0, high=5000)
     latency_sigma_ms: float = setting(30.0, "How well that is known, 1 σ", unit="ms", low=0, high=5000)
     max_pending: int = setting(2, "Shots under way at once; a wish above that is refused", low=1, high=1000)
@@ -151,6 +152,11 @@ def runtime_folder() -> Path:
     if given := os.environ.get("XDG_RUNTIME_DIR"):
         return Path(given) / "dappled"
     return Path(f"/tmp/dappled-{os.getuid()}")  # noqa: S108  # made 0700 and its owner checked before it is used
+
+
+def of_tables(tables: Mapping[str, Any], name: str) -> Settings:
+    """Settings from the tables that `to_tables` made, as they stand in the file `name`."""
+    return parse(tables, Source(name))
 
 
 def to_tables(settings: Settings) -> dict[str, Any]:

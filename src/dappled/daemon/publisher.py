@@ -56,8 +56,8 @@ class Publisher:
         slices: str,
         ask: str,
         *,
-        flight: str,
         answer: Answer,
+        flight: str = "",
         high_water_mark: int = 12,
         capacity: int = 8,
     ) -> None:
@@ -84,8 +84,9 @@ class Publisher:
             raise
         self._thread = threading.Thread(target=self._run, name="publisher", daemon=True)
 
-    def start(self) -> None:
-        """Begin to send and to listen."""
+    def start(self, flight: str = "") -> None:
+        """Begin to send and to listen; headers name the flight."""
+        self._flight = flight or self._flight
         self._thread.start()
 
     def publish(self, topic: str, facts: Mapping[str, Any], body: Any = None) -> None:
@@ -108,6 +109,8 @@ class Publisher:
 
     def stop(self, grace_s: float = 2.0) -> None:
         """Send what waits, go on answering until nobody has asked for half a second (at most `grace_s`), then close."""
+        if self._stopping.is_set():
+            return
         self._grace_s = grace_s
         self._stopping.set()
         self._ring()

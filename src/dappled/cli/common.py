@@ -1,0 +1,40 @@
+"""Arguments that several verbs share: which frame, camera, mask and files to decode with."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from dappled.drivers.darkroom import Recipe
+
+
+def add_recipe(parser: argparse.ArgumentParser, *, mask_needed: bool = True) -> None:
+    """--camera, --mask, --law, --white, --dark, --calibration, --focal-length, --f-number."""
+    parser.add_argument(
+        "--camera", default="auto", metavar="P", help="camera profile or TOML file (default: by the frame)"
+    )
+    parser.add_argument("--mask", required=mask_needed, metavar="P", help="mask profile or TOML file, or lenslet")
+    parser.add_argument("--law", default="", choices=("fd", "geometric"), help="carrier law (default: the camera's)")
+    parser.add_argument("--calibration", default="", metavar="FILE", help="file written by dappled calibrate")
+    parser.add_argument("--white", default="", metavar="FILE", help="white frame")
+    parser.add_argument("--dark", default="", metavar="FILE", help="dark frame")
+    parser.add_argument("--focal-length", type=float, metavar="MM", help="where the file doesn't say")
+    parser.add_argument("--f-number", type=float, metavar="N", help="where the file doesn't say")
+
+
+def recipe(arguments: argparse.Namespace) -> Recipe:
+    """The recipe that these arguments name."""
+    return Recipe(
+        camera=arguments.camera,
+        mask=arguments.mask,
+        law=arguments.law,
+        calibration=arguments.calibration,
+        white=arguments.white,
+        dark=arguments.dark,
+        workers=2,
+    )
+
+
+def frames(parser: argparse.ArgumentParser, count: str) -> None:
+    """The frames, as positional arguments."""
+    parser.add_argument("frames", nargs=count, type=Path, metavar="FRAME", help="RAF, CR2, DNG, TIFF, PNG or NPY")

@@ -1,0 +1,72 @@
+"""`dappled config check|show` and `dappled profiles`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import tomli_w
+
+from dappled.config import profiles, settings
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    if parser.prog.endswith("profiles"):
+        parser.add_argument("--json", action="store_true", help="as JSON")
+        parser.epilog = "example: dappled profiles"
+        parser.set_defaults(action="profiles")
+        return
+    parser.epilog = "example: dappled config check /etc/dappled.toml"
+    actions = parser.add_subparsers(dest="action", required=True)
+    check = actions.add_parser("check", help="is this file right?")
+    check.add_argument("file", type=Path)
+    show = actions.add_parser("show", help="every setting with its value, unit and meaning")
+    show.add_argument("file", type=Path, nargs="?")
+    show.add_argument("--json", action="store_true", help="as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    if arguments.action == "profiles":
+        return _profiles(arguments.json)
+    loaded = settings.load(arguments.file)
+    if arguments.action == "check":
+        if loaded.camera.profile != "auto":
+            profiles.camera(loaded.camera.profile)
+        if loaded.mask.profile not in ("", profiles.LENSLET):
+            profiles.mask(loaded.mask.profile)
+        print(f"{arguments.file}: good")
+    elif arguments.json:
+        print(json.dumps(settings.to_tables(loaded), indent=2))
+    else:
+        _show(settings.to_tables(loaded))
+    return 0
+
+
+def _show(tables: dict[str, dict[str, object]]) -> None:
+    shown = None
+    for table, key, _, rule in settings.describe():
+        if table != shown:
+            print(f"{'' if shown is None else chr(10)}[{table}]")
+            shown = table
+        unit = f" [{rule.unit}]" if rule.unit else ""
+        choices = f" ({', '.join(c or chr(34) * 2 for c in rule.choices)})" if rule.choices else ""
+        line = tomli_w.dumps({key: tables[table][key]}, multiline_strings=False).strip().replace("\n", " ")
+        print(f"{line:42} # {rule.text}{unit}{choices}")
+
+
+def _profiles(as_json: bool) -> int:
+    cameras = [profiles.camera(name) for name in profiles.shipped("cameras")]
+    masks = [profiles.mask(name) for name in profiles.shipped("masks")]
+    if as_json:
+        found = {
+            "cameras": [{"name": c.name, "law": c.law, "description": c.description} for c in cameras],
+            "masks": [{"name": m.name, "carriers": len(m.mask.orders()), "description": m.description} for m in masks],
+        }
+        print(json.dumps(found, indent=2))
+        return 0
+    for camera in cameras:
+        print(f"camera {camera.name:16} {camera.law:10} {camera.description}")
+    for mask in masks:
+        print(f"mask   {mask.name:16} {len(mask.mask.orders()):3} carriers {mask.description}")
+    return 0

@@ -1,0 +1,59 @@
+"""`dappled decode`: frames to light fields."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from tqdm import tqdm
+
+from dappled.cli import common
+from dappled.drivers.darkroom import Darkroom, Development
+from dappled.errors import DappledError
+from dappled.products import lightfiles
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "examples:\n  dappled decode frame.dng --mask reference-5x5 --calibration c.toml -o frame.zarr\n"
+        "  dappled decode *.png --mask lenslet --white white.png -o decoded/"
+    )
+    common.frames(parser, "+")
+    common.add_recipe(parser)
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT",
+                        help="light field (.zarr, .npz, .h5); with several frames a folder")  # fmt: skip
+    parser.add_argument("--overwrite", action="store_true", help="replace what stands there")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    darkroom = Darkroom(common.recipe(arguments))
+    darkroom.check()
+    single = len(arguments.frames) == 1 and arguments.output.suffix
+    if not single:
+        arguments.output.mkdir(parents=True, exist_ok=True)
+    bad = 0
+    for frame in tqdm(arguments.frames, unit="frame", disable=len(arguments.frames) < 2 or not sys.stderr.isatty()):
+        target = arguments.output if single else arguments.output / f"{frame.stem}.zarr"
+        try:
+            made = darkroom.develop(frame, focal_length_mm=arguments.focal_length, f_number=arguments.f_number)
+            lightfiles.save(target, made.light_field, overwrite=arguments.overwrite)
+            print(f"{target}: {summary(made)}")
+        except DappledError as error:
+            if single:
+                raise
+            bad += 1
+            print(f"dappled decode: {error}", file=sys.stderr)
+    if bad:
+        print(f"{bad} of {len(arguments.frames)} frames could not be decoded", file=sys.stderr)
+    return 1 if bad else 0
+
+
+def summary(made: Development) -> str:
+    """Slices, views, and where both came from."""
+    field = made.light_field
+    rows, columns = field.views.shape[:2]
+    views = f"{rows} × {columns} views" if rows else "no views (they need a calibration, or carriers to be seen)"
+    size = " × ".join(str(n) for n in field.slices.shape)
+    found = f"{made.carriers_found} of {made.carriers_predicted} carriers seen"
+    return f"slices {size}, {views}; {found}, {made.report.carriers_from}"

@@ -1,0 +1,133 @@
+"""`dappled flight list|show|check|report`: recorded flights."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from dappled.config import settings
+from dappled.flight import check, layout, summary
+from dappled.flight.errors import FlightError
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = "examples:\n  dappled flight list\n  dappled flight check ~/flights/20261121T101503Z-0a1b2c3d"
+    actions = parser.add_subparsers(dest="action", required=True)
+    listing = actions.add_parser("list", help="all flights in a folder")
+    listing.add_argument("folder", nargs="?", type=Path, help="flights folder (default: record.directory)")
+    for name, line in (
+        ("show", "every shot of a flight"),
+        ("check", "is every byte intact? exits 1 if not"),
+        ("report", "which wishes became frames; exits 1 if the books don't balance"),
+    ):
+        one = actions.add_parser(name, help=line)
+        one.add_argument("flight", nargs="?", type=Path, help="flight folder (default: the last one)")
+    for one in actions.choices.values():
+        one.add_argument("--json", action="store_true", help="as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    if arguments.action == "list":
+        return _list(arguments.folder or _flights(), arguments.json)
+    flight = arguments.flight or last_flight()
+    return {"show": _show, "check": _check, "report": _report}[arguments.action](flight, arguments.json)
+
+
+def last_flight() -> Path:
+    """The newest flight in the configured folder. Raises FlightError when there is none."""
+    found = layout.flights(_flights())
+    if not found:
+        raise FlightError(f"there is no flight in {_flights()} yet; name one, or record one with `dappled run`")
+    return found[-1].path
+
+
+def _flights() -> Path:
+    return Path(settings.load(None).record.directory)
+
+
+def _list(folder: Path, as_json: bool) -> int:
+    found = summary.list_flights(folder)
+    if as_json:
+        print(json.dumps([_plain(one) for one in found], indent=2))
+        return 0
+    for one in found:
+        if one.balance is None:
+            print(f"{one.name}  {one.problem}")
+        else:
+            b = one.balance
+            state = "" if b.closed else "  (open)"
+            print(f"{one.name}  {b.frames} frames, {b.failed} failed, {b.size / 1e6:.1f} MB{state}")
+    if not found:
+        print(f"no flights in {folder}", file=sys.stderr)
+    return 0
+
+
+def _show(flight: Path, as_json: bool) -> int:
+    found = summary.show(flight)
+    if as_json:
+        print(json.dumps(_plain(found), indent=2))
+        return 0
+    print(f"{found.name}")
+    for line in found.lines:
+        shot = line.row.shot
+        time = datetime.fromtimestamp(shot.wished_utc_ns / 1e9, UTC).strftime("%H:%M:%S.%f")[:-3]
+        words = [f"{shot.index:6d}", time, shot.cause.source, line.row.state]
+        if line.row.reason:
+            words.append(line.row.reason)
+        if line.frame:
+            words.append(f"{line.frame.name} {line.frame.size / 1e6:.1f} MB")
+        if line.tag and line.tag.pose.latitude_rad is not None and line.tag.pose.longitude_rad is not None:
+            pose = line.tag.pose
+            words.append(
+                f"{math.degrees(line.tag.pose.latitude_rad):.7f} {math.degrees(line.tag.pose.longitude_rad):.7f}"
+            )
+            words.append(f"{pose.altitude_msl_m:.1f} m")
+        if line.result:
+            words.append(f"{line.result.carriers_found}/{line.result.carriers_predicted} carriers")
+        print("  ".join(words))
+    for stray in found.strays:
+        print(f" stray  {stray.name}  {stray.reason}")
+    return 0
+
+
+def _check(flight: Path, as_json: bool) -> int:
+    found = check.check(flight)
+    if as_json:
+        print(json.dumps({**_plain(found), "intact": found.intact}, indent=2))
+    else:
+        for text in found.problems:
+            print(f"wrong: {text}")
+        for text in found.notes:
+            print(f"note:  {text}")
+        word = "intact" if found.intact else "NOT INTACT"
+        size = f"{found.size / 1e6:.1f} MB"
+        print(f"{found.flight}: {word}: {found.files} files, {size}, {found.telemetry_packets} telemetry packets")
+    return 0 if found.intact else 1
+
+
+def _report(flight: Path, as_json: bool) -> int:
+    found = summary.report(flight)
+    if as_json:
+        print(json.dumps({**_plain(found), "balanced": found.balanced}, indent=2))
+    else:
+        print(f"{found.flight}{'' if found.closed else ' (still open)'}")
+        for source, count in found.by_source.items():
+            print(f"  {count:6d} wishes from {source}")
+        print(f"  {found.wishes:6d} shots: {found.safe} safe, {found.failed} failed, {found.open} open")
+        print(f"  {found.frames:6d} frames, {found.size / 1e6:.1f} MB: {found.tagged} tagged, {found.decoded} decoded")
+        if found.strays:
+            print(f"  {found.strays:6d} files without a shot of their own")
+        print("the books balance" if found.balanced else "THE BOOKS DO NOT BALANCE: run `dappled flight check`")
+    return 0 if found.balanced else 1
+
+
+def _plain(value: Any) -> dict[str, Any]:
+    """A record as JSON values; paths become text."""
+    plain: dict[str, Any] = json.loads(json.dumps(asdict(value), default=str))
+    return plain

@@ -1,0 +1,202 @@
+"""`dappled replay`: a recorded flight, or a folder of frames with a .tlog, through the same street."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import dappled
+from dappled.cli import story
+from dappled.config import settings as configuration
+from dappled.daemon import inputs, replay
+from dappled.daemon.answers import Answers
+from dappled.daemon.books import ReplayBook
+from dappled.daemon.development import WorkerDeveloper
+from dappled.daemon.publisher import Publisher
+from dappled.daemon.replay import Progress, RecordedTelemetry, ReplayError
+from dappled.daemon.street import Names, Story, Street, Watchers
+from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency
+from dappled.drivers.camera import Identity
+from dappled.drivers.darkroom import Recipe
+from dappled.drivers.replay import ReplayCamera
+from dappled.flight import check, layout
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "examples:\n  dappled replay flights/20261121T101503Z-0a1b2c3d --verify\n"
+        "  dappled replay frames/ --mask lenslet --white white.png --telemetry flight.tlog --publish"
+    )
+    parser.add_argument("flight", type=Path, help="flight folder, or a folder of frames")
+    parser.add_argument(
+        "--rate", default="max", help="1.0 is as it was, 2 twice as fast, max as fast as it goes (default)"
+    )
+    parser.add_argument("--step", action="store_true", help="wait for Enter before each frame")
+    parser.add_argument("--publish", action=argparse.BooleanOptionalAction, default=False, help="send over ZeroMQ")
+    parser.add_argument("--verify", action="store_true", help="compare every hash; exit 1 on any difference")
+    parser.add_argument("--camera", metavar="P", help="camera profile or TOML file")
+    parser.add_argument("--mask", metavar="P", help="mask profile or TOML file, or lenslet")
+    parser.add_argument("--telemetry", type=Path, metavar="FILE", help=".tlog beside a folder of frames")
+    parser.add_argument("--white", metavar="FILE", help="white frame")
+    parser.add_argument("--dark", metavar="FILE", help="dark frame")
+    parser.add_argument("--calibration", metavar="FILE", help="file written by dappled calibrate")
+    parser.add_argument("--match", default="*", metavar="GLOB", help="which files of a folder are frames")
+    parser.add_argument("--start", metavar="UTC", help="time of the first frame, such as 2026-11-21T10:15:03Z")
+    parser.add_argument("--interval", type=float, default=1.0, metavar="S", help="between frames without a time")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings: endpoints, workers")
+    parser.add_argument("--json", action="store_true", help="one JSON object a frame")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    settings = configuration.load(arguments.config)
+    is_flight = (arguments.flight / layout.FlightFolder(arguments.flight).ledger.name).is_file()
+    if arguments.verify and not is_flight:
+        raise ReplayError(f"{arguments.flight} is no recorded flight: there are no hashes to verify")
+    problems = list(check.check(arguments.flight).problems) if arguments.verify else []
+    facts = layout.read_facts(layout.open_folder(arguments.flight)) if is_flight else {}
+    recipe = _recipe(arguments, facts, settings)
+    recording = _recording(arguments, is_flight)
+    names, latency, wait_ms = _as_recorded(arguments, facts, recipe)
+    telemetry = RecordedTelemetry(recording.telemetry, recording.horizons, wait_ms / 1e3)
+    book = replay.book(recording)
+    progress = Progress.begin()
+    failed = 0
+
+    def finished(one: Story) -> None:
+        nonlocal failed
+        failed += bool(one.problem) and one.frame is not None
+        print(story.as_json(one) if arguments.json else story.line(one), flush=True)
+        progress.note(one)
+
+    with ExitStack() as stack:
+        developer = WorkerDeveloper(recipe) if recipe else None
+        if developer:
+            stack.callback(developer.close)
+            developer.warm_up()
+        publisher = _publisher(settings, book, developer, stack) if arguments.publish else None
+        if publisher:
+            publisher.publish("start", _start(settings, names))
+        identity = Identity("dappled", "recording", "", str(arguments.flight))
+        camera = ReplayCamera(recording.files, identity)
+        street = Street(
+            camera=camera,
+            book=book,
+            poses=telemetry.pose,
+            developer=developer,
+            publisher=publisher,
+            latency=latency,
+            names=names,
+            watchers=Watchers(finished=finished),
+            decode_queue=1000,
+        )
+        street.start()
+        stack.callback(street.stop, 5.0)
+        replay.play(recording, street, progress, fire=camera.fire, pace=_pace(arguments))
+        if publisher:
+            counts = {"wished": len(recording.shots), "safe": len(progress.stories)}
+            sent = dict(publisher.statistics().sent)
+            publisher.publish("end", {"utc_ns": recording.shots[-1].wished_utc_ns, "shots": counts, "sent": sent})
+    if not arguments.verify:
+        return 1 if failed else 0
+    problems += book.verdict()
+    for text in problems:
+        print(f"different: {text}", file=sys.stderr)
+    count = sum(one.frame is not None for one in recording.expected)
+    print(f"verified {count} frames: " + (f"{len(problems)} differences" if problems else "all hashes the same"))
+    return 1 if problems else 0
+
+
+def _recipe(arguments: argparse.Namespace, facts: Mapping[str, Any], settings: configuration.Settings) -> Recipe | None:
+    given = {name: getattr(arguments, name) for name in ("camera", "mask", "white", "dark", "calibration")}
+    if facts:
+        if not facts.get("decode_in_flight") and not given["mask"]:
+            return None
+        return inputs.of_flight(arguments.flight, facts, given)
+    if not given["mask"]:
+        return None
+    named = {name: value for name, value in given.items() if value is not None}
+    return Recipe(**{"camera": settings.camera.profile, "workers": settings.decode.workers, **named})
+
+
+def _recording(arguments: argparse.Namespace, is_flight: bool) -> replay.Recording:
+    if is_flight:
+        return replay.of_flight(arguments.flight)
+    if not arguments.flight.is_dir():
+        raise ReplayError(f"{arguments.flight} is neither a flight nor a folder of frames")
+    return replay.of_folder(
+        arguments.flight,
+        arguments.match,
+        telemetry=arguments.telemetry,
+        start_utc_ns=_utc_ns(arguments.start),
+        interval_s=arguments.interval,
+    )
+
+
+def _as_recorded(
+    arguments: argparse.Namespace, facts: Mapping[str, Any], recipe: Recipe | None
+) -> tuple[Names, BodyLatency, float]:
+    """Names, body latency and waiting time of the flight; for a folder the frames' times are mid-exposure itself."""
+    if not facts:
+        return inputs.names(recipe), BodyLatency(0.0, 0.0, "given by --start and --interval"), 700.0
+    recorded = configuration.of_tables(facts["settings"], "flight.toml")
+    camera = recorded.camera
+    latency = BodyLatency(camera.latency_ms, camera.latency_sigma_ms, LATENCY_SOURCE)
+    changed = any(getattr(arguments, name) for name in ("camera", "mask"))
+    return inputs.names(recipe) if changed else Names(**facts["names"]), latency, recorded.pose.wait_ms
+
+
+def _publisher(
+    settings: configuration.Settings, book: ReplayBook, developer: WorkerDeveloper | None, stack: ExitStack
+) -> Publisher:
+    answers = Answers(book, developer)
+    publisher = Publisher(
+        settings.publish.slices,
+        settings.publish.ask,
+        answer=answers.answer,
+        high_water_mark=settings.publish.high_water_mark,
+    )
+    answers.start()
+    stack.callback(answers.stop)
+    publisher.start(book.root.absolute().name)
+    stack.callback(publisher.stop)
+    return publisher
+
+
+def _start(settings: configuration.Settings, names: Names) -> dict[str, Any]:
+    return {
+        "utc_ns": int(datetime.now(UTC).timestamp() * 1e9),
+        "software": f"dappled {dappled.__version__}",
+        "camera": names.camera,
+        "mask": names.mask,
+        "slices": settings.publish.slices,
+        "ask": settings.publish.ask,
+    }
+
+
+def _pace(arguments: argparse.Namespace) -> replay.Pace | None:
+    if arguments.step:
+        return lambda shot, before: (input(f"Enter for shot {shot.index} "), None)[1]
+    if arguments.rate == "max":
+        return None
+    try:
+        rate = float(arguments.rate)
+    except ValueError:
+        rate = 0.0
+    if not 0 < rate < 1e6:
+        raise ReplayError(f"--rate {arguments.rate} is neither a number above 0 nor max")
+    return replay.as_recorded(rate)
+
+
+def _utc_ns(text: str | None) -> int | None:
+    if text is None:
+        return None
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError:
+        raise ReplayError(f"--start {text} is no UTC time such as 2026-11-21T10:15:03Z") from None
+    return round((time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp() * 1e9)

@@ -1,0 +1,47 @@
+"""`dappled trigger`: the ground station's part, over MAVLink."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from dappled.config.schema import ConfigError
+from dappled.daemon.ground_client import GroundClient, Outcome
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = "example: dappled trigger --url udpout:127.0.0.1:14550 --count 3 --interval 2"
+    parser.add_argument(
+        "--url", default="udpout:127.0.0.1:14550", help="pymavlink connection string (default %(default)s)"
+    )
+    parser.add_argument("--count", type=int, default=1, metavar="N", help="photographs (default 1)")
+    parser.add_argument("--interval", type=float, default=0.0, metavar="S", help="seconds between them, at least")
+    parser.add_argument(
+        "--timeout", type=float, default=60.0, metavar="S", help="for the camera, and for each photograph"
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON object a photograph")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    if arguments.count < 1 or arguments.interval < 0:
+        raise ConfigError("--count is 1 or more, --interval 0 or more")
+    with GroundClient(arguments.url) as client:
+        client.find_camera(arguments.timeout)
+        outcomes = client.capture(
+            arguments.count,
+            arguments.interval,
+            timeout_s=arguments.timeout,
+            on_outcome=lambda one: print(_json(one) if arguments.json else _line(one), flush=True),
+        )
+    return 0 if all(one.ok for one in outcomes) else 1
+
+
+def _line(one: Outcome) -> str:
+    ack = "" if one.ack_ms is None else f", acknowledged after {one.ack_ms:.1f} ms"
+    if one.ok:
+        return f"image {one.index}{ack}"
+    return f"no image: {one.reason}{ack}"
+
+
+def _json(one: Outcome) -> str:
+    return json.dumps({"index": one.index, "ok": one.ok, "reason": one.reason, "ack_ms": one.ack_ms})

@@ -1,0 +1,97 @@
+"""The decode process: `python -m dappled.daemon.decode_worker FD`. Ends when its parent does."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import signal
+import socket
+import sys
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from dappled.daemon import wire
+from dappled.daemon.development import NICENESS, serve
+from dappled.decode.pictures import slice_mosaic
+from dappled.drivers.camera import Blob
+from dappled.drivers.camera_channel import Message
+from dappled.drivers.darkroom import Darkroom, Recipe
+from dappled.errors import DappledError
+
+Reply = tuple[Mapping[str, Any], tuple[int, ...]]
+
+
+class Worker:
+    """Answers the parent's questions with a darkroom that it sets up once."""
+
+    def __init__(self) -> None:
+        self._darkroom: Darkroom | None = None
+        self._preview_px = 1024
+
+    def __call__(self, question: Message) -> Reply:
+        body = question.body
+        if body["do"] == "set up":
+            self._darkroom = Darkroom(Recipe(**body["recipe"]))
+            self._preview_px = body["preview_px"]
+            return {}, ()
+        assert self._darkroom is not None  # "set up" comes first
+        try:
+            if body["do"] == "warm up":
+                self._darkroom.check()
+                return {"ready": True}, ()
+            return self._develop(self._darkroom, body["path"], body["focal_length_mm"], body["f_number"])
+        except DappledError as error:
+            return {"error": str(error)}, ()
+        except MemoryError:
+            return {"error": f"not enough memory to decode {body.get('path')}"}, ()
+
+    def _develop(self, darkroom: Darkroom, path: str, focal_length_mm: float | None, f_number: float | None) -> Reply:
+        done = darkroom.develop(path, focal_length_mm=focal_length_mm, f_number=f_number, views=False)
+        field = done.light_field
+        ms = dict(done.ms)
+        began = time.perf_counter()
+        slices = np.ascontiguousarray(field.slices)
+        data = memoryview(slices.data).cast("B")
+        sha256 = hashlib.sha256(data).hexdigest()
+        body = Blob.of(data, "slices")
+        ms["hash"] = (time.perf_counter() - began) * 1e3
+        began = time.perf_counter()
+        preview, size = self._preview(slices, field.carriers)
+        blob = Blob.of(preview, "preview")
+        ms["preview"] = (time.perf_counter() - began) * 1e3
+        facts = {
+            "sha256": sha256,
+            "arrays": [wire.describe_array("slices", slices, "1.0 = sensor white")],
+            "carriers": field.carriers.tolist(),
+            "carriers_from": done.report.carriers_from,
+            "carriers_found": done.carriers_found,
+            "carriers_predicted": done.carriers_predicted,
+            "law": field.attributes["law"],
+            "grid": field.grid.tolist(),
+            "preview_size": list(size),
+            "ms": ms,
+        }
+        return facts, (body.fd, blob.fd)
+
+    def _preview(self, slices: Any, carriers: Any) -> tuple[bytes, tuple[int, int]]:
+        step = max(1, round(max(slices.shape[1:]) * np.sqrt(2 * len(slices) - 1) / self._preview_px))
+        mosaic = slice_mosaic(slices[:, ::step, ::step], carriers)
+        file = io.BytesIO()
+        Image.fromarray(mosaic).save(file, "JPEG", quality=80)
+        return file.getvalue(), (mosaic.shape[1], mosaic.shape[0])
+
+
+def main() -> None:
+    """Serve the socket whose descriptor is the only argument."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C is the parent's to act on
+    os.nice(NICENESS)
+    serve(socket.socket(fileno=int(sys.argv[1])), Worker())
+
+
+if __name__ == "__main__":
+    main()

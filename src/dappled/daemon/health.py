@@ -1,0 +1,75 @@
+"""One record that says how everything is: for the stream, the log and whoever looks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from dappled.config.settings import Settings
+from dappled.daemon.publisher import PublisherStatistics
+from dappled.daemon.shutter import ShutterStatistics
+from dappled.daemon.street import Street
+from dappled.daemon.telemetry import TelemetryStatistics
+from dappled.drivers.mavlink import LinkStatistics
+from dappled.errors import DappledError
+from dappled.flight import layout
+
+SILENT_NS = 5 * 10**9
+
+
+def record(
+    settings: Settings,
+    *,
+    utc_ns: int,
+    monotonic_ns: int,
+    street: Street,
+    shutter: ShutterStatistics,
+    links: Sequence[LinkStatistics],
+    telemetry: TelemetryStatistics,
+    publisher: PublisherStatistics,
+    folder: Path,
+) -> dict[str, Any]:
+    """The facts of a `health` message; `problems` are sentences, none when all is well."""
+    problems = []
+    if street.camera_state not in ("ready", "busy"):
+        problems.append(f"camera {street.camera_state}: {street.camera_reason or 'no reason given'}")
+    if not settings.mavlink.url:
+        problems.append("no MAVLink link is configured: frames are tagged without poses")
+    for link in links:
+        if link.error:
+            problems.append(link.error)
+        elif link.last_heard_monotonic_ns is None or monotonic_ns - link.last_heard_monotonic_ns > SILENT_NS:
+            problems.append(f"MAVLink link {link.url}: nobody was heard for 5 s")
+    free = _free(folder)
+    if free is not None and free < settings.record.min_free_mb * 1_000_000:
+        problems.append(f"disk nearly full: {free // 1_000_000} MB left, new shots are refused")
+    if not settings.mask.profile:
+        problems.append("no mask is configured: frames are kept, not decoded (set mask.profile)")
+    stages = [asdict(stage.statistics()) for stage in street.stages]
+    for stage in stages:
+        if stage["dropped"]:
+            problems.append(f"{stage['name']} fell behind: {stage['dropped']} frames are only in the record")
+    return {
+        "utc_ns": utc_ns,
+        "camera": {"state": street.camera_state, "reason": street.camera_reason},
+        "link": {"urls": len(links), "packets": telemetry.packets, "positions": telemetry.positions},
+        "disk": {"free_bytes": free, "folder": str(folder)},
+        "shots": {
+            "wished": shutter.shots,
+            "safe": shutter.succeeded,
+            "failed": shutter.failed,
+            "pending": shutter.pending,
+            "refused": shutter.refused,
+        },
+        "stages": [*stages, {"name": "publish", "sent": dict(publisher.sent), "dropped": dict(publisher.dropped)}],
+        "problems": problems,
+    }
+
+
+def _free(folder: Path) -> int | None:
+    try:
+        return layout.free_bytes(folder)
+    except DappledError:
+        return None

@@ -1,0 +1,133 @@
+"""What decoding was given: the recipe from the settings, copies of its files in the flight, and the recipe of a replay.
+
+A flight keeps its own calibration, white and dark frame and profiles, so that it can be decoded the same way when the
+originals have changed.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from importlib import metadata, resources
+from pathlib import Path
+from typing import Any
+
+from dappled.config import profiles
+from dappled.config.settings import Settings
+from dappled.daemon.street import Names
+from dappled.drivers.darkroom import Darkroom, Recipe, camera_name
+from dappled.errors import DappledError
+from dappled.flight import durable
+
+FOLDER = "inputs"
+_LIBRARIES = ("numpy", "scipy", "rawpy", "pyzmq", "pymavlink", "gphoto2", "pillow", "tifffile")
+_FILES = ("calibration", "white", "dark")
+
+
+def recipe(settings: Settings) -> tuple[Names, Recipe | None]:
+    """What frames will be called, and how they are decoded: None where that isn't asked for or no mask is named.
+
+    Raises DappledError when a named profile or file isn't right.
+    """
+    names = Names(
+        camera=settings.camera.profile
+        if settings.camera.profile == "auto"
+        else camera_name(settings.camera.profile, None),
+        mask=Path(settings.mask.profile).stem if settings.mask.profile else "",
+        law=_law(settings),
+    )
+    if not settings.decode.enabled or not settings.mask.profile:
+        return names, None
+    made = Recipe(
+        camera=settings.camera.profile,
+        mask=settings.mask.profile,
+        law=settings.decode.law,
+        calibration=settings.decode.calibration,
+        white=settings.decode.white,
+        dark=settings.decode.dark,
+        workers=settings.decode.workers,
+    )
+    Darkroom(made).check()
+    return names, made
+
+
+def keep(made: Recipe, flight: Path) -> Recipe:
+    """The same recipe with its files and profiles copied into the flight. Raises DappledError when the disk refuses."""
+    folder = flight / FOLDER
+    try:
+        folder.mkdir(exist_ok=True)
+        kept: dict[str, Any] = {
+            name: _copy(getattr(made, name), folder, name) for name in _FILES if getattr(made, name)
+        }
+        kept["camera"] = _copy_profile(made.camera, folder, "cameras")
+        kept["mask"] = _copy_profile(made.mask, folder, "masks")
+        durable.sync_folder(folder)
+    except OSError as error:
+        raise DappledError(f"the decoder's inputs can't be copied to {folder}: {error.strerror}") from None
+    return replace(made, **kept)
+
+
+def of_flight(flight: Path, facts: Mapping[str, Any], overrides: Mapping[str, Any]) -> Recipe | None:
+    """The recipe that a recorded flight was decoded by, its files from the flight's own copies; overrides on top."""
+    settings = facts.get("settings", {})
+    decode, folder = settings.get("decode", {}), flight / FOLDER
+    made = Recipe(
+        camera=_kept_profile(settings.get("camera", {}).get("profile", "auto"), folder, "cameras"),
+        mask=_kept_profile(settings.get("mask", {}).get("profile", ""), folder, "masks"),
+        law=decode.get("law", ""),
+        workers=decode.get("workers", 1),
+        **{name: _kept(decode.get(name, ""), folder, name) for name in _FILES},
+    )
+    made = replace(made, **{name: value for name, value in overrides.items() if value is not None})
+    return made if made.mask else None
+
+
+def names(made: Recipe | None) -> Names:
+    """What a replay by another recipe calls things."""
+    if made is None:
+        return Names("auto", "", "")
+    return Names(
+        made.camera if made.camera == "auto" else camera_name(made.camera, None), Path(made.mask).stem, made.law
+    )
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the results depend on."""
+    return {"python": sys.version.split()[0], **{name: metadata.version(name) for name in _LIBRARIES}}
+
+
+def _law(settings: Settings) -> str:
+    if settings.decode.law or settings.camera.profile == "auto":
+        return settings.decode.law
+    return profiles.camera(settings.camera.profile).law
+
+
+def _copy(source: str, folder: Path, name: str) -> str:
+    target = folder / f"{name}{Path(source).suffix}"
+    shutil.copyfile(source, target)
+    return str(target)
+
+
+def _copy_profile(profile: str, folder: Path, kind: str) -> str:
+    """A copy of the profile under its own name; what is no file ("auto", "lenslet") stays as it is."""
+    if profile in ("auto", profiles.LENSLET):
+        return profile
+    target = folder / kind / f"{Path(profile).stem}.toml"
+    target.parent.mkdir(exist_ok=True)
+    if profile.endswith(".toml"):
+        shutil.copyfile(profile, target)
+    else:
+        shipped = resources.files("dappled.config") / "profiles" / kind / f"{profile}.toml"
+        target.write_text(shipped.read_text(encoding="utf-8"), encoding="utf-8")
+    return str(target)
+
+
+def _kept(named: str, folder: Path, name: str) -> str:
+    return str(folder / f"{name}{Path(named).suffix}") if named else ""
+
+
+def _kept_profile(profile: str, folder: Path, kind: str) -> str:
+    copy = folder / kind / f"{Path(profile).stem}.toml"
+    return str(copy) if copy.is_file() else profile

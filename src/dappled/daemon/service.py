@@ -1,0 +1,355 @@
+"""The daemon of a live flight: opens every part, runs the working loop, and closes all in the reverse order."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import dappled
+from dappled.config import profiles
+from dappled.config import settings as configuration
+from dappled.config.settings import Settings
+from dappled.daemon import health, inputs
+from dappled.daemon.answers import Answers
+from dappled.daemon.books import LiveBook
+from dappled.daemon.cameras import open_camera
+from dappled.daemon.clock import Clock, SystemClock
+from dappled.daemon.component import CameraFacts, Captured, Component, Storage
+from dappled.daemon.development import DevelopmentError, WorkerDeveloper
+from dappled.daemon.publisher import Publisher, Reply
+from dappled.daemon.shutter import Shutter
+from dappled.daemon.street import Names, Story, Street, Watchers
+from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency
+from dappled.daemon.telemetry import Telemetry
+from dappled.drivers.camera import Camera, StateChanged
+from dappled.drivers.darkroom import Recipe
+from dappled.drivers.mavlink import MavlinkLinks, Packet
+from dappled.errors import DappledError
+from dappled.flight import layout
+from dappled.flight import recording as flights
+from dappled.flight.ledger import LedgerReader
+from dappled.flight.records import Pose, Shot
+
+log = logging.getLogger(__name__)
+HEALTH_S = 1.0
+LOOK_S = 0.02
+
+
+class Service:
+    """One flight, from `start` to `stop`. `run` does both, with the working loop between.
+
+    `watchers` are told what the street does. Raises DappledError from `start` when a part can't be had; what was
+    opened is closed again. A camera that isn't there, a link without an autopilot and a recipe without a mask are no
+    such failures: the daemon says so and goes on.
+    """
+
+    def __init__(self, settings: Settings, *, watchers: Watchers | None = None, clock: Clock | None = None) -> None:
+        self.settings = settings
+        self._outside = watchers or Watchers()
+        self._clock = clock or SystemClock()
+        self._stack = ExitStack()
+        self._stopping = threading.Event()
+        self._telemetry = Telemetry(component_id=settings.mavlink.component_id)
+        self._component: Component | None = None
+        self._recording: flights.Recording | None = None
+        self._tagged: dict[int, Captured] = {}
+        self._health_due_ns = 0
+
+    # life
+
+    def start(self) -> None:
+        """Open everything. Order: what may refuse first, the flight folder after it, the camera last."""
+        with ExitStack() as stack:
+            names, recipe = inputs.recipe(self.settings)
+            camera = open_camera(self.settings.camera)
+            self._publisher = Publisher(
+                self.settings.publish.slices,
+                self.settings.publish.ask,
+                answer=self._answer,
+                high_water_mark=self.settings.publish.high_water_mark,
+            )
+            stack.callback(self._publisher.stop)
+            self._links = MavlinkLinks(
+                self.settings.mavlink.url,
+                system_id=self.settings.mavlink.system_id,
+                component_id=self.settings.mavlink.component_id,
+                tap=self._log_packet,
+                on_packet=self._packet,
+                clock=self._clock,
+            )
+            self._links.open()
+            stack.callback(self._links.stop)
+            self._recording = flights.begin(
+                Path(self.settings.record.directory), self._clock.utc_ns, self._facts(names, recipe)
+            )
+            stack.callback(self._close_recording)
+            stack.callback(self._links.stop)  # before the recording closes: packets are logged there
+            self._begin_street(camera, names, self._developer(recipe, stack), stack)
+            self._begin_component()
+            self._stack = stack.pop_all()
+        for text in self._recording.recovered:
+            log.warning("earlier flight: %s", text)
+
+    def _developer(self, recipe: Recipe | None, stack: ExitStack) -> WorkerDeveloper | None:
+        assert self._recording is not None
+        if recipe is None:
+            return None
+        kept = inputs.keep(recipe, self._recording.folder.path)
+        developer = WorkerDeveloper(kept)
+        stack.callback(developer.close)
+        threading.Thread(target=_warm_up, args=[developer], name="decoder warm-up", daemon=True).start()
+        return developer
+
+    def _begin_street(self, camera: Camera, names: Names, developer: WorkerDeveloper | None, stack: ExitStack) -> None:
+        assert self._recording is not None
+        self._book = LiveBook(self._recording, self._clock)
+        self._street = Street(
+            camera=camera,
+            book=self._book,
+            poses=self._pose,
+            developer=developer,
+            publisher=self._publisher,
+            latency=BodyLatency(self.settings.camera.latency_ms, self.settings.camera.latency_sigma_ms, LATENCY_SOURCE),
+            names=names,
+            watchers=Watchers(self._settled, self._story_tagged, self._outside.finished, self._camera_changed),
+            decode_queue=self.settings.decode.queue,
+            preview_interval_s=self.settings.publish.preview_interval_s,
+        )
+        self._answers = Answers(self._book, developer)
+        self._shutter = Shutter(
+            next_index=self._recording.next_index,
+            note=self._note,
+            fire=camera.fire,
+            clock=self._clock,
+            capacity=self.settings.camera.max_pending,
+            obstacle=self._obstacle,
+            on_change=self._changed,
+        )
+        self._answers.start()
+        stack.callback(self._answers.stop)
+        self._publisher.start(self._recording.folder.name)
+        self._publisher.publish("start", self._start_header(names))
+        stack.callback(self._say_end)
+        self._street.start()
+        stack.callback(lambda: self._street.stop(5.0))
+        self._shutter.start()
+        stack.callback(self._shutter.stop)
+
+    def _begin_component(self) -> None:
+        self._component = Component(
+            self._links,
+            self._shutter,
+            self._clock,
+            facts=self._camera_facts,
+            storage=self._storage,
+            lookup=self._lookup,
+        )
+        self._links.start()
+
+    def run(self, until: Callable[[], bool] = lambda: False) -> None:
+        """The working loop: heartbeats, health; until `stop` is asked for, or `until()` says so."""
+        while not self._stopping.is_set() and not until():
+            self.step()
+            self._stopping.wait(LOOK_S)
+
+    def step(self) -> None:
+        """One turn of the working loop."""
+        if self._component is not None and self.settings.mavlink.url:
+            self._component.tick()
+        now_ns = self._clock.monotonic_ns()
+        if now_ns >= self._health_due_ns:
+            self._health_due_ns = now_ns + round(HEALTH_S * 1e9)
+            self._publisher.publish("health", self.health())
+
+    def ask_to_stop(self) -> None:
+        """End `run` soon; safe in a signal handler."""
+        self._stopping.set()
+
+    def stop(self) -> None:
+        """Finish the frame in hand and close everything, in the reverse order of opening."""
+        self._stopping.set()
+        self._stack.close()
+
+    # what others may look at
+
+    @property
+    def folder(self) -> Path:
+        """The flight's folder."""
+        assert self._recording is not None
+        return self._recording.folder.path
+
+    def health(self) -> dict[str, Any]:
+        """The state of everything, as published."""
+        return health.record(
+            self.settings,
+            utc_ns=self._clock.utc_ns(),
+            monotonic_ns=self._clock.monotonic_ns(),
+            street=self._street,
+            shutter=self._shutter.statistics(),
+            links=self._links.statistics(),
+            telemetry=self._telemetry.statistics(),
+            publisher=self._publisher.statistics(),
+            folder=self.folder,
+        )
+
+    # wishes
+
+    def _note(self, shot: Shot) -> None:
+        assert self._recording is not None
+        self._recording.journal.note(shot)
+        self._book.wished(shot)
+        self._street.expect(shot)
+
+    def _obstacle(self) -> str | None:
+        if self._street.camera_state not in ("ready", "busy"):
+            return f"the camera is {self._street.camera_state}: {self._street.camera_reason or 'no reason given'}"
+        free = layout.free_bytes(self.folder)
+        if free < self.settings.record.min_free_mb * 1_000_000:
+            return f"the disk is nearly full: {free // 1_000_000} MB left, record.min_free_mb asks for more"
+        return None
+
+    def _settled(self, index: int, ok: bool) -> None:
+        self._shutter.settled(index, ok)
+        self._outside.settled(index, ok)
+
+    def _camera_changed(self, change: StateChanged) -> None:
+        log.info("camera %s %s", change.state, change.reason)
+        self._changed()
+        if change.identity is not None and self._recording is not None:
+            who = change.identity
+            self._recording.add_facts(
+                {"camera": {"make": who.make, "model": who.model, "serial": who.serial, "port": who.port}}
+            )
+        self._outside.camera(change)
+
+    def _changed(self) -> None:
+        if self._component is not None:
+            self._component.state_changed()
+
+    # poses
+
+    def _log_packet(self, stamp_us: int, raw: bytes) -> int:
+        assert self._recording is not None
+        return self._recording.telemetry.append(stamp_us, raw)
+
+    def _packet(self, packet: Packet) -> None:
+        if packet.number is not None:
+            self._telemetry.feed(packet.number, packet.stamp_us, packet.message)
+        if self._component is not None:
+            self._component.on_packet(packet)
+
+    def _pose(self, index: int, utc_ns: int, sigma_ns: int) -> Pose:
+        """The pose once telemetry from after the exposure is there, or `pose.wait_ms` after it as it is then."""
+        give_up_ns = utc_ns + round(self.settings.pose.wait_ms * 1e6)
+        while not self._telemetry.bracketed(utc_ns) and self._clock.utc_ns() < give_up_ns:
+            self._stopping.wait(0.005) if not self._stopping.is_set() else self._clock.wait(threading.Event(), 0.005)
+        return self._telemetry.pose_at(utc_ns, sigma_ns)
+
+    # what the ground station hears
+
+    def _story_tagged(self, story: Story) -> None:
+        index = story.shot.index
+        if story.tag is not None and story.frame is not None:
+            captured = Captured(index, True, story.tag.utc_ns, story.tag.pose, story.frame.name)
+        else:
+            captured = Captured(index, False)
+        if self._component is not None:
+            self._component.announce(captured)
+        self._outside.tagged(story)
+
+    def _lookup(self, index: int) -> Captured | None:
+        assert self._recording is not None
+        entry = self._recording.index.lookup(index)
+        if entry is None:
+            return None
+        if entry.state not in ("safe", "failed"):
+            return None  # still on its way: its own message will come
+        root = Path(self.settings.record.directory)
+        with LedgerReader.open(layout.FlightFolder(root / entry.flight).ledger) as ledger:
+            tag = ledger.tag(index)
+        if tag is None:
+            return Captured(index, entry.state == "safe", url=entry.frame or "")
+        return Captured(index, entry.state == "safe", tag.utc_ns, tag.pose, entry.frame or "")
+
+    def _camera_facts(self) -> CameraFacts:
+        who = self._street.identity
+        major, minor, patch = (int(part) for part in dappled.__version__.split(".")[:3])
+        chip = _sensor(self.settings)
+        return CameraFacts(
+            vendor=who.make if who else "dappled",
+            model=who.model if who else "masked camera",
+            firmware=(major, minor, patch),
+            **chip,
+        )
+
+    def _storage(self) -> Storage | None:
+        try:
+            usage = shutil.disk_usage(self.folder)
+        except OSError:
+            return None
+        return Storage(usage.total, usage.used, usage.free)
+
+    # beginning and end
+
+    def _facts(self, names: Names, recipe: Recipe | None) -> Mapping[str, Any]:
+        return {
+            "software": {"dappled": dappled.__version__, **inputs.versions()},
+            "settings": configuration.to_tables(self.settings),
+            "names": asdict(names),
+            "decode_in_flight": recipe is not None,
+        }
+
+    def _start_header(self, names: Names) -> dict[str, Any]:
+        return {
+            "utc_ns": self._clock.utc_ns(),
+            "software": f"dappled {dappled.__version__}",
+            "camera": names.camera,
+            "mask": names.mask,
+            "slices": self.settings.publish.slices,
+            "ask": self.settings.publish.ask,
+        }
+
+    def _answer(self, request: Mapping[str, Any], reply: Reply) -> None:
+        self._answers.answer(request, reply)
+
+    def _say_end(self) -> None:
+        now = self._shutter.statistics()
+        counts = {"wished": now.shots, "safe": now.succeeded, "failed": now.failed, "open": now.pending}
+        sent = dict(self._publisher.statistics().sent)
+        self._publisher.publish("end", {"utc_ns": self._clock.utc_ns(), "shots": counts, "sent": sent})
+        self._publisher.stop()  # answers last questions: before the decoder goes
+
+    def _close_recording(self) -> None:
+        assert self._recording is not None
+        for text in self._recording.close():
+            log.warning("%s", text)
+
+
+def _warm_up(developer: WorkerDeveloper) -> None:
+    try:
+        developer.warm_up()
+    except DevelopmentError as error:
+        log.warning("decoding will fail: %s", error)
+
+
+def _sensor(settings: Settings) -> dict[str, Any]:
+    """Sensor size and pixels of the configured camera, for CAMERA_INFORMATION; nothing where that isn't known."""
+    if settings.camera.profile == "auto":
+        return {}
+    try:
+        chip = profiles.camera(settings.camera.profile).raw[0].sensor
+    except DappledError:
+        return {}
+    height_mm, width_mm = chip.size_mm
+    return {
+        "sensor_width_mm": width_mm,
+        "sensor_height_mm": height_mm,
+        "columns": chip.shape[1],
+        "rows": chip.shape[0],
+    }

@@ -1,0 +1,64 @@
+"""When a frame was exposed, and what is known of it: the tag."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dappled.flight.records import Frame, Pose, Tag
+
+LATENCY_SOURCE = "trigger call + body latency"
+
+
+@dataclass(frozen=True, slots=True)
+class BodyLatency:
+    """From the trigger call to the start of the exposure: mean and 1 σ, and where the figure comes from."""
+
+    mean_ms: float
+    sigma_ms: float
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """Mid-exposure in UTC with its 1 σ, and how that was had."""
+
+    utc_ns: int
+    sigma_ns: int
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What the file says of the exposure; None where it doesn't."""
+
+    focal_length_mm: float | None = None
+    f_number: float | None = None
+    exposure_s: float | None = None
+    iso: float | None = None
+    model: str = ""
+
+
+def mid_exposure(fired_utc_ns: int, latency: BodyLatency, exposure_s: float | None) -> Exposure:
+    """The trigger call's time plus the body's latency plus half the exposure (none, where it is not known)."""
+    half_ns = round((exposure_s or 0.0) / 2 * 1e9)
+    return Exposure(
+        fired_utc_ns + round(latency.mean_ms * 1e6) + half_ns, round(latency.sigma_ms * 1e6), latency.source
+    )
+
+
+def tag(frame: Frame, exposure: Exposure, settings: Settings, *, camera: str, mask: str, pose: Pose) -> Tag:
+    """All that is known of a frame, in one record."""
+    return Tag(
+        index=frame.index,
+        utc_ns=exposure.utc_ns,
+        utc_sigma_ns=exposure.sigma_ns,
+        time_source=exposure.source,
+        focal_length_mm=settings.focal_length_mm,
+        f_number=settings.f_number,
+        exposure_s=settings.exposure_s,
+        iso=settings.iso,
+        camera=camera,
+        mask=mask,
+        frame_sha256=frame.sha256,
+        pose=pose,
+    )
