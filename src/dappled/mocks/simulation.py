@@ -1,0 +1,128 @@
+"""Everything around the daemon, simulated: a masked camera in a PTP/IP body, an autopilot, a ground station.
+
+The daemon meets them over its real doors: libgphoto2 over TCP, MAVLink over UDP. What the mask's installation looks
+like is drawn from the seed and told to nobody; the calibration comes from a bench frame, as a user would make it.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import tomli_w
+
+from dappled.config import profiles
+from dappled.config.settings import Settings
+from dappled.decode.calibration import CalibrationFrame, calibrate
+from dappled.decode.plane import to_plane
+from dappled.drivers import rawfile
+from dappled.mocks.autopilot import Autopilot
+from dappled.mocks.body import Body, BodyOptions
+from dappled.mocks.ground import GroundStation
+from dappled.mocks.masked_camera import reference_camera
+
+CAMERA, MASK = "reference-36mm", "reference-5x5"
+LATENCY_MS, LATENCY_SIGMA_MS = 60.0, 15.0 / 3**0.5  # the body's is spread evenly over 60 ± 15 ms
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """What is simulated. `scale` is the sensor's side as a share of the reference camera's 2776 × 3688 px; `f_number`
+    0 opens the lens; `truth`, for tests, is a folder for what the simulation knows."""
+
+    seed: int = 1
+    scale: float = 0.5
+    f_number: float = 14.8
+    truth: Path | None = None
+
+
+class Simulation:
+    """The simulated surroundings of one daemon. Use as a context manager around it."""
+
+    def __init__(self, world: World, settings: Settings, folder: Path) -> None:
+        """`folder` takes the calibration file. Nothing runs yet."""
+        self.world = world
+        self.start_monotonic_ns = time.monotonic_ns()
+        self._stack = ExitStack()
+        self._autopilot_port, self._ground_port = free_port(), free_port()
+        self._settings, self._folder = settings, folder
+
+    def __enter__(self) -> Settings:
+        """Start camera body and autopilot; the settings that make a daemon use them."""
+        world = self.world
+        calibration = self._calibrate()
+        with ExitStack() as stack:
+            body = Body.start(
+                BodyOptions(
+                    seed=world.seed,
+                    scale=world.scale,
+                    f_number=world.f_number or None,
+                    start_monotonic_ns=self.start_monotonic_ns,
+                    truth=world.truth,
+                )
+            )
+            stack.callback(body.stop)
+            autopilot = Autopilot.start(
+                f"udpout:127.0.0.1:{self._autopilot_port}",
+                seed=world.seed,
+                start_monotonic_ns=self.start_monotonic_ns,
+            )
+            stack.callback(autopilot.stop)
+            self._stack = stack.pop_all()
+        given = self._settings
+        links = (f"udpin:127.0.0.1:{self._autopilot_port}", f"udpin:127.0.0.1:{self._ground_port}", *given.mavlink.url)
+        return replace(
+            given,
+            camera=replace(
+                given.camera,
+                driver="gphoto2",
+                port=body.port,
+                profile=CAMERA,
+                serial="",
+                delete_after_download=True,  # its card is in memory
+                latency_ms=LATENCY_MS,
+                latency_sigma_ms=LATENCY_SIGMA_MS,
+            ),
+            mask=replace(given.mask, profile=MASK),
+            mavlink=replace(given.mavlink, url=links),
+            decode=replace(given.decode, calibration=str(calibration), white="", dark=""),
+        )
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def ground_station(self, frames: int, interval_s: float = 0.0) -> GroundStation:
+        """A ground station that asks for so many frames, each after the last one ended."""
+        station = GroundStation.start(f"udpout:127.0.0.1:{self._ground_port}", frames, interval_s)
+        self._stack.callback(station.stop)
+        return station
+
+    def _calibrate(self) -> Path:
+        """What `dappled calibrate` makes of the simulated camera's stopped-down bench frame."""
+        camera = reference_camera(self.world.seed, scale=self.world.scale, scene="white")
+        raw = rawfile.read(camera.bench_frame().file, "bench frame")
+        profile = profiles.camera(CAMERA)
+        plane = to_plane(raw.mosaic, black=raw.black, white=raw.white, cfa=raw.cfa)
+        assert raw.focal_length_mm is not None
+        assert raw.f_number is not None
+        found = calibrate(
+            [CalibrationFrame(plane, raw.focal_length_mm, raw.f_number)],
+            sensor=profile.sensor((plane.shape[0], plane.shape[1])),
+            mask=profiles.mask(MASK).mask,
+            law=profile.law,
+            mask_distance_mm=profile.mask_distance_mm,
+        )
+        path = self._folder / "calibration.toml"
+        path.write_text(tomli_w.dumps(found.to_dict()), encoding="utf-8")
+        return path
+
+
+def free_port() -> int:
+    """A UDP port of loopback that nobody uses at the moment."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        port: int = one.getsockname()[1]
+        return port

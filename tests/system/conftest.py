@@ -1,0 +1,82 @@
+"""One flight, recorded as a user would record it: the daemon and a subscriber in processes of their own."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+FRAMES = 3
+
+
+@dataclass(frozen=True)
+class Flown:
+    """What a simulated run left behind."""
+
+    flight: Path
+    received: Path
+    out: str
+    err: str
+    watched: str
+
+
+def dappled(*arguments: str, cwd: Path | None = None, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
+    """The `dappled` command in a process of its own."""
+    command = [sys.executable, "-m", "dappled", *arguments]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+@pytest.fixture(scope="session")
+def sockets() -> Iterator[Path]:
+    """A folder with a short name, for ipc sockets."""
+    with tempfile.TemporaryDirectory(prefix="dpl-") as folder:
+        yield Path(folder)
+
+
+@pytest.fixture(scope="session")
+def flown(tmp_path_factory: pytest.TempPathFactory, sockets: Path) -> Flown:
+    """Three frames through the whole street, with `dappled watch` as the subscriber."""
+    folder = tmp_path_factory.mktemp("flown")
+    endpoint = f"ipc://{sockets}/flown"
+    (folder / "dappled.toml").write_text(f'[record]\ndirectory = "flights"\n[publish]\nslices = "{endpoint}"\n')
+    watch = subprocess.Popen(
+        [sys.executable, "-m", "dappled", "watch", endpoint, "--save", str(folder / "received"),
+         "--count", str(FRAMES), "--timeout", "60"],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        run = dappled(
+            "run", "--simulate", "--seed", "5", "--frames", str(FRAMES), "--config", "dappled.toml", cwd=folder
+        )
+        watched, _ = watch.communicate(timeout=60)
+    finally:
+        watch.kill()
+    assert run.returncode == 0, run.stderr
+    assert watch.returncode == 0, watched
+    (flight,) = (entry for entry in (folder / "flights").iterdir() if entry.is_dir())
+    return Flown(flight, folder / "received", run.stdout, run.stderr, watched)
+
+
+@pytest.fixture
+def copied(flown: Flown, tmp_path: Path) -> Path:
+    """The flight, to be spoilt."""
+    target = tmp_path / flown.flight.name
+    shutil.copytree(flown.flight, target)
+    return target
+
+
+def flip(path: Path, place: int) -> None:
+    """Turn one bit of a file."""
+    with path.open("r+b") as file:
+        file.seek(place)
+        byte = file.read(1)[0]
+        file.seek(place)
+        file.write(bytes([byte ^ 1]))
+        os.fsync(file.fileno())

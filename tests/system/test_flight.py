@@ -1,0 +1,164 @@
+"""The main job, end to end: real libgphoto2, real MAVLink over UDP, real ZeroMQ, in processes of their own."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import sqlite3
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import rawpy
+
+from dappled.daemon import wire
+from dappled.flight import check, summary
+from dappled.mocks.path import Path as FlightPath
+from tests.system.conftest import FRAMES, Flown, dappled, flip
+
+
+def test_every_wish_became_one_frame(flown: Flown) -> None:
+    balance = summary.report(flown.flight)
+    assert (balance.wishes, balance.safe, balance.failed, balance.open) == (FRAMES, FRAMES, 0, 0)
+    assert (balance.tagged, balance.decoded, balance.strays) == (FRAMES, FRAMES, 0)
+    assert balance.balanced
+    assert balance.closed
+    (source,) = balance.by_source
+    assert source.startswith("mavlink:")
+
+
+def test_every_byte_is_intact(flown: Flown) -> None:
+    report = check.check(flown.flight)
+    assert report.problems == ()
+    assert report.files == FRAMES
+    assert report.telemetry_packets > 100
+
+
+def test_a_line_was_printed_for_each_frame(flown: Flown) -> None:
+    lines = flown.out.splitlines()
+    assert len(lines) == FRAMES
+    for index, line in enumerate(lines):
+        assert line.startswith(f"{index:06d}  IMAGE_START_CAPTURE #")
+        for word in ("50 mm", "carriers", "roll", "MB", "decode"):
+            assert word in line
+
+
+def test_frames_are_raw_files_that_libraw_opens(flown: Flown) -> None:
+    for frame in sorted((flown.flight / "frames").glob("*.dng")):
+        with rawpy.imread(str(frame)) as raw:
+            assert raw.raw_image_visible.shape == (1388, 1844)
+
+
+def test_the_subscriber_has_what_the_ledger_says(flown: Flown) -> None:
+    results = {line.row.shot.index: line.result for line in summary.show(flown.flight).lines}
+    saved = sorted(flown.received.glob("*.json"))
+    assert len(saved) == FRAMES
+    for file in saved:
+        header = json.loads(file.read_text())
+        jsonschema.validate(header, wire.schema("slices"))
+        slices = np.load(file.with_suffix(".npy"))
+        result = results[header["frame"]]
+        assert result is not None
+        assert hashlib.sha256(slices.tobytes()).hexdigest() == result.slices_sha256 == header["slices_sha256"]
+        assert slices.shape[0] == 13
+        assert file.with_suffix(".png").stat().st_size > 1000
+    assert "0 lost" in flown.watched
+
+
+def test_tags_say_where_the_camera_truly_was(flown: Flown) -> None:
+    """Against the simulation's own path: the body's latency is known to ± 15 ms, the vehicle flies 3 m/s."""
+    path = FlightPath(5)
+    tags = [line.tag for line in summary.show(flown.flight).lines]
+    assert len(tags) == FRAMES
+    for tag in tags:
+        assert tag is not None
+        assert tag.pose.source == "interpolated"
+        assert tag.focal_length_mm == 50.0
+        assert tag.pose.latitude_rad is not None
+        assert tag.pose.longitude_rad is not None
+        assert tag.pose.altitude_msl_m is not None
+        # the path's time is not told to the daemon: the nearest point of the whole path must be within reach
+        north = (math.degrees(tag.pose.latitude_rad) - path.home_latitude_deg) * 111_319.49
+        east = (
+            (math.degrees(tag.pose.longitude_rad) - path.home_longitude_deg)
+            * 111_319.49
+            * math.cos(math.radians(path.home_latitude_deg))
+        )
+        assert math.hypot(north, east) == pytest.approx(path.radius_m, abs=0.1)
+        height = tag.pose.altitude_msl_m - path.home_altitude_msl_m
+        assert height == pytest.approx(path.height_m, abs=0.6)
+
+
+def test_replay_verifies(flown: Flown) -> None:
+    done = dappled("replay", str(flown.flight), "--verify")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert f"verified {FRAMES} frames: all hashes the same" in done.stdout
+
+
+def test_one_flipped_byte_of_a_raw_file_is_found(copied: Path) -> None:
+    flip(sorted((copied / "frames").glob("*.dng"))[1], 2_000_000)
+    done = dappled("replay", str(copied), "--verify")
+    assert done.returncode == 1
+    assert "000001.dng" in done.stderr
+
+
+@pytest.mark.parametrize("share", [0.02, 0.6, 0.98])
+def test_one_flipped_byte_of_the_telemetry_is_found(copied: Path, share: float) -> None:
+    telemetry = copied / "telemetry.tlog"
+    flip(telemetry, int(telemetry.stat().st_size * share))
+    done = dappled("replay", str(copied), "--verify")
+    assert done.returncode == 1
+    assert "telemetry" in done.stderr
+
+
+@pytest.mark.parametrize("table", ["poses", "tags", "results"])
+def test_a_missing_hash_is_found(copied: Path, table: str) -> None:
+    with sqlite3.connect(copied / "flight.sqlite") as ledger:
+        ledger.execute(f"DELETE FROM {table} WHERE idx = 2")  # noqa: S608  # a table's name from this test
+    ledger.close()
+    done = dappled("replay", str(copied), "--verify")
+    assert done.returncode == 1
+    assert "frame 2" in done.stderr
+
+
+def test_a_changed_slices_hash_is_found(copied: Path) -> None:
+    with sqlite3.connect(copied / "flight.sqlite") as ledger:
+        (record,) = ledger.execute("SELECT record FROM results WHERE idx = 0").fetchone()
+        changed = {**json.loads(record), "slices_sha256": "0" * 64}
+        ledger.execute(
+            "UPDATE results SET slices_sha256 = ?, record = ? WHERE idx = 0", ["0" * 64, json.dumps(changed)]
+        )
+    ledger.close()
+    done = dappled("replay", str(copied), "--verify")
+    assert done.returncode == 1
+    assert "frame 0: its slices came out different" in done.stderr
+
+
+def test_verify_needs_a_flight(tmp_path: Path) -> None:
+    done = dappled("replay", str(tmp_path), "--verify")
+    assert done.returncode == 1
+    assert "no recorded flight" in done.stderr
+
+
+def test_flight_verbs_read_it(flown: Flown) -> None:
+    for verb in ("show", "check", "report"):
+        done = dappled("flight", verb, str(flown.flight))
+        assert done.returncode == 0, done.stderr
+        as_json = dappled("flight", verb, str(flown.flight), "--json")
+        assert json.loads(as_json.stdout)
+    listed = dappled("flight", "list", str(flown.flight.parent))
+    assert flown.flight.name in listed.stdout
+
+
+def test_the_flight_decodes_again_on_the_ground(flown: Flown, tmp_path: Path) -> None:
+    frame = sorted((flown.flight / "frames").glob("*.dng"))[0]
+    calibration = flown.flight / "inputs" / "calibration.toml"
+    done = dappled("decode", str(frame), "--mask", "reference-5x5", "--calibration", str(calibration),
+                   "-o", str(tmp_path / "f.npz"))  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    with np.load(tmp_path / "f.npz") as field:
+        assert field["views"].shape[:2] == (5, 5)
+        assert field["slices"].dtype == np.complex64
+        assert np.isfinite(field["views"]).all()
