@@ -67,7 +67,7 @@ def test_the_simulated_camera_is_asked_in_its_own_time_and_its_truth_is_kept(
         def __init__(self, *seed: int, **options: object) -> None:
             asked.append((*seed, options))
 
-        def expose(self, trigger_t_s: float, shot_number: int) -> SimpleNamespace:
+        def expose(self, trigger_t_s: float, shot_number: int, *, f_number: float | None) -> SimpleNamespace:
             asked.append((trigger_t_s, shot_number))
             truth = SimpleNamespace(save=lambda path: path.write_bytes(b"truth"))
             return SimpleNamespace(

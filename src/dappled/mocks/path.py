@@ -42,8 +42,8 @@ class Path:
     home_latitude_deg: float = 41.6361
     home_longitude_deg: float = -91.5417
     home_altitude_msl_m: float = 203.0
-    height_m: float = 12.0
-    speed_m_s: float = 3.0
+    height_m: float = 20.0
+    speed_m_s: float = 4.0
     radius_m: float = 25.0
 
     def pose(self, t_s: float) -> TruePose:
