@@ -39,7 +39,8 @@ def fetch_uv() -> str:
     print("fetching uv into .tools/ …", file=sys.stderr)
     TOOLS.mkdir(exist_ok=True)
     if importlib.util.find_spec("pip"):
-        pip = [sys.executable, "-m", "pip", "install", "--quiet", "--target", str(TOOLS), "--upgrade", "uv"]
+        pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "install", "--target", str(TOOLS)]
+        pip += ["--root-user-action=ignore", "--upgrade", "uv"]
         if subprocess.run(pip, check=False).returncode == 0 and (found := find_uv()):
             return found
     fetch_release(os.environ.get("DAPPLED_UV_RELEASES", RELEASES))

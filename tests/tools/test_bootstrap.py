@@ -1,0 +1,79 @@
+"""Setting up on a machine whose Python has no pip: uv comes from its releases, checked, and stays in .tools/."""
+
+from __future__ import annotations
+
+import hashlib
+import http.server
+import importlib.util
+import io
+import platform
+import tarfile
+import threading
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+
+@pytest.fixture
+def bootstrap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    path = Path(__file__).parents[2] / "tools" / "bootstrap.py"
+    spec = importlib.util.spec_from_file_location("bootstrap", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(module, "TOOLS", tmp_path / "tools")
+    (tmp_path / "tools").mkdir()
+    return module
+
+
+@pytest.fixture
+def releases(tmp_path: Path) -> Iterator[tuple[str, Path]]:
+    """A server with one release of a program called uv, and its folder."""
+    folder = tmp_path / "releases"
+    folder.mkdir()
+    name = f"uv-{platform.machine()}-unknown-linux-gnu"
+    program = b"#!/bin/sh\necho uv\n"
+    with tarfile.open(folder / f"{name}.tar.gz", "w:gz") as tar:
+        member = tarfile.TarInfo(f"{name}/uv")
+        member.size = len(program)
+        tar.addfile(member, io.BytesIO(program))
+    digest = hashlib.sha256((folder / f"{name}.tar.gz").read_bytes()).hexdigest()
+    (folder / f"{name}.tar.gz.sha256").write_text(f"{digest}  {name}.tar.gz\n")
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *args: object) -> None:
+            """Nothing: tests are quiet."""
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}", folder
+        server.shutdown()
+
+
+def test_a_released_uv_is_put_into_tools(bootstrap: ModuleType, releases: tuple[str, Path]) -> None:
+    bootstrap.fetch_release(releases[0])
+    uv = bootstrap.TOOLS / "uv"
+    assert uv.read_bytes().startswith(b"#!/bin/sh")
+    assert uv.stat().st_mode & 0o111
+
+
+def test_a_changed_release_is_refused(bootstrap: ModuleType, releases: tuple[str, Path]) -> None:
+    (archive,) = releases[1].glob("*.tar.gz")
+    archive.write_bytes(archive.read_bytes() + b"x")
+    with pytest.raises(SystemExit, match="does not match its SHA-256"):
+        bootstrap.fetch_release(releases[0])
+    assert not (bootstrap.TOOLS / "uv").exists()
+
+
+def test_no_network_is_one_sentence(bootstrap: ModuleType) -> None:
+    with pytest.raises(SystemExit, match="connect to the network, or install uv"):
+        bootstrap.fetch_release("http://127.0.0.1:9")
+
+
+def test_what_the_environment_is_made_from_is_the_lock(bootstrap: ModuleType) -> None:
+    assert len(bootstrap.wish()) == 64
+    assert bootstrap.wish() == bootstrap.wish()
