@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import mmap
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -49,20 +49,35 @@ def make_folder(path: Path) -> None:
 
 def write_file(path: Path, data: bytes) -> None:
     """Put `data` under `path`, replacing what was there, whole or not at all. Raises OSError."""
-    _put(path, data)
+
+    def fill(fd: int) -> None:
+        view = memoryview(data)
+        while view:
+            view = view[os.write(fd, view) :]
+
+    _put(path, fill)
 
 
 def copy_in(source_fd: int, size: int, path: Path) -> str:
     """Put the first `size` bytes of a file or memfd under `path`, durably; return their SHA-256 (hex).
 
-    The hash is taken beside the write, in another thread. Raises OSError, and EOFError when the source is shorter;
-    what stands under `path` then, if anything, is whole.
+    The bytes go from file to file inside the kernel, and the hash is taken beside that in another thread. (Writing
+    from a map of a memfd costs more: a page fault for every 4 KiB.) Raises OSError, and EOFError when the source is
+    shorter; what stands under `path` then, if anything, is whole.
     """
-    data = _mapped(source_fd, size)
+
+    def fill(fd: int) -> None:
+        done = 0
+        while done < size:
+            sent = os.sendfile(fd, source_fd, done, size - done)
+            if sent == 0:
+                raise EOFError(f"only {done} of {size} bytes came")
+            done += sent
+
     with ThreadPoolExecutor(1, "dappled-hash") as beside:
-        hashed = beside.submit(hashlib.sha256, data)
-        _put(path, data)
-        return hashed.result().hexdigest()
+        sha256 = beside.submit(hash_descriptor, source_fd, size)
+        _put(path, fill)
+        return sha256.result()
 
 
 def hash_file(path: Path) -> str:
@@ -72,26 +87,25 @@ def hash_file(path: Path) -> str:
 
 
 def hash_descriptor(fd: int, size: int) -> str:
-    """SHA-256 (hex) of the first `size` bytes of a file or memfd. Raises OSError, EOFError."""
-    return hashlib.sha256(_mapped(fd, size)).hexdigest()
+    """SHA-256 (hex) of the first `size` bytes of a file or memfd, whose offset stays. Raises OSError, EOFError."""
+    sha256 = hashlib.sha256()
+    buffer = memoryview(bytearray(1 << 20))
+    done = 0
+    while done < size:
+        got = os.preadv(fd, [buffer[: size - done]], done)
+        if got == 0:
+            raise EOFError(f"only {done} of {size} bytes came")
+        sha256.update(buffer[:got])
+        done += got
+    return sha256.hexdigest()
 
 
-def _mapped(fd: int, size: int) -> mmap.mmap:
-    """Unmapped when nobody holds it any more: an error's traceback may hold a view of it for a while."""
-    there = os.fstat(fd).st_size
-    if there < size:
-        raise EOFError(f"only {there} of {size} bytes came")
-    return mmap.mmap(fd, size, prot=mmap.PROT_READ)
-
-
-def _put(path: Path, data: bytes | mmap.mmap) -> None:
+def _put(path: Path, fill: Callable[[int], None]) -> None:
     part = temporary(path)
     try:
         fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
         try:
-            view = memoryview(data)
-            while view:
-                view = view[os.write(fd, view) :]
+            fill(fd)
             os.fsync(fd)
         finally:
             os.close(fd)
