@@ -1,0 +1,105 @@
+"""The command line as a whole: help everywhere, one sentence for a failure, the exit codes of the contract."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import dappled.cli
+from dappled.cli import VERBS, main
+
+
+@pytest.mark.parametrize("verb", sorted(VERBS))
+def test_every_verb_has_help_with_an_example(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([verb, "--help"])
+    assert ended.value.code == 0
+    assert "example" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [[], ["fly"], ["run", "--frames", "many"], ["carriers"], ["trigger", "--what"]])
+def test_a_wrong_call_ends_with_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["config", "check", "nowhere.toml"], "nowhere.toml: no such file"),
+        (["flight", "show", "nowhere"], "nowhere is not a flight folder"),
+        (["replay", "nowhere"], "neither a flight nor a folder of frames"),
+        (["decode", "nowhere.dng", "--mask", "mask-2", "-o", "x.npz"], "nowhere.dng"),
+        (["decode", "nowhere.dng", "--mask", "mask-22", "-o", "x.npz"], "did you mean mask-2"),
+        (["carriers", "--mask", "mask-2", "--shape", "10", "10"], "--camera"),
+        (["carriers", "--mask", "mask-2", "--shape", "10", "10", "--camera", "fujifilm-s5200"], "--focal-length"),
+        (["trigger", "--count", "0"], "--count is 1 or more"),
+        (["watch", "fish://"], "not a ZeroMQ endpoint"),
+    ],
+)
+def test_a_failure_is_one_sentence_and_ends_with_1(
+    words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 1
+    err = capsys.readouterr().err
+    assert said in err
+    assert err.startswith(f"dappled {words[0]}: ")
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_an_unforeseen_error_has_no_traceback_without_debug(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(_: object) -> int:
+        raise RuntimeError("of its own kind")
+
+    monkeypatch.setattr("dappled.cli.config.run", broken)
+    assert main(["profiles"]) == 1
+    assert "unexpected RuntimeError: of its own kind" in capsys.readouterr().err
+    with pytest.raises(RuntimeError):
+        main(["--debug", "profiles"])
+
+
+def test_profiles_and_settings_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["profiles", "--json"]) == 0
+    profiles = json.loads(capsys.readouterr().out)
+    assert {"name": "mask-2-full", "carriers": 25}.items() <= next(
+        m for m in profiles["masks"] if m["name"] == "mask-2-full"
+    ).items()
+    assert main(["config", "show", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["camera"]["driver"] == "gphoto2"
+    assert main(["config", "show"]) == 0
+    assert "[mavlink]" in capsys.readouterr().out
+
+
+def test_config_check_says_good_or_why_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good = tmp_path / "good.toml"
+    good.write_text('[camera]\nprofile = "canon-eos-450d"\n[mask]\nprofile = "lenslet"\n')
+    assert main(["config", "check", str(good)]) == 0
+    assert "good" in capsys.readouterr().out
+    bad = tmp_path / "bad.toml"
+    bad.write_text('[camera]\nprofile = "canon"\n')
+    assert main(["config", "check", str(bad)]) == 1
+    assert "canon-eos-450d" in capsys.readouterr().err
+
+
+def test_predicted_carriers_are_the_thesis_table_14_s_neighbours(capsys: pytest.CaptureFixture[str]) -> None:
+    """Table 11 at 13 mm: 566 and 1132 bins across, 572 and 1144 down."""
+    words = ["carriers", "--shape", "2776", "3688", "--camera", "fujifilm-s5200", "--mask", "mask-2"]
+    assert main([*words, "--focal-length", "13", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    at = {(c["ky"], c["kx"]): (c["row"] - 1388, c["col"] - 1844) for c in found["carriers"]}
+    assert at[1, 1] == pytest.approx((572, 566), abs=1)
+    assert at[2, 2] == pytest.approx((1144, 1132), abs=1)
+    assert set(at) == {(0, 0), *((a * k, b * k) for k in (1, 2) for a in (-1, 1) for b in (-1, 1))}
+
+
+def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert dappled.__version__ in capsys.readouterr().out
