@@ -51,11 +51,13 @@ class CameraProfile:
 
 @dataclass(frozen=True, slots=True)
 class MaskProfile:
-    """A mask by name."""
+    """A mask by name. `period_px` and `film_px_per_mm` say how it was printed, None where only a frequency is known."""
 
     name: str
     description: str
     mask: Mask
+    period_px: float | None = None
+    film_px_per_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +116,10 @@ def mask(name: str) -> MaskProfile:
     """A mask profile by shipped name or TOML file."""
     tables, source = _read(name, "masks")
     table = build(_MaskTable, tables, source, "")
+    if table.frequency_per_mm is not None and (table.period_px is not None or table.film_px_per_mm is not None):
+        raise ConfigError(
+            f"{source.name} gives frequency_per_mm and period_px or film_px_per_mm: leave one of them out"
+        )
     if table.frequency_per_mm is not None:
         frequency = table.frequency_per_mm
     elif table.period_px is not None and table.film_px_per_mm is not None:
@@ -124,6 +130,8 @@ def mask(name: str) -> MaskProfile:
         _stem(name),
         table.description,
         Mask(frequency, table.p, table.pattern, table.harmonics),  # type: ignore[arg-type]  # the schema checked the choices
+        table.period_px if table.film_px_per_mm is not None else None,
+        table.film_px_per_mm if table.period_px is not None else None,
     )
 
 

@@ -1,0 +1,123 @@
+"""`dappled mask`: from altitude to film, and what the bench says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dappled.cli import main
+from tests.decode.thesis_tables import TABLE_11, TABLE_14_LENGTHS, TABLE_14_V
+
+
+def _json(words: list[str], capsys: pytest.CaptureFixture[str], code: int = 0) -> dict[str, object]:
+    assert main([*words, "--json"]) == code
+    told: dict[str, object] = json.loads(capsys.readouterr().out)
+    return told
+
+
+def test_table_11_and_14_by_command(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["mask", "table", "--camera", "fujifilm-s5200", "--mask"]
+    rows = _json([*words, "mask-2"], capsys)["rows"]
+    assert isinstance(rows, list)
+    for row, (length, printed) in zip(rows, TABLE_11.items(), strict=True):
+        assert row["focal_length_mm"] == length
+        found = [h[key] for key in ("horizontal_px", "vertical_px") for h in row["harmonics"]]
+        assert found == pytest.approx(printed[2:], abs=1)
+    lengths = ["--focal-length", *map(str, TABLE_14_LENGTHS)]
+    rows = _json([*words, "mask-4", *lengths], capsys)["rows"]
+    assert isinstance(rows, list)
+    assert [r["harmonics"][0]["vertical_px"] for r in rows] == pytest.approx(TABLE_14_V[5], abs=1)
+    assert main([*words, "mask-2"]) == 0
+    assert "2453*" in capsys.readouterr().out
+    assert main([*words, "mask-2", "--carriers", "--focal-length", "13", "--rotation", "1"]) == 0
+    assert "crossed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["m.png", "m.tif"])
+def test_make_writes_the_thesis_negative(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["mask", "make", "mask-2", "--size-mm", "2", "3", "-o", str(tmp_path / name)]
+    told = _json([*words, "--negative"], capsys)
+    assert told["period_px"] == [10, 10]
+    negative = np.asarray(Image.open(tmp_path / name)).astype(int)
+    _json(words, capsys)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / name)) + negative, 255)
+    assert negative.shape == (228, 341)
+    spectrum = np.abs(np.fft.fft2(255 - negative[:220, :340])) / 220 / 340 / 255
+    assert {(22, 34), (44, 68)} <= {(int(y), int(x)) for y, x in np.argwhere(spectrum > 0.02)}
+
+
+def test_make_warns_of_mask_4_and_compensates_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "curve.csv").write_text("level,density\n0,2\n64,1.6\n128,1.1\n192,0.5\n255,0.1\n")
+    out = str(tmp_path / "m.png")
+    words = ["mask", "make", "mask-4", "--size-mm", "2", "3", "-o", out, "--curve", str(tmp_path / "curve.csv")]
+    assert main([*words, "--drawable-only", "--bits", "16"]) == 0
+    err = capsys.readouterr().err
+    assert err.count("warning: harmonic") == 6
+    assert "left out" in err
+    assert main(["mask", "make", "--wedge", "11", "-o", out]) == 0
+    assert len(np.unique(np.asarray(Image.open(out)))) == 11
+
+
+def test_diffraction_judges_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bench = tmp_path / "bench.csv"
+    bench.write_text("x_mm,y_mm\n" + "".join(f"{a * k},{b * k}\n" for k in (3, 7) for a in (1, -1) for b in (1, -1)))
+    for mask, code, said in (
+        ("mask-1", 1, "printed at scale 0.5"),
+        ("mask-2", 0, "as designed: 8 spots within 0.54 mm of where they should be\n"),
+        ("mask-3", 0, "as designed: 8 spots within 0.54 mm of where they should be; 8 fainter"),
+        ("reference-5x5", 1, "not this mask"),
+    ):
+        assert main(["mask", "diffraction", "--mask", mask, "--measured", str(bench)]) == code
+        assert capsys.readouterr().out.startswith(said)
+    picture = tmp_path / "wall.png"
+    told = _json(["mask", "diffraction", "--mask", "mask-2", "--picture", str(picture)], capsys)
+    assert isinstance(told["impulses"], list)
+    assert len(told["impulses"]) == 9
+    wall = np.asarray(Image.open(picture))
+    assert wall[wall.shape[0] // 2, wall.shape[1] // 2] == 255
+    assert np.median(wall) == 0
+
+
+def test_design_from_altitude_to_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "layout.png"
+    camera = ["--altitude", "40", "--camera", "fujifilm-s5200"]
+    told = _json(["mask", "design", *camera, "--focal-length", "13", "--picture", str(picture)], capsys)
+    assert told["works"]
+    assert told["films"] == ["4k", "8k", "16k"]
+    assert np.asarray(Image.open(picture)).max() > 200
+    assert main(["mask", "design", "--altitude", "40", "--camera", "reference-36mm"]) == 1
+    assert "27.76 of at most 24 mm" in capsys.readouterr().out
+    best = _json(["mask", "design", *camera, "--mask", "mask-2"], capsys)
+    assert best["slices_mm"] == pytest.approx(13.4, abs=0.05)
+    assert main(["mask", "plan", *camera, "--focal-length", "13", "--speed", "8", "--mask", "mask-2"]) == 0
+    assert "frames a minute" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["make", "-o", "x.png"], "name a mask profile"),
+        (["make", "mask-2", "--film", "5k", "-o", "x.png"], "no film '5k'"),
+        (["make", "mask-2", "--film", "100x100", "-o", "x.png"], "needs --density"),
+        (["make", "mask-2", "--size-mm", "30", "30", "-o", "x.png"], "it has 24 mm"),
+        (["make", "--period", "nan", "-o", "x.png"], "period = nan"),
+        (["make", "mask-2", "-o", "x.jpg"], "written as .png or .tif"),
+        (["table", "--mask", "mask-2", "--camera", "fujifilm-s5200", "--focal-length", "0.013"], "millimetres"),
+        (["design", "--altitude", "40", "--camera", "fujifilm-s5200"], "--focal-length says"),
+        (["plan", "--altitude", "40", "--camera", "reference-36mm", "--speed", "-3"], "ground speed = -3"),
+        (["diffraction", "--mask", "mask-2", "--measured", "nowhere.csv"], "nowhere.csv can't be read"),
+    ],
+)
+def test_a_wrong_wish_is_one_sentence(
+    words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["mask", *words]) in (1, 2)
+    err = capsys.readouterr().err
+    assert said in err
+    assert len(err.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
