@@ -5,11 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scipy import ndimage
 
 from dappled.decode.errors import DecodeError, NoLattice
 from dappled.decode.lenslets import LensletDecoder
-from dappled.decode.plane import estimate_balance, to_plane
+from dappled.decode.plane import to_plane
 
 PITCH = 10.4
 SHAPE = (420, 500)
@@ -65,23 +64,3 @@ def test_letters_with_their_white_frame(shared_data: Path) -> None:
     assert field.views.shape[:2] == (15, 15)
     assert report.found > 50
     assert np.isfinite(field.views).all()
-
-
-def test_a_hexagonal_bayer_raw_against_its_truth(shared_data: Path) -> None:
-    folder = shared_data / "lenslet/lytro_like"
-    frame, white = (np.asarray(Image.open(folder / f"{name}.png")) for name in ("raw", "white"))
-    cfa = np.array([[2, 1], [1, 0]])
-    balance = tuple(estimate_balance(white, black=168, cfa=cfa))
-    planes = [to_plane(each, black=168, white=4095, cfa=cfa, balance=balance) for each in (frame, white)]
-    field = LensletDecoder.with_white(planes[1]).decode(planes[0])
-    truth = np.load(folder / "truth.npz")["views"][0] / 65535
-    n = field.views.shape[0]
-    rows, columns = np.meshgrid(
-        np.arange(field.views.shape[2]) * field.grid[0, 0] / 5,
-        np.arange(field.views.shape[3]) * field.grid[1, 1] / 5,
-        indexing="ij",
-    )
-    expected = ndimage.map_coordinates(truth, [rows, columns], order=3, mode="nearest")[15:-15, 15:-15]
-    found = field.views[n // 2, n // 2][15:-15, 15:-15]
-    found = found * (expected.mean() / found.mean())
-    assert -10 * np.log10(np.mean((found - expected) ** 2)) > 30

@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from dappled.decode.masks import Mask
-from dappled.decode.views import Aperture, angular_frequencies, combine, from_slices, kappa, transfer, unmixing
+from dappled.decode.views import (
+    Aperture,
+    angular_frequencies,
+    combine,
+    finest_detail,
+    from_slices,
+    kappa,
+    transfer,
+    unmixing,
+)
 
 ORDERS = Mask(15.5, 2).half_orders()
 
@@ -118,3 +127,11 @@ def test_combining_is_the_real_part_of_the_product() -> None:
     slices = (rng.normal(size=(4, 5, 6)) + 1j * rng.normal(size=(4, 5, 6))).astype(np.complex64)
     g = rng.normal(size=(3, 4)) + 1j * rng.normal(size=(3, 4))
     np.testing.assert_allclose(combine(g, slices), np.einsum("vk,khw->vhw", g, slices).real, atol=1e-5)
+
+
+def test_the_finest_detail_tells_white_noise_and_is_blind_to_slow_change() -> None:
+    rng = np.random.default_rng(5)
+    noise = rng.normal(0, 0.3, (200, 220)) + 1j * rng.normal(0, 0.4, (200, 220))
+    y, x = np.mgrid[0:200, 0:220] / 220
+    assert finest_detail(noise + 5 * y - 3j * x * y) == pytest.approx(0.25, rel=0.03)
+    assert finest_detail(np.ones((2, 9), dtype=complex)) == 0.0

@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 
 from dappled.drivers.darkroom import Recipe
 
 
+def whole(text: str) -> int:
+    """An argument that is a whole number from 1."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 1")
+    return number
+
+
+def seconds(text: str) -> float:
+    """An argument that is a time of 0 s or more."""
+    number = float(text)
+    if not (math.isfinite(number) and number >= 0):
+        raise argparse.ArgumentTypeError(f"{text} is not a time of 0 s or more")
+    return number
+
+
 def add_recipe(parser: argparse.ArgumentParser, *, mask_needed: bool = True) -> None:
-    """--camera, --mask, --law, --white, --dark, --calibration, --focal-length, --f-number."""
+    """--camera, --mask, --law, and what files and numbers go with a frame."""
     parser.add_argument(
         "--camera", default="auto", metavar="P", help="camera profile or TOML file (default: by the frame)"
     )
@@ -18,6 +35,9 @@ def add_recipe(parser: argparse.ArgumentParser, *, mask_needed: bool = True) -> 
     parser.add_argument("--calibration", default="", metavar="FILE", help="file written by dappled calibrate")
     parser.add_argument("--white", default="", metavar="FILE", help="white frame")
     parser.add_argument("--dark", default="", metavar="FILE", help="dark frame")
+    parser.add_argument("--cfa", default="", metavar="BGGR", help="colour pattern, row by row, where the file has none")
+    parser.add_argument("--black", type=float, metavar="N", help="black level, where the file doesn't say")
+    parser.add_argument("--white-level", type=float, metavar="N", help="level of a full pixel (a 12-bit PNG: 4095)")
     parser.add_argument("--focal-length", type=float, metavar="MM", help="where the file doesn't say")
     parser.add_argument("--f-number", type=float, metavar="N", help="where the file doesn't say")
 
@@ -32,6 +52,10 @@ def recipe(arguments: argparse.Namespace) -> Recipe:
         white=arguments.white,
         dark=arguments.dark,
         workers=2,
+        cfa=arguments.cfa,
+        black=arguments.black,
+        white_level=arguments.white_level,
+        colour=getattr(arguments, "colour", False),
     )
 
 

@@ -23,6 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     common.add_recipe(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT",
                         help="light field (.zarr, .npz, .h5); with several frames a folder")  # fmt: skip
+    parser.add_argument("--colour", action="store_true", help="views in red, green and blue (default: grey)")
     parser.add_argument("--overwrite", action="store_true", help="replace what stands there")
 
 

@@ -69,9 +69,9 @@ class Decoder(Protocol):
         """The light field of a plane float32 (H, W). Raises DecodeError."""
 
     def decode_reported(
-        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None
+        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None, views: bool = True
     ) -> tuple[LightField, DecodeReport]:
-        """`decode`, and which carriers it used."""
+        """`decode`, and which carriers it used; without `views` only the slices."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +82,7 @@ class MaskDecoder:
     are to be seen near the prediction, the frame's own lattice is used. `focal_sigma_mm` is what the focal length is
     known to (half of the EXIF rounding): it widens the search. `size` of the slices in bins of the padded transform;
     None: as large as the spacing allows. Views need a calibration, or a frame that shows its carriers; else only the
-    slices are there, and `views` has the shape (0, 0, h, w).
+    slices are there, and `views` has the shape (0, 0, h, w). `colours` says that the planes are colour mosaics.
     """
 
     sensor: Sensor
@@ -94,6 +94,7 @@ class MaskDecoder:
     aperture: Aperture | None = None
     focal_sigma_mm: float = 0.05
     workers: int = 1
+    colours: bool = False
 
     def __post_init__(self) -> None:
         """Raises DecodeError for an unknown law, or another camera's calibration."""
@@ -122,9 +123,9 @@ class MaskDecoder:
         return self.decode_reported(plane, focal_length_mm=focal_length_mm, f_number=f_number)[0]
 
     def decode_reported(
-        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None
+        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None, views: bool = True
     ) -> tuple[LightField, DecodeReport]:
-        """`decode`, and which carriers it used. Without an f-number only the slices are made."""
+        """`decode`, and which carriers it used. Without `views`, or an f-number, only the slices are made."""
         if focal_length_mm is None:
             raise DecodeError("the frame's focal length is unknown: give it with --focal-length")
         if not (focal_length_mm > 0 and (f_number is None or f_number > 0)):
@@ -141,9 +142,12 @@ class MaskDecoder:
         used = [c for c in lattice.carriers([(c.ky, c.kx) for c in predicted]) if c.on_sensor]
         slices = self.cut(spectrum, lattice, used)
         noise = spectrum.noise_rms()
-        views, offsets, views_from = self._views(
-            slices, lattice, carriers_from, focal_length_mm=focal_length_mm, f_number=f_number, noise_rms=noise
-        )
+        if views:
+            made, offsets, views_from = self._views(
+                slices, lattice, carriers_from, focal_length_mm=focal_length_mm, f_number=f_number, noise_rms=noise
+            )
+        else:
+            made, offsets, views_from = *no_views(slices), "none"
         report = DecodeReport(tuple(predicted), tuple(measured), tuple(used), carriers_from, views_from, noise)
         facts: dict[str, Any] = {
             "law": self.law,
@@ -152,7 +156,7 @@ class MaskDecoder:
             "mask_distance_mm": self._distance(focal_length_mm),
             "calibrated": self.calibration is not None,
         }
-        return light_field(slices, views, offsets, plane=plane, report=report, facts=facts), report
+        return light_field(slices, made, offsets, plane=plane, report=report, facts=facts), report
 
     def transform(self, plane: Plane, focal_length_mm: float) -> Spectrum:
         """The spectrum as far out as this focal length's slices and searches need it."""
@@ -218,7 +222,7 @@ class MaskDecoder:
         f_number: float | None,
         noise_rms: float,
     ) -> tuple[Views, NDArray[np.float64], ViewsFrom]:
-        none = np.zeros((0, 0, *slices.values.shape[1:]), dtype=np.float32), np.zeros((0, 0, 2))
+        none = no_views(slices)
         if f_number is None:
             return *none, "none"
         orders = [(c.ky, c.kx) for c in slices.carriers]
@@ -251,6 +255,7 @@ class MaskDecoder:
             rotation_rad=rotation,
             aperture=aperture,
             noise_variance=noise_rms**2 * slices.band,
+            colours=self.colours,
         )
         return views, offsets, views_from
 
@@ -303,6 +308,11 @@ def _own_transfer(
     origin, _ = origin_of([order for order, usable in zip(orders, used, strict=True) if usable], seen[used])
     turns = transfer(orders, np.ones(len(orders)), origin)
     return np.where(keep, (seen * np.conj(turns)).real, 0.0) * turns
+
+
+def no_views(slices: Slices) -> tuple[Views, NDArray[np.float64]]:
+    """The views (0, 0, h, w) and offsets (0, 0, 2) of slices alone."""
+    return np.zeros((0, 0, *slices.values.shape[1:]), dtype=np.float32), np.zeros((0, 0, 2))
 
 
 def light_field(

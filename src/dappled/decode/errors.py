@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dappled.errors import DappledError
 
-class DecodeError(ValueError):
+
+class DecodeError(DappledError, ValueError):
     """A frame can't be decoded as asked; one clear sentence: what, where, what to do."""
 
 

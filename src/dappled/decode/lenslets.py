@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.calibration import at_centre, at_corner, relative_transfer
 from dappled.decode.carriers import Carrier, Lattice
-from dappled.decode.decoder import DecodeReport, light_field
+from dappled.decode.decoder import DecodeReport, light_field, no_views
 from dappled.decode.errors import DecodeError
 from dappled.decode.lattice import FoundLattice, find_lattice
 from dappled.decode.lightfield import LightField
@@ -22,6 +22,7 @@ from dappled.decode.spectrum import Spectrum
 from dappled.decode.views import Aperture, Views, from_lenslet_slices
 
 _MOST_VIEWS = 15  # per axis
+MOSAIC_ROLLOFF = 0.3  # cycles/pixel: the chroma of a Bayer mosaic stands around 0.5, and what a pixel tells ends there
 _DARKEST = 0.05  # of the white frame's brightest view: what is less lit isn't divided up further
 
 
@@ -39,6 +40,7 @@ class LensletDecoder:
     """Decodes lenslet frames. With a white frame the lattice, its origin and the vignetting of the views are the
     white frame's; without one each frame's own lattice is found anew (half a second on ten megapixels).
 
+    `rolloff` in cycles/pixel (`MOSAIC_ROLLOFF` for colour mosaics) holds the noise and chroma of far carriers down.
     `views_per_axis` odd; None: as many as the seen orders carry, no more than the pixels under a lenslet, and 15.
     """
 
@@ -46,9 +48,12 @@ class LensletDecoder:
     white: White | None = None
     views_per_axis: int | None = None
     workers: int = 1
+    rolloff: float | None = None
 
     @classmethod
-    def with_white(cls, white_plane: Plane, *, views_per_axis: int | None = None, workers: int = 1) -> LensletDecoder:
+    def with_white(
+        cls, white_plane: Plane, *, views_per_axis: int | None = None, workers: int = 1, rolloff: float | None = None
+    ) -> LensletDecoder:
         """A decoder that knows a white frame (float32 (H, W)). Raises NoLattice where that shows no lenslets."""
         shape = (white_plane.shape[0], white_plane.shape[1])
         spectrum = Spectrum.of(white_plane, workers=workers)
@@ -56,9 +61,9 @@ class LensletDecoder:
         slices = _cut(spectrum, found, workers)
         origin = lenslet_origin(slices)
         count = views_per_axis or views_carried(found)
-        views = from_lenslet_slices(slices.values, slices.carriers, origin, offsets_px(found.lattice, count))
+        views = from_lenslet_slices(slices.values, slices.carriers, origin, offsets_px(found.lattice, count), rolloff)
         white = White(found, at_centre(origin, found.lattice, shape), views)
-        return cls(shape, white, count, workers)
+        return cls(shape, white, count, workers, rolloff)
 
     def decode(
         self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None
@@ -67,9 +72,12 @@ class LensletDecoder:
         return self.decode_reported(plane, focal_length_mm=focal_length_mm, f_number=f_number)[0]
 
     def decode_reported(
-        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None
+        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None, views: bool = True
     ) -> tuple[LightField, DecodeReport]:
-        """`decode`, and which carriers it used. Focal length and f-number only go into the attributes."""
+        """`decode`, and which carriers it used; without `views` only the slices.
+
+        Focal length and f-number only go into the attributes.
+        """
         if plane.shape != self.shape:
             raise DecodeError(f"the frame is {plane.shape} px, this decoder is made for {self.shape}")
         spectrum = Spectrum.of(plane, workers=self.workers)
@@ -80,16 +88,21 @@ class LensletDecoder:
         else:
             origin = lenslet_origin(slices)
         count = self.views_per_axis or views_carried(found)
-        views = from_lenslet_slices(slices.values, slices.carriers, origin, offsets_px(found.lattice, count))
-        if self.white is not None:
-            views = flattened(views, self.white.views)
+        if views:
+            at = offsets_px(found.lattice, count)
+            made = from_lenslet_slices(slices.values, slices.carriers, origin, at, self.rolloff)
+            if self.white is not None:
+                made = flattened(made, self.white.views)
+            offsets = Aperture(count).offsets()
+        else:
+            made, offsets = no_views(slices)
         seen = dict(zip(found.orders, found.measured, strict=True))
         report = DecodeReport(
             predicted=slices.carriers,
             measured=tuple(seen.get((c.ky, c.kx)) for c in slices.carriers),
             used=slices.carriers,
             carriers_from="calibrated" if self.white is not None else "found",
-            views_from="white" if self.white is not None else "frame",
+            views_from="none" if not views else "white" if self.white is not None else "frame",
             noise_rms=spectrum.noise_rms(),
         )
         facts: dict[str, Any] = {
@@ -99,7 +112,7 @@ class LensletDecoder:
             "lenslet_pitch_px": list(found.spacing_px),
             "lattice_rotation_rad": found.rotation_rad,
         }
-        return light_field(slices, views, Aperture(count).offsets(), plane=plane, report=report, facts=facts), report
+        return light_field(slices, made, offsets, plane=plane, report=report, facts=facts), report
 
 
 def views_carried(found: FoundLattice) -> int:

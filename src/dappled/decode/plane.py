@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from dappled.decode.errors import DecodeError
+from dappled.decode.threads import each, spans
 
 Plane = NDArray[np.float32]
 LARGEST_PIXELS = 120_000_000  # 480 MB of float32; a spectrum of it takes as much again
 _SMALLEST_SIDE = 16
+_ROWS = 96  # at a time: a run of them stays in the cache
 
 
 def to_plane(
@@ -22,8 +24,9 @@ def to_plane(
     black: float | Sequence[float],
     white: float,
     cfa: NDArray[Any] | None = None,
-    balance: Sequence[float] | None = None,
+    balance: Sequence[float] | NDArray[np.float64] | None = None,
     dark: NDArray[Any] | None = None,
+    workers: int = 1,
 ) -> Plane:
     """The mosaic as float32 (H, W), linear, 0 = black, 1.0 = sensor white.
 
@@ -44,27 +47,38 @@ def to_plane(
     _check_values(mosaic, white)
     scale = 1.0 / (white - levels)
     if balance is None:
-        gains = estimate_balance(mosaic, black=black, cfa=pattern)
+        gains = estimate_balance(mosaic, black=black, cfa=pattern, workers=workers)
     else:
         gains = np.asarray(balance, dtype=np.float64)
         if gains.shape != (colours,) or not np.all(np.isfinite(gains) & (gains > 0)):
             raise DecodeError(f"the white balance needs {colours} positive gains, one per colour, and is {balance}")
     plane = np.empty(mosaic.shape, dtype=np.float32)
-    for row in range(pattern.shape[0]):
+    period = pattern.shape[0]
+    factors, offsets = [], []
+    for row in range(period):
         along = _repeat(pattern[row], mosaic.shape[1])
-        factor = (gains * scale)[along].astype(np.float32)
-        if dark is None:
-            np.multiply(mosaic[row :: pattern.shape[0]], factor, out=plane[row :: pattern.shape[0]], casting="unsafe")
-            plane[row :: pattern.shape[0]] -= (levels[along] * factor).astype(np.float32)
-        else:
-            part = mosaic[row :: pattern.shape[0]].astype(np.float32) - dark[row :: pattern.shape[0]]
-            np.multiply(part, factor, out=plane[row :: pattern.shape[0]])
-    if float(np.quantile(plane[::7, ::7], 0.99)) < 1e-3:
+        factors.append((gains * scale)[along].astype(np.float32))
+        offsets.append((levels[along] * factors[-1]).astype(np.float32))
+
+    def develop(rows: slice) -> None:
+        for row in range(period):
+            lines = slice(rows.start + row, rows.stop, period)
+            if dark is None:
+                np.multiply(mosaic[lines], factors[row], out=plane[lines], casting="unsafe")
+                plane[lines] -= offsets[row]
+            else:
+                np.subtract(mosaic[lines], dark[lines], out=plane[lines], dtype=np.float32, casting="unsafe")
+                plane[lines] *= factors[row]
+
+    each(develop, spans(mosaic.shape[0], period * max(1, _ROWS // period)), workers)
+    if float(np.mean(plane[::7, ::7] > 1e-3)) < 0.01:
         raise DecodeError("the frame is black: nothing in it is above a thousandth of sensor white")
     return plane
 
 
-def estimate_balance(mosaic: NDArray[Any], *, black: float | Sequence[float], cfa: NDArray[Any]) -> NDArray[np.float64]:
+def estimate_balance(
+    mosaic: NDArray[Any], *, black: float | Sequence[float], cfa: NDArray[Any], workers: int = 1
+) -> NDArray[np.float64]:
     """Gains per colour index that give all colours the mean of the commonest one (1.0 for a colour without light).
 
     A mosaic of equal means has no impulse of its colour pattern left in the spectrum.
@@ -75,19 +89,33 @@ def estimate_balance(mosaic: NDArray[Any], *, black: float | Sequence[float], cf
     counts = np.bincount(pattern.ravel(), minlength=colours)
     if np.count_nonzero(counts) == 1:
         return np.ones(colours)
+    a, b = pattern.shape
+    along = np.zeros((a, mosaic.shape[1]))
+    whole = np.uint64 if mosaic.dtype.kind == "u" else np.float64
+
+    def add(row: int) -> None:
+        for lines in spans(mosaic.shape[0], a * _ROWS):  # 32 bits hold the sum of so few
+            part = mosaic[lines.start + row : lines.stop : a]
+            along[row] += part.sum(axis=0, dtype=np.uint32 if whole is np.uint64 else whole)
+
+    each(add, range(a), workers)
     sums = np.zeros(colours)
     for (row, column), colour in np.ndenumerate(pattern):
-        sums[colour] += mosaic[row :: pattern.shape[0], column :: pattern.shape[1]].mean() - levels[colour]
+        count = len(range(row, mosaic.shape[0], a)) * len(range(column, mosaic.shape[1], b))
+        sums[colour] += along[row, column::b].sum() / count - levels[colour]
     means = sums / np.maximum(counts, 1)
     reference = means[int(np.argmax(counts))]
     lit = means > 1e-3 * max(reference, 1e-12)
     return np.where(lit, reference / np.where(lit, means, 1.0), 1.0)
 
 
-def even_colours(plane: Plane, cfa: NDArray[Any], reference: Sequence[int], *, cell_px: int = 48) -> Plane:
+def even_colours(
+    plane: Plane, cfa: NDArray[Any], reference: Sequence[int], *, cell_px: int = 48, workers: int = 1
+) -> Plane:
     """The plane with every colour brought to the reference colours' local mean, changed in place.
 
-    `cfa` (a, b) colour indices as in `to_plane`, `reference` the indices of green. A colour cast that varies slowly
+    `cfa` (a, b) colour indices as in `to_plane`, `reference` the indices of green (of all colours
+    for their plain mean). A colour cast that varies slowly
     modulates the mosaic at the colour pattern's own frequencies, and the mask repeats it around all its carriers: into
     other carriers' bands. Local means are taken over `cell_px`, several periods of any mask or lenslet.
     """
@@ -99,31 +127,105 @@ def even_colours(plane: Plane, cfa: NDArray[Any], reference: Sequence[int], *, c
     places: dict[int, list[tuple[int, int]]] = {}
     for (row, column), colour in np.ndenumerate(pattern):
         places.setdefault(int(colour), []).append((row, column))
-    means = {c: np.mean([_block_means(plane[r::a, k::b], steps) for r, k in at], axis=0) for c, at in places.items()}
+    sums = _cell_means(plane, (a, b), steps, workers)
+    means = {c: np.mean([sums[place] for place in at], axis=0) for c, at in places.items()}
     known = [means[colour] for colour in reference if colour in means]
     if not known:
         return plane
     wanted = np.mean(known, axis=0)
     floor = 1e-3 * max(float(wanted.mean()), 1e-12)
-    for colour, at in places.items():
-        gain = np.where(means[colour] > floor, np.clip(wanted / np.maximum(means[colour], floor), 0.1, 10), 1.0)
-        for row, column in at:
-            part = plane[row::a, column::b]
-            down, along = (_between(part.shape[i], gain.shape[i], steps[i]) for i in (0, 1))
-            part *= down @ gain.astype(np.float32) @ along.T
+    # One gain image for each row of the pattern: every pixel's own colour, between the cells' middles.
+    lines: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
+    for row in range(a):
+        blocks = wanted.shape
+        along = np.zeros((blocks[0], plane.shape[1]), dtype=np.float32)
+        for column in range(b):
+            mean = means[int(pattern[row, column])]
+            gain = np.where(mean > floor, np.clip(wanted / np.maximum(mean, floor), 0.1, 10), 1.0).astype(np.float32)
+            width = len(range(column, plane.shape[1], b))
+            along[:, column::b] = gain @ _between(width, blocks[1], steps[1]).T
+        lines.append((_between(len(range(row, plane.shape[0], a)), blocks[0], steps[0]), along))
+
+    def even(rows: slice) -> None:
+        for row, (down, along) in enumerate(lines):
+            part = plane[rows.start + row : rows.stop : a]
+            weights = down[rows.start // a : rows.start // a + len(part)]
+            near = np.flatnonzero(weights.any(axis=0))  # the few cells that these rows lie between
+            part *= weights[:, near] @ along[near]
+
+    each(even, spans(plane.shape[0], a * max(1, _ROWS // a)), workers)
     return plane
 
 
-def _block_means(part: Plane, steps: tuple[int, int]) -> NDArray[np.float64]:
-    rows, columns = part.shape[0] // steps[0], part.shape[1] // steps[1]
-    whole = part[: rows * steps[0], : columns * steps[1]].reshape(rows, steps[0], columns, steps[1])
-    return np.asarray(whole.mean(axis=(1, 3), dtype=np.float64))
+def _cell_means(
+    plane: Plane, period: tuple[int, int], steps: tuple[int, int], workers: int
+) -> dict[tuple[int, int], NDArray[np.float64]]:
+    """The mean of each cell for each place (row, column) of the colour pattern; a cell is `steps` patterns."""
+    (a, b), (down, across) = period, steps
+    rows, columns = plane.shape[0] // (a * down), plane.shape[1] // (b * across)
+    width = columns * across * b
+    sums = np.empty((a, rows, width), dtype=np.float32)
+
+    def add(row: int) -> None:
+        for place in range(a):
+            first = row * down * a + place
+            plane[first : first + down * a : a, :width].sum(axis=0, out=sums[place, row])
+
+    each(add, range(rows), workers)
+    cells = sums.reshape(a, rows, columns, across, b).sum(axis=3, dtype=np.float64) / (down * across)
+    return {(row, column): cells[row, :, :, column] for row in range(a) for column in range(b)}
+
+
+def local_colours(
+    plane: Plane, cfa: NDArray[Any], colours: Sequence[int], reference: Sequence[int], *, cell_px: int = 12
+) -> NDArray[np.float32]:
+    """(len(colours), rows, columns): local means of colours, over the mean of the reference colours', 1 for grey.
+
+    The cells are `cell_px` on a side and stand for the whole frame: a lenslet, or half a mask period. Finer chroma is
+    not told apart from other carriers' bands.
+    """
+    pattern = np.asarray(cfa, dtype=np.intp)
+    a, b = pattern.shape
+    steps = min(plane.shape[0] // a, max(1, cell_px // a)), min(plane.shape[1] // b, max(1, cell_px // b))
+    cells = _cell_means(plane, (a, b), steps, 1)
+    smooth = {place: ndimage.uniform_filter(mean, 3, mode="nearest") for place, mean in cells.items()}
+    means = {
+        int(colour): np.mean([smooth[at] for at, c in np.ndenumerate(pattern) if c == colour], axis=0)
+        for colour in np.unique(pattern)
+    }
+    grey = np.mean([means[colour] for colour in reference], axis=0)
+    grey = np.maximum(grey, 1e-3 * max(float(grey.mean()), 1e-12))
+    return np.stack([np.clip(means[colour] / grey, 0, 10) for colour in colours]).astype(np.float32)
+
+
+def coloured(
+    views: NDArray[np.float32], grid: NDArray[np.float64], colours: NDArray[np.float32], shape: tuple[int, ...]
+) -> NDArray[np.float32]:
+    """Views (V, U, h, w, 3): each of (V, U, h, w) times the frame's `local_colours` (3, rows, columns).
+
+    `grid` as in `LightField`, `shape` the frame's. All views share the colours of their place; parallax is in the grey.
+    """
+    height, width = views.shape[2:]
+    down = between(np.arange(height) * grid[0, 0] / shape[0] * colours.shape[1], colours.shape[1])
+    along = between(np.arange(width) * grid[1, 1] / shape[1] * colours.shape[2], colours.shape[2])
+    places = np.ascontiguousarray(np.moveaxis(down @ colours @ along.T, 0, -1))
+    made = np.empty((*views.shape, len(colours)), dtype=np.float32)
+    np.multiply(views[..., None], places, out=made)
+    return made
 
 
 def _between(size: int, blocks: int, step: int) -> NDArray[np.float32]:
-    """(size, blocks): linear interpolation between the blocks' centres, constant beyond the outer ones."""
-    at = np.clip((np.arange(size) + 0.5) / step - 0.5, 0, blocks - 1)
-    return np.maximum(0, 1 - np.abs(at[:, None] - np.arange(blocks))).astype(np.float32)
+    return between((np.arange(size) + 0.5) / step, blocks)
+
+
+def between(places: NDArray[np.floating], blocks: int) -> NDArray[np.float32]:
+    """(n, blocks): linear interpolation at n places, counted in blocks from the first one's edge.
+
+    Between the blocks' middles; constant beyond the outer ones.
+    """
+    at = np.clip(places - 0.5, 0, blocks - 1)
+    weights: NDArray[np.float32] = np.maximum(0, 1 - np.abs(at[:, None] - np.arange(blocks))).astype(np.float32)
+    return weights
 
 
 def white_gain(white_plane: Plane, cell_px: float) -> Plane:

@@ -15,6 +15,7 @@ from scipy import fft
 from dappled.decode.carriers import Carrier, Lattice
 from dappled.decode.errors import DecodeError
 from dappled.decode.spectrum import Complex, Spectrum
+from dappled.decode.threads import each
 
 Window = Literal["box", "cell"]
 
@@ -88,34 +89,34 @@ def extract(
     if not (2 <= height <= spectrum.padded[0] and 2 <= width <= spectrum.padded[1]):
         raise DecodeError(f"a slice of {height}×{width} bins doesn't fit a spectrum of {spectrum.padded}")
     scale = np.float32(1 / (spectrum.padded[0] * spectrum.padded[1]))
-    bands = np.empty((len(carriers), height, width), dtype=np.complex64)
     share = height * width / (spectrum.padded[0] * spectrum.padded[1])
     cell = None
     if window == "cell" and lattice is not None:
         cell = _cell_weights(lattice, spectrum.padded, size)
         share *= float(np.mean(cell**2))
-    fractions = np.empty((len(carriers), 2))
-    top_left = (height // 2, width // 2)
-    buffer = np.empty((height, width), dtype=np.complex64)
-    for band, carrier, fraction in zip(bands, carriers, fractions, strict=True):
-        row, column = spectrum.bins(carrier.fy, carrier.fx)
-        whole = round(row), round(column)
-        fraction[:] = row - whole[0], column - whole[1]
-        spectrum.block_into(buffer, whole[0] - top_left[0], whole[1] - top_left[1], wrap=wrap)
-        if cell is not None:
-            buffer *= cell
-        _unshift(band, buffer, scale)
-    images = fft.ifft2(bands, axes=(1, 2), norm="forward", overwrite_x=True, workers=workers)
     rows = _samples(spectrum.shape[0], spectrum.padded[0], height)
     columns = _samples(spectrum.shape[1], spectrum.padded[1], width)
     values = np.empty((len(carriers), rows, columns), dtype=np.complex64)
-    for k, (image, (dy, dx), carrier) in enumerate(zip(images, fractions, carriers, strict=True)):
-        turn_y = np.exp(-2j * np.pi * dy * np.arange(rows) / height).astype(np.complex64)
-        turn_x = np.exp(-2j * np.pi * dx * np.arange(columns) / width).astype(np.complex64)
+
+    def cut(k: int) -> None:
+        carrier = carriers[k]
+        row, column = spectrum.bins(carrier.fy, carrier.fx)
+        whole = round(row), round(column)
+        block = np.empty((height, width), dtype=np.complex64)
+        spectrum.block_into(block, whole[0] - height // 2, whole[1] - width // 2, wrap=wrap)
+        if cell is not None:
+            block *= cell
+        band = np.empty((height, width), dtype=np.complex64)
+        _unshift(band, block, scale)
+        image = fft.ifft2(band, norm="forward", overwrite_x=True)
+        turn_y = np.exp(-2j * np.pi * (row - whole[0]) * np.arange(rows) / height).astype(np.complex64)
+        turn_x = np.exp(-2j * np.pi * (column - whole[1]) * np.arange(columns) / width).astype(np.complex64)
         np.multiply(image[:rows, :columns], turn_y[:, None], out=values[k])
         values[k] *= turn_x
         if carrier.ky == 0 and carrier.kx == 0:
             values[k] += np.float32(spectrum.mean)
+
+    each(cut, range(len(carriers)), workers)
     grid = np.array([[spectrum.padded[0] / height, 0.0, 0.0], [0.0, spectrum.padded[1] / width, 0.0]])
     return Slices(values, tuple(carriers), grid, share)
 

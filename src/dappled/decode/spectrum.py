@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from dappled.decode.errors import DecodeError
+from dappled.decode.threads import each, spans
 
 Complex = NDArray[np.complex64]
+_ROWS = 96  # transformed at a time: fixed, so that the same rows share a run for any number of workers
+_TILE = 34  # bins on a side, one of its edge for the window
 
 
 def padded_shape(shape: tuple[int, int]) -> tuple[int, int]:
@@ -39,9 +42,22 @@ class Spectrum:
             raise DecodeError(f"a plane has two axes, this array has {plane.ndim}")
         padded = padded_shape((plane.shape[0], plane.shape[1]))
         columns = min(padded[1] // 2 + 1, int(np.ceil(largest_fx * padded[1])) + 2)
-        mean = float(plane.mean(dtype=np.float64))
-        along = fft.rfft(plane - np.float32(mean), n=padded[1], axis=1, workers=workers)
-        half = fft.fft(along[:, :columns], n=padded[0], axis=0, workers=workers)
+        runs = spans(plane.shape[0], _ROWS)
+        sums = np.empty(len(runs))
+
+        def add(run: int) -> None:
+            sums[run] = plane[runs[run]].sum(axis=1, dtype=np.float32).sum(dtype=np.float64)
+
+        each(add, range(len(runs)), workers)
+        mean = float(sums.sum() / plane.size)
+        half = np.empty((padded[0], columns), dtype=np.complex64)
+        half[plane.shape[0] :] = 0
+
+        def along(rows: slice) -> None:
+            half[rows] = fft.rfft(plane[rows] - np.float32(mean), n=padded[1], axis=1)[:, :columns]
+
+        each(along, runs, workers)
+        half = fft.fft(half, axis=0, overwrite_x=True, workers=workers)
         return cls(half, (plane.shape[0], plane.shape[1]), padded, mean)
 
     def bins(self, fy: float, fx: float) -> tuple[float, float]:
@@ -106,7 +122,7 @@ class Spectrum:
         tiles = []
         for rows in np.array_split(np.arange(self.half.shape[0]), 16):
             for columns in np.array_split(np.arange(self.half.shape[1]), 8):
-                part = hann(self.half[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1][:66, :66])
+                part = hann(self.half[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1][:_TILE, :_TILE])
                 if part.size:
                     tiles.append(float(np.median(part.real**2 + part.imag**2)))
         power = float(np.quantile(tiles, 0.1)) / math.log(2)  # the median of an exponential is ln 2 of its mean

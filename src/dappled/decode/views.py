@@ -32,6 +32,7 @@ from dappled.decode.masks import Order
 Views = NDArray[np.float32]
 _SHARED = 1e3  # variance of what all views share, over that of what one view has alone
 _MODEL_ERROR = 0.06  # share of the common image in a coefficient: transfer, aperture, ringing at the frame's end
+_COLOURED = 4.0  # residue in a whole band over what its finest detail says: chroma is stronger in coarse detail
 _SMALLEST_NOISE = 1e-9  # relative variance of a coefficient: float32 and its transforms
 
 
@@ -154,6 +155,16 @@ def view_variance(
     return max(min(total / share if share else 0.0, ceiling), floor, 1e-12)
 
 
+def finest_detail(image: NDArray[np.complexfloating]) -> float:
+    """The variance of white noise that would explain what a complex image (h, w) holds against the mask
+    [1 −2 1]ᵀ[1 −2 1] (Immerkær 1996): blind to planes and slow changes. 0 for images under 3 × 3."""
+    if min(image.shape) < 3:
+        return 0.0
+    rows = image[:-2] - 2 * image[1:-1] + image[2:]
+    both = rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:]
+    return float(np.mean(both.real**2 + both.imag**2)) / 36
+
+
 def combine(coefficients: NDArray[np.complex128], slices: NDArray[np.complex64]) -> Views:
     """Re(G @ slices) as float32 (rows of G, h, w)."""
     count, height, width = slices.shape
@@ -175,17 +186,23 @@ def from_slices(
     aperture: Aperture,
     noise_variance: float,
     model_error: float = _MODEL_ERROR,
+    colours: bool = False,
 ) -> tuple[Views, NDArray[np.float64]]:
     """(views float32 (V, U, h, w), view_offsets float64 (V, U, 2)) of a masked frame.
 
     `slices` complex64 (K, h, w) with DC first and no carrier together with its conjugate; `transfers` (K,) their T_k
     (T_0 = 1); `noise_variance` of a slice pixel; `model_error` the relative error of what all views share, in a
-    coefficient. The offsets are shares of the frame's own aperture.
+    coefficient. With `colours` the frame was a colour mosaic: what chroma a band holds is measured in its finest detail
+    and counts as noise, and where orders tell nothing views fall back to the image that they share; detail that is
+    parallax is lost with it. The offsets are shares of the frame's own aperture.
     """
     angular = angular_frequencies(orders, kappa_cycles, rotation_rad)
     # What all views share comes through a carrier with the aperture's transform of it, and its error with that.
     shared = np.abs(transfers * aperture.transform(angular)) ** 2 * float(np.mean(slices[0].real ** 2))
     noise = noise_variance + model_error**2 * shared * np.any(angular != 0, axis=1)
+    if colours:
+        common = transfers * aperture.transform(angular)
+        noise[1:] += [_COLOURED * finest_detail(s - c * slices[0]) for s, c in zip(slices[1:], common[1:], strict=True)]
     alone = view_variance(slices, angular, transfers, aperture, noise)
     coefficients = unmixing(angular, transfers, aperture, noise_variance=noise, view_variance=alone)
     n = aperture.views
@@ -202,15 +219,19 @@ def from_lenslet_slices(
     carriers: Sequence[Carrier],
     origin: tuple[float, float],
     offsets_px: NDArray[np.float64],
+    rolloff: float | None = None,
 ) -> Views:
     """Views float32 (V, U, h, w) of a lenslet frame at pixel offsets (V, U, 2) from the lenslets' centres.
 
-    view(δ) = Σ_k slice_k e^{−2πi k·x0} e^{2πi f_k·δ} over all carriers, conjugates included.
+    view(δ) = Σ_k w_k slice_k e^{−2πi k·x0} e^{2πi f_k·δ} over all carriers, conjugates included. `rolloff` in
+    cycles/pixel is where w falls off, w = 1/(1 + (|f|/rolloff)⁶); None: w = 1.
     """
     orders = [(c.ky, c.kx) for c in carriers]
     turns = transfer(orders, np.ones(len(orders)), origin)
     frequencies = np.array([(c.fy, c.fx) for c in carriers])
     kernel = np.exp(2j * np.pi * offsets_px.reshape(-1, 2) @ frequencies.T) * np.conj(turns)
+    if rolloff is not None:
+        kernel /= 1 + (np.hypot(frequencies[:, 0], frequencies[:, 1]) / rolloff) ** 6
     twice = np.array([1.0 if order == (0, 0) else 2.0 for order in orders])  # a carrier and its conjugate
     n_v, n_u = offsets_px.shape[:2]
     return combine(kernel * twice, slices).reshape(n_v, n_u, *slices.shape[1:])

@@ -20,7 +20,7 @@ from dappled.decode import plane as planes
 from dappled.decode.calibration import Calibration
 from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
 from dappled.decode.errors import DecodeError
-from dappled.decode.lenslets import LensletDecoder
+from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
 from dappled.decode.plane import Plane
 from dappled.drivers import rawfile
@@ -38,6 +38,8 @@ class Recipe:
 
     `camera` a profile, a TOML file or "auto" (by the frame's model); `mask` a profile, a TOML file or "lenslet";
     `law` "" takes the camera's; the files are "" where there are none.
+    `cfa` (as "BGGR", row by row), `black` and `white_level` are for files that don't say so themselves. `colour` asks
+    for views in red, green and blue.
     """
 
     camera: str
@@ -47,6 +49,10 @@ class Recipe:
     white: str = ""
     dark: str = ""
     workers: int = 1
+    cfa: str = ""
+    black: float | None = None
+    white_level: float | None = None
+    colour: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,13 +66,13 @@ class Development:
 
     @property
     def carriers_found(self) -> int:
-        """Carriers seen in the whole plane: those of the half plane, their conjugates, and the mean."""
-        return 2 * self.report.found - 1
+        """Carriers seen in the whole plane, the mean left out: those of the half plane and their conjugates."""
+        return 2 * (self.report.found - 1)
 
     @property
     def carriers_predicted(self) -> int:
         """Carriers predicted on the sensor, counted likewise."""
-        return 2 * len(self.report.predicted) - 1
+        return 2 * (len(self.report.predicted) - 1)
 
 
 class Darkroom:
@@ -74,9 +80,10 @@ class Darkroom:
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
-        self._decoders: dict[tuple[tuple[int, int], str], Decoder] = {}
+        self._decoders: dict[tuple[tuple[int, int], str, bool], Decoder] = {}
         self._dark: NDArray[Any] | None = None
         self._gains: dict[tuple[int, int], Plane] = {}
+        self._balance: NDArray[np.float64] | None = None
 
     def check(self) -> None:
         """Raises DappledError when the recipe names something that isn't there or isn't right."""
@@ -104,36 +111,76 @@ class Darkroom:
         """
         ms: dict[str, float] = {}
         with _timed(ms, "read"):
-            raw = rawfile.read(Path(path))
+            raw = self.read(path)
         with _named(path):
             with _timed(ms, "plane"):
-                plane = self.plane(raw)
-            decoder = self.decoder(plane.shape, raw.camera_model or "")
+                plane, chroma = self._plane(raw, colour=self.recipe.colour and views)
+            decoder = self.decoder(plane.shape, raw.camera_model or "", colours=raw.cfa is not None)
             focal_length_mm = focal_length_mm or raw.focal_length_mm
             f_number = f_number or raw.f_number
             with _timed(ms, "slices and views" if views else "slices"):
                 light_field, report = decoder.decode_reported(
-                    plane, focal_length_mm=focal_length_mm, f_number=f_number if views else None
+                    plane, focal_length_mm=focal_length_mm, f_number=f_number, views=views
                 )
+                if chroma is not None:
+                    light_field = replace(
+                        light_field, views=planes.coloured(light_field.views, light_field.grid, chroma, plane.shape)
+                    )
         attributes = {**light_field.attributes, "camera": self.camera_name(raw.camera_model), "mask": self.recipe.mask}
         return Development(replace(light_field, attributes=attributes), report, raw, ms)
 
     def plane(self, raw: RawFile) -> Plane:
         """The linear plane of a frame: black, white, dark frame; for masks also colours evened out, and white frame."""
-        cfa, black = _one_index_a_colour(raw)
-        made = planes.to_plane(raw.mosaic, black=black, white=raw.white, cfa=cfa, dark=self._dark_frame())
-        if cfa is not None and self.recipe.mask != profiles.LENSLET:
-            planes.even_colours(made, cfa, [raw.colour_names.index("G")] if "G" in raw.colour_names else [0])
-        if self.recipe.white and self.recipe.mask != profiles.LENSLET:
-            made = planes.divide(made, self._gain((made.shape[0], made.shape[1])))
-        return made
+        return self._plane(raw, colour=False)[0]
 
-    def decoder(self, shape: tuple[int, ...], model: str) -> Decoder:
-        """The decoder for frames of this shape from this camera."""
-        size = (shape[0], shape[1])
-        if (size, model) not in self._decoders:
-            self._decoders[size, model] = self._make(size, model)
-        return self._decoders[size, model]
+    def read(self, path: Path | str) -> RawFile:
+        """A frame's file, with what the recipe says about it. Raises DappledError."""
+        return said(rawfile.read(Path(path)), self.recipe)
+
+    def _plane(self, raw: RawFile, *, colour: bool) -> tuple[Plane, NDArray[np.float32] | None]:
+        """The plane, and local colours (3, rows, columns) as shares of it where they are asked for."""
+        raw = said(raw, self.recipe)
+        lenslets = self.recipe.mask == profiles.LENSLET
+        workers = self.recipe.workers
+        cfa, black = _one_index_a_colour(raw)
+        made = planes.to_plane(
+            raw.mosaic,
+            black=black,
+            white=raw.white,
+            cfa=cfa,
+            balance=None if cfa is None or not lenslets else self._white_balance(),
+            dark=self._dark_frame(),
+            workers=workers,
+        )
+        chroma = None
+        if cfa is not None:
+            names = raw.colour_names
+            # Behind lenslets the grey view is the mean of the colours; a masked frame has most of its detail in green.
+            reference = [names.index("G")] if "G" in names and not lenslets else sorted({int(c) for c in cfa.flat})
+            if colour and all(name in names for name in "RGB"):
+                chroma = planes.local_colours(made, cfa, [names.index(name) for name in "RGB"], reference)
+            planes.even_colours(made, cfa, reference, workers=workers)
+        elif colour:
+            raise DecodeError("the frame has no colour pattern: decode it without --colour, or name it with --cfa")
+        if self.recipe.white and not lenslets:
+            made = planes.divide(made, self._gain((made.shape[0], made.shape[1])))
+        return made, chroma
+
+    def _white_balance(self) -> NDArray[np.float64] | None:
+        """The gains that make the white frame grey; None without one."""
+        if self.recipe.white and self._balance is None:
+            raw = self.read(self.recipe.white)
+            cfa, black = _one_index_a_colour(raw)
+            if cfa is not None:
+                self._balance = planes.estimate_balance(raw.mosaic, black=black, cfa=cfa)
+        return self._balance
+
+    def decoder(self, shape: tuple[int, ...], model: str, *, colours: bool = False) -> Decoder:
+        """The decoder for frames of this shape from this camera; `colours` where they are colour mosaics."""
+        key = (shape[0], shape[1]), model, colours
+        if key not in self._decoders:
+            self._decoders[key] = self._make(*key)
+        return self._decoders[key]
 
     def mask_decoder(self, shape: tuple[int, int], model: str) -> MaskDecoder:
         """The decoder of a camera with a printed mask. Raises DarkroomError for lenslets."""
@@ -160,14 +207,15 @@ class Darkroom:
         """The profile's name, or the model, or "unknown": what tags and headers call the camera."""
         return camera_name(self.recipe.camera, model)
 
-    def _make(self, shape: tuple[int, int], model: str) -> Decoder:
+    def _make(self, shape: tuple[int, int], model: str, colours: bool) -> Decoder:
         recipe = self.recipe
         if recipe.mask == profiles.LENSLET:
+            rolloff = MOSAIC_ROLLOFF if colours else None
             if not recipe.white:
-                return LensletDecoder(shape, workers=recipe.workers)
-            white = rawfile.read(Path(recipe.white))
+                return LensletDecoder(shape, workers=recipe.workers, rolloff=rolloff)
+            white = self.read(recipe.white)
             with _named(recipe.white):
-                return LensletDecoder.with_white(self.plane(white), workers=recipe.workers)
+                return LensletDecoder.with_white(self.plane(white), workers=recipe.workers, rolloff=rolloff)
         camera = self.camera(model)
         return MaskDecoder(
             camera.sensor(shape),
@@ -176,6 +224,7 @@ class Darkroom:
             camera.mask_distance_mm,
             calibration=self._calibration() if recipe.calibration else None,
             workers=recipe.workers,
+            colours=colours,
         )
 
     def _calibration(self) -> Calibration:
@@ -185,12 +234,12 @@ class Darkroom:
 
     def _dark_frame(self) -> NDArray[Any] | None:
         if self.recipe.dark and self._dark is None:
-            self._dark = rawfile.read(Path(self.recipe.dark)).mosaic
+            self._dark = self.read(self.recipe.dark).mosaic
         return self._dark
 
     def _gain(self, shape: tuple[int, int]) -> Plane:
         if shape not in self._gains:
-            raw = rawfile.read(Path(self.recipe.white))
+            raw = self.read(self.recipe.white)
             with _named(self.recipe.white):
                 cfa, black = _one_index_a_colour(raw)
                 white = planes.to_plane(raw.mosaic, black=black, white=raw.white, cfa=cfa)
@@ -210,6 +259,28 @@ def _one_index_a_colour(raw: RawFile) -> tuple[NDArray[np.int64] | None, float |
     if any(levels[index] != levels[one] for index, one in enumerate(first)):
         return raw.cfa, raw.black
     return np.array(first, dtype=np.int64)[raw.cfa], raw.black
+
+
+def said(raw: RawFile, recipe: Recipe) -> RawFile:
+    """What a file says, with what the recipe says instead. Raises DarkroomError for a pattern that is none."""
+    changed: dict[str, Any] = {}
+    if recipe.cfa:
+        side = math.isqrt(len(recipe.cfa))
+        pattern = recipe.cfa.upper()
+        if side < 2 or side * side != len(pattern) or set(pattern) != set("RGB"):
+            raise DarkroomError(
+                f"--cfa {recipe.cfa} is no colour pattern: name its letters R, G, B row by row, as in BGGR"
+            )
+        changed["cfa"] = np.array(["RGB".index(letter) for letter in pattern], dtype=np.int64).reshape(side, side)
+        changed["colour_names"] = ("R", "G", "B")
+        changed["balance"] = None
+        if isinstance(raw.black, tuple):
+            changed["black"] = max(raw.black)
+    if recipe.black is not None:
+        changed["black"] = recipe.black
+    if recipe.white_level is not None:
+        changed["white"] = recipe.white_level
+    return replace(raw, **changed) if changed else raw
 
 
 def camera_name(camera: str, model: str | None) -> str:
