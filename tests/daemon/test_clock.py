@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 import time
 
+import pytest
+
 from dappled.daemon.clock import RecordedClock, SystemClock
 
 
@@ -36,3 +38,13 @@ def test_waits_end_with_the_recorded_time_the_event_or_the_record() -> None:
     assert clock.wait(event, 1e6)
     clock.close()
     assert not clock.wait(threading.Event(), 1e6)
+
+
+@pytest.mark.parametrize("step_s", [3600, -3600])
+def test_a_step_of_the_systems_clock_reaches_no_stamp(monkeypatch: pytest.MonkeyPatch, step_s: int) -> None:
+    clock = SystemClock()
+    before_ns = clock.utc_ns()
+    truly = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: truly() + step_s * 10**9)
+    assert 0 <= clock.utc_ns() - before_ns < 60 * 10**9
+    assert abs(SystemClock().utc_ns() - before_ns) > 3500 * 10**9  # the next flight goes by the new time

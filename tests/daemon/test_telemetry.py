@@ -134,6 +134,20 @@ def test_an_instant_after_the_last_sample_is_nearest_and_far_away_none() -> None
     assert (far.source, far.latitude_rad, far.attitude, far.age_ms) == ("none", None, None, None)
 
 
+def test_a_gap_in_the_telemetry_at_the_exposure_is_marked_and_counted() -> None:
+    """4 s without a packet around the exposure: nothing is bridged, the nearest sample stands, and sigma says so."""
+    around_us = START_NS // 1000 + 20 * 10**6
+    packets = [p for p in recording(Path(3, speed_m_s=8.0), 40) if abs(p[1] - around_us) > 2 * 10**6]
+    pose = fed(packets).pose_at(START_NS + 20 * 10**9, 0)
+    assert pose.source == "nearest"
+    assert pose.age_ms == pytest.approx(2000, abs=200)
+    assert pose.position_sigma_m is not None
+    assert pose.position_sigma_m >= position_error_m(pose, Path(3, speed_m_s=8.0).pose(20.0)) / 3
+    assert pose.position_sigma_m > 10
+    beside = fed(packets).pose_at(START_NS + 30 * 10**9, 0)
+    assert beside.source == "interpolated"
+
+
 def test_without_telemetry_there_is_no_pose_and_no_zero() -> None:
     pose = Telemetry().pose_at(START_NS, 0)
     assert pose.source == "none"

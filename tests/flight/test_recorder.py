@@ -3,10 +3,12 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import random
 import resource
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -179,22 +181,31 @@ for index in itertools.count(flight.next_index):
 """
 
 
-def killed_after(flights: Path, lines: int) -> list[list[str]]:
-    """Run the writer, kill it -9 after so many lines; return all whole lines that it said."""
+def killed_after(flights: Path, lines: int, later_s: float = 0.0) -> list[list[str]]:
+    """Run the writer, kill it -9 so long after so many lines; return all whole lines that it said."""
     command = [sys.executable, "-c", WRITER, str(flights)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=Path(__file__).parents[2]) as writer:
         assert writer.stdout is not None
         said = [writer.stdout.readline() for _ in range(lines)]
+        time.sleep(later_s)  # a moment that is nobody's, not a wait for something
         writer.kill()
         said += writer.stdout.readlines()
     return [line.decode().split() for line in said if line.endswith(b"\n")]
 
 
-@pytest.mark.parametrize("moments", [(1, 2, 5), pytest.param(tuple(range(1, 61)), marks=pytest.mark.slow)])
-def test_kill_9_loses_nothing_that_was_acknowledged(flights: Path, moments: tuple[int, ...]) -> None:
+def some_moments(seed: int, count: int) -> list[tuple[int, float]]:
+    """Moments spread over the first dozen frames: after how many lines, and how much later."""
+    chosen = random.Random(seed)  # noqa: S311  moments, not secrets
+    return [(chosen.randint(1, 24), chosen.uniform(0, 0.012)) for _ in range(count)]
+
+
+@pytest.mark.parametrize(
+    ("seed", "count"), [(0, 3), *(pytest.param(seed, 40, marks=pytest.mark.slow) for seed in range(1, 6))]
+)
+def test_kill_9_loses_nothing_that_was_acknowledged(flights: Path, seed: int, count: int) -> None:
     from dappled.flight import layout, recording  # noqa: PLC0415  only what the check afterwards needs
 
-    said = [line for lines in moments for line in killed_after(flights, lines)]
+    said = [line for moment in some_moments(seed, count) for line in killed_after(flights, *moment)]
     ended = recording.begin(flights, lambda: 1_795_256_104_000_000_000)
     indices = [int(line[1]) for line in said if line[0] == "noted"]
     assert indices == sorted(set(indices))

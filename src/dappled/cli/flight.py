@@ -1,4 +1,4 @@
-"""`dappled flight list|show|check|report`: recorded flights."""
+"""`dappled flight list|show|check|report|offload`: recorded flights."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import argparse
 import json
 import math
 import sys
+import time
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from dappled.config import settings
-from dappled.flight import check, layout, summary
+from dappled.flight import check, layout, offload, summary
 from dappled.flight.errors import FlightError
 
 
@@ -28,6 +31,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     ):
         one = actions.add_parser(name, help=line)
         one.add_argument("flight", nargs="?", type=Path, help="flight folder (default: the last one)")
+    away = actions.add_parser("offload", help="copy a flight to another disk and verify it by hash; prune on request")
+    away.add_argument("destination", type=Path, metavar="DEST", help="folder that will hold the flight's folder")
+    away.add_argument("flight", nargs="?", type=Path, help="flight folder (default: the last one)")
+    away.add_argument("--prune", action="store_true", help="afterwards remove the frames here; the ledger stays")
     for one in actions.choices.values():
         one.add_argument("--json", action="store_true", help="as JSON")
 
@@ -36,6 +43,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.action == "list":
         return _list(arguments.folder or _flights(), arguments.json)
     flight = arguments.flight or last_flight()
+    if arguments.action == "offload":
+        return _offload(flight, arguments.destination, arguments.prune, arguments.json)
     return {"show": _show, "check": _check, "report": _report}[arguments.action](flight, arguments.json)
 
 
@@ -125,6 +134,19 @@ def _report(flight: Path, as_json: bool) -> int:
             print(f"  {found.strays:6d} files without a shot of their own")
         print("the books balance" if found.balanced else "THE BOOKS DO NOT BALANCE: run `dappled flight check`")
     return 0 if found.balanced else 1
+
+
+def _offload(flight: Path, destination: Path, prune: bool, as_json: bool) -> int:
+    total = sum(path.stat().st_size for path in flight.rglob("*") if path.is_file())
+    with tqdm(total=total, unit="B", unit_scale=True, disable=None, delay=1.0) as bar:
+        done = offload.offload(flight, destination, prune=prune, utc_ns=time.time_ns, progress=bar.update)
+    if as_json:
+        print(json.dumps(_plain(done), indent=2))
+    else:
+        print(f"{done.destination}: {done.copied} files copied and verified, {done.there_already} were there already")
+        if done.pruned:
+            print(f"{done.pruned} frames removed from {flight}; its ledger stays")
+    return 0
 
 
 def _plain(value: Any) -> dict[str, Any]:

@@ -20,29 +20,40 @@ class BodyLatency:
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """Mid-exposure in UTC with its 1 σ, and how that was had."""
+    """Mid-exposure in UTC with its 1 σ, and how that was had.
+
+    `half_ns` is half the exposure as far as known. `called_utc_ns` is when the trigger call was made: nothing exposes
+    before it; None where nobody knows.
+    """
 
     utc_ns: int
     sigma_ns: int
     source: str
+    half_ns: int = 0
+    called_utc_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What the file says of the exposure; None where it doesn't."""
+    """What the file says of the exposure; None where it doesn't. `taken` is the camera's own time (see EXIF)."""
 
     focal_length_mm: float | None = None
     f_number: float | None = None
     exposure_s: float | None = None
     iso: float | None = None
     model: str = ""
+    taken: str | None = None
 
 
 def mid_exposure(fired_utc_ns: int, latency: BodyLatency, exposure_s: float | None) -> Exposure:
     """The trigger call's time plus the body's latency plus half the exposure (none, where it is not known)."""
     half_ns = round((exposure_s or 0.0) / 2 * 1e9)
     return Exposure(
-        fired_utc_ns + round(latency.mean_ms * 1e6) + half_ns, round(latency.sigma_ms * 1e6), latency.source
+        fired_utc_ns + round(latency.mean_ms * 1e6) + half_ns,
+        round(latency.sigma_ms * 1e6),
+        latency.source,
+        half_ns,
+        fired_utc_ns,
     )
 
 

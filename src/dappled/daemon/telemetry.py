@@ -14,8 +14,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
+from dappled.daemon import feedback
 from dappled.daemon.boot_clock import Answer, BootClock, from_arrivals, from_timesync
+from dappled.daemon.feedback import Feedback
 from dappled.daemon.interpolation import hermite, metres_per_radian, norm, normalised, slerp, turn_rad
+from dappled.daemon.tagger import Exposure
 from dappled.drivers.mavlink import Message
 from dappled.flight.records import Pose, Quaternion, Vector3
 
@@ -90,6 +93,7 @@ class TelemetryStatistics:
     timesync_answers: int
     reboots: int
     out_of_order: int
+    feedbacks: int = 0
 
 
 class Telemetry:
@@ -107,12 +111,15 @@ class Telemetry:
         self._positions: list[PositionSample] = []
         self._attitudes: list[AttitudeSample] = []
         self._accuracies: list[AccuracySample] = []
+        self._feedbacks: list[Feedback] = []
+        self._unix_minus_boot_ns: int | None = None
         self._answers: list[Answer] = []
         self._requests: dict[int, int] = {}
         self._boots: list[int] = [0]  # packet numbers at which the autopilot's time began anew
         self._boot_ns: int | None = None
         self._back_since_ns: int | None = None
         self._positions_seen = self._attitudes_seen = self._answers_seen = self._out_of_order = self._reboots = 0
+        self._feedbacks_seen = 0
 
     def feed(self, number: int, stamp_us: int, message: Message) -> None:
         """Fold in one packet. Numbers must rise. Messages of no interest only count."""
@@ -145,7 +152,31 @@ class Telemetry:
             alive = bool(attitudes) and attitudes[0].boot_ns >= positions[0].boot_ns - 5 * 10**9
             return not alive or attitudes[0].boot_ns >= boot_ns
 
-    def pose_at(self, utc_ns: int, utc_sigma_ns: float, *, upto_packet: int | None = None) -> Pose:
+    def settled(self, exposure: Exposure) -> bool:
+        """Whether waiting longer would not make this exposure's pose better: samples from after it are there; from an
+        autopilot that tells of the hot shoe, also all that it could tell of this exposure."""
+        later_ns = feedback.reach_ns(exposure) if self._feedbacks_seen else 0
+        return self.bracketed(exposure.utc_ns + later_ns)
+
+    def locate(self, exposure: Exposure, *, upto_packet: int | None = None) -> tuple[Exposure, Pose]:
+        """When and where a frame was exposed, from the packets below `upto_packet` (all so far).
+
+        Where the autopilot saw the hot shoe close, its word replaces the expectation (see `feedback`): that time is on
+        the autopilot's own clock, as the poses are, so the clocks between the two machines don't count.
+        """
+        with self._lock:
+            limit = self._packets if upto_packet is None else upto_packet
+            clock = self._clock(limit)
+            events = self._feedbacks[_index(self._feedbacks, self._first(limit)) : _index(self._feedbacks, limit)]
+        event = None if clock is None else feedback.choose(events, exposure, clock)
+        if clock is None or event is None:
+            return exposure, self.pose_at(exposure.utc_ns, exposure.sigma_ns, upto_packet=limit)
+        better, boot_ns = feedback.refined(exposure, event, clock)
+        return better, self.pose_at(better.utc_ns, feedback.CONTACT_SIGMA_NS, upto_packet=limit, boot_ns=boot_ns)
+
+    def pose_at(
+        self, utc_ns: int, utc_sigma_ns: float, *, upto_packet: int | None = None, boot_ns: int | None = None
+    ) -> Pose:
         """The pose at mid-exposure, UTC ± one sigma (nanoseconds), from the packets below `upto_packet` (all so far).
 
         Position: cubic Hermite with the reported velocities, over gaps up to 2.5 s. Attitude: slerp, over gaps up to
@@ -155,17 +186,20 @@ class Telemetry:
         Sigmas: time (exposure and clocks) × speed and × turn rate; for the position also the receiver's horizontal
         accuracy (h_acc, else HDOP × 2.5 m); None without either. The autopilot reports no accuracy of its attitude, so
         `attitude_sigma_rad` holds what time contributes, and nothing else.
+
+        `boot_ns`, where given, is the same instant as the autopilot itself told it; sigma is then of that.
         """
         with self._lock:
             limit = self._packets if upto_packet is None else upto_packet
             clock = self._clock(limit)
             if clock is None:
                 return _no_pose(utc_ns, limit)
-            boot_ns = clock.boot_ns(utc_ns)
+            clock_sigma_ns = clock.sigma_ns if boot_ns is None else 0.0
+            boot_ns = clock.boot_ns(utc_ns) if boot_ns is None else boot_ns
             positions = _around(self._positions, self._first(limit), limit, boot_ns, POSITION_GAP_NS)
             attitudes = _around(self._attitudes, self._first(limit), limit, boot_ns, ATTITUDE_GAP_NS)
             accuracy = self._accuracy(limit)
-        sigma_s = math.hypot(utc_sigma_ns, clock.sigma_ns, _HALF_MS_NS / math.sqrt(3)) / 1e9
+        sigma_s = math.hypot(utc_sigma_ns, clock_sigma_ns, _HALF_MS_NS / math.sqrt(3)) / 1e9
         attitude, attitude_sigma = _attitude(attitudes, boot_ns, sigma_s)
         if not positions:
             return _no_pose(utc_ns, limit, boot_ns, attitude, attitude_sigma)
@@ -199,6 +233,7 @@ class Telemetry:
                 self._answers_seen,
                 self._reboots,
                 self._out_of_order,
+                self._feedbacks_seen,
             )
 
     def _feed_position(self, number: int, stamp_ns: int, message: Message) -> None:
@@ -248,6 +283,19 @@ class Telemetry:
             sigma = message.eph / 100 * METRES_PER_HDOP
         self._accuracies.append(AccuracySample(number, stamp_ns, 0, sigma))
 
+    def _feed_system_time(self, number: int, stamp_ns: int, message: Message) -> None:
+        if self._ours(message) and message.time_unix_usec > feedback.EPOCH_US and message.time_boot_ms > 0:
+            self._unix_minus_boot_ns = message.time_unix_usec * 1000 - (message.time_boot_ms * 10**6 + _HALF_MS_NS)
+
+    def _feed_feedback(self, number: int, stamp_ns: int, message: Message) -> None:
+        if not self._ours(message):
+            return
+        boot_ns = feedback.boot_ns(message, self._unix_minus_boot_ns)
+        if boot_ns is None or self._boot_ns is None or abs(boot_ns - self._boot_ns) > NEAREST_NS:
+            return
+        self._feedbacks_seen += 1
+        self._feedbacks.append(Feedback(number, stamp_ns, boot_ns, message.get_type()))
+
     def _feed_timesync(self, number: int, stamp_ns: int, message: Message) -> None:
         if message.tc1 == 0:
             if message.get_srcComponent() == self._component_id and 0 <= stamp_ns - message.ts1 < 10**9:
@@ -290,6 +338,7 @@ class Telemetry:
             self._boots.append(number)
             self._reboots += 1
             self._requests.clear()
+            self._unix_minus_boot_ns = None
             self._boot_ns = boot_ns
         self._back_since_ns = None
         self._boot_ns = boot_ns if self._boot_ns is None else max(self._boot_ns, boot_ns)
@@ -325,7 +374,7 @@ class Telemetry:
         return self._accuracies[place - 1].horizontal_sigma_m
 
     def _prune(self, before_ns: int) -> None:
-        for history in (self._positions, self._attitudes, self._accuracies):
+        for history in (self._positions, self._attitudes, self._accuracies, self._feedbacks):
             keep = bisect_left(history, before_ns, key=lambda s: s.stamp_ns)
             del history[:keep]
         del self._answers[: bisect_left(self._answers, before_ns, key=lambda a: a.received_utc_ns)]
@@ -346,6 +395,9 @@ _HANDLERS = {
     "ATTITUDE": Telemetry._feed_attitude,
     "GPS_RAW_INT": Telemetry._feed_accuracy,
     "TIMESYNC": Telemetry._feed_timesync,
+    "SYSTEM_TIME": Telemetry._feed_system_time,
+    "CAMERA_FEEDBACK": Telemetry._feed_feedback,
+    "CAMERA_TRIGGER": Telemetry._feed_feedback,
 }
 
 

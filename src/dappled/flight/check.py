@@ -51,7 +51,10 @@ def check(path: Path) -> Report:
                 (notes if lock.is_held(path.parent) else problems).append(
                     "the flight is still recorded, or was never closed: the next `dappled run` puts it in order"
                 )
-            for file_size, problem in _files(folder, ledger):
+            gone = ledger.facts().get("offloaded")
+            if gone is not None:
+                notes.append(f"its {gone['files']} frames were offloaded to {gone['destination']}, and removed here")
+            for file_size, problem in _files(folder, ledger, pruned=gone is not None):
                 files, size = files + 1, size + file_size
                 problems += [problem] if problem else []
             problems += _names(folder, ledger, closed)
@@ -67,10 +70,12 @@ def _acknowledged(ledger: LedgerReader) -> list[Frame | Stray]:
     return [*ledger.frames(), *ledger.strays()]
 
 
-def _files(folder: FlightFolder, ledger: LedgerReader) -> Iterator[tuple[int, str | None]]:
-    """(bytes read, problem) for every file that the ledger acknowledges."""
+def _files(folder: FlightFolder, ledger: LedgerReader, *, pruned: bool) -> Iterator[tuple[int, str | None]]:
+    """(bytes read, problem) for every file that the ledger acknowledges; in a pruned flight it may be gone."""
     for row in _acknowledged(ledger):
         path = folder.path / row.name
+        if pruned and not path.exists():
+            continue
         try:
             size = path.stat().st_size
             if size != row.size:

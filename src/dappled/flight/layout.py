@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import secrets
+import shutil
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -104,6 +105,7 @@ def create(root: Path, utc_ns: int | None, facts: Mapping[str, Any] | None = Non
         write_facts(folder, facts or {})
         durable.sync_folder(root)
     except OSError as error:
+        shutil.rmtree(folder.path, ignore_errors=True)
         raise disk_error("make the flight folder", folder.path, error) from error
     return folder
 

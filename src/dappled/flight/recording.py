@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -93,6 +94,7 @@ def begin(
         next_index = index.next_index()
         start_utc_ns = utc_ns() if utc_known else None
         folder = layout.create(root, start_utc_ns, facts)
+        stack.callback(shutil.rmtree, folder.path, ignore_errors=True)  # a flight that could not begin
         ledger = Ledger(folder.ledger, utc_ns)
         stack.callback(ledger.close)
         index.add_flight(folder.name, start_utc_ns)

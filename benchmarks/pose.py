@@ -1,0 +1,239 @@
+"""How well a frame knows where it was taken, by what its time comes from; and how honest the reported sigmas are.
+
+A simulated flight: 15 m/s, turning at 30°/s, 10 Hz position, 50 Hz attitude, link latency 20 ± 10 ms each way, clocks
+that drift by 50 ppm, a receiver with 1 cm accuracy (RTK). Each frame is tagged by the daemon's own code from what the
+link had delivered by then. Errors are horizontal distances and whole turns, against the truth at mid-exposure.
+
+python benchmarks/pose.py [--json] [--frames 400] [--seed 1] [--log FLIGHT.tlog]
+
+With --log: that real flight instead. Each position and attitude is left out in turn (every --stride-th) and predicted
+from its neighbours.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import random
+import statistics
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path as File
+
+from dappled.daemon.camera_clock import CameraClock, exposure_from_camera
+from dappled.daemon.interpolation import metres_per_radian, turn_rad
+from dappled.daemon.tagger import BodyLatency, Exposure, mid_exposure
+from dappled.daemon.telemetry import Telemetry, first_position_utc_ns
+from dappled.drivers.mavlink import Decoder, Message, mavlink
+from dappled.flight import telemetry_log
+from dappled.flight.records import Pose
+from dappled.mocks.autopilot import BootTime, telemetry_message
+from dappled.mocks.path import Path, from_euler
+
+START_NS = 1_790_000_000 * 10**9
+SPEED_M_S = 15.0
+TURN_RAD_S = math.radians(30)
+LATENCY_S, JITTER_S = 0.020, 0.010
+DRIFT = 50e-6
+RECEIVER_SIGMA_M = 0.010  # horizontal, as a distance; slow: it moves over a minute
+EXPOSURE_S = 1 / 1000
+BODY = BodyLatency(60.0, 10.0, "trigger call + body latency")
+CONTACT_SIGMA_S = 0.001  # the worst that counts as a hot shoe
+CAMERA_CLOCK_S = -3600.37  # the body's clock against UTC: another zone, and some seconds' part
+WARM_UP_S, EVERY_S = 40.0, 1.37
+RATES_HZ = {
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10.0,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """One frame's truth: when it was asked for, and mid-exposure, seconds of the simulation."""
+
+    called_s: float
+    middle_s: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--frames", type=int, default=400)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--log", type=File)
+    parser.add_argument("--stride", type=int, default=29)
+    arguments = parser.parse_args()
+    figures = (
+        leave_one_out(arguments.log, arguments.stride) if arguments.log else measure(arguments.frames, arguments.seed)
+    )
+    if arguments.json:
+        print(json.dumps(figures))
+        return
+    for name, row in figures.items():
+        print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in row.items()))
+
+
+def measure(frames: int, seed: int) -> dict[str, dict[str, float]]:
+    """By the source of the exposure's time: rms errors, rms reported sigmas, and their ratio."""
+    rng = random.Random(seed)  # noqa: S311  a simulation
+    path = Path(seed, speed_m_s=SPEED_M_S, radius_m=SPEED_M_S / TURN_RAD_S)
+    taken = [_take(WARM_UP_S + EVERY_S * number, rng) for number in range(frames)]
+    packets = sorted(_packets(path, taken, rng), key=lambda packet: packet[0])
+    found: dict[str, list[tuple[Taken, Exposure, Pose]]] = {"hot_shoe": [], "body_latency": [], "camera_clock": []}
+    with_shoe, without = Telemetry(), Telemetry()
+    camera, told = CameraClock(), 0
+    for number, (stamp_ns, message) in enumerate(packets):
+        with_shoe.feed(number, stamp_ns // 1000, message)
+        if message.get_type() != "CAMERA_FEEDBACK":
+            without.feed(number, stamp_ns // 1000, message)
+        while told < frames and stamp_ns > _utc_ns(taken[told].middle_s) + 400_000_000:
+            one, told = taken[told], told + 1
+            expected = mid_exposure(_utc_ns(one.called_s), BODY, EXPOSURE_S)
+            found["hot_shoe"].append((one, *with_shoe.locate(expected)))
+            found["body_latency"].append((one, *without.locate(expected)))
+            begin_s = one.middle_s - EXPOSURE_S / 2
+            says_s = math.floor(START_NS / 1e9 + begin_s + CAMERA_CLOCK_S)  # EXIF has whole seconds
+            by_camera = exposure_from_camera(camera, says_s * 10**9, 10**9, EXPOSURE_S)
+            if by_camera is not None:
+                found["camera_clock"].append((one, *without.locate(by_camera)))
+            camera = camera.learnt(says_s * 10**9, 10**9, expected)
+    return {name: _figures(path, rows) for name, rows in found.items()}
+
+
+def leave_one_out(log: File, stride: int) -> dict[str, dict[str, float]]:
+    """Horizontal distances (m) and turns (degrees) between recorded samples and what their neighbours say of them."""
+    decode = Decoder()
+    packets = []
+    for number, stamp_us, raw in telemetry_log.read(log):
+        if (message := decode(raw)) is not None:
+            packets.append((number, stamp_us, message))
+    first = first_position_utc_ns(packets) or 0
+    found: dict[str, list[float]] = {"position_m": [], "attitude_deg": []}
+    refused = 0
+    kinds = {"GLOBAL_POSITION_INT", "ATTITUDE"}
+    chosen = [i for i, p in enumerate(packets) if p[2].get_type() in kinds and p[1] * 1000 > first + 60 * 10**9]
+    for place in chosen[::stride]:
+        left_out = packets[place][2]
+        telemetry = Telemetry()
+        for packet in (*packets[max(0, place - 1500) : place], *packets[place + 1 : place + 400]):
+            telemetry.feed(*packet)
+        clock = telemetry.boot_clock()
+        pose = clock and telemetry.pose_at(clock.utc_ns(left_out.time_boot_ms * 10**6 + 500_000), 0)
+        if not pose or pose.source != "interpolated" or pose.latitude_rad is None or pose.longitude_rad is None:
+            refused += 1
+        elif left_out.get_type() == "ATTITUDE" and pose.attitude is not None:
+            truth = from_euler(left_out.roll, left_out.pitch, left_out.yaw)
+            found["attitude_deg"].append(math.degrees(turn_rad(pose.attitude, truth)))
+        elif left_out.get_type() == "GLOBAL_POSITION_INT":
+            north_m, east_m = metres_per_radian(pose.latitude_rad, 0.0)
+            north = (pose.latitude_rad - math.radians(left_out.lat / 1e7)) * north_m
+            east = (pose.longitude_rad - math.radians(left_out.lon / 1e7)) * east_m
+            found["position_m"].append(math.hypot(north, east))
+    rows = {
+        name: {
+            "samples": len(values),
+            "median": statistics.median(values),
+            "rms": _rms(values),
+            "p95": sorted(values)[int(0.95 * len(values))],
+        }
+        for name, values in found.items()
+    }
+    return {**rows, "refused": {"samples": refused}}
+
+
+def _take(called_s: float, rng: random.Random) -> Taken:
+    latency_s = rng.gauss(BODY.mean_ms, BODY.sigma_ms) / 1e3
+    called_s += rng.uniform(0, 0.5)
+    return Taken(called_s, called_s + latency_s + EXPOSURE_S / 2)
+
+
+def _packets(path: Path, taken: Sequence[Taken], rng: random.Random) -> Iterator[tuple[int, Message]]:
+    """(arrival UTC, message): telemetry, TIMESYNC at 5 Hz, a hot-shoe feedback for each frame."""
+    boot = BootTime(drift=DRIFT)
+    end_s = taken[-1].middle_s + 2
+    phase = [rng.uniform(0, 2 * math.pi) for _ in range(2)]
+
+    def delay_s() -> float:
+        return max(0.001, rng.gauss(LATENCY_S, JITTER_S))
+
+    for message_id, rate in RATES_HZ.items():
+        for step in range(int(end_s * rate)):
+            t_s = step / rate
+            message = telemetry_message(message_id, path.pose(t_s), boot.ns(t_s), (_utc_ns(t_s)) // 1000)
+            if message_id == mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT:
+                message = _received(message, t_s, phase)
+            if message_id == mavlink.MAVLINK_MSG_ID_GPS_RAW_INT:
+                message.h_acc = round(RECEIVER_SIGMA_M * 1e3)
+            yield _utc_ns(t_s + delay_s()), _headed(message)
+    for step in range(int(end_s * 5)):
+        sent_s = step / 5
+        there_s = sent_s + delay_s()
+        yield _utc_ns(sent_s), _headed(mavlink.MAVLink_timesync_message(0, _utc_ns(sent_s)), 100)
+        answer = mavlink.MAVLink_timesync_message(boot.ns(there_s), _utc_ns(sent_s))
+        yield _utc_ns(there_s + delay_s()), _headed(answer)
+    for number, one in enumerate(taken):
+        contact_s = one.middle_s - EXPOSURE_S / 2 + rng.gauss(0, CONTACT_SIGMA_S)
+        message = mavlink.MAVLink_camera_feedback_message(
+            boot.ns(contact_s) // 1000, 1, 0, number % 65536, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, number
+        )
+        yield _utc_ns(contact_s + delay_s()), _headed(message)
+
+
+def _received(message: Message, t_s: float, phase: Sequence[float]) -> Message:
+    """With the receiver's slow error: each axis a sine of one minute, both together RECEIVER_SIGMA_M rms."""
+    north_m, east_m = metres_per_radian(math.radians(message.lat / 1e7), message.alt / 1e3)
+    for name, metres, shift in (("lat", north_m, phase[0]), ("lon", east_m, phase[1])):
+        error_m = RECEIVER_SIGMA_M * math.sin(2 * math.pi * t_s / 61 + shift)
+        setattr(message, name, getattr(message, name) + round(math.degrees(error_m / metres) * 1e7))
+    return message
+
+
+def _headed(message: Message, component: int = 1) -> Message:
+    message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=component))
+    return message
+
+
+def _utc_ns(t_s: float) -> int:
+    return START_NS + round(t_s * 1e9)
+
+
+def _figures(path: Path, rows: Sequence[tuple[Taken, Exposure, Pose]]) -> dict[str, float]:
+    metres, turns, sigma_m, sigma_rad, late_ms, sigma_ms = [], [], [], [], [], []
+    for one, exposure, pose in rows:
+        if pose.latitude_rad is None or pose.longitude_rad is None or pose.attitude is None:
+            continue
+        truth = path.pose(one.middle_s)
+        north_m, east_m = metres_per_radian(pose.latitude_rad, truth.altitude_msl_m)
+        metres.append(
+            math.hypot(
+                (pose.latitude_rad - math.radians(truth.latitude_deg)) * north_m,
+                (pose.longitude_rad - math.radians(truth.longitude_deg)) * east_m,
+            )
+        )
+        turns.append(math.degrees(turn_rad(pose.attitude, truth.attitude)))
+        sigma_m.append(pose.position_sigma_m or 0.0)
+        sigma_rad.append(math.degrees(pose.attitude_sigma_rad or 0.0))
+        late_ms.append((exposure.utc_ns - _utc_ns(one.middle_s)) / 1e6)
+        sigma_ms.append(exposure.sigma_ns / 1e6)
+    return {
+        "frames": len(metres),
+        "time_rms_ms": _rms(late_ms),
+        "time_sigma_ms": _rms(sigma_ms),
+        "position_rms_m": _rms(metres),
+        "position_sigma_m": _rms(sigma_m),
+        "position_sigma_over_error": _rms(sigma_m) / _rms(metres),
+        "attitude_rms_deg": _rms(turns),
+        "attitude_sigma_deg": _rms(sigma_rad),
+        "attitude_sigma_over_error": _rms(sigma_rad) / _rms(turns),
+    }
+
+
+def _rms(values: Sequence[float]) -> float:
+    return math.sqrt(sum(value * value for value in values) / len(values))
+
+
+if __name__ == "__main__":
+    main()

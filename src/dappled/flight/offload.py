@@ -1,0 +1,127 @@
+"""A flight is brought to another disk: copied, read back, compared; only then, and only if asked, pruned here."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from dappled.flight import check, durable, layout
+from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.layout import FlightFolder
+from dappled.flight.ledger import Ledger, LedgerReader
+
+FACT = "offloaded"
+_SHARED_MEMORY = "-shm"
+
+
+@dataclass(frozen=True, slots=True)
+class Offloaded:
+    """What was done. `copied` and `there_already` count files; `size` is that of all of them, in bytes."""
+
+    flight: str
+    destination: Path
+    copied: int
+    there_already: int
+    size: int
+    pruned: int
+
+
+def offload(
+    flight: Path,
+    destination: Path,
+    *,
+    prune: bool,
+    utc_ns: Callable[[], int],
+    progress: Callable[[int], object] = lambda size: None,
+) -> Offloaded:
+    """Copy a closed flight to `destination/<its name>`; every file is read back from there and compared by SHA-256
+    with its source, and the copy is checked whole against its own ledger. Doing so again finishes what was left.
+
+    `prune` then removes the frames (and strays) here; ledger, journal and telemetry stay, so that image indices go on
+    and can be answered. Raises FlightError: flight open or not intact, copy different, disk refuses. Nothing is
+    removed then. `progress` is told the bytes done.
+    """
+    folder = layout.open_folder(flight)
+    _refuse_what_is_open(folder)
+    target = destination / flight.resolve().name
+    if target.resolve().is_relative_to(flight.resolve()):
+        raise FlightError(f"cannot offload {flight} into itself: {target}; give a folder on another disk")
+    copied = there = size = 0
+    for source in _files(flight):
+        goal = target / source.relative_to(flight)
+        done, length = _bring(source, goal)
+        copied, there, size = copied + done, there + (not done), size + length
+        progress(length)
+    found = check.check(target)
+    if found.problems:
+        raise FlightError(
+            f"the copy {target} is not intact ({found.problems[0]}): nothing was removed; "
+            f"run `dappled flight check {flight}`"
+        )
+    pruned = _prune(folder, target, utc_ns) if prune else 0
+    return Offloaded(folder.path.name, target, copied, there, size, pruned)
+
+
+def _refuse_what_is_open(folder: FlightFolder) -> None:
+    with LedgerReader.open(folder.ledger) as ledger:
+        facts = ledger.facts()
+    if "closed_utc_ns" not in facts:
+        raise FlightError(
+            f"{folder.path} is still recorded, or was never closed: stop the daemon, or start it once to close it"
+        )
+    if FACT in facts:
+        raise FlightError(f"{folder.path} was offloaded to {facts[FACT]['destination']} and pruned already")
+
+
+def _files(flight: Path) -> Iterator[Path]:
+    """All files but SQLite's shared memory; the reader that was just closed has folded the WAL into the ledger."""
+    for root, folders, names in os.walk(flight):
+        folders.sort()
+        for name in sorted(names):
+            path = Path(root) / name
+            if not name.endswith(_SHARED_MEMORY) and path.is_file() and not path.is_symlink():
+                yield path
+
+
+def _bring(source: Path, goal: Path) -> tuple[bool, int]:
+    """(copied or not, size). A file that is there with the same bytes stays; another one is refused."""
+    try:
+        with source.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            if goal.exists():
+                if durable.hash_file(goal) != durable.hash_file(source):
+                    raise FlightError(f"{goal} is there already and differs from {source}: move it away first")
+                return False, size
+            durable.make_folder(goal.parent)
+            sha256 = durable.copy_in(file.fileno(), size, goal)
+        if _hash_on_disk(goal) != sha256:
+            raise FlightError(f"{goal} reads back different from {source}: check that disk; nothing was removed")
+    except EOFError as error:
+        raise FlightError(f"{source} changed while it was copied ({error}); try again") from error
+    except OSError as error:
+        raise disk_error(f"copy {source} to", goal, error) from error
+    return True, size
+
+
+def _hash_on_disk(path: Path) -> str:
+    """SHA-256 of a file, its pages dropped from memory first, so that the disk is asked."""
+    with path.open("rb") as file:
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        return durable.hash_descriptor(file.fileno(), os.fstat(file.fileno()).st_size)
+
+
+def _prune(folder: FlightFolder, target: Path, utc_ns: Callable[[], int]) -> int:
+    """Remove the frames and strays that the ledger acknowledges. The ledger says so before the first one goes."""
+    with Ledger(folder.ledger, utc_ns) as ledger:
+        names = [frame.name for frame in ledger.frames()] + [stray.name for stray in ledger.strays()]
+        ledger.set_fact(FACT, {"destination": str(target.absolute()), "utc_ns": utc_ns(), "files": len(names)})
+        ledger.add_event(FACT, f"{len(names)} files were copied to {target}, verified, and removed here")
+    try:
+        for name in names:
+            (folder.path / name).unlink(missing_ok=True)
+        durable.sync_folder(folder.frames)
+    except OSError as error:
+        raise disk_error("prune", folder.frames, error) from error
+    return len(names)
