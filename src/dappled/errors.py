@@ -1,5 +1,26 @@
 """The family of errors that a person is told in one sentence: what, where, what to do."""
 
+from __future__ import annotations
+
+import logging
+from typing import ClassVar
+
 
 class DappledError(Exception):
-    """Something a person can mend. The message is the whole sentence; no traceback is shown with it."""
+    """Something a person can mend. The message is the whole sentence; no traceback is shown with it.
+
+    `exit_code` is what a command ends with: 1 for a failure, 2 where the call itself was wrong.
+    """
+
+    exit_code: ClassVar[int] = 1
+
+
+def sentence(error: BaseException) -> str:
+    """What a person is told of an error: its own words, or its kind where it was never meant for a person."""
+    return str(error) if isinstance(error, DappledError) else f"unexpected {type(error).__name__}: {error}"
+
+
+def report(log: logging.Logger, what: str, error: BaseException) -> None:
+    """Log an error as one sentence; the traceback of an unexpected one only in the log's details."""
+    details = not isinstance(error, DappledError) and log.isEnabledFor(logging.DEBUG)
+    log.warning("%s: %s", what, sentence(error), exc_info=error if details else None)

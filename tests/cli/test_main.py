@@ -19,7 +19,10 @@ def test_every_verb_has_help_with_an_example(verb: str, capsys: pytest.CaptureFi
     assert "example" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", [[], ["fly"], ["run", "--frames", "many"], ["carriers"], ["trigger", "--what"]])
+@pytest.mark.parametrize(
+    "words",
+    [[], ["fly"], ["run", "--frames", "many"], ["carriers"], ["trigger", "--what"], ["trigger", "--count", "0"]],
+)
 def test_a_wrong_call_ends_with_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(words)
@@ -28,24 +31,29 @@ def test_a_wrong_call_ends_with_2(words: list[str], capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "code", "said"),
     [
-        (["config", "check", "nowhere.toml"], "nowhere.toml: no such file"),
-        (["flight", "show", "nowhere"], "nowhere is not a flight folder"),
-        (["replay", "nowhere"], "neither a flight nor a folder of frames"),
-        (["decode", "nowhere.dng", "--mask", "mask-2", "-o", "x.npz"], "nowhere.dng"),
-        (["decode", "nowhere.dng", "--mask", "mask-22", "-o", "x.npz"], "did you mean mask-2"),
-        (["carriers", "--mask", "mask-2", "--shape", "10", "10"], "--camera"),
-        (["carriers", "--mask", "mask-2", "--shape", "10", "10", "--camera", "fujifilm-s5200"], "--focal-length"),
-        (["trigger", "--count", "0"], "--count is 1 or more"),
-        (["watch", "fish://"], "not a ZeroMQ endpoint"),
+        (["config", "check", "nowhere.toml"], 2, "nowhere.toml: no such file"),
+        (["flight", "show", "nowhere"], 1, "nowhere is not a flight folder"),
+        (["replay", "nowhere"], 1, "neither a flight nor a folder of frames"),
+        (["decode", "nowhere.dng", "--mask", "mask-2", "-o", "x.npz"], 1, "nowhere.dng"),
+        (["decode", "nowhere.dng", "--mask", "mask-22", "-o", "x.npz"], 2, "did you mean mask-2"),
+        (["carriers", "--mask", "mask-2", "--shape", "10", "10"], 2, "--camera"),
+        (["carriers", "--mask", "mask-2", "--shape", "10", "10", "--camera", "fujifilm-s5200"], 2, "--focal-length"),
+        (["watch", "fish://"], 1, "not a ZeroMQ endpoint"),
     ],
 )
-def test_a_failure_is_one_sentence_and_ends_with_1(
-    words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_failure_is_one_sentence_and_has_its_exit_code(
+    *,
+    words: list[str],
+    code: int,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(words) == 1
+    assert main(words) == code
     err = capsys.readouterr().err
     assert said in err
     assert err.startswith(f"dappled {words[0]}: ")
@@ -84,7 +92,7 @@ def test_config_check_says_good_or_why_not(tmp_path: Path, capsys: pytest.Captur
     assert "good" in capsys.readouterr().out
     bad = tmp_path / "bad.toml"
     bad.write_text('[camera]\nprofile = "canon"\n')
-    assert main(["config", "check", str(bad)]) == 1
+    assert main(["config", "check", str(bad)]) == 2
     assert "canon-eos-450d" in capsys.readouterr().err
 
 

@@ -106,13 +106,35 @@ def test_a_lost_message_is_asked_for_and_had(endpoint: str) -> None:
         connected(one, subscriber)
         one.publish("slices", {"frame": 40, "arrays": []}, b"")
         assert receive(subscriber, "slices").header["frame"] == 40
-        subscriber._next["slices"] = 0  # as if the first had been number 0 and lost on the way
+        subscriber._next["f"] = 0  # as if the first had been number 0 and lost on the way
         one.publish("slices", {"frame": 41, "arrays": []}, b"")
         assert receive(subscriber, "slices").header["frame"] == 41
         answer_ = receive(subscriber, "slices")
         assert answer_.header["frame"] == 40
         np.testing.assert_array_equal(answer_.arrays()["slices"], STACK)
         assert (asked, subscriber.gaps, subscriber.recovered, subscriber.lost) == ([40], 1, 1, 0)
+    one.stop(0.2)
+
+
+def test_a_late_subscriber_gets_what_it_asks_for_also_at_the_end(endpoint: str) -> None:
+    """Three slices go out before anybody listens; `end` says how many there were."""
+
+    def answer(request: Mapping[str, Any], reply: Reply) -> None:
+        facts = {"frame": request["frame"], "arrays": [wire.describe_array("slices", STACK, "1")]}
+        reply(Message("slices", facts, STACK.tobytes()))
+
+    one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer, capacity=100)
+    one.start()
+    for frame in (40, 41, 42):
+        one.publish("slices", {"frame": frame, "arrays": []}, b"")
+    with Subscriber(endpoint, endpoint + ".ask", from_start=True) as subscriber:
+        connected(one, subscriber)
+        one.publish("end", {"utc_ns": 0, "shots": {}})
+        end = receive(subscriber, "end")
+        assert end.header["sent"]["slices"] == 3
+        frames = {receive(subscriber, "slices").header["frame"] for _ in range(3)}
+        assert frames == {40, 41, 42}
+        assert (subscriber.gaps, subscriber.recovered, subscriber.lost, subscriber.waiting_for) == (3, 3, 0, 0)
     one.stop(0.2)
 
 

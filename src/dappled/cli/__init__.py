@@ -21,7 +21,9 @@ VERBS: dict[str, tuple[str, str]] = {
     "decode": ("decode", "frames to light fields"),
     "carriers": ("carriers", "predicted and measured carriers of a frame"),
     "calibrate": ("calibrate", "fit lattice, law and phases to frames"),
-    "flight": ("flight", "recorded flights: list, show, check, report"),
+    "mask": ("mask", "the printed mask: make, table, diffraction, design, and plan a flight with it"),
+    "flight": ("flight", "recorded flights: list, show, check, report, offload"),
+    "geotag": ("geotag", "positions and attitudes for other programs: XMP sidecars, geo.txt, CSV, GeoJSON"),
     "config": ("config", "check or show settings"),
     "profiles": ("config", "shipped camera and mask profiles"),
 }
@@ -64,11 +66,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if parsed.debug:
             raise
         print(f"dappled {parsed.verb}: {error}", file=sys.stderr)
-        return 1
+        return error.exit_code
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nobody reads any more: end quietly
+        return 1
+    except OSError as error:
+        if parsed.debug:
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"dappled {parsed.verb}: {where}{error.strerror or error}", file=sys.stderr)
         return 1
     except Exception as error:
         if parsed.debug:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -12,6 +13,7 @@ from typing import Any
 
 import dappled
 from dappled.cli import story
+from dappled.cli.common import seconds
 from dappled.config import settings as configuration
 from dappled.daemon import inputs, replay
 from dappled.daemon.answers import Answers
@@ -34,7 +36,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("flight", type=Path, help="flight folder, or a folder of frames")
     parser.add_argument(
-        "--rate", default="max", help="1.0 is as it was, 2 twice as fast, max as fast as it goes (default)"
+        "--rate",
+        default=None,
+        type=_rate,
+        metavar="RATE",
+        help="1.0 is as it was, 2 twice as fast, max as fast as it goes (default)",
     )
     parser.add_argument("--step", action="store_true", help="wait for Enter before each frame")
     parser.add_argument("--publish", action=argparse.BooleanOptionalAction, default=False, help="send over ZeroMQ")
@@ -46,8 +52,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dark", metavar="FILE", help="dark frame")
     parser.add_argument("--calibration", metavar="FILE", help="file written by dappled calibrate")
     parser.add_argument("--match", default="*", metavar="GLOB", help="which files of a folder are frames")
-    parser.add_argument("--start", metavar="UTC", help="time of the first frame, such as 2026-11-21T10:15:03Z")
-    parser.add_argument("--interval", type=float, default=1.0, metavar="S", help="between frames without a time")
+    parser.add_argument(
+        "--start", type=_utc_ns, metavar="UTC", help="time of the first frame, such as 2026-11-21T10:15:03Z"
+    )
+    parser.add_argument("--interval", type=seconds, default=1.0, metavar="S", help="between frames without a time")
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings: endpoints, workers")
     parser.add_argument("--json", action="store_true", help="one JSON object a frame")
 
@@ -61,15 +69,17 @@ def run(arguments: argparse.Namespace) -> int:
     facts = layout.read_facts(layout.open_folder(arguments.flight)) if is_flight else {}
     recipe = _recipe(arguments, facts, settings)
     recording = _recording(arguments, is_flight)
-    names, latency, wait_ms = _as_recorded(arguments, facts, recipe)
-    telemetry = RecordedTelemetry(recording.telemetry, recording.horizons, wait_ms / 1e3)
+    names, latency, recorded = _as_recorded(arguments, facts, recipe)
+    telemetry = RecordedTelemetry(
+        recording.telemetry,
+        recording.horizons,
+        wait_s=recorded.pose.wait_ms / 1e3,
+        component_id=recorded.mavlink.component_id,
+    )
     book = replay.book(recording)
     progress = Progress.begin()
-    failed = 0
 
     def finished(one: Story) -> None:
-        nonlocal failed
-        failed += bool(one.problem) and one.frame is not None
         print(story.as_json(one) if arguments.json else story.line(one), flush=True)
         progress.note(one)
 
@@ -96,14 +106,14 @@ def run(arguments: argparse.Namespace) -> int:
         )
         street.start()
         stack.callback(street.stop, 5.0)
-        replay.play(recording, street, progress, fire=camera.fire, pace=_pace(arguments))
+        replay.play(recording, street, progress, pace=_pace(arguments))
         if publisher:
-            counts = {"wished": len(recording.shots), "safe": len(progress.stories)}
-            sent = dict(publisher.statistics().sent)
-            publisher.publish("end", {"utc_ns": recording.shots[-1].wished_utc_ns, "shots": counts, "sent": sent})
+            counts = {"wished": len(recording.shots), "safe": progress.frames}
+            publisher.publish("end", {"utc_ns": recording.shots[-1].wished_utc_ns, "shots": counts})
+            publisher.stop()  # answers last questions: before the decoder goes
     if not arguments.verify:
-        return 1 if failed else 0
-    problems += book.verdict()
+        return 1 if progress.bad else 0
+    problems += book.verdict(decoded=recipe is not None)
     for text in problems:
         print(f"different: {text}", file=sys.stderr)
     count = sum(one.frame is not None for one in recording.expected)
@@ -132,22 +142,24 @@ def _recording(arguments: argparse.Namespace, is_flight: bool) -> replay.Recordi
         arguments.flight,
         arguments.match,
         telemetry=arguments.telemetry,
-        start_utc_ns=_utc_ns(arguments.start),
+        start_utc_ns=arguments.start,
         interval_s=arguments.interval,
     )
 
 
 def _as_recorded(
     arguments: argparse.Namespace, facts: Mapping[str, Any], recipe: Recipe | None
-) -> tuple[Names, BodyLatency, float]:
-    """Names, body latency and waiting time of the flight; for a folder the frames' times are mid-exposure itself."""
+) -> tuple[Names, BodyLatency, configuration.Settings]:
+    """Names, body latency and settings of the flight; the frames of a folder begin to expose at their times."""
     if not facts:
-        return inputs.names(recipe), BodyLatency(0.0, 0.0, "given by --start and --interval"), 700.0
+        return inputs.names(recipe), BodyLatency(0.0, 0.0, "given by --start and --interval"), configuration.Settings()
+    if "settings" not in facts or "names" not in facts:
+        raise ReplayError(f"{arguments.flight}/flight.toml lacks its settings; replay its folder frames/ with --mask")
     recorded = configuration.of_tables(facts["settings"], "flight.toml")
     camera = recorded.camera
     latency = BodyLatency(camera.latency_ms, camera.latency_sigma_ms, LATENCY_SOURCE)
     changed = any(getattr(arguments, name) for name in ("camera", "mask"))
-    return inputs.names(recipe) if changed else Names(**facts["names"]), latency, recorded.pose.wait_ms
+    return inputs.names(recipe) if changed else Names(**facts["names"]), latency, recorded
 
 
 def _publisher(
@@ -181,22 +193,22 @@ def _start(settings: configuration.Settings, names: Names) -> dict[str, Any]:
 def _pace(arguments: argparse.Namespace) -> replay.Pace | None:
     if arguments.step:
         return lambda shot, before: (input(f"Enter for shot {shot.index} "), None)[1]
-    if arguments.rate == "max":
-        return None
-    try:
-        rate = float(arguments.rate)
-    except ValueError:
-        rate = 0.0
-    if not 0 < rate < 1e6:
-        raise ReplayError(f"--rate {arguments.rate} is neither a number above 0 nor max")
-    return replay.as_recorded(rate)
+    return None if arguments.rate is None else replay.as_recorded(arguments.rate)
 
 
-def _utc_ns(text: str | None) -> int | None:
-    if text is None:
+def _rate(text: str) -> float | None:
+    """How many times as fast as it was; None for max."""
+    if text == "max":
         return None
+    rate = float(text)
+    if not (math.isfinite(rate) and rate > 0):
+        raise argparse.ArgumentTypeError(f"{text} is neither a number above 0 nor max")
+    return rate
+
+
+def _utc_ns(text: str) -> int:
     try:
         time = datetime.fromisoformat(text)
     except ValueError:
-        raise ReplayError(f"--start {text} is no UTC time such as 2026-11-21T10:15:03Z") from None
+        raise argparse.ArgumentTypeError(f"{text} is no UTC time such as 2026-11-21T10:15:03Z") from None
     return round((time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp() * 1e9)

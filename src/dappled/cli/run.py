@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import tempfile
@@ -13,12 +14,23 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
+from typing import Protocol
 
 from dappled.cli import story
+from dappled.cli.common import seconds, whole
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
 from dappled.daemon.service import Service
+from dappled.daemon.stages import Stage
 from dappled.daemon.street import Story, Watchers
+from dappled.drivers.camera import StateChanged
+
+
+class Asker(Protocol):
+    """A ground station that asks for frames."""
+
+    def running(self) -> bool:
+        """Whether it still asks, or waits for an answer."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -26,15 +38,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings (default: every default)")
     parser.add_argument("--simulate", action="store_true", help="no hardware: simulated camera and autopilot")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulation (default 1)")
-    parser.add_argument("--for", dest="seconds", type=float, metavar="SECONDS", help="end after this time")
-    parser.add_argument("--frames", type=int, metavar="N", help="end after N frames; a simulated ground station asks")
+    parser.add_argument("--for", dest="seconds", type=seconds, metavar="SECONDS", help="end after this time")
+    parser.add_argument("--frames", type=whole, metavar="N", help="end after N frames; a simulated ground station asks")
     parser.add_argument("--json", action="store_true", help="one JSON object a frame")
 
 
 def run(arguments: argparse.Namespace) -> int:
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # until there is a daemon to end in order
+    try:
+        return _run(arguments)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _run(arguments: argparse.Namespace) -> int:
     settings = configuration.load(arguments.config)
     if not arguments.simulate:
-        return _serve(settings, arguments, lambda: None)
+        return _serve(settings, arguments, None)
     from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # a real flight doesn't load the mocks
 
     if arguments.config is None:
@@ -44,50 +64,99 @@ def run(arguments: argparse.Namespace) -> int:
         simulation = Simulation(World(seed=arguments.seed), settings, Path(folder))
         print("simulating a masked camera, an autopilot and a ground station", file=sys.stderr)
         with simulation as simulated:
-            ask = (lambda: simulation.ground_station(arguments.frames)) if arguments.frames else (lambda: None)
+            ask = (lambda: simulation.ground_station(arguments.frames)) if arguments.frames else None
             return _serve(simulated, arguments, ask)
 
 
-def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], object]) -> int:
+def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], Asker] | None) -> int:
     """Run the daemon until it is told to end, or has had its frames or its time."""
     told = _Told(arguments.json)
-    service = Service(settings, watchers=Watchers(finished=told.finished))
+    service = Service(settings, watchers=Watchers(finished=told.finished, camera=told.camera))
+    asked = threading.Event()
     with ExitStack() as stack:
+        for number in (signal.SIGINT, signal.SIGTERM):  # until all is closed: a second ^C must not cut that short
+            stack.callback(signal.signal, number, signal.signal(number, _stopper(service, asked)))
+        stack.callback(told.close)
         service.start()
         stack.callback(service.stop)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            stack.callback(signal.signal, number, signal.signal(number, _stopper(service)))
         print(f"flight {service.folder}", file=sys.stderr)
         print(f"stream {settings.publish.slices}", file=sys.stderr)
+        goal = _Goal(service, told, arguments.frames, arguments.seconds, ask)
         problems = _Problems(service)
-        until = time.monotonic() + (arguments.seconds or 1e12)
-        ask()
-        service.run(
-            lambda: (
-                problems.tell()
-                or time.monotonic() >= until
-                or bool(arguments.frames and told.count >= arguments.frames)
-            )
-        )
-    bad = told.failed
-    print(f"{told.count} shots: {told.count - bad} frames safe and decoded, {bad} with a problem", file=sys.stderr)
-    short = bool(arguments.frames) and told.count - bad < arguments.frames
-    return 1 if short else 0
+        service.run(lambda: problems.tell() or goal.reached())
+        problems.tell(now=True)
+    print(told.summary(), file=sys.stderr)
+    short = bool(arguments.frames) and told.good < arguments.frames
+    return 1 if short and not asked.is_set() else 0  # who ends it by a signal has had enough
+
+
+class _Goal:
+    """When the daemon has had its frames or its time. The ground station asks once the camera is ready."""
+
+    def __init__(
+        self,
+        service: Service,
+        told: _Told,
+        frames: int | None,
+        seconds: float | None,
+        ask: Callable[[], Asker] | None,
+    ) -> None:
+        self._service, self._told, self._frames, self._ask = service, told, frames, ask
+        self._until = None if seconds is None else time.monotonic() + seconds
+        self._asker: Asker | None = None
+
+    def reached(self) -> bool:
+        if self._until is not None and time.monotonic() >= self._until:
+            return True
+        if self._frames is None:
+            return False
+        if self._ask is not None and self._asker is None and self._told.camera_state == "ready":
+            self._asker = self._ask()
+        if self._told.count >= self._frames:
+            return True
+        return self._asker is not None and not self._asker.running() and self._told.count >= self._service.wished
 
 
 class _Told:
-    """Prints a line a frame, and counts."""
+    """Prints a line a frame, and what becomes of the camera; counts. A terminal that stands still holds up nobody."""
 
     def __init__(self, as_json: bool) -> None:
-        self.count = self.failed = 0
+        self.count = self.safe = self.decoded = self.good = 0
+        self.camera_state = "starting"
         self._as_json = as_json
         self._lock = threading.Lock()
+        self._lines: Stage[str] = Stage("print", _print, capacity=1000, policy="drop oldest")
+        self._lines.start()
 
     def finished(self, one: Story) -> None:
         with self._lock:
             self.count += 1
-            self.failed += bool(one.problem)
-            print(story.as_json(one) if self._as_json else story.line(one), flush=True)
+            self.safe += one.frame is not None
+            self.decoded += one.developed is not None
+            self.good += not one.problem
+        self._lines.put(story.as_json(one) if self._as_json else story.line(one))
+
+    def close(self) -> None:
+        """Print what waits, for a second at most."""
+        self._lines.stop(1.0)
+
+    def camera(self, change: StateChanged) -> None:
+        if change.state in ("busy", self.camera_state):
+            return
+        self.camera_state = change.state
+        reason = f": {change.reason}" if change.reason else ""
+        print(f"camera {change.state}{reason}", file=sys.stderr)
+
+    def summary(self) -> str:
+        bad = self.count - self.good
+        return f"{self.count} shots: {self.safe} frames safe, {self.decoded} decoded, {bad} with a problem"
+
+
+def _print(line: str) -> None:
+    try:
+        print(line, flush=True)
+    except OSError:  # nobody reads any more; the record is what counts
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # for as long as we live
 
 
 class _Problems:
@@ -96,10 +165,10 @@ class _Problems:
     def __init__(self, service: Service) -> None:
         self._service = service
         self._said: set[str] = set()
-        self._due = time.monotonic() + 5.0
+        self._due = time.monotonic() + 1.0
 
-    def tell(self) -> bool:
-        if time.monotonic() >= self._due:
+    def tell(self, *, now: bool = False) -> bool:
+        if now or time.monotonic() >= self._due:
             self._due = time.monotonic() + 1.0
             problems = set(self._service.health()["problems"])
             for text in sorted(problems - self._said):
@@ -108,8 +177,9 @@ class _Problems:
         return False
 
 
-def _stopper(service: Service) -> Callable[[int, FrameType | None], None]:
+def _stopper(service: Service, asked: threading.Event) -> Callable[[int, FrameType | None], None]:
     def stop(_number: int, _frame: FrameType | None) -> None:
+        asked.set()
         service.ask_to_stop()
 
     return stop

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from dappled.config.schema import ConfigError
+from dappled.cli.common import seconds, whole
 from dappled.daemon.ground_client import GroundClient, Outcome
 
 
@@ -14,17 +14,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--url", default="udpout:127.0.0.1:14550", help="pymavlink connection string (default %(default)s)"
     )
-    parser.add_argument("--count", type=int, default=1, metavar="N", help="photographs (default 1)")
-    parser.add_argument("--interval", type=float, default=0.0, metavar="S", help="seconds between them, at least")
+    parser.add_argument("--count", type=whole, default=1, metavar="N", help="photographs (default 1)")
+    parser.add_argument("--interval", type=seconds, default=0.0, metavar="S", help="seconds between them, at least")
     parser.add_argument(
-        "--timeout", type=float, default=60.0, metavar="S", help="for the camera, and for each photograph"
+        "--timeout", type=seconds, default=60.0, metavar="S", help="for the camera, and for each photograph"
     )
     parser.add_argument("--json", action="store_true", help="one JSON object a photograph")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    if arguments.count < 1 or arguments.interval < 0:
-        raise ConfigError("--count is 1 or more, --interval 0 or more")
     with GroundClient(arguments.url) as client:
         client.find_camera(arguments.timeout)
         outcomes = client.capture(

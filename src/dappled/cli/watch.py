@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from dappled.cli.common import seconds, whole
 from dappled.config import settings
 from dappled.daemon.subscriber import Subscriber
 from dappled.daemon.wire import Message
@@ -23,8 +24,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--ask", help="endpoint that answers questions (default: beside an ipc stream)")
     parser.add_argument("--save", type=Path, metavar="DIR", help="keep each frame's header, slices and mosaic here")
-    parser.add_argument("--count", type=int, metavar="N", help="end after the slices of N frames")
-    parser.add_argument("--timeout", type=float, metavar="S", help="give up after S seconds without a message")
+    parser.add_argument("--from-start", action="store_true", help="also what the flight sent before this began")
+    parser.add_argument("--count", type=whole, metavar="N", help="end after the slices of N frames")
+    parser.add_argument("--timeout", type=seconds, metavar="S", help="give up after S seconds without a message")
     parser.add_argument("--json", action="store_true", help="one JSON object a line")
 
 
@@ -36,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.save.mkdir(parents=True, exist_ok=True)
     frames: set[tuple[str, int]] = set()
     ended = False
-    with Subscriber(endpoint, ask) as subscriber:
+    with Subscriber(endpoint, ask, from_start=arguments.from_start) as subscriber:
         heard = time.monotonic()
         while not (ended and not subscriber.waiting_for) and (arguments.count is None or len(frames) < arguments.count):
             message = subscriber.receive(0.5)
@@ -57,7 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
             print(
                 f"{len(frames)} frames received, {subscriber.recovered} of them asked for again, {subscriber.lost} lost"
             )
-        short = arguments.count is not None and len(frames) < arguments.count
+        wanted = 1 if arguments.count is None and not ended else arguments.count or 0
+        short = len(frames) < wanted
         return 1 if short or subscriber.lost else 0
 
 

@@ -20,6 +20,8 @@ Record = TypeVar("Record")
 class ConfigError(DappledError):
     """Something configured is wrong; one sentence with the place, the value, and what to do."""
 
+    exit_code = 2
+
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Rule:

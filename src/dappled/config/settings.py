@@ -52,6 +52,15 @@ class PoseSettings:
     wait_ms: float = setting(
         700.0, "How long a tag may wait for telemetry after the exposure", unit="ms", low=0, high=10_000
     )
+    lever_arm_m: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.0), "From the antenna to the camera: forward, right, down", unit="m", low=-100, high=100
+    )
+    mount: tuple[float, float, float, float, float, float, float, float, float] = setting(
+        (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+        "Rotation from camera axes (right, down, forward) to body axes, row by row; default: down, image top forward",
+        low=-1,
+        high=1,
+    )
 
 
 @dataclass(frozen=True, slots=True)

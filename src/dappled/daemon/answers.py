@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from dappled.daemon.development import Developer
@@ -10,7 +10,7 @@ from dappled.daemon.publisher import Reply
 from dappled.daemon.stages import Stage
 from dappled.daemon.street import Book, frame_header, slices_header
 from dappled.daemon.wire import Message, WireError
-from dappled.errors import DappledError
+from dappled.errors import sentence
 
 WAITING = 32
 
@@ -18,8 +18,9 @@ WAITING = 32
 class Answers:
     """Works off questions one by one, behind a bounded queue; a question that finds it full is refused in words."""
 
-    def __init__(self, book: Book, developer: Developer | None) -> None:
-        self._book, self._developer = book, developer
+    def __init__(self, book: Book, developer: Developer | None, give_way: Callable[[], object] = lambda: None) -> None:
+        """`give_way` waits, bounded, while the flight itself has something to decode: viewing comes after it."""
+        self._book, self._developer, self._give_way = book, developer, give_way
         self._stage: Stage[tuple[Mapping[str, Any], Reply]] = Stage(
             "answers", self._work, capacity=WAITING, on_failure=self._failed
         )
@@ -51,9 +52,9 @@ class Answers:
             return Message("frame", frame_header(tag, frame, None))
         if self._developer is None:
             raise WireError("this flight is not decoded: no mask is configured")
+        self._give_way()
         developed = self._developer.develop(self._book.path(frame), tag.focal_length_mm, tag.f_number)
         return Message("slices", slices_header(tag, developed), developed.body)
 
     def _failed(self, item: tuple[Mapping[str, Any], Reply], error: Exception) -> None:
-        text = str(error) if isinstance(error, DappledError) else f"unexpected {type(error).__name__}"
-        item[1](Message("error", {"error": text}))
+        item[1](Message("error", {"error": sentence(error)}))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from importlib.metadata import entry_points
 
+from dappled.config.schema import ConfigError
 from dappled.config.settings import CameraSettings
 from dappled.drivers.camera import Camera, CameraError
 
@@ -11,11 +12,12 @@ GROUP = "dappled.cameras"
 
 
 def open_camera(settings: CameraSettings) -> Camera:
-    """The configured driver, not started yet. Raises CameraError where no package brings one of that name."""
+    """The configured driver, not started yet. Raises ConfigError where no package brings one of that name, and
+    CameraError where it can't be loaded."""
     found = {entry.name: entry for entry in entry_points(group=GROUP)}
     entry = found.get(settings.driver)
     if entry is None:
-        raise CameraError(f"no camera driver is called {settings.driver!r}; installed: {', '.join(sorted(found))}")
+        raise ConfigError(f"no camera driver is called {settings.driver!r}; installed: {', '.join(sorted(found))}")
     options = {
         "port": settings.port or None,
         "serial": settings.serial or None,
@@ -23,5 +25,9 @@ def open_camera(settings: CameraSettings) -> Camera:
         "delete_after_download": settings.delete_after_download,
         "timeouts": {"file_s": settings.file_timeout_s},
     }
-    camera: Camera = entry.load()(options)
+    try:
+        make = entry.load()
+    except (ImportError, AttributeError) as error:
+        raise CameraError(f"the camera driver {settings.driver!r} can't be loaded ({error}); install it anew") from None
+    camera: Camera = make(options)
     return camera

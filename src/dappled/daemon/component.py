@@ -34,6 +34,7 @@ STREAMS = (  # what poses need from the autopilot: message, interval in microsec
 )
 _TICK_S = 0.02
 _OLD_IMAGES = 256
+_OLD_IMAGES_A_TICK = 2
 
 ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
 DENIED = mavlink.MAV_RESULT_DENIED
@@ -233,7 +234,7 @@ class Component:
             self._links.send(_MESSAGES[number](self))
 
     def _send_old_images(self) -> None:
-        while self._old_images:
+        for _ in range(min(_OLD_IMAGES_A_TICK, len(self._old_images))):  # each may open a ledger: heartbeats go on
             index, link = self._old_images.popleft()
             captured = self._lookup(index)
             if captured is not None:

@@ -21,7 +21,7 @@ from dappled.decode.pictures import slice_mosaic
 from dappled.drivers.camera import Blob
 from dappled.drivers.camera_channel import Message
 from dappled.drivers.darkroom import Darkroom, Recipe
-from dappled.errors import DappledError
+from dappled.errors import sentence
 
 Reply = tuple[Mapping[str, Any], tuple[int, ...]]
 
@@ -45,10 +45,8 @@ class Worker:
                 self._darkroom.check()
                 return {"ready": True}, ()
             return self._develop(self._darkroom, body["path"], body["focal_length_mm"], body["f_number"])
-        except DappledError as error:
-            return {"error": str(error)}, ()
-        except MemoryError:
-            return {"error": f"not enough memory to decode {body.get('path')}"}, ()
+        except Exception as error:  # noqa: BLE001  # no frame may end the worker: the next one may be good
+            return {"error": _naming(body.get("path"), error)}, ()
 
     def _develop(self, darkroom: Darkroom, path: str, focal_length_mm: float | None, f_number: float | None) -> Reply:
         done = darkroom.develop(path, focal_length_mm=focal_length_mm, f_number=f_number, views=False)
@@ -84,6 +82,12 @@ class Worker:
         file = io.BytesIO()
         Image.fromarray(mosaic).save(file, "JPEG", quality=80)
         return file.getvalue(), (mosaic.shape[1], mosaic.shape[0])
+
+
+def _naming(path: str | None, error: Exception) -> str:
+    """The error's sentence, with the frame's file in it."""
+    text = "there is not enough memory for it" if isinstance(error, MemoryError) else sentence(error)
+    return text if path is None or path in text else f"{path}: {text}"
 
 
 def main() -> None:

@@ -21,6 +21,7 @@ from dappled.errors import DappledError
 from dappled.flight.entries import Result
 
 NICENESS = 10
+_LOOK_S = 0.1
 
 
 class DevelopmentError(DappledError):
@@ -81,6 +82,7 @@ class WorkerDeveloper:
         self._turn = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._channel: Channel | None = None
+        self._closed = False
         self.restarts = 0
 
     def warm_up(self) -> None:
@@ -97,19 +99,32 @@ class WorkerDeveloper:
             )
 
     def close(self) -> None:
-        """End the worker."""
-        with self._turn:
-            self._end()
+        """End the worker, also in the middle of a frame, which then is not decoded."""
+        self._closed = True
+        if not self._turn.acquire(timeout=0):
+            while not self._turn.acquire(timeout=_LOOK_S):
+                if process := self._process:
+                    process.kill()
+        self._end()
+        self._turn.release()
 
     def _ask(self, question: Mapping[str, Any]) -> Message:
-        channel = self._channel or self._begin()
+        if self._closed:
+            raise DevelopmentError(f"{question.get('path', 'the recipe')} was not decoded: the decoder was stopped")
+        if self._process is not None and self._process.poll() is not None:
+            self._end()  # it died between two frames: neither is to blame
+            self.restarts += 1
         try:
+            channel = self._channel or self._begin()
             channel.send(question, timeout_s=5.0)
             answer = channel.receive(self._timeout_s)
         except ChannelError:
             code = self._end()
             self.restarts += 1
             raise DevelopmentError(f"the decoder died ({_manner(code)}) on {question.get('path', 'start')}") from None
+        except OSError as error:
+            self._end()
+            raise DevelopmentError(f"the decoder's process can't be started: {error.strerror}") from None
         if answer is None:
             self._end()
             self.restarts += 1

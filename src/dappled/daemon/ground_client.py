@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from dappled.daemon.clock import SystemClock
 from dappled.drivers.mavlink import MavlinkLinks, Message, Packet, mavlink
+from dappled.errors import DappledError
 
 ACK_S = 0.5
 ACK_TRIES = 4
@@ -17,7 +18,7 @@ _ASK_AGAIN_S = 3.0
 _KEPT = 1000
 
 
-class GroundError(Exception):
+class GroundError(DappledError):
     """The camera could not be reached: one sentence."""
 
 
@@ -110,7 +111,9 @@ class GroundClient:
         """Ask for `count` photographs, each after the last one ended, at least `interval_s` apart."""
         outcomes: list[Outcome] = []
         status = self.request(mavlink.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS)
-        expected = 0 if status is None else int(status.image_count)
+        if status is None:
+            raise GroundError("the camera answers no request for its capture status: which image is new can't be told")
+        expected = int(status.image_count)
         for _ in range(count):
             began = time.monotonic()
             outcome = self._capture_one(expected, timeout_s)

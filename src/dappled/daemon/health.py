@@ -24,6 +24,7 @@ def record(
     *,
     utc_ns: int,
     monotonic_ns: int,
+    began_monotonic_ns: int,
     street: Street,
     shutter: ShutterStatistics,
     links: Sequence[LinkStatistics],
@@ -32,15 +33,15 @@ def record(
     folder: Path,
 ) -> dict[str, Any]:
     """The facts of a `health` message; `problems` are sentences, none when all is well."""
-    problems = []
-    if street.camera_state not in ("ready", "busy"):
-        problems.append(f"camera {street.camera_state}: {street.camera_reason or 'no reason given'}")
+    problems = [f"the {name} thread has ended: restart dappled" for name in street.dead()]
+    if street.camera_state not in ("starting", "ready", "busy"):
+        problems.append(camera_sentence(street))
     if not settings.mavlink.url:
         problems.append("no MAVLink link is configured: frames are tagged without poses")
     for link in links:
         if link.error:
             problems.append(link.error)
-        elif link.last_heard_monotonic_ns is None or monotonic_ns - link.last_heard_monotonic_ns > SILENT_NS:
+        elif monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS:
             problems.append(f"MAVLink link {link.url}: nobody was heard for 5 s")
     free = _free(folder)
     if free is not None and free < settings.record.min_free_mb * 1_000_000:
@@ -66,6 +67,12 @@ def record(
         "stages": [*stages, {"name": "publish", "sent": dict(publisher.sent), "dropped": dict(publisher.dropped)}],
         "problems": problems,
     }
+
+
+def camera_sentence(street: Street) -> str:
+    """Why there is no camera to fire: "the camera is absent: …"."""
+    reason = f": {street.camera_reason}" if street.camera_reason else ""
+    return f"the camera is {street.camera_state}{reason}"
 
 
 def _free(folder: Path) -> int | None:

@@ -6,7 +6,6 @@ originals have changed.
 
 from __future__ import annotations
 
-import shutil
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
@@ -57,13 +56,12 @@ def keep(made: Recipe, flight: Path) -> Recipe:
     """The same recipe with its files and profiles copied into the flight. Raises DappledError when the disk refuses."""
     folder = flight / FOLDER
     try:
-        folder.mkdir(exist_ok=True)
+        durable.make_folder(folder)
         kept: dict[str, Any] = {
             name: _copy(getattr(made, name), folder, name) for name in _FILES if getattr(made, name)
         }
         kept["camera"] = _copy_profile(made.camera, folder, "cameras")
         kept["mask"] = _copy_profile(made.mask, folder, "masks")
-        durable.sync_folder(folder)
     except OSError as error:
         raise DappledError(f"the decoder's inputs can't be copied to {folder}: {error.strerror}") from None
     return replace(made, **kept)
@@ -73,12 +71,13 @@ def of_flight(flight: Path, facts: Mapping[str, Any], overrides: Mapping[str, An
     """The recipe that a recorded flight was decoded by, its files from the flight's own copies; overrides on top."""
     settings = facts.get("settings", {})
     decode, folder = settings.get("decode", {}), flight / FOLDER
+    files: dict[str, Any] = {name: _kept(decode.get(name, ""), folder, name) for name in _FILES}
     made = Recipe(
         camera=_kept_profile(settings.get("camera", {}).get("profile", "auto"), folder, "cameras"),
         mask=_kept_profile(settings.get("mask", {}).get("profile", ""), folder, "masks"),
         law=decode.get("law", ""),
         workers=decode.get("workers", 1),
-        **{name: _kept(decode.get(name, ""), folder, name) for name in _FILES},
+        **files,
     )
     made = replace(made, **{name: value for name, value in overrides.items() if value is not None})
     return made if made.mask else None
@@ -106,7 +105,7 @@ def _law(settings: Settings) -> str:
 
 def _copy(source: str, folder: Path, name: str) -> str:
     target = folder / f"{name}{Path(source).suffix}"
-    shutil.copyfile(source, target)
+    durable.write_file(target, Path(source).read_bytes())
     return str(target)
 
 
@@ -115,12 +114,10 @@ def _copy_profile(profile: str, folder: Path, kind: str) -> str:
     if profile in ("auto", profiles.LENSLET):
         return profile
     target = folder / kind / f"{Path(profile).stem}.toml"
-    target.parent.mkdir(exist_ok=True)
-    if profile.endswith(".toml"):
-        shutil.copyfile(profile, target)
-    else:
-        shipped = resources.files("dappled.config") / "profiles" / kind / f"{profile}.toml"
-        target.write_text(shipped.read_text(encoding="utf-8"), encoding="utf-8")
+    durable.make_folder(target.parent)
+    shipped = resources.files("dappled.config") / "profiles" / kind / f"{profile}.toml"
+    source = Path(profile) if profile.endswith(".toml") else shipped
+    durable.write_file(target, source.read_bytes())
     return str(target)
 
 

@@ -24,6 +24,7 @@ import zmq
 
 from dappled.daemon import wire
 from dappled.daemon.wire import Message, WireError
+from dappled.errors import report
 
 log = logging.getLogger(__name__)
 
@@ -74,11 +75,16 @@ class Publisher:
         self._start: Message | None = None
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._stopping = threading.Event()
+        self._closed = False
         self._context = zmq.Context()
+        self._endpoints = (slices, ask)
+        self._pub: zmq.Socket[Any] | None = None
         try:
             self._pub = _bind(self._context, zmq.PUB, slices, high_water_mark)
             self._router = _bind(self._context, zmq.ROUTER, ask, high_water_mark) if ask else None
         except WireError:
+            if self._pub is not None:
+                _unlink(slices)
             self._context.destroy(linger=0)
             os.close(self._wake)
             raise
@@ -116,14 +122,19 @@ class Publisher:
         self._ring()
         if self._thread.is_alive():
             self._thread.join(grace_s + 3)
-        for one in (self._pub, self._router):
+        for endpoint, one in zip(self._endpoints, (self._pub, self._router), strict=True):
             if one is not None:
+                _unlink(endpoint)
                 one.close(linger=round(grace_s * 1000))
         self._context.term()
-        os.close(self._wake)
+        with self._lock:
+            self._closed = True  # an answer may still be on its way: it must not ring a descriptor that is another's
+            os.close(self._wake)
 
     def _ring(self) -> None:
-        os.eventfd_write(self._wake, 1)
+        with self._lock:
+            if not self._closed:
+                os.eventfd_write(self._wake, 1)
 
     def _drop_one(self) -> None:
         for topic in DROP_ORDER:
@@ -157,23 +168,30 @@ class Publisher:
                 if not self._waiting:
                     return
                 peer, message = self._waiting.popleft()
-                header = dict(message.header)
-                if not peer:
-                    header = self._envelope(message, self._sent[message.topic])
-                    self._sent[message.topic] += 1
-                    self._remember(message, header)
-            parts = [message.topic.encode(), wire.encode(header)]
-            if message.body is not None:
-                parts.append(message.body)
-            if not peer:
-                self._pub.send_multipart(parts, copy=False)
-            else:
-                assert self._router is not None  # a reply can only be to a question
-                self._open_questions -= 1
-                try:
-                    self._router.send_multipart([peer, *parts], flags=zmq.NOBLOCK, copy=False)
-                except zmq.ZMQError as error:  # the asker is gone or does not read: its loss
-                    log.info("an answer found nobody: %s", error)
+            try:
+                self._send_reply(peer, message) if peer else self._send(message)
+            except Exception as error:  # noqa: BLE001  # one message that can't be sent must not end the stream
+                report(log, f"{message.topic} was not sent", error)
+                with self._lock:
+                    self._dropped[message.topic] = self._dropped.get(message.topic, 0) + 1
+
+    def _send(self, message: Message) -> None:
+        assert self._pub is not None  # bound since the beginning
+        header = self._envelope(message, self._sent[message.topic])
+        if message.topic == "end":
+            header["sent"] = dict(self._sent)  # so that a subscriber can tell what it missed last
+        self._pub.send_multipart(_parts(message, header), copy=False)
+        with self._lock:
+            self._sent[message.topic] += 1
+            self._remember(message, header)
+
+    def _send_reply(self, peer: bytes, message: Message) -> None:
+        assert self._router is not None  # a reply can only be to a question
+        self._open_questions -= 1
+        try:
+            self._router.send_multipart([peer, *_parts(message, message.header)], flags=zmq.NOBLOCK, copy=False)
+        except zmq.ZMQError as error:  # the asker is gone or does not read: its loss
+            log.info("an answer found nobody: %s", error)
 
     def _envelope(self, message: Message, seq: int | None) -> dict[str, Any]:
         return {
@@ -238,6 +256,11 @@ class Publisher:
         return reply
 
 
+def _parts(message: Message, header: Mapping[str, Any]) -> list[Any]:
+    body = [] if message.body is None else [message.body]
+    return [message.topic.encode(), wire.encode(header), *body]
+
+
 def _question(payload: list[bytes]) -> dict[str, Any]:
     """One JSON object with `get` and, unless it asks for the start, `frame` or `seq`. Raises WireError."""
     try:
@@ -277,6 +300,12 @@ def _bind(context: zmq.Context[Any], kind: int, endpoint: str, high_water_mark: 
     if endpoint.startswith("ipc://"):
         Path(endpoint.removeprefix("ipc://")).chmod(0o660)
     return one
+
+
+def _unlink(endpoint: str) -> None:
+    """ZeroMQ leaves an ipc socket's file behind; while it is still bound nobody else can have taken the name."""
+    if endpoint.startswith("ipc://"):
+        Path(endpoint.removeprefix("ipc://")).unlink(missing_ok=True)
 
 
 def _answers(path: str) -> bool:

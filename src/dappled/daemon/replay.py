@@ -10,6 +10,7 @@ from pathlib import Path
 
 from dappled.daemon.books import Expected, ReplayBook
 from dappled.daemon.street import Story, Street
+from dappled.daemon.tagger import Exposure
 from dappled.daemon.telemetry import Telemetry, first_position_utc_ns
 from dappled.drivers.mavlink_framing import Decoder, Message
 from dappled.drivers.replay import Recorded
@@ -75,6 +76,8 @@ def of_folder(
 ) -> Recording:
     """Frames in a folder, in the order of their names; the first at `start_utc_ns` (None: the telemetry's first
     position, or 1970 without telemetry), the others at `interval_s` after each other."""
+    if telemetry is not None and not telemetry.is_file():
+        raise ReplayError(f"{telemetry}: there is no such telemetry file; check --telemetry")
     paths = [path for path in sorted(folder.glob(match)) if path.suffix.lower() in FRAME_SUFFIXES and path.is_file()]
     if not paths:
         raise ReplayError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
@@ -84,7 +87,10 @@ def of_folder(
     for index, path in enumerate(paths):
         utc_ns = start_utc_ns + round(index * interval_s * 1e9)
         shot = Shot(index, Cause("replay", path.name), utc_ns, utc_ns)
-        frame = Frame(index, path.name, path.name, path.stat().st_size, durable.hash_file(path), utc_ns)
+        try:
+            frame = Frame(index, path.name, path.name, path.stat().st_size, durable.hash_file(path), utc_ns)
+        except OSError as error:
+            raise ReplayError(f"{path} can't be read: {error.strerror}") from None
         shots.append(shot)
         files.append(Recorded(index, path, path.name, (utc_ns, utc_ns), utc_ns))
         expected.append(Expected(ShotRow(shot, "safe", None, utc_ns, utc_ns), frame))
@@ -94,17 +100,18 @@ def of_folder(
 class RecordedTelemetry:
     """Poses from a telemetry file, fed packet by packet just as far as each frame's pose was made from."""
 
-    def __init__(self, path: Path | None, horizons: dict[int, int], wait_s: float) -> None:
+    def __init__(self, path: Path | None, horizons: dict[int, int], *, wait_s: float, component_id: int = 100) -> None:
+        """`component_id` is the one that the recording daemon had."""
         self._horizons, self._wait_ns = horizons, round(wait_s * 1e9)
-        self._telemetry = Telemetry()
+        self._telemetry = Telemetry(component_id=component_id)
         self._packets = _packets(path) if path else iter(())
         self._fed = 0
 
-    def pose(self, index: int, utc_ns: int, sigma_ns: int) -> Pose:
-        """The pose of a frame (see `Street`); frames come in the order of their exposure."""
+    def pose(self, index: int, exposure: Exposure) -> tuple[Exposure, Pose]:
+        """When and where a frame was exposed (see `Street`); frames come in the order of their exposure."""
         horizon = self._horizons.get(index)
-        while self._fed != horizon:
-            if horizon is None and self._telemetry.bracketed(utc_ns):
+        while horizon is None or self._fed < horizon:
+            if horizon is None and self._telemetry.settled(exposure):
                 break
             packet = next(self._packets, None)
             if packet is None:
@@ -112,9 +119,9 @@ class RecordedTelemetry:
             number, stamp_us, message = packet
             self._telemetry.feed(number, stamp_us, message)
             self._fed = number + 1
-            if horizon is None and stamp_us * 1000 > utc_ns + self._wait_ns:
+            if horizon is None and stamp_us * 1000 > exposure.utc_ns + self._wait_ns:
                 break
-        return self._telemetry.pose_at(utc_ns, sigma_ns, upto_packet=horizon)
+        return self._telemetry.locate(exposure, upto_packet=horizon)
 
 
 @dataclass(slots=True)
@@ -122,15 +129,17 @@ class Progress:
     """Hands the shots to the street one by one, and knows when each has come to its end."""
 
     finished: threading.Semaphore
-    stories: list[Story]
+    frames: int = 0
+    bad: int = 0
 
     @classmethod
     def begin(cls) -> Progress:
-        return cls(threading.Semaphore(0), [])
+        return cls(threading.Semaphore(0))
 
     def note(self, story: Story) -> None:
-        """For `Watchers.finished`."""
-        self.stories.append(story)
+        """For `Watchers.finished`: counts, and keeps nothing of the story."""
+        self.frames += story.frame is not None
+        self.bad += bool(story.problem) and story.frame is not None
         self.finished.release()
 
 
@@ -152,7 +161,6 @@ def play(
     street: Street,
     progress: Progress,
     *,
-    fire: Callable[[int], None],
     pace: Pace | None,
     timeout_s: float = 120.0,
 ) -> None:
@@ -162,7 +170,7 @@ def play(
         if pace:
             pace(shot, before)
         street.expect(shot)
-        fire(shot.index)
+        street.fire(shot.index)
         if pace is None and not progress.finished.acquire(timeout=timeout_s):
             raise ReplayError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
         before = shot

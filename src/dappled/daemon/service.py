@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 import threading
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -23,14 +24,14 @@ from dappled.daemon.clock import Clock, SystemClock
 from dappled.daemon.component import CameraFacts, Captured, Component, Storage
 from dappled.daemon.development import DevelopmentError, WorkerDeveloper
 from dappled.daemon.publisher import Publisher, Reply
-from dappled.daemon.shutter import Shutter
+from dappled.daemon.shutter import Shutter, Verdict, Wish
 from dappled.daemon.street import Names, Story, Street, Watchers
-from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency
+from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency, Exposure
 from dappled.daemon.telemetry import Telemetry
-from dappled.drivers.camera import Camera, StateChanged
+from dappled.drivers.camera import Camera, Identity, StateChanged
 from dappled.drivers.darkroom import Recipe
 from dappled.drivers.mavlink import MavlinkLinks, Packet
-from dappled.errors import DappledError
+from dappled.errors import DappledError, report
 from dappled.flight import layout
 from dappled.flight import recording as flights
 from dappled.flight.ledger import LedgerReader
@@ -58,8 +59,11 @@ class Service:
         self._telemetry = Telemetry(component_id=settings.mavlink.component_id)
         self._component: Component | None = None
         self._recording: flights.Recording | None = None
-        self._tagged: dict[int, Captured] = {}
+        self._started = False
         self._health_due_ns = 0
+        self._identity: Identity | None = None
+        self._refused: deque[tuple[Wish, str]] = deque(maxlen=1000)
+        self._began_monotonic_ns = self._clock.monotonic_ns()
 
     # life
 
@@ -88,10 +92,12 @@ class Service:
             self._recording = flights.begin(
                 Path(self.settings.record.directory), self._clock.utc_ns, self._facts(names, recipe)
             )
+            stack.callback(self._remove_litter)
             stack.callback(self._close_recording)
             stack.callback(self._links.stop)  # before the recording closes: packets are logged there
             self._begin_street(camera, names, self._developer(recipe, stack), stack)
             self._begin_component()
+            self._started = True
             self._stack = stack.pop_all()
         for text in self._recording.recovered:
             log.warning("earlier flight: %s", text)
@@ -121,15 +127,16 @@ class Service:
             decode_queue=self.settings.decode.queue,
             preview_interval_s=self.settings.publish.preview_interval_s,
         )
-        self._answers = Answers(self._book, developer)
+        self._answers = Answers(self._book, developer, self._street.decoding_idle)
         self._shutter = Shutter(
             next_index=self._recording.next_index,
             note=self._note,
-            fire=camera.fire,
+            fire=self._street.fire,
             clock=self._clock,
             capacity=self.settings.camera.max_pending,
             obstacle=self._obstacle,
             on_change=self._changed,
+            on_refused=self._refused.append,
         )
         self._answers.start()
         stack.callback(self._answers.stop)
@@ -149,6 +156,7 @@ class Service:
             facts=self._camera_facts,
             storage=self._storage,
             lookup=self._lookup,
+            healthy=lambda: not self._street.dead(),
         )
         self._links.start()
 
@@ -162,6 +170,7 @@ class Service:
         """One turn of the working loop."""
         if self._component is not None and self.settings.mavlink.url:
             self._component.tick()
+        self._note_refusals()
         now_ns = self._clock.monotonic_ns()
         if now_ns >= self._health_due_ns:
             self._health_due_ns = now_ns + round(HEALTH_S * 1e9)
@@ -176,6 +185,10 @@ class Service:
         self._stopping.set()
         self._stack.close()
 
+    def wish(self, wish: Wish) -> Verdict:
+        """A wish from this side of the links: a console, or a test."""
+        return self._shutter.wish(wish)
+
     # what others may look at
 
     @property
@@ -184,12 +197,18 @@ class Service:
         assert self._recording is not None
         return self._recording.folder.path
 
+    @property
+    def wished(self) -> int:
+        """Shots so far."""
+        return self._shutter.statistics().shots
+
     def health(self) -> dict[str, Any]:
         """The state of everything, as published."""
         return health.record(
             self.settings,
             utc_ns=self._clock.utc_ns(),
             monotonic_ns=self._clock.monotonic_ns(),
+            began_monotonic_ns=self._began_monotonic_ns,
             street=self._street,
             shutter=self._shutter.statistics(),
             links=self._links.statistics(),
@@ -208,11 +227,24 @@ class Service:
 
     def _obstacle(self) -> str | None:
         if self._street.camera_state not in ("ready", "busy"):
-            return f"the camera is {self._street.camera_state}: {self._street.camera_reason or 'no reason given'}"
-        free = layout.free_bytes(self.folder)
+            return health.camera_sentence(self._street)
+        try:
+            free = layout.free_bytes(self.folder)
+        except DappledError as error:
+            return str(error)
         if free < self.settings.record.min_free_mb * 1_000_000:
             return f"the disk is nearly full: {free // 1_000_000} MB left, record.min_free_mb asks for more"
         return None
+
+    def _note_refusals(self) -> None:
+        """Refused wishes stand in the flight too, as events; written here, where nobody waits for an answer."""
+        while self._refused:
+            wish, reason = self._refused.popleft()
+            try:
+                self._book.event("refused", f"{wish.kind} from {wish.source}: {reason}")
+            except DappledError as error:
+                report(log, "refusals", error)
+                return
 
     def _settled(self, index: int, ok: bool) -> None:
         self._shutter.settled(index, ok)
@@ -221,11 +253,13 @@ class Service:
     def _camera_changed(self, change: StateChanged) -> None:
         log.info("camera %s %s", change.state, change.reason)
         self._changed()
-        if change.identity is not None and self._recording is not None:
-            who = change.identity
-            self._recording.add_facts(
-                {"camera": {"make": who.make, "model": who.model, "serial": who.serial, "port": who.port}}
-            )
+        if change.identity not in (None, self._identity) and self._recording is not None:
+            who = self._identity = change.identity
+            facts = {"make": who.make, "model": who.model, "serial": who.serial, "port": who.port}
+            try:
+                self._recording.add_facts({"camera": facts})
+            except DappledError as error:
+                report(log, "camera", error)
         self._outside.camera(change)
 
     def _changed(self) -> None:
@@ -244,12 +278,12 @@ class Service:
         if self._component is not None:
             self._component.on_packet(packet)
 
-    def _pose(self, index: int, utc_ns: int, sigma_ns: int) -> Pose:
+    def _pose(self, index: int, exposure: Exposure) -> tuple[Exposure, Pose]:
         """The pose once telemetry from after the exposure is there, or `pose.wait_ms` after it as it is then."""
-        give_up_ns = utc_ns + round(self.settings.pose.wait_ms * 1e6)
-        while not self._telemetry.bracketed(utc_ns) and self._clock.utc_ns() < give_up_ns:
+        give_up_ns = exposure.utc_ns + round(self.settings.pose.wait_ms * 1e6)
+        while not self._telemetry.settled(exposure) and self._clock.utc_ns() < give_up_ns:
             self._stopping.wait(0.005) if not self._stopping.is_set() else self._clock.wait(threading.Event(), 0.005)
-        return self._telemetry.pose_at(utc_ns, sigma_ns)
+        return self._telemetry.locate(exposure)
 
     # what the ground station hears
 
@@ -258,21 +292,23 @@ class Service:
         if story.tag is not None and story.frame is not None:
             captured = Captured(index, True, story.tag.utc_ns, story.tag.pose, story.frame.name)
         else:
-            captured = Captured(index, False)
+            captured = Captured(index, story.frame is not None, url=story.frame.name if story.frame else "")
         if self._component is not None:
             self._component.announce(captured)
         self._outside.tagged(story)
 
     def _lookup(self, index: int) -> Captured | None:
         assert self._recording is not None
-        entry = self._recording.index.lookup(index)
-        if entry is None:
+        try:
+            entry = self._recording.index.lookup(index)
+            if entry is None or entry.state not in ("safe", "failed") or self._street.in_hand(index):
+                return None  # unknown, or still on its way: its own message will come
+            root = Path(self.settings.record.directory)
+            with LedgerReader.open(layout.FlightFolder(root / entry.flight).ledger) as ledger:
+                tag = ledger.tag(index)
+        except DappledError as error:  # such as an old flight that was moved away
+            report(log, f"image {index} can't be looked up", error)
             return None
-        if entry.state not in ("safe", "failed"):
-            return None  # still on its way: its own message will come
-        root = Path(self.settings.record.directory)
-        with LedgerReader.open(layout.FlightFolder(root / entry.flight).ledger) as ledger:
-            tag = ledger.tag(index)
         if tag is None:
             return Captured(index, entry.state == "safe", url=entry.frame or "")
         return Captured(index, entry.state == "safe", tag.utc_ns, tag.pose, entry.frame or "")
@@ -319,11 +355,18 @@ class Service:
         self._answers.answer(request, reply)
 
     def _say_end(self) -> None:
+        self._note_refusals()
         now = self._shutter.statistics()
         counts = {"wished": now.shots, "safe": now.succeeded, "failed": now.failed, "open": now.pending}
-        sent = dict(self._publisher.statistics().sent)
-        self._publisher.publish("end", {"utc_ns": self._clock.utc_ns(), "shots": counts, "sent": sent})
+        self._publisher.publish("end", {"utc_ns": self._clock.utc_ns(), "shots": counts})
         self._publisher.stop()  # answers last questions: before the decoder goes
+
+    def _remove_litter(self) -> None:
+        """A start that failed leaves no flight without a shot behind."""
+        assert self._recording is not None
+        folder = self._recording.folder
+        if not self._started and folder.journal.exists() and folder.journal.stat().st_size == 0:
+            shutil.rmtree(folder.path, ignore_errors=True)
 
     def _close_recording(self) -> None:
         assert self._recording is not None

@@ -86,6 +86,7 @@ class Shutter:
         capacity: int = 8,
         obstacle: Callable[[], str | None] = lambda: None,
         on_change: Callable[[], None] = lambda: None,
+        on_refused: Callable[[tuple[Wish, str]], None] = lambda refused: None,
     ) -> None:
         self._next_index = next_index
         self._note = note
@@ -94,6 +95,7 @@ class Shutter:
         self._capacity = capacity
         self._obstacle = obstacle
         self._on_change = on_change
+        self._on_refused = on_refused
         self._lock = threading.Lock()
         self._recent = Recent()
         self._pending: set[int] = set()
@@ -223,6 +225,7 @@ class Shutter:
                 reason = f"the wish could not be written down: {error}"
         if reason is not None:
             self._refused += 1
+            self._on_refused((wish, reason))
             log.warning("A shot was refused (%s, %s): %s", wish.source, wish.kind, reason)
             return Verdict("refused", reason=reason)
         self._next_index += 1

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
+from dappled.errors import report
+
 Item = TypeVar("Item")
 Policy = Literal["refuse", "drop oldest"]
 log = logging.getLogger(__name__)
@@ -61,6 +63,11 @@ class Stage(Generic[Item]):
         """Begin to work."""
         self._thread.start()
 
+    @property
+    def alive(self) -> bool:
+        """Whether the thread works, or waits for work."""
+        return self._thread.is_alive()
+
     def put(self, item: Item) -> bool:
         """Hand over an item; False when it was turned away. Never waits."""
         lost: Item | None = None
@@ -76,8 +83,8 @@ class Stage(Generic[Item]):
                 self._items.append(item)
                 self._accepted += 1
                 self._changed.notify_all()
-        if self._on_drop and (lost is not None or not taken):
-            self._on_drop(item if lost is None else lost)
+        if lost is not None or not taken:
+            self._call(self._on_drop, item if lost is None else lost)
         return taken
 
     def wait_idle(self, timeout_s: float) -> bool:
@@ -86,12 +93,19 @@ class Stage(Generic[Item]):
             return self._changed.wait_for(lambda: not self._items and not self._busy, timeout_s)
 
     def stop(self, timeout_s: float) -> bool:
-        """Take no more, work off what waits, end the thread; False when that took longer than `timeout_s`."""
+        """Take no more, work off what waits, end the thread. False when that took longer than `timeout_s`: then what
+        still waits is dropped, and the thread ends after the item in hand."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
         if self._thread.is_alive():
             self._thread.join(timeout_s)
+        with self._changed:
+            left = list(self._items)
+            self._items.clear()
+            self._dropped += len(left)
+        for item in left:
+            self._call(self._on_drop, item)
         return not self._thread.is_alive()
 
     def statistics(self) -> Statistics:
@@ -119,12 +133,18 @@ class Stage(Generic[Item]):
                 self._busy = True
             try:
                 self._work(item)
-            except Exception as error:  # one bad item must not end the stage; it is counted and told
-                log.exception("%s failed", self.name)
+            except Exception as error:  # noqa: BLE001  # one bad item must not end the stage; it is counted and told
+                report(log, self.name, error)
                 with self._changed:
                     self._failed += 1
-                if self._on_failure:
-                    self._on_failure(item, error)
+                self._call(self._on_failure, item, error)
             else:
                 with self._changed:
                     self._done += 1
+
+    def _call(self, told: Callable[..., None] | None, *facts: object) -> None:
+        try:
+            if told:
+                told(*facts)
+        except Exception as error:  # noqa: BLE001  # nor must whoever is told
+            report(log, f"{self.name}: telling it", error)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from types import TracebackType
 from typing import Any
@@ -13,12 +14,15 @@ import zmq
 from dappled.daemon import wire
 from dappled.daemon.wire import Message, WireError
 
+AT_ONCE = 4  # questions under way; the others wait their turn here
+
 
 class Subscriber:
     """Receives messages in order of arrival; lost `slices` are asked for on `ask` and handed out when they come.
 
-    `endpoint` and `ask` are ZeroMQ endpoints; without `ask` gaps are only counted. `lost` counts slices that were
-    missed and not had by asking. `clock` is monotonic seconds.
+    `endpoint` and `ask` are ZeroMQ endpoints; without `ask` gaps are only counted. With `from_start` the slices that a
+    flight sent before this subscriber came count as a gap too. `gaps` counts slices that were missed, `recovered` those
+    had by asking, `lost` those not had. `clock` is monotonic seconds.
     """
 
     def __init__(
@@ -27,13 +31,16 @@ class Subscriber:
         ask: str = "",
         *,
         topics: Collection[str] = wire.TOPICS,
+        from_start: bool = False,
         high_water_mark: int = 8,
         answer_timeout_s: float = 30.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._clock = clock
         self._answer_timeout_s = answer_timeout_s
-        self._next: dict[str, int] = {}
+        self._from_start = from_start
+        self._next: dict[str, int] = {}  # by flight: the slices' next seq
+        self._missing: deque[int] = deque()
         self._asked: dict[int, float] = {}  # seq of slices → deadline
         self.gaps = self.recovered = self.lost = 0
         self._context = zmq.Context()
@@ -74,7 +81,7 @@ class Subscriber:
     @property
     def waiting_for(self) -> int:
         """How many answers are still to come."""
-        return len(self._asked)
+        return len(self._asked) + len(self._missing)
 
     def receive(self, timeout_s: float) -> Message | None:
         """The next message, live or asked for; None when there was none for that long."""
@@ -94,20 +101,28 @@ class Subscriber:
                 return None
 
     def _watch_gaps(self, message: Message) -> None:
-        seq = message.header.get("seq")
-        if not isinstance(seq, int):
+        header = message.header
+        flight, seq = str(header.get("flight", "")), header.get("seq")
+        if message.topic == "slices" and isinstance(seq, int):
+            until, after = seq, seq + 1
+        elif message.topic == "end" and isinstance(sent := header.get("sent"), dict):
+            until = after = int(sent.get("slices", 0))
+        else:
             return
-        expected = self._next.get(message.topic, seq)
-        self._next[message.topic] = seq + 1
-        if message.topic != "slices":
-            return
-        for missed in range(expected, seq):
+        for missed in range(self._next.get(flight, 0 if self._from_start else until), until):
             self.gaps += 1
             if self._dealer is None:
                 self.lost += 1
             else:
-                self._asked[missed] = self._clock() + self._answer_timeout_s
-                self.ask({"get": "slices", "seq": missed})
+                self._missing.append(missed)
+        self._next[flight] = max(after, self._next.get(flight, 0))
+        self._ask_next()
+
+    def _ask_next(self) -> None:
+        while self._missing and len(self._asked) < AT_ONCE:
+            seq = self._missing.popleft()
+            self._asked[seq] = self._clock() + self._answer_timeout_s
+            self.ask({"get": "slices", "seq": seq})
 
     def _answered(self, answer: Message) -> Message:
         question = answer.header.get("asked")
@@ -117,6 +132,7 @@ class Subscriber:
                 self.lost += 1
             else:
                 self.recovered += 1
+        self._ask_next()
         return answer
 
     def _give_up(self) -> None:
@@ -124,6 +140,7 @@ class Subscriber:
         for seq in [seq for seq, deadline in self._asked.items() if deadline < now]:
             del self._asked[seq]
             self.lost += 1
+        self._ask_next()
 
 
 def subscribe(

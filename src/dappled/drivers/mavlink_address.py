@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from dappled.errors import DappledError
+
 Kind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial"]
 FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, udpbcast:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or /dev/ttyX[,BAUD]"
 DEFAULT_BAUD = 115200
@@ -18,7 +20,7 @@ _SCHEMES: dict[str, Kind] = {
 }
 
 
-class LinkError(Exception):
+class LinkError(DappledError):
     """A link can't be had: one sentence with the url and what to do."""
 
 

@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled.errors import DappledError
 from dappled.mocks.eos450d import CARD_BYTES, SERIAL, Eos450d, Expose
 from dappled.mocks.faults import Faults
 from dappled.mocks.ptpip import Responder
@@ -29,7 +30,7 @@ _START_S = 30.0
 _ANSWER_S = 5.0
 
 
-class BodyError(Exception):
+class BodyError(DappledError):
     """The body's process didn't start or doesn't answer."""
 
 
@@ -97,6 +98,9 @@ class Body:
         except (BodyError, ValueError) as error:
             _end(process)
             raise BodyError(f"the simulated body did not start: {error}") from error
+        except BaseException:  # interrupted: it must not be left behind
+            _end(process)
+            raise
         return cls(process, lines, port)
 
     @property
@@ -288,6 +292,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         serve(_options(arguments), sys.stdin)
     except ValueError as error:
         sys.exit(f"body: {error}")
+    except BrokenPipeError:
+        os._exit(0)  # the starter is gone; nothing is left to be said, not even at the exit
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import subprocess
 import sys
 
@@ -58,6 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--timeout", type=float, default=60.0, help="seconds to wait for the camera, and for each photo"
     )
     wanted = parser.parse_args(arguments)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C reaches the whole group; the starter ends us
     try:
         with GroundClient(wanted.url) as client:
             client.find_camera(wanted.timeout)

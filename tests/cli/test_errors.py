@@ -1,0 +1,92 @@
+"""Every error that a person may meet is one sentence on the command line, and never a traceback."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Iterator
+
+import pytest
+
+import dappled
+from dappled import cli
+from dappled.errors import DappledError
+
+INTERNAL = {  # caught where they arise, and told as another error or as an event
+    "dappled.drivers.camera_channel.ChannelError",
+    "dappled.drivers.gphoto2_session.SessionError",
+    "dappled.mocks.ptp.MalformedPacketError",
+}
+
+
+def error_classes() -> Iterator[type[Exception]]:
+    """All exception classes that dappled defines."""
+    for found in pkgutil.walk_packages(dappled.__path__, "dappled."):
+        if found.name == "dappled.__main__":
+            continue
+        module = importlib.import_module(found.name)
+        for _, one in inspect.getmembers(module, inspect.isclass):
+            if issubclass(one, Exception) and one.__module__ == found.name:
+                yield one
+
+
+def full_name(one: type) -> str:
+    return f"{one.__module__}.{one.__qualname__}"
+
+
+CLASSES = sorted(set(error_classes()), key=full_name)
+
+
+def test_every_error_for_a_person_is_of_the_family() -> None:
+    strangers = {
+        full_name(one)
+        for one in CLASSES
+        if not issubclass(one, DappledError) and not any(full_name(base) in INTERNAL for base in one.__mro__)
+    }
+    assert strangers == set()
+    assert len(CLASSES) > 10
+
+
+def ended(monkeypatch: pytest.MonkeyPatch, error: BaseException, *flags: str) -> int:
+    """The exit code of `dappled profiles` when it meets the error."""
+    from dappled.cli import config  # noqa: PLC0415  # patched here
+
+    def run(_: object) -> int:
+        raise error
+
+    monkeypatch.setattr(config, "run", run)
+    return cli.main([*flags, "profiles"])
+
+
+@pytest.mark.parametrize("one", [c for c in CLASSES if issubclass(c, DappledError)], ids=full_name)
+def test_it_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], one: type[DappledError]
+) -> None:
+    error = one.__new__(one)  # some want more than a sentence
+    Exception.__init__(error, "the disk is full; free some space")
+    assert ended(monkeypatch, error) == one.exit_code
+    out, err = capfd.readouterr()
+    assert (out, err) == ("", "dappled profiles: the disk is full; free some space\n")
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (PermissionError(13, "Permission denied", "/root/x"), "/root/x: Permission denied"),
+        (OSError("odd"), "odd"),
+        (ZeroDivisionError("bug"), "unexpected ZeroDivisionError: bug"),
+    ],
+)
+def test_other_errors_are_one_line_too(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], error: Exception, words: str
+) -> None:
+    assert ended(monkeypatch, error) == 1
+    err = capfd.readouterr().err
+    assert words in err
+    assert err.count("\n") == 1
+
+
+def test_debug_shows_where_it_came_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(DappledError, match="why"):
+        ended(monkeypatch, DappledError("why"), "--debug")

@@ -1,0 +1,194 @@
+"""A camera, a developer and a flight for tests of the street: small, and true to the protocols."""
+
+from __future__ import annotations
+
+import mmap
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dappled.daemon.books import LiveBook
+from dappled.daemon.clock import RecordedClock, SystemClock
+from dappled.daemon.development import Developed, DevelopmentError
+from dappled.daemon.shutter import Shutter, Verdict, Wish
+from dappled.daemon.street import Names, Story, Street, Watchers
+from dappled.daemon.tagger import BodyLatency
+from dappled.drivers.camera import Arrival, Blob, CameraError, Event, Fired, ShotFailed, StateChanged
+from dappled.flight import recording
+from dappled.flight.records import Pose, Shot
+
+
+def no_pose(utc_ns: int = 0) -> Pose:
+    return Pose("none", utc_ns, None, None, None, None, None, None, None, None, None, None, 0)
+
+
+Script = Callable[[int], list[Event | Exception]]
+
+
+def fired(shot: int) -> Fired:
+    now = time.monotonic_ns()
+    return Fired(shot, now, now + 1000)
+
+
+def arrival(shot: int | None, data: bytes = b"", name: str = "IMG_0001.DNG") -> Arrival:
+    return Arrival(shot, name, Blob.of(data or b"frame %d" % (shot or 0)), time.monotonic_ns())
+
+
+def failed(shot: int, reason: str = "the mirror is stuck") -> ShotFailed:
+    return ShotFailed(shot, reason, time.monotonic_ns())
+
+
+def good(shot: int) -> list[Event | Exception]:
+    return [fired(shot), arrival(shot)]
+
+
+class FakeCamera:
+    """A driver that plays a script for each shot. An exception in it is raised by `next_event`; one that stands first
+    and is a CameraError by `fire`."""
+
+    def __init__(self, script: Script = good) -> None:
+        self.script = script
+        self.fired: list[int] = []
+        self.released: list[int | None] = []
+        self.stopped = False
+        self._events: queue.SimpleQueue[Event | Exception] = queue.SimpleQueue()
+
+    def start(self) -> None:
+        self._events.put(StateChanged("ready", "", time.monotonic_ns()))
+
+    def fire(self, shot: int) -> None:
+        self.fired.append(shot)
+        events = self.script(shot)
+        if events and isinstance(events[0], CameraError):
+            for event in events[1:]:
+                self._events.put(event)
+            raise events[0]
+        for event in events:
+            self._events.put(event)
+
+    def say(self, event: Event) -> None:
+        self._events.put(event)
+
+    def next_event(self, timeout_s: float) -> Event | None:
+        try:
+            event = self._events.get(timeout=timeout_s) if timeout_s > 0 else self._events.get_nowait()
+        except queue.Empty:
+            return None
+        if isinstance(event, Exception):
+            raise event
+        return event
+
+    def release(self, arrival: Arrival) -> None:
+        self.released.append(arrival.shot)
+
+    def stop(self) -> None:
+        self.stopped = True
+
+
+class FakeDeveloper:
+    """Every frame decodes to the same few bytes, unless `problem` says otherwise."""
+
+    def __init__(self) -> None:
+        self.problem = ""
+        self.gate = threading.Event()
+        self.gate.set()
+        self.seen: list[str] = []
+
+    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> Developed:
+        self.seen.append(path)
+        assert self.gate.wait(20)
+        if self.problem:
+            raise DevelopmentError(self.problem)
+        body = mmap.mmap(-1, 16)
+        arrays = [{"name": "slices", "dtype": "<c8", "shape": [1, 1, 2], "unit": "1"}]
+        unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+        return Developed(body, "0" * 64, arrays, [[0.0] * 4], "calibrated", 1, 1, "geometric", unit, b"", (0, 0))
+
+
+@dataclass
+class Rig:
+    """A street with its shutter and book, in front of a fake camera."""
+
+    flight: recording.Recording
+    camera: FakeCamera
+    street: Street
+    shutter: Shutter
+    developer: FakeDeveloper | None
+    stories: list[Story] = field(default_factory=list)
+    settled: list[tuple[int, bool]] = field(default_factory=list)
+    tagged: list[int] = field(default_factory=list)
+
+    def wish(self, number: int) -> Verdict:
+        return self.shutter.wish(Wish("test", "console", number))
+
+    def ended(self, index: int) -> Story:
+        """The story of a shot, once it is finished."""
+        until = time.monotonic() + 20
+        while time.monotonic() < until:
+            for story in list(self.stories):
+                if story.shot.index == index:
+                    return story
+            threading.Event().wait(0.002)
+        raise AssertionError(f"shot {index} never ended")
+
+    def events(self) -> list[str]:
+        return [f"{event.kind}: {event.text}" for event in self.flight.ledger.events()]
+
+
+def eventually(condition: Callable[[], object], what: str) -> None:
+    until = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < until, f"never: {what}"
+        threading.Event().wait(0.002)
+
+
+@contextmanager
+def rig(
+    flights: Path, script: Script = good, *, decode: bool = True, queue_: int = 4, stop_s: float = 5.0
+) -> Iterator[Rig]:
+    """A street at work on a new flight in `flights`; stopped and closed at the end."""
+    clock = SystemClock()
+    flight = recording.begin(flights, clock.utc_ns, {})
+    book = LiveBook(flight, clock)
+    camera = FakeCamera(script)
+    developer = FakeDeveloper() if decode else None
+    made: list[Rig] = []
+
+    def settled(index: int, ok: bool) -> None:
+        made[0].settled.append((index, ok))
+        made[0].shutter.settled(index, ok)
+
+    def note(shot: Shot) -> None:
+        flight.journal.note(shot)
+        book.wished(shot)
+        made[0].street.expect(shot)
+
+    street = Street(
+        camera=camera,
+        book=book,
+        poses=lambda index, exposure: (exposure, no_pose(exposure.utc_ns)),
+        developer=developer,
+        publisher=None,
+        latency=BodyLatency(60.0, 15.0, "test"),
+        names=Names("test", "mask", "geometric"),
+        watchers=Watchers(
+            settled,
+            lambda story: made[0].tagged.append(story.shot.index),
+            lambda story: made[0].stories.append(story),  # noqa: PLW0108  # a test may take the list away
+        ),
+        decode_queue=queue_,
+    )
+    now_ns = clock.utc_ns()  # it stands still, so that a slow machine makes no new wish of a retry
+    steady = RecordedClock(now_ns, now_ns - clock.monotonic_ns())
+    shutter = Shutter(next_index=flight.next_index, note=note, fire=street.fire, clock=steady, capacity=1000)
+    made.append(Rig(flight, camera, street, shutter, developer))
+    street.start()
+    try:
+        yield made[0]
+    finally:
+        street.stop(stop_s)
+        flight.close()

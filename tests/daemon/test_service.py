@@ -1,0 +1,118 @@
+"""The whole daemon with a fake camera: what its parts tell each other when one of them is in trouble."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dappled.config import settings as configuration
+from dappled.config.settings import PoseSettings, PublishSettings, RecordSettings, Settings
+from dappled.daemon import service as module
+from dappled.daemon.service import Service
+from dappled.daemon.shutter import Wish
+from dappled.daemon.street import Story, Watchers
+from dappled.errors import DappledError
+from dappled.flight import check, layout
+from dappled.flight.errors import FlightError
+from tests.daemon.fakes import FakeCamera, eventually
+
+
+@pytest.fixture
+def camera(monkeypatch: pytest.MonkeyPatch) -> FakeCamera:
+    """The camera that every daemon of this test gets."""
+    one = FakeCamera()
+    monkeypatch.setattr(module, "open_camera", lambda _: one)
+    return one
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Iterator[Settings]:
+    with tempfile.TemporaryDirectory(prefix="dpl-") as sockets:
+        yield configuration.resolve(
+            Settings(
+                record=RecordSettings(str(tmp_path / "flights"), 0),
+                pose=PoseSettings(0.0),
+                publish=PublishSettings(slices=f"ipc://{sockets}/s"),
+            )
+        )
+
+
+def started(settings: Settings, stories: list[Story]) -> Service:
+    service = Service(settings, watchers=Watchers(finished=stories.append))
+    service.start()
+    eventually(lambda: service.health()["camera"]["state"] == "ready", "the camera is ready")
+    return service
+
+
+def test_a_wish_goes_to_the_end_and_can_be_looked_up_in_the_next_flight(camera: FakeCamera, settings: Settings) -> None:
+    stories: list[Story] = []
+    service = started(settings, stories)
+    assert service.wish(Wish("test", "console", 1)).index == 0
+    eventually(lambda: stories, "the shot's end")
+    assert service.wished == 1
+    service.stop()
+    assert check.check(service.folder).intact
+    assert camera.stopped
+    after = started(settings, stories)
+    found = after._lookup(0)
+    assert found is not None
+    assert (found.ok, found.url) == (True, "frames/000000.dng")
+    assert after.wish(Wish("test", "console", 1)).index == 1
+    after.stop()
+
+
+def test_an_old_flight_that_was_moved_away_is_unknown(camera: FakeCamera, settings: Settings) -> None:
+    stories: list[Story] = []
+    first = started(settings, stories)
+    first.wish(Wish("test", "console", 1))
+    eventually(lambda: stories, "the shot's end")
+    first.stop()
+    second = started(settings, stories)
+    first.folder.rename(first.folder.parent.parent / "moved")
+    assert second._lookup(0) is None
+    assert second._lookup(99) is None
+    second.stop()
+
+
+def test_a_disk_that_can_t_be_asked_refuses_in_words(
+    camera: FakeCamera, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = started(settings, [])
+
+    def refuse(_: Path) -> int:
+        raise FlightError("cannot ask for the free space of the disk")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(layout, "free_bytes", refuse)
+        verdict = service.wish(Wish("test", "console", 1))
+    assert (verdict.outcome, verdict.reason) == ("refused", "cannot ask for the free space of the disk")
+    service.stop()
+    assert not camera.fired
+
+
+def test_a_start_that_fails_late_leaves_nothing(
+    camera: FakeCamera, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise DappledError("not today")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(module, "Component", refuse)
+        service = Service(settings)
+        with pytest.raises(DappledError, match="not today"):
+            service.start()
+    root = Path(settings.record.directory)
+    assert [path.name for path in root.iterdir() if path.is_dir()] == []
+    assert not Path(settings.publish.slices.removeprefix("ipc://")).exists()
+    started(settings, []).stop()
+
+
+def test_stop_twice_and_before_start_is_harmless(camera: FakeCamera, settings: Settings) -> None:
+    Service(settings).stop()
+    service = started(replace(settings), [])
+    service.stop()
+    service.stop()

@@ -1,0 +1,113 @@
+"""A whole daemon inside the test's own process, in front of a simulated body that shows any file one likes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from dappled.config import settings as configuration
+from dappled.config.schema import Source
+from dappled.config.settings import Settings
+from dappled.daemon.service import Service
+from dappled.daemon.shutter import Verdict, Wish
+from dappled.daemon.street import Story, Watchers
+from dappled.flight import check, summary
+from dappled.flight.ledger import LedgerReader
+
+DEADLINE_S = 30.0
+
+
+def eventually(condition: Callable[[], object], what: str, deadline_s: float = DEADLINE_S) -> None:
+    """Wait until the condition holds; fails after the deadline."""
+    until = time.monotonic() + deadline_s
+    while not condition():
+        assert time.monotonic() < until, f"not within {deadline_s} s: {what}"
+        threading.Event().wait(0.005)
+
+
+def settings_of(folder: Path, **tables: Mapping[str, Any]) -> Settings:
+    """Settings with record and endpoints in `folder`; the tables given come on top."""
+    ours: dict[str, dict[str, Any]] = {
+        "camera": {"port": "ptpip:127.0.0.1:1:1"},
+        "record": {"directory": str(folder / "flights"), "min_free_mb": 0},
+        "publish": {"slices": f"ipc://{folder}/s"},
+        "pose": {"wait_ms": 0},
+    }
+    for name, table in tables.items():
+        ours.setdefault(name, {}).update(table)
+    return configuration.resolve(configuration.parse(ours, Source("test")))
+
+
+class Flying:
+    """A daemon that runs, and what came down its street."""
+
+    def __init__(self, service: Service, stories: list[Story], settled: list[tuple[int, bool]]) -> None:
+        self.service, self.stories, self.settled = service, stories, settled
+        self._wishes = 0
+
+    @property
+    def problems(self) -> str:
+        return "\n".join(self.service.health()["problems"])
+
+    @property
+    def camera(self) -> str:
+        state: str = self.service.health()["camera"]["state"]
+        return state
+
+    def until_ready(self) -> None:
+        eventually(lambda: self.camera == "ready", f"camera ready: {self.problems}")
+
+    def wish(self) -> Verdict:
+        self._wishes += 1
+        return self.service.wish(Wish("test", "console", self._wishes))
+
+    def shoot(self) -> Story:
+        """One shot to its end."""
+        self.until_ready()
+        verdict = self.wish()
+        assert verdict.outcome == "shot", verdict.reason
+        eventually(lambda: any(one.shot.index == verdict.index for one in self.stories), f"shot {verdict.index}")
+        return next(one for one in self.stories if one.shot.index == verdict.index)
+
+
+@contextmanager
+def flying(settings: Settings) -> Iterator[Flying]:
+    """The daemon of these settings, at work; in the end it is stopped, and its record must be whole."""
+    stories: list[Story] = []
+    settled: list[tuple[int, bool]] = []
+    service = Service(
+        settings,
+        watchers=Watchers(finished=stories.append, settled=lambda index, ok: settled.append((index, ok))),
+    )
+    service.start()
+    folder = service.folder
+    loop = threading.Thread(target=service.run, name="daemon")
+    loop.start()
+    try:
+        yield Flying(service, stories, settled)
+    finally:
+        service.ask_to_stop()
+        loop.join(5)
+        service.stop()
+    assert not loop.is_alive()
+    assert_whole(folder)
+    assert len({one.shot.index for one in stories}) == len(stories), "a shot ended twice"
+
+
+def assert_whole(flight: Path) -> None:
+    """`flight check` is good, the books balance, and every shot is safe or failed."""
+    assert check.check(flight).problems == ()
+    balance = summary.report(flight)
+    assert balance.balanced
+    assert balance.closed
+    assert balance.open == 0
+
+
+def told(flight: Path) -> list[str]:
+    """The ledger's events, as "kind: text"."""
+    with LedgerReader.open(flight / "flight.sqlite") as ledger:
+        return [f"{event.kind}: {event.text}" for event in ledger.events()]
