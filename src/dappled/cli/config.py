@@ -60,13 +60,24 @@ def _profiles(as_json: bool) -> int:
     masks = [profiles.mask(name) for name in profiles.shipped("masks")]
     if as_json:
         found = {
-            "cameras": [{"name": c.name, "law": c.law, "description": c.description} for c in cameras],
+            "cameras": [
+                {
+                    "name": c.name,
+                    "law": c.law,
+                    "description": c.description,
+                    "raw": [{"name": raw.name, "shape": list(raw.sensor.shape)} for raw in c.raw],
+                }
+                for c in cameras
+            ],
             "masks": [{"name": m.name, "carriers": len(m.mask.orders()), "description": m.description} for m in masks],
         }
         print(json.dumps(found, indent=2))
         return 0
     for camera in cameras:
         print(f"camera {camera.name:16} {camera.law:10} {camera.description}")
+        for raw in camera.raw:
+            height, width = raw.sensor.shape
+            print(f"{'':34} {height} × {width} px: {raw.name}")
     for mask in masks:
         print(f"mask   {mask.name:16} {len(mask.mask.orders()):3} carriers {mask.description}")
     return 0
