@@ -398,6 +398,8 @@ def test_a_disk_that_is_nearly_full_refuses_new_shots(body: Body, here: Path) ->
         assert "the disk is nearly full" in str(verdict.reason)
         assert "disk nearly full" in daemon.problems
     assert not daemon.stories
+    balance = summary.report(daemon.service.folder)
+    assert (balance.wishes, balance.refused) == (0, 1)  # a wish that was refused stands in the flight as well
 
 
 @contextmanager

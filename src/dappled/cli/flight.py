@@ -127,7 +127,9 @@ def _report(flight: Path, as_json: bool) -> int:
     else:
         print(f"{found.flight}{'' if found.closed else ' (still open)'}")
         for source, count in found.by_source.items():
-            print(f"  {count:6d} wishes from {source}")
+            print(f"  {count:6d} shots wished for by {source}")
+        if found.refused:
+            print(f"  {found.refused:6d} wishes refused, each with its reason (dappled flight show --json: events)")
         print(f"  {found.wishes:6d} shots: {found.safe} safe, {found.failed} failed, {found.open} open")
         print(f"  {found.frames:6d} frames, {found.size / 1e6:.1f} MB: {found.tagged} tagged, {found.decoded} decoded")
         if found.strays:

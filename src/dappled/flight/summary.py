@@ -17,7 +17,8 @@ from dappled.flight.records import Frame, Tag
 
 @dataclass(frozen=True, slots=True)
 class Balance:
-    """The books of a flight: every wish is safe, failed or still open. `by_source` counts wishes."""
+    """The books of a flight: every wish that became a shot is safe, failed or still open; `refused` ones became none.
+    `by_source` counts shots."""
 
     flight: str
     wishes: int
@@ -31,6 +32,7 @@ class Balance:
     size: int
     by_source: Mapping[str, int]
     closed: bool
+    refused: int = 0
 
     @property
     def balanced(self) -> bool:
@@ -91,6 +93,7 @@ def report(path: Path) -> Balance:
             size=sum(frame.size for frame in frames),
             by_source=dict(sorted(Counter(row.shot.cause.source for row in shots).items())),
             closed="closed_utc_ns" in ledger.facts(),
+            refused=sum(event.kind == "refused" for event in ledger.events()),
         )
 
 
