@@ -88,18 +88,6 @@ class Calibration:
         (ay, ax), (by, bx) = self._law(focal_length_mm, distance) @ correction
         return Lattice((float(ay), float(ax)), (float(by), float(bx)))
 
-    def transfer_at(self, focal_length_mm: float, orders: Sequence[Order]) -> NDArray[np.complex128]:
-        """(K,) T_k at pixel (0, 0) for half-plane orders of the mask."""
-        nearest = self.nearest(focal_length_mm)
-        origin = at_corner(nearest.origin, self.lattice_at(focal_length_mm), self.shape)
-        known = dict(zip(self.mask.half_orders(), nearest.transfer, strict=True))
-        return transfer(orders, [known[order] for order in orders], origin)
-
-    def kappa_at(self, focal_length_mm: float, f_number: float) -> float:
-        """κ of a frame, with the fitted mask distance."""
-        distance = self.nearest(focal_length_mm).mask_distance_mm
-        return kappa(self.mask.frequency_per_mm, distance, focal_length_mm, f_number)
-
     def _law(self, focal_length_mm: float, mask_distance_mm: float) -> NDArray[np.float64]:
         return LAWS[self.law](self.mask, self.sensor, mask_distance_mm, focal_length_mm).matrix()
 

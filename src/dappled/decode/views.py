@@ -209,11 +209,6 @@ def from_slices(
     return combine(coefficients, slices).reshape(n, n, *slices.shape[1:]), aperture.offsets()
 
 
-def lenslet_offsets(views: int) -> NDArray[np.float64]:
-    """(N, N, 2) points under a lenslet in shares of the pitch: u/N, the larger u at pixels of larger column."""
-    return Aperture(views).offsets()
-
-
 def from_lenslet_slices(
     slices: NDArray[np.complex64],
     carriers: Sequence[Carrier],
