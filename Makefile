@@ -32,9 +32,11 @@ test-slow: setup ## the tests that take longer
 bench: setup ## what the performance claims are measured with
 	@for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
 
-lock: setup ## resolve requirements.lock anew from pyproject.toml
+lock: setup ## resolve the two locks anew from pyproject.toml: everything, and what flies
 	@uv=$$(command -v uv || echo .tools/bin/uv); $$uv pip compile -q --universal --python-version 3.11 --generate-hashes \
-	  --no-header --all-extras --group dev pyproject.toml -o requirements.lock
+	  --no-header --all-extras --group dev pyproject.toml -o requirements.lock; \
+	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header -c requirements.lock \
+	  --no-annotate pyproject.toml -o requirements-onboard.lock
 
 clean: ## remove what set-up and tests made
 	rm -rf .venv .tools build .coverage* htmlcov .mypy_cache .ruff_cache .pytest_cache .hypothesis

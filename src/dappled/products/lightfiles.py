@@ -7,6 +7,7 @@ in Zarr; in .npz they are the JSON text of the array `attributes`; in HDF5 the f
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import secrets
@@ -17,8 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
-import zarr.errors
 from numpy.typing import NDArray
 
 from dappled.decode.lightfield import LightField
@@ -72,7 +71,7 @@ def load(path: Path) -> LightField:
         raise
     except KeyError as error:
         raise LightFileError(f"{path} is not a light field: it lacks {error}") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zarr.errors.BaseZarrError, TypeError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, TypeError) as error:
         raise LightFileError(f"{path} is not a light field, or is damaged: {error}") from error
     _fits(path, arrays)
     for name, (kind, _) in _ARRAYS.items():
@@ -125,7 +124,7 @@ def _json(path: Path, attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _save_zarr(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
-    group = zarr.open_group(store=part, mode="w-", zarr_format=3, attributes=attributes)
+    group = _zarr(part).open_group(store=part, mode="w-", zarr_format=3, attributes=attributes)
     for name, values in arrays.items():
         # One chunk a slice, or a view: what is looked at one at a time.
         lead = {"slices": 1, "views": 2}.get(name, 0)
@@ -134,6 +133,7 @@ def _save_zarr(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
 
 
 def _load_zarr(path: Path) -> tuple[_Arrays, dict[str, Any]]:
+    zarr = _zarr(path)
     group = zarr.open_group(store=path, mode="r")
     arrays: _Arrays = {}
     for name in _ARRAYS:
@@ -168,14 +168,22 @@ def _load_h5(path: Path) -> tuple[_Arrays, dict[str, Any]]:
         return {name: np.asarray(file[name]) for name in _ARRAYS}, json.loads(file.attrs[_ATTRIBUTES])
 
 
+def _zarr(path: Path) -> Any:
+    return _ground("zarr", path, "Zarr", "use .npz")
+
+
 def _h5py(path: Path) -> Any:
+    return _ground("h5py", path, "HDF5", "use .npz")
+
+
+def _ground(name: str, path: Path, what: str, instead: str) -> Any:
+    """A library that the onboard install leaves out."""
     try:
-        import h5py  # noqa: PLC0415  optional: the onboard install leaves it out
+        return importlib.import_module(name)
     except ImportError as error:
         raise LightFileError(
-            f"{path.name} needs HDF5; install it with: pip install 'dappled[ground]' (or use .zarr or .npz)"
+            f"{path.name} needs {what}; install it with: pip install 'dappled[ground]' (or {instead})"
         ) from error
-    return h5py
 
 
 def _sync(path: Path) -> None:
