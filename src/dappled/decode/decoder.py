@@ -14,6 +14,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.aperture import used_aperture
 from dappled.decode.calibration import Calibration, at_corner, origin_of, relative_transfer
 from dappled.decode.carriers import LAWS, Carrier, Lattice, Sensor
 from dappled.decode.errors import DecodeError
@@ -143,11 +144,11 @@ class MaskDecoder:
         slices = self.cut(spectrum, lattice, used)
         noise = spectrum.noise_rms()
         if views:
-            made, offsets, views_from = self._views(
+            made, offsets, views_from, told = self._views(
                 slices, lattice, carriers_from, focal_length_mm=focal_length_mm, f_number=f_number, noise_rms=noise
             )
         else:
-            made, offsets, views_from = *no_views(slices), "none"
+            made, offsets, views_from, told = *no_views(slices), "none", None
         report = DecodeReport(tuple(predicted), tuple(measured), tuple(used), carriers_from, views_from, noise)
         facts: dict[str, Any] = {
             "law": self.law,
@@ -155,6 +156,7 @@ class MaskDecoder:
             "f_number": f_number,
             "mask_distance_mm": self._distance(focal_length_mm),
             "calibrated": self.calibration is not None,
+            "transfers": told,
         }
         return light_field(slices, made, offsets, plane=plane, report=report, facts=facts), report
 
@@ -221,10 +223,12 @@ class MaskDecoder:
         focal_length_mm: float,
         f_number: float | None,
         noise_rms: float,
-    ) -> tuple[Views, NDArray[np.float64], ViewsFrom]:
+    ) -> tuple[Views, NDArray[np.float64], ViewsFrom, list[list[float]] | None]:
+        """Views, their offsets, where phases came from, and what each slice is of the light field: rows
+        [ωv, ωu, Re T, Im T], T = 0 where a slice was not used."""
         none = no_views(slices)
         if f_number is None:
-            return *none, "none"
+            return *none, "none", None
         orders = [(c.ky, c.kx) for c in slices.carriers]
         aperture = self.aperture or Aperture(self.mask.views_per_axis)
         cycles = kappa(self.mask.frequency_per_mm, self._distance(focal_length_mm), focal_length_mm, f_number)
@@ -235,17 +239,20 @@ class MaskDecoder:
             origin = at_corner(known.origin, lattice, self.sensor.shape)
             transfers = transfer(orders, [magnitudes[order] for order in orders], origin)
             rotation = known.rotation_rad
+            cycles = used_aperture(
+                slices.values, transfers, orders, nominal_kappa=cycles, rotation_rad=rotation, aperture=aperture
+            ).kappa
             views_from: ViewsFrom = "calibration"
         elif carriers_from == "measured":
             rotation = _rotation(lattice, self.lattice_at(focal_length_mm))
             through = aperture.transform(angular_frequencies(orders, cycles, rotation)).real
             keep = np.abs(through) > _LEAST_THROUGH
             if np.linalg.matrix_rank([order for order, usable in zip(orders, keep, strict=True) if usable]) < 2:
-                return *none, "none"
+                return *none, "none", None
             transfers = _own_transfer(slices.values, orders, through, keep)
             views_from = "frame"
         else:
-            return *none, "none"
+            return *none, "none", None
         keep &= np.abs(transfers) > 1e-3  # a carrier that the mask doesn't make tells nothing
         views, offsets = from_slices(
             slices.values if keep.all() else slices.values[keep],
@@ -257,7 +264,10 @@ class MaskDecoder:
             noise_variance=noise_rms**2 * slices.band,
             colours=self.colours,
         )
-        return views, offsets, views_from
+        angular = angular_frequencies(orders, cycles, rotation)
+        used = np.where(keep, transfers, 0)
+        told = np.column_stack([angular, used.real, used.imag]).tolist()
+        return views, offsets, views_from, told
 
 
 def _own_lattice(
