@@ -11,14 +11,13 @@ import numpy as np
 
 from dappled.config.settings import Settings, resolve
 from dappled.daemon.clock import SystemClock
+from dappled.daemon.interpolation import metres_per_radian
 from dappled.daemon.service import Service
 from dappled.flight import summary
-from dappled.mocks.path import EARTH_RADIUS_M
 from dappled.mocks.path import Path as FlightPath
 from dappled.mocks.simulation import Simulation, World
 
 SEED, FRAMES = 8, 3
-METRES_PER_DEGREE = math.radians(1) * EARTH_RADIUS_M
 
 
 def test_tags_hold_the_true_time_place_and_attitude(tmp_path: Path, sockets: Path) -> None:
@@ -61,9 +60,9 @@ def test_tags_hold_the_true_time_place_and_attitude(tmp_path: Path, sockets: Pat
         exposed_t_s = json.loads(shot.read_text())["mid_exposure_t_s"]
         assert abs(tagged_t_s - exposed_t_s) < 0.018  # ± 15 ms of latency that nobody can know, and the way to the body
         true = path.pose(tagged_t_s)
-        north = (math.degrees(pose.latitude_rad) - true.latitude_deg) * METRES_PER_DEGREE
-        east = (math.degrees(pose.longitude_rad) - true.longitude_deg) * METRES_PER_DEGREE
-        east *= math.cos(math.radians(true.latitude_deg))
+        north_m, east_m = metres_per_radian(pose.latitude_rad, pose.altitude_msl_m)
+        north = (pose.latitude_rad - math.radians(true.latitude_deg)) * north_m
+        east = (pose.longitude_rad - math.radians(true.longitude_deg)) * east_m
         assert math.hypot(north, east) < 0.05
         assert abs(pose.altitude_msl_m - true.altitude_msl_m) < 0.05
         turn = 2 * math.degrees(math.acos(min(1.0, abs(float(np.dot(pose.attitude, true.attitude))))))

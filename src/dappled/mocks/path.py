@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dappled.daemon.interpolation import metres_per_radian
 from dappled.flight.records import Quaternion, Vector3
-
-EARTH_RADIUS_M = 6378137.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +54,9 @@ class Path:
         sign = math.copysign(1.0, turn[0])
         rates = tuple(float(2 * sign * c / (2 * step)) for c in turn[1:])
         north, east, down = now[0]
-        latitude = self.home_latitude_deg + math.degrees(north / EARTH_RADIUS_M)
-        longitude = self.home_longitude_deg + math.degrees(
-            east / (EARTH_RADIUS_M * math.cos(math.radians(self.home_latitude_deg)))
-        )
+        north_m, east_m = metres_per_radian(math.radians(self.home_latitude_deg), self.home_altitude_msl_m)
+        latitude = self.home_latitude_deg + math.degrees(north / north_m)
+        longitude = self.home_longitude_deg + math.degrees(east / east_m)
         return TruePose(
             t_s=t_s,
             position_ned_m=now[0],
