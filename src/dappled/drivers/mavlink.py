@@ -12,12 +12,14 @@ from typing import Protocol
 from dappled.drivers.mavlink_address import Address, LinkError, parse
 from dappled.drivers.mavlink_channel import Channel, open_channel
 from dappled.drivers.mavlink_framing import Decoder, Framed, Framer, Message, mavlink, pack
+from dappled.drivers.mavlink_signing import Guard, Signing, SigningError, SigningStatistics
 
 __all__ = ["Decoder", "LinkError", "LinkStatistics", "MavlinkLinks", "Message", "Packet", "mavlink"]
 
 log = logging.getLogger(__name__)
 _REOPEN_S = 1.0
 _LOOK_S = 0.2
+_KEEP_S = 1.0
 
 
 class Clock(Protocol):
@@ -30,7 +32,10 @@ class Clock(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One packet, in or (`sent`) out. `number` is its place in the telemetry log, None if it could not be logged."""
+    """One packet, in or (`sent`) out. `number` is its place in the telemetry log, None if it could not be logged.
+
+    `trusted`: False for an unsigned packet on a signed link that may be heard, but not obeyed.
+    """
 
     number: int | None
     stamp_us: int
@@ -38,11 +43,15 @@ class Packet:
     message: Message
     raw: bytes
     sent: bool = False
+    trusted: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class LinkStatistics:
-    """What went over a link so far. `error` says why it is down, None when it is up."""
+    """What went over a link so far. `error` says why it is down, None when it is up; `signing` is None without a key.
+
+    `packets_in` counts what was taken; packets that signing refused stand in `signing` alone, and in no log.
+    """
 
     url: str
     packets_in: int
@@ -53,6 +62,7 @@ class LinkStatistics:
     failures: int
     last_heard_monotonic_ns: int | None
     error: str | None
+    signing: SigningStatistics | None = None
 
 
 class MavlinkLinks:
@@ -74,6 +84,7 @@ class MavlinkLinks:
         tap: Callable[[int, bytes], int],
         on_packet: Callable[[Packet], None],
         clock: Clock,
+        signing: Signing | None = None,
     ) -> None:
         self.component_id = component_id
         self.system_id = system_id
@@ -83,7 +94,10 @@ class MavlinkLinks:
         self._order = threading.RLock()
         self._stop = threading.Event()
         self._opened = False
-        self._links = [_Link(number, parse(url)) for number, url in enumerate(urls)]
+        self._signing_time = signing.time if signing else None
+        guards = signing.guards if signing else [None] * len(urls)
+        pairs = zip(urls, guards, strict=True)
+        self._links = [_Link(number, parse(url), guard) for number, (url, guard) in enumerate(pairs)]
         self._threads: list[threading.Thread] = []
 
     def open(self) -> None:
@@ -109,6 +123,10 @@ class MavlinkLinks:
         self.open()
         for link in self._links:
             thread = threading.Thread(target=self._receive, args=(link,), name=f"mavlink {link.number}", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+        if self._signing_time is not None:
+            thread = threading.Thread(target=self._keep_signing_time, name="mavlink signing", daemon=True)
             self._threads.append(thread)
             thread.start()
 
@@ -144,7 +162,10 @@ class MavlinkLinks:
             link.packets_unsent += 1
             return False
         link.packer.srcSystem, link.packer.srcComponent = self.system_id, self.component_id
-        raw = pack(message, link.packer, version_1=link.heard_1 and not link.heard_2)
+        if link.guard is None:
+            raw = pack(message, link.packer, version_1=link.heard_1 and not link.heard_2)
+        else:
+            raw = link.guard.sign(lambda: pack(message, link.packer, version_1=False), link.packer)
         stamp_us = self._clock.utc_ns() // 1000
         try:
             taken = channel.write(raw)
@@ -158,7 +179,9 @@ class MavlinkLinks:
         self._deliver(link, stamp_us, raw, message, sent=True)
         return True
 
-    def _deliver(self, link: _Link, stamp_us: int, raw: bytes, message: Message, *, sent: bool) -> None:
+    def _deliver(
+        self, link: _Link, stamp_us: int, raw: bytes, message: Message, *, sent: bool, trusted: bool = True
+    ) -> None:
         number: int | None = None
         try:
             number = self._tap(stamp_us, raw)
@@ -167,7 +190,7 @@ class MavlinkLinks:
                 log.exception("A MAVLink packet could not be written to the telemetry log")
             link.packets_unlogged += 1
         try:
-            self._on_packet(Packet(number, stamp_us, link.number, message, raw, sent))
+            self._on_packet(Packet(number, stamp_us, link.number, message, raw, sent, trusted))
         except Exception:  # one packet that nobody foresaw must not end the link
             link.failures += 1
             log.exception("A MAVLink packet (%s) could not be handled", message.get_type())
@@ -181,17 +204,11 @@ class MavlinkLinks:
                 framer = Framer()
                 continue
             try:
-                readable, writable, _ = select.select(
-                    [channel], [channel] if channel.wants_write() else [], [], _LOOK_S
-                )
-                if writable:
-                    with self._order:
-                        channel.flush()
-                if not readable:
+                if not self._wait(channel):
                     continue
                 data = channel.read()
                 stamp_us = self._clock.utc_ns() // 1000
-            except (OSError, ValueError) as error:  # ValueError: select on a descriptor that another thread closed
+            except (OSError, ValueError) as error:  # ValueError: a descriptor that another thread closed
                 link.error = f"MAVLink link {link.address.url}: {error}"
                 continue
             if data is None:
@@ -205,13 +222,31 @@ class MavlinkLinks:
                 self._received(link, stamp_us, framed)
             link.packets_bad += framer.bad - bad
 
+    def _wait(self, channel: Channel) -> bool:
+        """Whether there is something to read; sends what waits. poll knows descriptors above 1023, select does not."""
+        poll = select.poll()
+        poll.register(channel, select.POLLIN | (select.POLLOUT if channel.wants_write() else 0))
+        ready = sum(events for _, events in poll.poll(_LOOK_S * 1e3))
+        if ready & select.POLLOUT:
+            with self._order:
+                channel.flush()
+        return bool(ready & ~select.POLLOUT)
+
     def _received(self, link: _Link, stamp_us: int, framed: Framed) -> None:
         with self._order:
+            message = framed.message
+            trusted = True
+            if link.guard is not None:
+                source = (message.get_srcSystem(), message.get_srcComponent())
+                trust = link.guard.judge(framed.raw, *source, message.get_msgId())
+                if trust == "refuse":
+                    return
+                trusted = trust == "obey"
             link.packets_in += 1
             link.last_heard_monotonic_ns = self._clock.monotonic_ns()
             link.heard_1 |= framed.version == 1
             link.heard_2 |= framed.version == 2
-            self._deliver(link, stamp_us, framed.raw, framed.message, sent=False)
+            self._deliver(link, stamp_us, framed.raw, message, sent=False, trusted=trusted)
 
     def _reopen(self, link: _Link) -> None:
         with self._order:
@@ -228,6 +263,21 @@ class MavlinkLinks:
         with self._order:
             link.channel, link.error = channel, None
 
+    def _keep_signing_time(self) -> None:
+        assert self._signing_time is not None
+        failed = False
+        while True:
+            ending = self._stop.wait(_KEEP_S)
+            try:
+                self._signing_time.keep(ending=ending)
+                failed = False
+            except SigningError as error:  # the links go on; said once
+                if not failed:
+                    log.warning("%s", error)
+                failed = True
+            if ending:
+                return
+
     def _close_channels(self) -> None:
         for link in self._links:
             if link.channel is not None:
@@ -238,9 +288,10 @@ class MavlinkLinks:
 class _Link:
     """One link's state; its receiving thread and, under the order lock, the senders write it."""
 
-    def __init__(self, number: int, address: Address) -> None:
+    def __init__(self, number: int, address: Address, guard: Guard | None) -> None:
         self.number = number
         self.address = address
+        self.guard = guard
         self.channel: Channel | None = None
         self.error: str | None = None
         self.packer = mavlink.MAVLink(None)
@@ -260,4 +311,5 @@ class _Link:
             self.failures,
             self.last_heard_monotonic_ns,
             self.error,
+            self.guard.statistics() if self.guard else None,
         )

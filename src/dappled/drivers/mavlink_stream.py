@@ -1,0 +1,140 @@
+"""Streams under a MAVLink link: TCP, as client or server, and serial devices."""
+
+from __future__ import annotations
+
+import os
+import socket
+import termios
+from collections.abc import Callable
+from contextlib import suppress
+
+from dappled.drivers.mavlink_address import Address, LinkError
+
+_CHUNK = 65536
+_OUTBOX_LIMIT = 65536
+
+
+class Stream:
+    """A descriptor that carries bytes both ways. What it can't take at once waits: whole packets, at most 64 KiB."""
+
+    datagrams = False
+
+    def __init__(self, fd: int, close: Callable[[], None], port: int = 0) -> None:
+        self._fd, self._close, self._port = fd, close, port
+        self._waiting = bytearray()
+
+    def fileno(self) -> int:
+        return self._fd
+
+    def read(self) -> bytes | None:
+        try:
+            return os.read(self._fd, _CHUNK) or None
+        except BlockingIOError:
+            return b""
+
+    def write(self, data: bytes) -> bool:
+        if len(self._waiting) + len(data) > _OUTBOX_LIMIT:
+            return False
+        self._waiting += data
+        self.flush()
+        return True
+
+    def wants_write(self) -> bool:
+        return bool(self._waiting)
+
+    def flush(self) -> None:
+        while self._waiting:
+            try:
+                count = os.write(self._fd, self._waiting)
+            except BlockingIOError:
+                return
+            del self._waiting[:count]
+
+    def port(self) -> int:
+        return self._port
+
+    def close(self) -> None:
+        self._close()
+
+
+class Listener:
+    """A TCP server for one client at a time; when it has gone the next one is let in."""
+
+    datagrams = False
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
+        self._client: Stream | None = None
+
+    def fileno(self) -> int:
+        return self._client.fileno() if self._client else self._sock.fileno()
+
+    def read(self) -> bytes | None:
+        if self._client is None:
+            with suppress(BlockingIOError):
+                self._client = over_tcp(self._sock.accept()[0])
+            return b""
+        try:
+            data = self._client.read()
+        except OSError:
+            data = None
+        if data is None:
+            self._leave()
+            return b""
+        return data
+
+    def write(self, data: bytes) -> bool:
+        try:
+            return self._client.write(data) if self._client else False
+        except OSError:  # reading tells that it has gone
+            return False
+
+    def wants_write(self) -> bool:
+        return self._client is not None and self._client.wants_write()
+
+    def flush(self) -> None:
+        try:
+            if self._client:
+                self._client.flush()
+        except OSError:  # as above
+            return
+
+    def port(self) -> int:
+        return int(self._sock.getsockname()[1])
+
+    def close(self) -> None:
+        self._leave()
+        self._sock.close()
+
+    def _leave(self) -> None:
+        client, self._client = self._client, None
+        if client:
+            client.close()
+
+
+def over_tcp(sock: socket.socket) -> Stream:
+    """A connected TCP socket as a stream. Raises OSError."""
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setblocking(False)
+    return Stream(sock.fileno(), sock.close, int(sock.getsockname()[1]))
+
+
+def over_serial(address: Address) -> Stream:
+    """A serial device in raw mode, 8N1, without flow control. Raises OSError, and LinkError for what is no such."""
+    speed = getattr(termios, f"B{address.port}", None)
+    if speed is None:
+        raise LinkError(
+            f"MAVLink link {address.url}: no serial port runs at {address.port} baud; write 57600, 115200 or 921600"
+        )
+    fd = os.open(address.host, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        attributes = termios.tcgetattr(fd)
+        attributes[6][termios.VMIN], attributes[6][termios.VTIME] = 1, 0
+        attributes[:6] = [0, 0, termios.CS8 | termios.CREAD | termios.CLOCAL, 0, speed, speed]
+        termios.tcsetattr(fd, termios.TCSANOW, attributes)
+    except termios.error as error:
+        os.close(fd)
+        raise LinkError(
+            f"MAVLink link {address.url}: {address.host} is not a serial device; correct mavlink.url"
+        ) from error
+    return Stream(fd, lambda: os.close(fd))
