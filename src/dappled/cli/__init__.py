@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 
 import dappled
+from dappled.daemon import journal
 from dappled.errors import DappledError
 
 # Verb: (module of this package, one line). The module has `configure(parser)` and `run(arguments) -> exit code`.
@@ -17,7 +18,9 @@ VERBS: dict[str, tuple[str, str]] = {
     "run": ("run", "the daemon: fire, record, tag, decode, publish"),
     "replay": ("replay", "a recorded flight, or a folder of frames, through the same daemon"),
     "watch": ("watch", "subscribe: show and save what arrives"),
+    "keys": ("keys", "keys for who may subscribe over the network, and the console's token"),
     "trigger": ("trigger", "the ground station's part: ask for frames over MAVLink"),
+    "mavlink": ("mavlink", "keys for signed MAVLink links"),
     "decode": ("decode", "frames to light fields"),
     "carriers": ("carriers", "predicted and measured carriers of a frame"),
     "calibrate": ("calibrate", "fit lattice, law and phases to frames"),
@@ -55,9 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     wanted = next((word for word in words if not word.startswith("-")), None)
     parsed = parser(wanted).parse_args(words)
-    logging.basicConfig(
-        level=logging.DEBUG if parsed.debug else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
-    )
+    quiet = logging.INFO if parsed.verb == "run" and "JOURNAL_STREAM" in os.environ else logging.WARNING
+    logging.basicConfig(level=logging.DEBUG if parsed.debug else quiet, handlers=[journal.handler()])
     logging.getLogger("PIL").setLevel(logging.INFO)
     try:
         code: int = parsed.run(parsed)

@@ -20,10 +20,13 @@ from dappled.cli import story
 from dappled.cli.common import seconds, whole
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
+from dappled.daemon import health
+from dappled.daemon.notify import Notifier
 from dappled.daemon.service import Service
 from dappled.daemon.stages import Stage
 from dappled.daemon.street import Story, Watchers
 from dappled.drivers.camera import StateChanged
+from dappled.errors import DappledError
 
 
 class Asker(Protocol):
@@ -72,18 +75,33 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
     """Run the daemon until it is told to end, or has had its frames or its time."""
     told = _Told(arguments.json)
     service = Service(settings, watchers=Watchers(finished=told.finished, camera=told.camera))
-    asked = threading.Event()
+    asked, hung_up = threading.Event(), threading.Event()
+    manager = Notifier()
     with ExitStack() as stack:
+        stack.callback(signal.signal, signal.SIGHUP, signal.signal(signal.SIGHUP, lambda *_: hung_up.set()))
         for number in (signal.SIGINT, signal.SIGTERM):  # until all is closed: a second ^C must not cut that short
             stack.callback(signal.signal, number, signal.signal(number, _stopper(service, asked)))
         stack.callback(told.close)
         service.start()
         stack.callback(service.stop)
+        stack.callback(manager.stopping)
+        manager.ready(time.monotonic_ns())
         print(f"flight {service.folder}", file=sys.stderr)
         print(f"stream {settings.publish.slices}", file=sys.stderr)
         goal = _Goal(service, told, arguments.frames, arguments.seconds, ask)
-        problems = _Problems(service)
-        service.run(lambda: problems.tell() or goal.reached())
+        problems = _Problems(service, manager)
+
+        def turn() -> bool:
+            """After each turn of the working loop: whether to end."""
+            if hung_up.is_set():
+                hung_up.clear()
+                _reload(service, arguments, manager)
+            if service.whole():
+                manager.working(time.monotonic_ns())
+            problems.tell()
+            return goal.reached()
+
+        service.run(turn)
         problems.tell(now=True)
     print(told.summary(), file=sys.stderr)
     short = bool(arguments.frames) and told.good < arguments.frames
@@ -160,21 +178,34 @@ def _print(line: str) -> None:
 
 
 class _Problems:
-    """Says each problem once, when it comes up."""
+    """Says each problem once, when it comes up; the service manager's status line has all of them."""
 
-    def __init__(self, service: Service) -> None:
-        self._service = service
+    def __init__(self, service: Service, manager: Notifier) -> None:
+        self._service, self._manager = service, manager
         self._said: set[str] = set()
         self._due = time.monotonic() + 1.0
 
-    def tell(self, *, now: bool = False) -> bool:
+    def tell(self, *, now: bool = False) -> None:
         if now or time.monotonic() >= self._due:
             self._due = time.monotonic() + 1.0
-            problems = set(self._service.health()["problems"])
+            told = self._service.health()
+            problems = set(told["problems"])
             for text in sorted(problems - self._said):
                 print(f"problem: {text}", file=sys.stderr)
             self._said = problems
-        return False
+            self._manager.status(health.line(told))
+
+
+def _reload(service: Service, arguments: argparse.Namespace, manager: Notifier) -> None:
+    """SIGHUP: read the settings again, take what can change in flight, refuse the rest in words."""
+    manager.reloading(time.monotonic_ns())
+    try:
+        told = service.reload(configuration.load(arguments.config)) if arguments.config else ["there is no --config"]
+    except DappledError as error:
+        told = [f"the settings stay as they are: {error}"]
+    for text in told or ["nothing has changed"]:
+        print(f"reload: {text}", file=sys.stderr)
+    manager.ready(time.monotonic_ns())
 
 
 def _stopper(service: Service, asked: threading.Event) -> Callable[[int, FrameType | None], None]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -67,6 +67,13 @@ def record(
         "stages": [*stages, {"name": "publish", "sent": dict(publisher.sent), "dropped": dict(publisher.dropped)}],
         "problems": problems,
     }
+
+
+def line(told: Mapping[str, Any]) -> str:
+    """A health record in one line, for a status display."""
+    shots, problems = told["shots"], told["problems"]
+    counts = f"camera {told['camera']['state']}, {shots['safe']} of {shots['wished']} frames safe"
+    return f"{counts}; {'; '.join(problems)}" if problems else f"{counts}; all is well"
 
 
 def camera_sentence(street: Street) -> str:

@@ -16,7 +16,7 @@ import dappled
 from dappled.config import profiles
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.daemon import health, inputs
+from dappled.daemon import curve, health, inputs
 from dappled.daemon.answers import Answers
 from dappled.daemon.books import LiveBook
 from dappled.daemon.cameras import open_camera
@@ -24,6 +24,7 @@ from dappled.daemon.clock import Clock, SystemClock
 from dappled.daemon.component import CameraFacts, Captured, Component, Storage
 from dappled.daemon.development import DevelopmentError, WorkerDeveloper
 from dappled.daemon.publisher import Publisher, Reply
+from dappled.daemon.reload import merge
 from dappled.daemon.shutter import Shutter, Verdict, Wish
 from dappled.daemon.street import Names, Story, Street, Watchers
 from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency, Exposure
@@ -77,6 +78,8 @@ class Service:
                 self.settings.publish.ask,
                 answer=self._answer,
                 high_water_mark=self.settings.publish.high_water_mark,
+                keys=curve.server(self.settings.publish.keys, self.settings.publish.clients),
+                mode=int(self.settings.publish.socket_mode, 8),
             )
             stack.callback(self._publisher.stop)
             self._links = MavlinkLinks(
@@ -189,7 +192,16 @@ class Service:
         """A wish from this side of the links: a console, or a test."""
         return self._shutter.wish(wish)
 
+    def reload(self, wanted: Settings) -> list[str]:
+        """Take from these settings what can change in flight; a sentence for each change, taken or refused."""
+        self.settings, told = merge(self.settings, wanted)
+        return told
+
     # what others may look at
+
+    def whole(self) -> bool:
+        """Whether every part of the street still works."""
+        return not self._street.dead()
 
     @property
     def folder(self) -> Path:
