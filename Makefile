@@ -2,7 +2,8 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check test-fast test-slow bench lock clean
+.PHONY: help setup demo test check test-fast test-slow bench lock install uninstall clean
+PREFIX ?= /usr/local
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -37,6 +38,12 @@ lock: setup ## resolve the two locks anew from pyproject.toml: everything, and w
 	  --no-header --all-extras --group dev pyproject.toml -o requirements.lock; \
 	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header -c requirements.lock \
 	  --no-annotate pyproject.toml -o requirements-onboard.lock
+
+install: ## the service under PREFIX (default /usr/local): environment, unit, udev rule, settings
+	@$(PYTHON) tools/install.py install --prefix $(PREFIX) $(if $(DESTDIR),--destdir $(DESTDIR)) $(if $(SYSCONFDIR),--sysconfdir $(SYSCONFDIR))
+
+uninstall: ## take it away again; settings and flights stay
+	@$(PYTHON) tools/install.py uninstall --prefix $(PREFIX) $(if $(DESTDIR),--destdir $(DESTDIR)) $(if $(SYSCONFDIR),--sysconfdir $(SYSCONFDIR))
 
 clean: ## remove what set-up and tests made
 	rm -rf .venv .tools build .coverage* htmlcov .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,134 @@
+"""The daemon as systemd runs it: told when it is ready, fed, reloaded, ended; the unit itself; the installed tree."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+UNIT = ROOT / "systemd/dappled.service"
+ANALYZE = shutil.which("systemd-analyze") or ""
+analyze = pytest.mark.skipif(not ANALYZE, reason="no systemd-analyze on this machine")
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(tmp_path / "notify"))
+        listener.settimeout(30)
+        yield listener
+
+
+@pytest.fixture
+def served(manager: socket.socket, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """The daemon with no hardware at all, as a service."""
+    (tmp_path / "dappled.toml").write_text('[record]\ndirectory = "flights"\nmin_free_mb = 1\n', encoding="utf-8")
+    told = {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "400000", "RUNTIME_DIRECTORY": str(tmp_path / "r")}
+    (tmp_path / "r").mkdir(mode=0o700)
+    command = [sys.executable, "-m", "dappled", "run", "--config", str(tmp_path / "dappled.toml")]
+    daemon = subprocess.Popen(command, env=os.environ | told, stderr=subprocess.PIPE, text=True)
+    try:
+        yield daemon
+    finally:
+        daemon.kill()
+        daemon.wait()
+        assert daemon.stderr is not None
+        daemon.stderr.close()
+
+
+def until(manager: socket.socket, wanted: Callable[[str], bool]) -> str:
+    """The first message that is wanted; the socket's time-out is the deadline."""
+    while True:
+        message = manager.recv(4096).decode()
+        if wanted(message):
+            return message
+
+
+def test_systemd_hears_of_a_whole_life(manager: socket.socket, served: subprocess.Popen[str], tmp_path: Path) -> None:
+    assert until(manager, lambda text: not text.startswith("STATUS")) == "READY=1"
+    assert "the camera is" in until(manager, lambda text: "the camera is" in text)  # no body here: said, not fatal
+    until(manager, "WATCHDOG=1".__eq__)
+    until(manager, "WATCHDOG=1".__eq__)
+    settings = tmp_path / "dappled.toml"
+    settings.write_text('[record]\ndirectory = "elsewhere"\nmin_free_mb = 2\n', encoding="utf-8")
+    served.send_signal(signal.SIGHUP)
+    until(manager, lambda text: text.startswith("RELOADING=1\nMONOTONIC_USEC="))
+    assert until(manager, lambda text: text == "READY=1" or text.startswith("STOPPING")) == "READY=1"
+    settings.write_text("[record\n", encoding="utf-8")
+    served.send_signal(signal.SIGHUP)
+    until(manager, "READY=1".__eq__)
+    served.send_signal(signal.SIGTERM)
+    until(manager, "STOPPING=1".__eq__)
+    assert served.wait(10) == 0
+    said = served.communicate()[1]
+    assert "reload: record.min_free_mb is 2 now (was 1)" in said
+    assert "takes a restart" in said
+    assert "reload: the settings stay as they are:" in said
+
+
+def test_a_stopped_loop_is_not_fed(manager: socket.socket, served: subprocess.Popen[str]) -> None:
+    until(manager, "WATCHDOG=1".__eq__)
+    served.send_signal(signal.SIGSTOP)
+    manager.settimeout(1)
+    with pytest.raises(TimeoutError):  # what was sent before it stood still, and then nothing
+        until(manager, lambda _: False)
+    served.send_signal(signal.SIGCONT)
+    manager.settimeout(30)
+    until(manager, "WATCHDOG=1".__eq__)
+
+
+@analyze
+def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
+    unit = tmp_path / "dappled.service"
+    unit.write_text(UNIT.read_text(encoding="utf-8").replace("/usr/local/bin/dappled", "/bin/true"), encoding="utf-8")
+    verified = subprocess.run([ANALYZE, "verify", unit], capture_output=True, text=True, check=False)
+    assert (verified.returncode, verified.stderr) == (0, "")
+
+
+@analyze
+def test_the_unit_exposes_little() -> None:
+    words = [ANALYZE, "security", "--offline=yes", "--threshold=16", str(UNIT)]
+    judged = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert judged.returncode == 0, judged.stdout[-300:]
+
+
+def test_the_service_s_settings_are_good() -> None:
+    words = [sys.executable, "-m", "dappled", "config", "check", str(ROOT / "systemd/dappled.toml")]
+    assert subprocess.run(words, capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_installed_flown_and_removed(tmp_path: Path) -> None:
+    """`make install` into an empty prefix, one flight with what it installed, and `make uninstall`."""
+    prefix, home = tmp_path / "prefix", tmp_path / "home"
+    home.mkdir()
+    make = ["make", "-C", str(ROOT), f"PREFIX={prefix}", f"PYTHON={sys.executable}"]
+    subprocess.run([*make, "install"], check=True, capture_output=True)
+    unit = (prefix / "lib/systemd/system/dappled.service").read_text(encoding="utf-8")
+    assert f"ExecStart={prefix}/bin/dappled run --config {prefix}/etc/dappled/dappled.toml" in unit
+    size_mb = sum(path.lstat().st_size for path in prefix.rglob("*")) / 1e6
+    assert size_mb <= 350
+    flown = subprocess.run(
+        [prefix / "bin/dappled", "run", "--simulate", "--frames", "1"],
+        cwd=home,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert flown.returncode == 0, flown.stderr
+    assert "1 shots: 1 frames safe, 1 decoded" in flown.stderr
+    settings = prefix / "etc/dappled/dappled.toml"
+    settings.write_text("# mine\n", encoding="utf-8")
+    subprocess.run([*make, "install"], check=True, capture_output=True)
+    assert settings.read_text(encoding="utf-8") == "# mine\n"
+    subprocess.run([*make, "uninstall"], check=True, capture_output=True)
+    assert [path for path in prefix.rglob("*") if path.is_file()] == [settings]
