@@ -15,7 +15,7 @@ import dappled
 from dappled.cli import story
 from dappled.cli.common import seconds
 from dappled.config import settings as configuration
-from dappled.daemon import inputs, replay
+from dappled.daemon import curve, inputs, replay
 from dappled.daemon.answers import Answers
 from dappled.daemon.books import ReplayBook
 from dappled.daemon.development import WorkerDeveloper
@@ -171,6 +171,8 @@ def _publisher(
         settings.publish.ask,
         answer=answers.answer,
         high_water_mark=settings.publish.high_water_mark,
+        keys=curve.server(settings.publish.keys, settings.publish.clients),
+        mode=int(settings.publish.socket_mode, 8),
     )
     answers.start()
     stack.callback(answers.stop)

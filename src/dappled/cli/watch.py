@@ -12,6 +12,7 @@ from PIL import Image
 
 from dappled.cli.common import seconds, whole
 from dappled.config import settings
+from dappled.daemon.curve import ClientKeys, KeyFileError, load_own, load_public
 from dappled.daemon.subscriber import Subscriber
 from dappled.daemon.wire import Message
 from dappled.decode.pictures import slice_mosaic
@@ -27,6 +28,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--from-start", action="store_true", help="also what the flight sent before this began")
     parser.add_argument("--count", type=whole, metavar="N", help="end after the slices of N frames")
     parser.add_argument("--timeout", type=seconds, metavar="S", help="give up after S seconds without a message")
+    parser.add_argument("--keys", type=Path, metavar="FILE", help="your NAME.key_secret, for a tcp endpoint")
+    parser.add_argument("--server-key", type=Path, metavar="FILE", help="the vehicle's NAME.key")
     parser.add_argument("--json", action="store_true", help="one JSON object a line")
 
 
@@ -38,7 +41,10 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.save.mkdir(parents=True, exist_ok=True)
     frames: set[tuple[str, int]] = set()
     ended = False
-    with Subscriber(endpoint, ask, from_start=arguments.from_start) as subscriber:
+    if bool(arguments.keys) != bool(arguments.server_key):
+        raise KeyFileError("--keys and --server-key go together: your own secret key, and the vehicle's public one")
+    keys = ClientKeys(load_own(arguments.keys), load_public(arguments.server_key)) if arguments.keys else None
+    with Subscriber(endpoint, ask, from_start=arguments.from_start, keys=keys) as subscriber:
         heard = time.monotonic()
         while not (ended and not subscriber.waiting_for) and (arguments.count is None or len(frames) < arguments.count):
             message = subscriber.receive(0.5)

@@ -12,17 +12,16 @@ import json
 import logging
 import os
 import select
-import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import zmq
 
-from dappled.daemon import wire
+from dappled.daemon import curve, endpoints, wire
+from dappled.daemon.curve import ServerKeys
 from dappled.daemon.wire import Message, WireError
 from dappled.errors import report
 
@@ -30,26 +29,29 @@ log = logging.getLogger(__name__)
 
 Reply = Callable[[Message], None]
 Answer = Callable[[Mapping[str, Any], Reply], None]
-DROP_ORDER = ("preview", "health", "slices")
-REMEMBERED = 4096  # slices whose frame number is known by sequence
+DROP_ORDER = ("preview", "health", "depth", "slices")
+REMEMBERED = 65536  # slices whose frame number is known by sequence
 QUESTION_BYTES = 4096
 
 
 @dataclass(frozen=True, slots=True)
 class PublisherStatistics:
-    """Counters so far, by topic; `questions` and `refused` of the ROUTER."""
+    """Counters so far, by topic; `questions` and `refused` of the ROUTER; peers that came with a wrong key."""
 
     sent: Mapping[str, int]
     dropped: Mapping[str, int]
     waiting: int
     questions: int
     refused: int
+    wrong_keys: int = 0
 
 
 class Publisher:
     """Publishes messages and hands questions to `answer(request, reply)`, which replies from any thread, once.
 
-    Raises WireError when an endpoint can't be bound.
+    `slices` and `ask` are the endpoints; `ask` "" answers nobody. `keys` turn CURVE on for those that are tcp, `mode`
+    is that of ipc sockets. `private` is one more endpoint, ipc, for processes of the daemon itself, its questions on
+    "`private`.ask". Raises WireError when an endpoint can't be bound.
     """
 
     def __init__(
@@ -61,6 +63,9 @@ class Publisher:
         flight: str = "",
         high_water_mark: int = 12,
         capacity: int = 8,
+        keys: ServerKeys | None = None,
+        mode: int = 0o660,
+        private: str = "",
     ) -> None:
         self._flight = flight
         self._answer = answer
@@ -70,21 +75,27 @@ class Publisher:
         self._sent = dict.fromkeys(wire.TOPICS, 0)
         self._dropped = dict.fromkeys(wire.TOPICS, 0)
         self._frame_of: dict[int, int] = {}
-        self._questions = self._refused = self._open_questions = 0
+        self._questions = self._refused = self._open_questions = self._wrong_keys = 0
         self._grace_s = 0.0
         self._start: Message | None = None
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._stopping = threading.Event()
         self._closed = False
         self._context = zmq.Context()
-        self._endpoints = (slices, ask)
-        self._pub: zmq.Socket[Any] | None = None
+        self._allowed = keys.allowed if keys else {}
+        self._bound: list[str] = []
         try:
-            self._pub = _bind(self._context, zmq.PUB, slices, high_water_mark)
-            self._router = _bind(self._context, zmq.ROUTER, ask, high_water_mark) if ask else None
+            # Whoever judges keys is there before the first door is opened.
+            self._zap = self._judge() if keys else None
+            self._pub = self._socket(zmq.PUB, high_water_mark, [private, slices], keys, mode)
+            self._router = (
+                self._socket(zmq.ROUTER, high_water_mark, [private and f"{private}.ask", ask], keys, mode)
+                if ask or private
+                else None
+            )
         except WireError:
-            if self._pub is not None:
-                _unlink(slices)
+            for endpoint in self._bound:
+                endpoints.unlink(endpoint)
             self._context.destroy(linger=0)
             os.close(self._wake)
             raise
@@ -110,7 +121,12 @@ class Publisher:
         """Counters, taken together."""
         with self._lock:
             return PublisherStatistics(
-                dict(self._sent), dict(self._dropped), len(self._waiting), self._questions, self._refused
+                dict(self._sent),
+                dict(self._dropped),
+                len(self._waiting),
+                self._questions,
+                self._refused,
+                self._wrong_keys,
             )
 
     def stop(self, grace_s: float = 2.0) -> None:
@@ -122,10 +138,13 @@ class Publisher:
         self._ring()
         if self._thread.is_alive():
             self._thread.join(grace_s + 3)
-        for endpoint, one in zip(self._endpoints, (self._pub, self._router), strict=True):
+        for endpoint in self._bound:
+            endpoints.unlink(endpoint)
+        for one in (self._pub, self._router):
             if one is not None:
-                _unlink(endpoint)
                 one.close(linger=round(grace_s * 1000))
+        if self._zap is not None:
+            self._zap.close(linger=0)
         self._context.term()
         with self._lock:
             self._closed = True  # an answer may still be on its way: it must not ring a descriptor that is another's
@@ -149,8 +168,11 @@ class Publisher:
         poller.register(self._wake, select.POLLIN)
         if self._router is not None:
             poller.register(self._router.FD, select.POLLIN)
+        if self._zap is not None:
+            poller.register(self._zap.FD, select.POLLIN)
         quiet_rounds = 0
         while True:
+            self._let_in()
             self._send_waiting()
             self._hear_questions()
             if self._stopping.is_set():
@@ -176,7 +198,6 @@ class Publisher:
                     self._dropped[message.topic] = self._dropped.get(message.topic, 0) + 1
 
     def _send(self, message: Message) -> None:
-        assert self._pub is not None  # bound since the beginning
         header = self._envelope(message, self._sent[message.topic])
         if message.topic == "end":
             header["sent"] = dict(self._sent)  # so that a subscriber can tell what it missed last
@@ -210,6 +231,42 @@ class Publisher:
         elif message.topic == "start":
             self._start = Message("start", header)
 
+    def _let_in(self) -> None:
+        """Judge the keys of those who connect."""
+        while self._zap is not None:
+            try:
+                request = self._zap.recv_multipart(flags=zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            answer, name = curve.judge(request, self._allowed)
+            self._zap.send_multipart(answer)
+            if name is None:
+                self._wrong_keys += 1
+                log.warning("a peer with a key that is not on the list was turned away")
+            else:
+                log.info("%s came with its key", name)
+
+    def _judge(self) -> zmq.Socket[Any]:
+        one: zmq.Socket[Any] = self._context.socket(zmq.REP)
+        one.bind(curve.ZAP_ENDPOINT)
+        return one
+
+    def _socket(
+        self, kind: int, high_water_mark: int, wanted: list[str], keys: ServerKeys | None, mode: int
+    ) -> zmq.Socket[Any]:
+        one: zmq.Socket[Any] = self._context.socket(kind)
+        one.setsockopt(zmq.LINGER, 0)
+        one.setsockopt(zmq.SNDHWM, high_water_mark)
+        one.setsockopt(zmq.RCVHWM, 100)
+        one.setsockopt(zmq.MAXMSGSIZE, QUESTION_BYTES)
+        if kind == zmq.ROUTER:
+            one.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        for endpoint in filter(None, wanted):
+            endpoints.prepare(endpoint, keyed=keys is not None)
+            endpoints.bind(one, endpoint, keys=keys, mode=mode)
+            self._bound.append(endpoint)
+        return one
+
     def _hear_questions(self) -> None:
         if self._router is None:
             return
@@ -239,6 +296,8 @@ class Publisher:
                 reply(Message("error", {"error": str(error)}))
 
     def _resolved(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        if request.get("flight") not in (None, self._flight):
+            raise WireError(f"flight {request['flight']} is over, this is {self._flight}: replay its folder instead")
         if "frame" in request or "seq" not in request:
             return request
         frame = self._frame_of.get(request["seq"])
@@ -277,43 +336,3 @@ def _question(payload: list[bytes]) -> dict[str, Any]:
         if not isinstance(number, int) or isinstance(number, bool) or number < 0:
             raise WireError("a question names a frame (or, for slices, a seq) by a whole number from 0")
     return request
-
-
-def _bind(context: zmq.Context[Any], kind: int, endpoint: str, high_water_mark: int) -> zmq.Socket[Any]:
-    wire.prepare_endpoint(endpoint)
-    if endpoint.startswith("ipc://") and _answers(endpoint.removeprefix("ipc://")):
-        raise WireError(f"{endpoint} is in use by another program; stop it, or choose another endpoint")
-    one: zmq.Socket[Any] = context.socket(kind)
-    one.setsockopt(zmq.LINGER, 0)
-    one.setsockopt(zmq.SNDHWM, high_water_mark)
-    one.setsockopt(zmq.RCVHWM, 100)
-    one.setsockopt(zmq.MAXMSGSIZE, QUESTION_BYTES)
-    if kind == zmq.ROUTER:
-        one.setsockopt(zmq.ROUTER_MANDATORY, 1)
-    try:
-        one.bind(endpoint)
-    except zmq.ZMQError as error:
-        one.close()
-        if error.errno == zmq.EADDRINUSE:
-            raise WireError(f"{endpoint} is in use by another program; stop it, or choose another endpoint") from None
-        raise WireError(f"{endpoint} can't be bound ({error.strerror}); choose another endpoint") from None
-    if endpoint.startswith("ipc://"):
-        Path(endpoint.removeprefix("ipc://")).chmod(0o660)
-    return one
-
-
-def _unlink(endpoint: str) -> None:
-    """ZeroMQ leaves an ipc socket's file behind; while it is still bound nobody else can have taken the name."""
-    if endpoint.startswith("ipc://"):
-        Path(endpoint.removeprefix("ipc://")).unlink(missing_ok=True)
-
-
-def _answers(path: str) -> bool:
-    """Whether somebody listens on a UNIX socket: ZeroMQ would take its place without a word."""
-    with socket.socket(socket.AF_UNIX) as probe:
-        probe.settimeout(1)
-        try:
-            probe.connect(path)
-        except OSError:
-            return False
-        return True

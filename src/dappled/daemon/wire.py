@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import stat
-import urllib.parse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +16,7 @@ from dappled.errors import DappledError
 from dappled.flight.records import Tag
 
 VERSION = 1
-TOPICS = ("start", "frame", "slices", "preview", "health", "end")
-Topic = Literal["start", "frame", "slices", "preview", "health", "end"]
+TOPICS = ("start", "frame", "slices", "depth", "preview", "health", "end")
 
 
 class WireError(DappledError):
@@ -128,32 +123,3 @@ def schema(topic: str) -> dict[str, Any]:
     text = (resources.files("dappled.daemon") / "schemas" / f"{topic}.json").read_text(encoding="utf-8")
     loaded: dict[str, Any] = json.loads(text)
     return loaded
-
-
-def prepare_endpoint(endpoint: str) -> None:
-    """Make an endpoint safe to bind: ipc folders exist and are private; tcp stays on loopback. Raises WireError."""
-    url = urllib.parse.urlsplit(endpoint)
-    if url.scheme == "ipc":
-        path = Path(endpoint.removeprefix("ipc://"))
-        if not path.is_absolute() or len(str(path).encode()) > 107:
-            raise WireError(f"{endpoint} must be an absolute path of at most 107 bytes")
-        _prepare_folder(path.parent, endpoint)
-        if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
-            raise WireError(f"{endpoint}: a file that is no socket stands there; choose another endpoint")
-    elif url.scheme == "tcp":
-        if url.hostname not in ("127.0.0.1", "localhost", "::1"):
-            raise WireError(
-                f"{endpoint} would be open to the network without keys: dappled binds tcp on loopback only; "
-                "use ipc:// or tcp://127.0.0.1:PORT and a tunnel"
-            )
-    else:
-        raise WireError(f"{endpoint} is neither ipc:// nor tcp://")
-
-
-def _prepare_folder(folder: Path, endpoint: str) -> None:
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        raise WireError(f"{endpoint}: its folder can't be made ({error.strerror}); choose another endpoint") from None
-    if folder.stat().st_uid not in (0, os.getuid()):
-        raise WireError(f"{endpoint}: {folder} belongs to another user; choose another endpoint")

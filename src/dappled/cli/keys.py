@@ -1,0 +1,56 @@
+"""`dappled keys`: who may subscribe over the network, and the console's token."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import secrets
+from pathlib import Path
+
+from dappled.daemon import curve
+
+HOME = Path("~/.config/dappled/keys")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "example, a laptop that watches a vehicle:\n"
+        "  vehicle$ dappled keys make vehicle\n"
+        "  laptop$  dappled keys make laptop        # carry laptop.key to the vehicle's folder of clients\n"
+        "  laptop$  dappled watch tcp://10.0.0.7:5555 --keys laptop.key_secret --server-key vehicle.key"
+    )
+    verbs = parser.add_subparsers(dest="what", metavar="WHAT", required=True)
+    make = verbs.add_parser("make", help="a pair: NAME.key to give away, NAME.key_secret to keep")
+    make.add_argument("name", metavar="NAME", help="whose it is: letters, digits, dot, dash, underscore")
+    make.add_argument("-o", "--folder", type=Path, default=HOME, help=f"where to (default {HOME})")
+    show = verbs.add_parser("show", help="the public key in a file")
+    show.add_argument("file", type=Path, metavar="FILE", help="NAME.key or NAME.key_secret")
+    token = verbs.add_parser("token", help="a token for the console")
+    token.add_argument("file", type=Path, metavar="FILE", help="where to; must not exist yet")
+    for one in (make, show, token):
+        one.add_argument("--json", action="store_true", help="as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    match arguments.what:
+        case "make":
+            public, secret = curve.make(arguments.folder.expanduser(), arguments.name)
+            facts = {"public": str(public), "secret": str(secret)}
+            words = f"{public}  to give away\n{secret}  to keep: name it in publish.keys, or after --keys"
+        case "show":
+            key = curve.load_public(arguments.file).decode()
+            facts, words = {"public_key": key}, key
+        case _:
+            facts, words = {"token_file": str(arguments.file)}, _token(arguments.file)
+    print(json.dumps(facts) if arguments.json else words)
+    return 0
+
+
+def _token(path: Path) -> str:
+    try:
+        curve.write_new(path.expanduser(), secrets.token_urlsafe(24) + "\n", 0o600)
+    except FileExistsError:
+        raise curve.KeyFileError(f"{path} is there already: choose another name, or move it away") from None
+    except OSError as error:
+        raise curve.KeyFileError(f"{path} can't be written: {error.strerror}") from None
+    return f"{path}  name it in console.token; whoever knows what is in it may use the console"

@@ -1,0 +1,170 @@
+"""CURVE keys on disk, and who may subscribe with which: for tcp endpoints that more than this machine can reach.
+
+The files are those of ZeroMQ itself (ZPL, as pyzmq's `zmq.auth` reads and writes): NAME.key holds a public key and may
+be given away, NAME.key_secret both and stays here. Keys are 40 characters of Z85.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import zmq
+import zmq.utils.z85
+
+from dappled.errors import DappledError
+
+ZAP_ENDPOINT = "inproc://zeromq.zap.01"  # ZeroMQ's RFC 27
+_KEY = r'^\s*{}-key\s*=\s*"([^"\n]*)"\s*$'
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+class KeyFileError(DappledError):
+    """A key file can't be made or used; one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """One party's own pair, Z85."""
+
+    public: bytes
+    secret: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ServerKeys:
+    """What a publisher needs: its own pair, and the public keys that may connect, each with its owner's name."""
+
+    own: Keys
+    allowed: Mapping[bytes, str]
+
+
+@dataclass(frozen=True, slots=True)
+class ClientKeys:
+    """What a subscriber needs: its own pair, and the publisher's public key."""
+
+    own: Keys
+    server: bytes
+
+
+def make(folder: Path, name: str) -> tuple[Path, Path]:
+    """Make a pair as `folder`/NAME.key and NAME.key_secret (mode 0600); existing files are never overwritten.
+
+    Raises KeyFileError.
+    """
+    if not _NAME.fullmatch(name):
+        raise KeyFileError(f"{name!r} is no name for a key: letters, digits, dot, dash and underscore, 64 at most")
+    public, secret = zmq.curve_keypair()
+    paths = folder / f"{name}.key", folder / f"{name}.key_secret"
+    head = "# A ZeroMQ CURVE key made by dappled; {}\nmetadata\ncurve\n"
+    line = '    {}-key = "{}"\n'
+    texts = (
+        head.format("public: give it to the other side") + line.format("public", public.decode()),
+        head.format("SECRET: leave it where it is")
+        + line.format("public", public.decode())
+        + line.format("secret", secret.decode()),
+    )
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for path, text, mode in zip(reversed(paths), reversed(texts), (0o600, 0o644), strict=True):
+            write_new(path, text, mode)
+    except FileExistsError as error:
+        raise KeyFileError(f"{error.filename} is there already: choose another name, or move it away") from None
+    except OSError as error:
+        raise KeyFileError(f"{error.filename or folder} can't be written: {error.strerror}") from None
+    return paths
+
+
+def write_new(path: Path, text: str, mode: int) -> None:
+    """Write a file that must not exist yet, with this mode from its first moment. Raises OSError."""
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    with os.fdopen(fd, "w", encoding="ascii") as file:
+        os.fchmod(fd, mode)
+        file.write(text)
+
+
+def read_private(path: Path, what: str) -> str:
+    """The text of a secret file that only its owner can read. Raises KeyFileError with what to do."""
+    try:
+        facts = path.stat()
+        text = path.read_text(encoding="ascii")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise KeyFileError(f"{path} can't be read as {what}: {why}") from None
+    if stat.S_IMODE(facts.st_mode) & 0o077:
+        raise KeyFileError(f"{path} can be read by others than its owner: chmod 600 {path}")
+    if facts.st_uid not in (0, os.getuid()):
+        raise KeyFileError(f"{path} belongs to another user: {what} must be your own")
+    return text
+
+
+def load_own(path: Path) -> Keys:
+    """A pair from NAME.key_secret. Raises KeyFileError, also where others could read it."""
+    text = read_private(path, "a secret key")
+    return Keys(_key(text, "public", path), _key(text, "secret", path))
+
+
+def load_public(path: Path) -> bytes:
+    """A public key from NAME.key (or NAME.key_secret). Raises KeyFileError."""
+    try:
+        text = path.read_text(encoding="ascii")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise KeyFileError(f"{path} can't be read as a public key: {why}") from None
+    return _key(text, "public", path)
+
+
+def load_allowed(folder: Path) -> dict[bytes, str]:
+    """The public keys of a folder's *.key files by key, named by file. Raises KeyFileError where it is empty, holds a
+    file that is no key, or could be added to by anybody."""
+    try:
+        mode = folder.stat().st_mode
+        files = sorted(folder.glob("*.key"))
+    except OSError as error:
+        raise KeyFileError(f"{folder} can't be read as a folder of clients' keys: {error.strerror}") from None
+    if mode & 0o002:
+        raise KeyFileError(f"anybody can write to {folder}, so anybody could let himself in: chmod o-w {folder}")
+    if not files:
+        raise KeyFileError(f"{folder} holds no NAME.key: put the public key of each subscriber there")
+    return {load_public(path): path.stem for path in files}
+
+
+def server(own: str, allowed: str) -> ServerKeys | None:
+    """A publisher's keys from its two settings; None where neither is set. Raises KeyFileError."""
+    if not own and not allowed:
+        return None
+    if not own or not allowed:
+        raise KeyFileError("publish.keys and publish.clients go together: your own secret key, and who may subscribe")
+    return ServerKeys(load_own(Path(own)), load_allowed(Path(allowed)))
+
+
+def judge(request: Sequence[bytes], allowed: Mapping[bytes, str]) -> tuple[list[bytes], str | None]:
+    """The answer to one ZAP request (RFC 27), and the name of who was let in, None for nobody."""
+    version, number = request[0], request[1]
+    name = None
+    if version == b"1.0" and len(request) == 7 and request[5] == b"CURVE" and len(request[6]) == 32:
+        name = allowed.get(zmq.utils.z85.encode(request[6]))
+    status = (b"200", b"OK") if name is not None else (b"400", b"this key is not on the list")
+    return [b"1.0", number, *status, (name or "").encode(), b""], name
+
+
+def _key(text: str, which: str, path: Path) -> bytes:
+    found = re.search(_KEY.format(which), text, re.MULTILINE)
+    if found is None:
+        raise KeyFileError(f"{path} holds no {which} key: dappled keys make writes such files")
+    key = found[1].encode()
+    if not _is_key(key):
+        raise KeyFileError(f"{path}: its {which} key is not 40 characters of Z85")
+    return key
+
+
+def _is_key(text: bytes) -> bool:
+    try:
+        return len(text) == 40 and len(zmq.utils.z85.decode(text)) == 32
+    except (ValueError, KeyError, IndexError, OverflowError, struct.error):
+        return False
