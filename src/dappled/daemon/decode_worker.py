@@ -20,7 +20,7 @@ from dappled.daemon.development import NICENESS, serve
 from dappled.decode.pictures import slice_mosaic
 from dappled.drivers.camera import Blob
 from dappled.drivers.camera_channel import Message
-from dappled.drivers.darkroom import Darkroom, Recipe
+from dappled.drivers.darkroom import Darkroom, Development, Recipe
 from dappled.errors import sentence
 
 Reply = tuple[Mapping[str, Any], tuple[int, ...]]
@@ -71,6 +71,7 @@ class Worker:
             "carriers_predicted": done.carriers_predicted,
             "law": field.attributes["law"],
             "grid": field.grid.tolist(),
+            "seen": _seen(done),
             "preview_size": list(size),
             "ms": ms,
         }
@@ -82,6 +83,26 @@ class Worker:
         file = io.BytesIO()
         Image.fromarray(mosaic).save(file, "JPEG", quality=80)
         return file.getvalue(), (mosaic.shape[1], mosaic.shape[0])
+
+
+def _seen(done: Development) -> dict[str, Any]:
+    """What a viewer needs to draw the spectrum and make views: see the schema of `slices`."""
+    report = done.report
+    named = report.carriers_from != "found"
+    pairs = zip(report.predicted, report.measured, strict=True) if named else ()
+    carriers = [
+        {
+            "at": [c.ky, c.kx, round(c.fy, 9), round(c.fx, 9)],
+            "seen": m and [round(m.fy, 9), round(m.fx, 9), round(m.strength, 6)],
+        }
+        for c, m in pairs
+    ]
+    return {
+        "frame_shape": done.light_field.attributes["shape"],
+        "mosaic": done.raw.cfa is not None,
+        "noise_rms": report.noise_rms,
+        "predicted": carriers,
+    }
 
 
 def _naming(path: str | None, error: Exception) -> str:

@@ -33,7 +33,8 @@ class Developed:
     """What came out of a frame. `body` holds the arrays of `arrays` end to end, `sha256` is the body's.
 
     `carriers` are rows [ky, kx, fy, fx]; `grid` (2, 3) leads from (y, x, 1) of a slice to sensor (row, column).
-    `preview` is a JPEG of `preview_size` (width, height). `ms` names what took how long.
+    `preview` is a JPEG of `preview_size` (width, height). `ms` names what took how long. `seen` is what viewers need
+    besides, in the words of the `slices` schema.
     """
 
     body: mmap.mmap
@@ -48,6 +49,7 @@ class Developed:
     preview: bytes
     preview_size: tuple[int, int]
     ms: Mapping[str, float] = field(default_factory=dict)
+    seen: Mapping[str, Any] = field(default_factory=dict)
 
     def result(self, index: int, decode_ms: float | None, run: str = "live") -> Result:
         """The row of the ledger."""
@@ -183,6 +185,7 @@ def _developed(answer: Message) -> Developed:
         preview=preview,
         preview_size=(facts["preview_size"][0], facts["preview_size"][1]),
         ms=facts["ms"],
+        seen=facts["seen"],
     )
 
 

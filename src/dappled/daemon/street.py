@@ -423,6 +423,7 @@ def slices_header(tag: Tag, developed: Developed) -> dict[str, object]:
         "carriers_from": developed.carriers_from,
         "carriers_found": developed.carriers_found,
         "grid": developed.grid,
+        **developed.seen,
         "slices_sha256": developed.sha256,
         "arrays": developed.arrays,
     }

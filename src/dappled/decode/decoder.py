@@ -144,7 +144,7 @@ class MaskDecoder:
         slices = self.cut(spectrum, lattice, used)
         noise = spectrum.noise_rms()
         if views:
-            made, offsets, views_from, told = self._views(
+            made, offsets, views_from, told = self.views(
                 slices, lattice, carriers_from, focal_length_mm=focal_length_mm, f_number=f_number, noise_rms=noise
             )
         else:
@@ -214,7 +214,7 @@ class MaskDecoder:
             return self.calibration.nearest(focal_length_mm).mask_distance_mm
         return self.mask_distance_mm
 
-    def _views(
+    def views(
         self,
         slices: Slices,
         lattice: Lattice,
@@ -224,8 +224,8 @@ class MaskDecoder:
         f_number: float | None,
         noise_rms: float,
     ) -> tuple[Views, NDArray[np.float64], ViewsFrom, list[list[float]] | None]:
-        """Views, their offsets, where phases came from, and what each slice is of the light field: rows
-        [ωv, ωu, Re T, Im T], T = 0 where a slice was not used."""
+        """Views of slices that were cut before, their offsets, where phases came from, and what each slice is of the
+        light field: rows [ωv, ωu, Re T, Im T], T = 0 where a slice was not used."""
         none = no_views(slices)
         if f_number is None:
             return *none, "none", None
