@@ -2,7 +2,7 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check test-fast test-slow bench lock install uninstall clean
+.PHONY: help setup demo test check test-fast test-slow soak bench lock install uninstall clean
 PREFIX ?= /usr/local
 
 help: ## show this list
@@ -29,6 +29,9 @@ test-fast: setup
 
 test-slow: setup ## the tests that take longer
 	@$(BIN)/pytest -m slow
+
+soak: setup ## half an hour in which something goes wrong every few seconds; MINUTES=n for another time
+	@$(BIN)/python -m dappled.mocks.soak --minutes $(or $(MINUTES),30)
 
 bench: setup ## what the performance claims are measured with
 	@for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done

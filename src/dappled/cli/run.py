@@ -48,10 +48,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # until there is a daemon to end in order
+    hung_up = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         return _run(arguments)
     finally:
         signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGHUP, hung_up)
 
 
 def _run(arguments: argparse.Namespace) -> int:

@@ -168,10 +168,20 @@ class Autopilot:
         self._process = process
 
     @classmethod
-    def start(cls, url: str, *, seed: int, start_monotonic_ns: int, jitter_s: float = 0.0) -> Autopilot:
-        """Start one that flies `Path(seed)` since `start_monotonic_ns` and speaks on `url` (udpout:HOST:PORT)."""
+    def start(
+        cls,
+        url: str,
+        *,
+        seed: int,
+        start_monotonic_ns: int,
+        jitter_s: float = 0.0,
+        booted_s: float = BootTime().offset_s,
+    ) -> Autopilot:
+        """Start one that flies `Path(seed)` since `start_monotonic_ns` and speaks on `url` (udpout:HOST:PORT). It was
+        booted `booted_s` before the flight began; less than zero: in flight."""
         command = [sys.executable, "-m", "dappled.mocks.autopilot", "--with-parent", "--url", url, "--seed", str(seed)]
         command += ["--start-monotonic-ns", str(start_monotonic_ns), "--jitter", str(jitter_s)]
+        command += [f"--booted={booted_s}"]
         return cls(subprocess.Popen(command, stdin=subprocess.PIPE))
 
     def running(self) -> bool:
@@ -204,10 +214,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--start-monotonic-ns", type=int, default=None, help="when the flight began; default now")
     parser.add_argument("--system-id", type=int, default=1)
     parser.add_argument("--jitter", type=float, default=0.0, help="seconds that telemetry may be late")
+    parser.add_argument("--booted", type=float, default=BootTime().offset_s, help="seconds before the flight began")
     parser.add_argument("--with-parent", action="store_true", help="end when standard input is closed")
     wanted = parser.parse_args(arguments)
     start_ns = time.monotonic_ns() if wanted.start_monotonic_ns is None else wanted.start_monotonic_ns
-    flyer = Flyer(Path(wanted.seed), start_ns, BootTime(), lambda _: None, wanted.jitter, wanted.system_id)
+    flyer = Flyer(Path(wanted.seed), start_ns, BootTime(wanted.booted), lambda _: None, wanted.jitter, wanted.system_id)
 
     def received(packet: Packet) -> None:
         if not packet.sent:

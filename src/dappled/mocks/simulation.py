@@ -55,7 +55,7 @@ class Simulation:
         world = self.world
         calibration = self._calibrate()
         with ExitStack() as stack:
-            body = Body.start(
+            self.body = body = Body.start(
                 BodyOptions(
                     seed=world.seed,
                     scale=world.scale,
@@ -65,12 +65,10 @@ class Simulation:
                 )
             )
             stack.callback(body.stop)
-            autopilot = Autopilot.start(
-                f"udpout:127.0.0.1:{self._autopilot_port}",
-                seed=world.seed,
-                start_monotonic_ns=self.start_monotonic_ns,
+            self._autopilot = Autopilot.start(
+                self.autopilot_url, seed=world.seed, start_monotonic_ns=self.start_monotonic_ns
             )
-            stack.callback(autopilot.stop)
+            stack.callback(self._stop_autopilot)
             self._stack = stack.pop_all()
         given = self._settings
         links = (f"udpin:127.0.0.1:{self._autopilot_port}", f"udpin:127.0.0.1:{self._ground_port}", *given.mavlink.url)
@@ -94,9 +92,32 @@ class Simulation:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
+    @property
+    def autopilot_url(self) -> str:
+        """Where the autopilot sends to."""
+        return f"udpout:127.0.0.1:{self._autopilot_port}"
+
+    @property
+    def ground_url(self) -> str:
+        """Where a ground station finds the daemon."""
+        return f"udpout:127.0.0.1:{self._ground_port}"
+
+    def reboot_autopilot(self) -> None:
+        """The autopilot loses power and comes back: its time since boot begins anew, the flight goes on."""
+        self._autopilot.stop()
+        self._autopilot = Autopilot.start(
+            self.autopilot_url,
+            seed=self.world.seed,
+            start_monotonic_ns=self.start_monotonic_ns,
+            booted_s=-(time.monotonic_ns() - self.start_monotonic_ns) / 1e9,
+        )
+
+    def _stop_autopilot(self) -> None:
+        self._autopilot.stop()
+
     def ground_station(self, frames: int, interval_s: float = 0.0) -> GroundStation:
         """A ground station that asks for so many frames, each after the last one ended."""
-        station = GroundStation.start(f"udpout:127.0.0.1:{self._ground_port}", frames, interval_s)
+        station = GroundStation.start(self.ground_url, frames, interval_s)
         self._stack.callback(station.stop)
         return station
 

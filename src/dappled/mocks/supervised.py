@@ -1,0 +1,106 @@
+"""The daemon in a process of its own, restarted when it dies, and what it takes of the machine."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+END_S = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Resources:
+    """What the daemon holds: memory of its own process, open files, threads, and its child processes."""
+
+    rss_mb: float
+    files: int
+    threads: int
+    children: int
+
+    def told(self) -> dict[str, float]:
+        """As a mapping, for JSON."""
+        return asdict(self)
+
+    def grown(self, after: Resources) -> list[str]:
+        """A sentence for each thing of which there is more now: 3 files, 2 threads, 10 % and 16 MB are no growth."""
+        said = []
+        if after.rss_mb > 1.1 * self.rss_mb + 16:
+            said.append(f"memory grew from {self.rss_mb:.0f} to {after.rss_mb:.0f} MB")
+        for name, slack in (("files", 3), ("threads", 2), ("children", 0)):
+            was, now = getattr(self, name), getattr(after, name)
+            if now > was + slack:
+                said.append(f"{name} grew from {was} to {now}")
+        return said
+
+
+class Supervised:
+    """`dappled run --config FILE`, kept alive. Its output goes to `log`. Use as a context manager."""
+
+    def __init__(self, config: Path, log: Path) -> None:
+        self._command = [sys.executable, "-m", "dappled", "run", "--config", str(config)]
+        self._log = log
+        self._process: subprocess.Popen[bytes] | None = None
+        self.lives = 0
+
+    def __enter__(self) -> Supervised:
+        self.keep_alive()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None and self._process.poll() is None:
+            self._process.kill()
+            self._process.wait(END_S)
+
+    @property
+    def pid(self) -> int:
+        """The daemon's process."""
+        assert self._process is not None
+        return self._process.pid
+
+    def keep_alive(self) -> None:
+        """Start it when it doesn't run."""
+        if self._process is None or self._process.poll() is not None:
+            self.lives += 1
+            with self._log.open("ab") as log:
+                self._process = subprocess.Popen(self._command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+
+    def kill(self) -> None:
+        """kill -9."""
+        assert self._process is not None
+        self._process.kill()
+        self._process.wait(END_S)
+
+    def children(self) -> dict[int, str]:
+        """Its child processes: number → command line."""
+        found = {}
+        for task in Path(f"/proc/{self.pid}/task").iterdir():
+            for child in (task / "children").read_text(encoding="ascii").split():
+                line = Path(f"/proc/{child}/cmdline").read_bytes().replace(b"\0", b" ")
+                found[int(child)] = line.decode(errors="replace")
+        return found
+
+    def resources(self) -> Resources:
+        """What it holds now."""
+        status = Path(f"/proc/{self.pid}/status").read_text(encoding="ascii", errors="replace")
+        told = dict(line.split(":", 1) for line in status.splitlines() if ":" in line)
+        return Resources(
+            rss_mb=int(told["VmRSS"].split()[0]) / 1e3,
+            files=len(os.listdir(f"/proc/{self.pid}/fd")),
+            threads=int(told["Threads"]),
+            children=len(self.children()),
+        )
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send it a signal."""
+        assert self._process is not None
+        self._process.send_signal(number)
+
+    def end(self) -> int:
+        """SIGTERM, and its exit code. Raises subprocess.TimeoutExpired after 20 s."""
+        assert self._process is not None
+        self._process.terminate()
+        return self._process.wait(END_S)
