@@ -75,6 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
         recording.horizons,
         wait_s=recorded.pose.wait_ms / 1e3,
         component_id=recorded.mavlink.component_id,
+        attitude_sigma_rad=math.radians(recorded.pose.attitude_sigma_deg),
     )
     book = replay.book(recording)
     progress = Progress.begin()

@@ -13,6 +13,9 @@ from typing import Any
 from dappled.config.schema import ConfigError, Rule, Source, build, read_toml, setting
 
 
+SOCKET_MODES = ("0600", "0660", "0666")
+
+
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
     driver: str = setting("gphoto2", "Driver by name: gphoto2, or one that another package registers")
@@ -39,6 +42,17 @@ class MavlinkSettings:
         100, "MAV_COMP_ID_CAMERA and the five after it are what autopilots look for", low=1, high=255
     )
     system_id: int = setting(1, "Used until an autopilot is heard, whose id is then adopted", low=1, high=255)
+    keys: tuple[str, ...] = setting(
+        (), 'Signing key files (dappled mavlink key), one a link in the order of url, "" for none; one alone is for all'
+    )
+    unsigned: str = setting(
+        "refuse",
+        "Packets without a signature on a link with a key: refused, heard but not obeyed, or allowed",
+        choices=("refuse", "listen", "allow"),
+    )
+    feedback_is_shot: bool = setting(
+        False, "The autopilot fires the camera by wire, and each CAMERA_FEEDBACK of it is a shot"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +66,13 @@ class PoseSettings:
     wait_ms: float = setting(
         700.0, "How long a tag may wait for telemetry after the exposure", unit="ms", low=0, high=10_000
     )
+    attitude_sigma_deg: float = setting(
+        0.0,
+        "How well the autopilot knows its attitude, 1 σ, where it doesn't say; 0: not known",
+        unit="°",
+        low=0,
+        high=90,
+    )
     lever_arm_m: tuple[float, float, float] = setting(
         (0.0, 0.0, 0.0), "From the antenna to the camera: forward, right, down", unit="m", low=-100, high=100
     )
@@ -60,6 +81,9 @@ class PoseSettings:
         "Rotation from camera axes (right, down, forward) to body axes, row by row; default: down, image top forward",
         low=-1,
         high=1,
+    )
+    on_gimbal: bool = setting(
+        False, "The camera hangs on the gimbal: its reported attitude counts, and mount turns camera axes into its axes"
     )
 
 
@@ -80,11 +104,19 @@ class PublishSettings:
     ask: str = setting("", "ZeroMQ endpoint that answers questions about recorded frames; empty: beside the stream")
     high_water_mark: int = setting(12, "Messages that may wait for a slow subscriber; 3 a frame", low=1, high=1000)
     preview_interval_s: float = setting(1.0, "At most one preview in this time", unit="s", low=0, high=3600)
+    socket_mode: str = setting("0660", "Who may connect to ipc sockets, as chmod says it", choices=SOCKET_MODES)
+    keys: str = setting("", "Secret CURVE key for tcp endpoints, made by dappled keys make; empty: none off loopback")
+    clients: str = setting("", "Folder with the public key, NAME.key, of each who may subscribe over tcp")
 
 
 @dataclass(frozen=True, slots=True)
 class ConsoleSettings:
     bind: str = setting("", "host:port of the operator's console; empty: no console")
+    token: str = setting("", "File with the token that a console beyond loopback asks for, made by dappled keys token")
+    hosts: tuple[str, ...] = setting((), "More names that browsers may reach the console by")
+    map: str = setting(
+        "", "Picture behind the track: PNG or JPEG with a world file in degrees beside it; empty: a grid"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +175,7 @@ def resolve(settings: Settings, beside: Path | None = None) -> Settings:
         settings,
         camera=dataclasses.replace(settings.camera, profile=profile(settings.camera.profile)),
         mask=dataclasses.replace(settings.mask, profile=profile(settings.mask.profile)),
+        mavlink=dataclasses.replace(settings.mavlink, keys=tuple(path(each) for each in settings.mavlink.keys)),
         record=dataclasses.replace(settings.record, directory=path(settings.record.directory)),
         decode=dataclasses.replace(
             settings.decode,
@@ -150,7 +183,12 @@ def resolve(settings: Settings, beside: Path | None = None) -> Settings:
             white=path(settings.decode.white),
             dark=path(settings.decode.dark),
         ),
-        publish=dataclasses.replace(publish, slices=slices, ask=ask),
+        publish=dataclasses.replace(
+            publish, slices=slices, ask=ask, keys=path(publish.keys), clients=path(publish.clients)
+        ),
+        console=dataclasses.replace(
+            settings.console, token=path(settings.console.token), map=path(settings.console.map)
+        ),
     )
 
 

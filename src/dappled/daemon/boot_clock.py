@@ -10,7 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
 DRIFT_SIGMA = 50e-6  # crystals of autopilots: some tens of ppm between two machines
+_PRIOR = np.diag([0.0, 1 / (DRIFT_SIGMA * 1e9) ** 2])  # of level (ns) and slope (ns/s)
 _TIMESYNC_FLOOR_NS = 50_000.0
 _TIMESYNC_ASYMMETRY = 0.05  # share of the least round trip by which the two ways may differ; not observable
 _ARRIVAL_FLOOR_NS = 5e6  # the shortest way through radio, UART and scheduler; not observable from one side
@@ -24,6 +30,11 @@ class Answer:
     sent_utc_ns: int
     received_utc_ns: int
     boot_ns: int
+
+    @property
+    def stamp_ns(self) -> int:
+        """When it came."""
+        return self.received_utc_ns
 
     @property
     def delay_ns(self) -> int:
@@ -61,39 +72,39 @@ def from_timesync(answers: Sequence[Answer]) -> BootClock | None:
 
     An answer that took `e` longer than the quickest one is wrong by at most e/2, all of it on one way: its weight is
     1 / (s² + (e/2)²). `s` is half the lower quartile of e, so that on a link where delays spread evenly (no answer is
-    much better than the next) all answers share the work. The slope has a prior of 0 ± 50 ppm.
+    much better than the next) all answers share the work. The slope has a prior of 0 ± 50 ppm. Sigma comes from what
+    the answers leave over, each at its own weight (White's estimate): right also where the weights are not.
     """
     if len(answers) < 3:
         return None
     reference = answers[-1]
-    least = min(a.delay_ns for a in answers)
-    excess = [float(a.delay_ns - least) for a in answers]
-    floor_ns = max(_TIMESYNC_FLOOR_NS, sorted(excess)[len(excess) // 4] / 2)
-    s_w = s_x = s_y = s_xy = 0.0
-    s_xx = 1 / (DRIFT_SIGMA * 1e9) ** 2
-    rows = []
-    for answer, e in zip(answers, excess, strict=True):
-        w = 1 / (floor_ns**2 + (e / 2) ** 2)
-        x = (answer.boot_ns - reference.boot_ns) / 1e9
-        y = float(answer.offset_ns - reference.offset_ns)
-        rows.append((w, x, y))
-        s_w += w
-        s_x += w * x
-        s_y += w * y
-        s_xx += w * x * x
-        s_xy += w * x * y
-    determinant = s_w * s_xx - s_x * s_x
-    level = (s_xx * s_y - s_x * s_xy) / determinant
-    slope = (s_w * s_xy - s_x * s_y) / determinant
-    spread = sum(w * (y - level - slope * x) ** 2 for w, x, y in rows) / max(1, len(rows) - 2)
-    fit_variance = s_xx / determinant * max(spread, 0.01)
+    delay = np.array([answer.delay_ns for answer in answers], dtype=np.float64)
+    x = np.array([answer.boot_ns - reference.boot_ns for answer in answers], dtype=np.float64) / 1e9
+    y = np.array([answer.offset_ns - reference.offset_ns for answer in answers], dtype=np.float64)
+    half = (delay - delay.min()) / 2
+    weight = 1 / (max(_TIMESYNC_FLOOR_NS, float(np.sort(half)[len(half) // 4])) ** 2 + half**2)
+    freedom = len(answers) - 2
+    _, _, left = _line(x, y, weight)
+    weight /= max(float(weight @ left**2) / freedom, 1e-4)  # now in the prior's own measure
+    (level, slope), inverse, left = _line(x, y, weight)
+    sides = np.stack([np.ones_like(x), x]) * (weight * left)
+    scatter = sides @ sides.T * (len(answers) / freedom) + _PRIOR
+    variance = max(float((inverse @ scatter @ inverse)[0, 0]), 0.1 * float(inverse[0, 0]))
     return BootClock(
         "timesync",
         reference.boot_ns,
         reference.offset_ns + round(level),
-        slope / 1e9,
-        math.sqrt(fit_variance + (_TIMESYNC_ASYMMETRY * least) ** 2),
+        float(slope) / 1e9,
+        math.hypot(math.sqrt(variance), _TIMESYNC_ASYMMETRY * float(delay.min())),
     )
+
+
+def _line(x: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Weighted least squares with the prior: (level, slope), the inverse of the normal matrix, what is left over."""
+    sides = np.stack([np.ones_like(x), x])
+    inverse = np.asarray(np.linalg.inv((sides * weight) @ sides.T + _PRIOR), dtype=np.float64)
+    found = inverse @ (sides @ (weight * y))
+    return found, inverse, y - found @ sides
 
 
 def from_arrivals(arrivals: Sequence[tuple[int, int]]) -> BootClock | None:

@@ -43,6 +43,72 @@ def normalised(*parts: float) -> Quaternion:
     return w / length, x / length, y / length, z / length
 
 
+def hermite_doubt(moved: Vector3, start: Vector3, end: Vector3, span_s: float, share: float) -> float:
+    """Metres (1 σ) by which `hermite` may miss at `share` of a way `moved`, with the velocities at its ends.
+
+    A way that disagrees with its velocities' mean was not wholly told by them: half of the difference, in the middle.
+    """
+    missing = math.hypot(*(moved[i] - 0.5 * (start[i] + end[i]) * span_s for i in range(3)))
+    return 0.5 * missing * (4 * share * (1 - share)) ** 2
+
+
+def slerp_doubt(
+    ends: tuple[Quaternion, Quaternion], rates: tuple[Vector3, Vector3], span_s: float, share: float
+) -> float:
+    """Radians (1 σ) by which `slerp` may miss at `share`: the cubic that also has the body's rates (rad/s) at the ends,
+    less the even turn."""
+    even = rotation_vector(multiply(conjugate(ends[0]), ends[1]))
+    u = share
+    begin, end = u**3 - 2 * u**2 + u, u**3 - u**2
+    off = [begin * (rates[0][i] * span_s - even[i]) + end * (rates[1][i] * span_s - even[i]) for i in range(3)]
+    return math.hypot(*off)
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """The turn `b`, then the turn `a`, of vectors."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+def conjugate(q: Quaternion) -> Quaternion:
+    """The turn back."""
+    return q[0], -q[1], -q[2], -q[3]
+
+
+def rotation_vector(q: Quaternion) -> Vector3:
+    """A unit quaternion as axis × angle, the shorter way."""
+    sign = math.copysign(1.0, q[0])
+    length = norm((q[1], q[2], q[3]))
+    scale = 2.0 if length < 1e-12 else 2 * math.atan2(length, abs(q[0])) / length
+    return sign * scale * q[1], sign * scale * q[2], sign * scale * q[3]
+
+
+def turned_by_heading(q: Quaternion, vehicle: Quaternion) -> Quaternion:
+    """`q`, whose yaw counts from the vehicle's nose, to north: turned about the vertical by the vehicle's heading."""
+    w, x, y, z = vehicle
+    half = 0.5 * math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return multiply((math.cos(half), 0.0, 0.0, math.sin(half)), q)
+
+
+def from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
+    """Aerospace angles (yaw, then pitch, then roll) as a quaternion, body to north-east-down."""
+    cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
+    cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
+    cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
 def turn_rad(a: Quaternion, b: Quaternion) -> float:
     """The angle between two attitudes."""
     cross = (

@@ -100,10 +100,18 @@ def of_folder(
 class RecordedTelemetry:
     """Poses from a telemetry file, fed packet by packet just as far as each frame's pose was made from."""
 
-    def __init__(self, path: Path | None, horizons: dict[int, int], *, wait_s: float, component_id: int = 100) -> None:
-        """`component_id` is the one that the recording daemon had."""
+    def __init__(
+        self,
+        path: Path | None,
+        horizons: dict[int, int],
+        *,
+        wait_s: float,
+        component_id: int = 100,
+        attitude_sigma_rad: float = 0.0,
+    ) -> None:
+        """`component_id` and `attitude_sigma_rad` are those that the recording daemon had."""
         self._horizons, self._wait_ns = horizons, round(wait_s * 1e9)
-        self._telemetry = Telemetry(component_id=component_id)
+        self._telemetry = Telemetry(component_id=component_id, attitude_sigma_rad=attitude_sigma_rad)
         self._packets = _packets(path) if path else iter(())
         self._fed = 0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 import threading
 from collections import deque
@@ -16,13 +17,14 @@ import dappled
 from dappled.config import profiles
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.daemon import curve, health, inputs
+from dappled.daemon import curve, health, inputs, links
 from dappled.daemon.answers import Answers
 from dappled.daemon.books import LiveBook
 from dappled.daemon.cameras import open_camera
 from dappled.daemon.clock import Clock, SystemClock
 from dappled.daemon.component import CameraFacts, Captured, Component, Storage
 from dappled.daemon.development import DevelopmentError, WorkerDeveloper
+from dappled.daemon.knobs import Knobs, OwnKnob
 from dappled.daemon.publisher import Publisher, Reply
 from dappled.daemon.reload import merge
 from dappled.daemon.shutter import Shutter, Verdict, Wish
@@ -31,7 +33,7 @@ from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency, Exposure
 from dappled.daemon.telemetry import Telemetry
 from dappled.drivers.camera import Camera, Identity, StateChanged
 from dappled.drivers.darkroom import Recipe
-from dappled.drivers.mavlink import MavlinkLinks, Packet
+from dappled.drivers.mavlink import Packet, mavlink
 from dappled.errors import DappledError, report
 from dappled.flight import layout
 from dappled.flight import recording as flights
@@ -57,13 +59,18 @@ class Service:
         self._clock = clock or SystemClock()
         self._stack = ExitStack()
         self._stopping = threading.Event()
-        self._telemetry = Telemetry(component_id=settings.mavlink.component_id)
+        self._telemetry = Telemetry(
+            component_id=settings.mavlink.component_id,
+            attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
+        )
         self._component: Component | None = None
         self._recording: flights.Recording | None = None
         self._started = False
         self._health_due_ns = 0
         self._identity: Identity | None = None
-        self._refused: deque[tuple[Wish, str]] = deque(maxlen=1000)
+        self._notes: deque[tuple[str, str]] = deque(maxlen=1000)
+        self._said: set[str] = set()
+        self._focal_length_mm: float | None = None
         self._began_monotonic_ns = self._clock.monotonic_ns()
 
     # life
@@ -82,14 +89,7 @@ class Service:
                 mode=int(self.settings.publish.socket_mode, 8),
             )
             stack.callback(self._publisher.stop)
-            self._links = MavlinkLinks(
-                self.settings.mavlink.url,
-                system_id=self.settings.mavlink.system_id,
-                component_id=self.settings.mavlink.component_id,
-                tap=self._log_packet,
-                on_packet=self._packet,
-                clock=self._clock,
-            )
+            self._links = links.configured(self.settings, self._clock, tap=self._log_packet, on_packet=self._packet)
             self._links.open()
             stack.callback(self._links.stop)
             self._recording = flights.begin(
@@ -99,7 +99,7 @@ class Service:
             stack.callback(self._close_recording)
             stack.callback(self._links.stop)  # before the recording closes: packets are logged there
             self._begin_street(camera, names, self._developer(recipe, stack), stack)
-            self._begin_component()
+            self._begin_component(self._knobs(camera, names, recipe))
             self._started = True
             self._stack = stack.pop_all()
         for text in self._recording.recovered:
@@ -139,7 +139,7 @@ class Service:
             capacity=self.settings.camera.max_pending,
             obstacle=self._obstacle,
             on_change=self._changed,
-            on_refused=self._refused.append,
+            on_refused=self._refused,
         )
         self._answers.start()
         stack.callback(self._answers.stop)
@@ -151,15 +151,31 @@ class Service:
         self._shutter.start()
         stack.callback(self._shutter.stop)
 
-    def _begin_component(self) -> None:
+    def _knobs(self, camera: Camera, names: Names, recipe: Recipe | None) -> Knobs:
+        """What a ground station may set: the body's settings; and here, whether frames are decoded in flight."""
+        decoding = OwnKnob(
+            "LF_DECODE",
+            "Decode in flight",
+            lambda: "on" if recipe and self._street.decoding else "off",
+            ("on", "off"),
+            self._decode_in_flight if recipe else None,
+        )
+        mask = OwnKnob("LF_MASK", "Mask", lambda: names.mask or "none")
+        return Knobs(camera, (decoding, mask, OwnKnob("LF_LAW", "Carrier law", lambda: names.law or "none")))
+
+    def _begin_component(self, knobs: Knobs) -> None:
         self._component = Component(
             self._links,
             self._shutter,
             self._clock,
+            knobs,
             facts=self._camera_facts,
             storage=self._storage,
             lookup=self._lookup,
             healthy=lambda: not self._street.dead(),
+            pose=lambda: self._telemetry.pose_at(self._clock.utc_ns(), 0.0),
+            mount=self.settings.pose.mount,
+            feedback_is_shot=self.settings.mavlink.feedback_is_shot,
         )
         self._links.start()
 
@@ -173,11 +189,13 @@ class Service:
         """One turn of the working loop."""
         if self._component is not None and self.settings.mavlink.url:
             self._component.tick()
-        self._note_refusals()
+        self._write_notes()
         now_ns = self._clock.monotonic_ns()
         if now_ns >= self._health_due_ns:
             self._health_due_ns = now_ns + round(HEALTH_S * 1e9)
-            self._publisher.publish("health", self.health())
+            record = self.health()
+            self._publisher.publish("health", record)
+            self._tell_pilot(record["problems"])
 
     def ask_to_stop(self) -> None:
         """End `run` soon; safe in a signal handler."""
@@ -248,14 +266,23 @@ class Service:
             return f"the disk is nearly full: {free // 1_000_000} MB left, record.min_free_mb asks for more"
         return None
 
-    def _note_refusals(self) -> None:
-        """Refused wishes stand in the flight too, as events; written here, where nobody waits for an answer."""
-        while self._refused:
-            wish, reason = self._refused.popleft()
+    def _refused(self, refused: tuple[Wish, str]) -> None:
+        wish, reason = refused
+        self._notes.append(("refused", f"{wish.kind} from {wish.source}: {reason}"))
+
+    def _decode_in_flight(self, value: str) -> None:
+        self._street.decoding = value == "on"
+        self._notes.append(("decoding", f"{value} from now on, by the ground station"))
+
+    def _write_notes(self) -> None:
+        """Refused wishes and the like stand in the flight too, as events; written here, where nobody waits for an
+        answer."""
+        while self._notes:
+            kind, text = self._notes.popleft()
             try:
-                self._book.event("refused", f"{wish.kind} from {wish.source}: {reason}")
+                self._book.event(kind, text)
             except DappledError as error:
-                report(log, "refusals", error)
+                report(log, "events", error)
                 return
 
     def _settled(self, index: int, ok: bool) -> None:
@@ -307,7 +334,23 @@ class Service:
             captured = Captured(index, story.frame is not None, url=story.frame.name if story.frame else "")
         if self._component is not None:
             self._component.announce(captured)
+            if story.frame is None:
+                self._component.say(f"image {index} failed: {story.problem}", mavlink.MAV_SEVERITY_ERROR)
+        if story.tag is not None:
+            self._focal_length_mm = story.tag.focal_length_mm or self._focal_length_mm
         self._outside.tagged(story)
+
+    def _tell_pilot(self, problems: list[str]) -> None:
+        """Each problem once, when it comes up; and when the last has gone."""
+        component, now = self._component, set(problems)
+        if component is None:
+            return
+        for text in problems:
+            if text not in self._said:
+                component.say(text)
+        if self._said and not now:
+            component.say("all is well again", mavlink.MAV_SEVERITY_INFO)
+        self._said = now
 
     def _lookup(self, index: int) -> Captured | None:
         assert self._recording is not None
@@ -333,6 +376,7 @@ class Service:
             vendor=who.make if who else "dappled",
             model=who.model if who else "masked camera",
             firmware=(major, minor, patch),
+            focal_length_mm=self._focal_length_mm,
             **chip,
         )
 
@@ -367,7 +411,7 @@ class Service:
         self._answers.answer(request, reply)
 
     def _say_end(self) -> None:
-        self._note_refusals()
+        self._write_notes()
         now = self._shutter.statistics()
         counts = {"wished": now.shots, "safe": now.succeeded, "failed": now.failed, "open": now.pending}
         self._publisher.publish("end", {"utc_ns": self._clock.utc_ns(), "shots": counts})

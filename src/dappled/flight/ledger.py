@@ -17,7 +17,7 @@ from typing import Any, Self, TypeVar, cast
 
 from dappled.flight.entries import Event, Result, ShotRow, Stray
 from dappled.flight.errors import FlightError
-from dappled.flight.records import Cause, Frame, Pose, Shot, ShotState, Tag, canonical, digest
+from dappled.flight.records import Cause, Frame, Gnss, Pose, Shot, ShotState, Tag, canonical, digest
 from dappled.flight.states import advance
 
 _Record = TypeVar("_Record")
@@ -346,8 +346,10 @@ def _shot_row(row: Sequence[Any]) -> ShotRow:
 
 
 def _pose(value: dict[str, Any]) -> Pose:
-    lists = {key: tuple(item) for key, item in value.items() if isinstance(item, list)}
-    return Pose(**{**value, **lists})
+    made: dict[str, Any] = {key: tuple(item) for key, item in value.items() if isinstance(item, list)}
+    if value.get("gnss") is not None:
+        made["gnss"] = Gnss(**value["gnss"])
+    return Pose(**{**value, **made})
 
 
 def _tag(value: dict[str, Any]) -> Tag:

@@ -49,13 +49,32 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
+class Gnss:
+    """What the receiver last said of itself before the exposure (GPS_RAW_INT). Accuracies are one sigma as it tells.
+
+    `fix_type` is MAVLink's GPS_FIX_TYPE: 3 is 3D, 5 RTK float, 6 RTK fixed. `age_ms` counts up to the exposure.
+    """
+
+    fix_type: int
+    satellites: int | None
+    hdop: float | None
+    vdop: float | None
+    horizontal_accuracy_m: float | None
+    vertical_accuracy_m: float | None
+    velocity_accuracy_m_s: float | None
+    age_ms: float
+
+
+@dataclass(frozen=True, slots=True)
 class Pose:
     """Position and attitude of the vehicle at mid-exposure, and how well each is known.
 
     `attitude` is the unit quaternion (w, x, y, z) from body (forward, right, down) to north-east-down. Sigmas are one
-    standard deviation. `source` says how the pose was had: "interpolated", "nearest" (no sample on one side: marked,
-    not hidden) or "none". `age_ms` is the time from mid-exposure to the nearest position sample.
-    `telemetry_packets` is how many packets of telemetry.tlog were taken into account: a replay stops there too.
+    standard deviation; `position_sigma_m` is horizontal, as a distance. `source` says how the pose was had:
+    "interpolated", "nearest" (no sample on one side: marked, not hidden) or "none". `age_ms` is the time from
+    mid-exposure to the nearest position sample. `telemetry_packets` is how many packets of telemetry.tlog were taken
+    into account: a replay stops there too. `gimbal_attitude` is that of a gimbal's head (forward, right, down) to
+    north-east-down, where one reports it; `gimbal_source` names its message.
     """
 
     source: Literal["interpolated", "nearest", "none"]
@@ -71,6 +90,10 @@ class Pose:
     attitude_sigma_rad: float | None
     age_ms: float | None
     telemetry_packets: int
+    vertical_sigma_m: float | None = None
+    gnss: Gnss | None = None
+    gimbal_attitude: Quaternion | None = None
+    gimbal_source: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
