@@ -17,7 +17,20 @@ from dappled.daemon.development import Developed, DevelopmentError
 from dappled.daemon.shutter import Shutter, Verdict, Wish
 from dappled.daemon.street import Names, Story, Street, Watchers
 from dappled.daemon.tagger import BodyLatency
-from dappled.drivers.camera import Arrival, Blob, CameraError, Event, Fired, ShotFailed, StateChanged
+from dappled.drivers.camera import (
+    Arrival,
+    Blob,
+    CameraError,
+    Companion,
+    Event,
+    Fired,
+    Identity,
+    Setting,
+    SettingName,
+    ShotFailed,
+    StateChanged,
+    check_change,
+)
 from dappled.flight import recording
 from dappled.flight.records import Pose, Shot
 
@@ -82,8 +95,18 @@ class FakeCamera:
             raise event
         return event
 
-    def release(self, arrival: Arrival) -> None:
+    def release(self, arrival: Arrival | Companion) -> None:
         self.released.append(arrival.shot)
+
+    @property
+    def identity(self) -> Identity | None:
+        return None
+
+    def settings(self) -> tuple[Setting, ...]:
+        return ()
+
+    def change(self, name: SettingName, value: str) -> None:
+        check_change((), name, value)
 
     def stop(self) -> None:
         self.stopped = True

@@ -12,7 +12,17 @@ from dataclasses import dataclass
 
 import pytest
 
-from dappled.drivers.camera import Arrival, Camera, Event, Fired, ShotFailed, StateChanged
+from dappled.drivers.camera import (
+    Arrival,
+    Camera,
+    CameraError,
+    Companion,
+    Event,
+    Fired,
+    SettingsChanged,
+    ShotFailed,
+    StateChanged,
+)
 
 PATIENCE_S = 30.0
 
@@ -50,7 +60,14 @@ def until_shot_ends(camera: Camera, shot: int) -> list[Event]:
     return until(camera, lambda event: isinstance(event, Arrival | ShotFailed) and event.shot == shot)
 
 
-def content(arrival: Arrival) -> bytes:
+def until_quiet(camera: Camera) -> None:
+    """Until no event came for a second: a camera tells its settings some time after it is ready."""
+    deadline = time.monotonic() + PATIENCE_S
+    while camera.next_event(1.0) is not None:
+        assert time.monotonic() < deadline, "events without end"
+
+
+def content(arrival: Arrival | Companion) -> bytes:
     """The bytes behind an arrival's descriptor, read with pread; the descriptor is closed."""
     data = os.pread(arrival.blob.fd, arrival.blob.size + 1, 0)
     arrival.blob.close()
@@ -59,7 +76,7 @@ def content(arrival: Arrival) -> bytes:
 
 def of_shots(events: list[Event]) -> list[tuple[type[Event], int | None]]:
     """What the events say of shots: kind and shot."""
-    return [(type(event), event.shot) for event in events if not isinstance(event, StateChanged)]
+    return [(type(event), event.shot) for event in events if not isinstance(event, StateChanged | SettingsChanged)]
 
 
 class CameraContract:
@@ -76,6 +93,7 @@ class CameraContract:
         assert ready.identity is not None
         assert ready.identity.make
         assert ready.identity.model
+        assert rig.camera.identity == ready.identity
 
     def test_a_shot_is_fired_and_its_file_arrives(self, rig: Rig) -> None:
         rig.camera.start()
@@ -83,7 +101,7 @@ class CameraContract:
         before_ns = time.monotonic_ns()
         rig.camera.fire(7)
         events = until_shot_ends(rig.camera, 7)
-        fired, arrival = [event for event in events if not isinstance(event, StateChanged)]
+        fired, arrival = [event for event in events if not isinstance(event, StateChanged | SettingsChanged)]
         assert isinstance(fired, Fired)
         assert isinstance(arrival, Arrival)
         assert fired.shot == arrival.shot == 7
@@ -118,8 +136,33 @@ class CameraContract:
     def test_an_idle_camera_has_no_events(self, rig: Rig) -> None:
         rig.camera.start()
         until_state(rig.camera, "ready")
+        until_quiet(rig.camera)
         assert rig.camera.next_event(0.3) is None
         assert rig.camera.next_event(0.0) is None
+        assert rig.camera.identity is not None
+
+    def test_an_unknown_setting_or_choice_is_refused_with_a_sentence(self, rig: Rig) -> None:
+        with pytest.raises(CameraError, match="iso"):
+            rig.camera.change("iso", "no such ISO")  # not started: nothing is known
+        rig.camera.start()
+        until_state(rig.camera, "ready")
+        until_quiet(rig.camera)
+        for each in rig.camera.settings():
+            with pytest.raises(CameraError, match=each.name):
+                rig.camera.change(each.name, "no such value")
+
+    def test_each_setting_can_be_set_to_its_last_choice(self, rig: Rig) -> None:
+        rig.camera.start()
+        until_state(rig.camera, "ready")
+        until_quiet(rig.camera)
+        for each in [one for one in rig.camera.settings() if one.choices]:
+            rig.camera.change(each.name, each.choices[-1])
+            told = until(rig.camera, lambda event: isinstance(event, SettingsChanged))[-1]
+            assert isinstance(told, SettingsChanged)
+            assert not told.refused
+            assert told.settings == rig.camera.settings()
+            now = {one.name: one.value for one in told.settings}
+            assert now[each.name] == each.choices[-1], each.name
 
     def test_a_shot_without_a_camera_fails_with_a_sentence(self, rig: Rig) -> None:
         rig.camera.fire(1)  # not started

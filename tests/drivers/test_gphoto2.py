@@ -15,11 +15,12 @@ from typing import Any
 
 import pytest
 
-from dappled.drivers.camera import Arrival, CameraError, Fired, ShotFailed, StateChanged
+from dappled.drivers.camera import Arrival, CameraError, Companion, Fired, ShotFailed, StateChanged
 from dappled.drivers.camera_channel import Channel
 from dappled.drivers.gphoto2 import GPhoto2Camera, RestartBudget, open_camera, spawn_process
 from dappled.drivers.gphoto2_settings import GPhoto2Settings, parse_settings
 from dappled.mocks.body import Body, BodyOptions, pattern
+from dappled.mocks.eos450d import thumbnail
 from tests.drivers.contract import CameraContract, Rig, content, of_shots, until, until_shot_ends, until_state
 
 SIZE = 3_000_001
@@ -449,3 +450,112 @@ def test_budget_allows_its_number_in_any_window() -> None:
     assert budget.wait_ns(60 * second) == 0
     budget.spend(60 * second)
     assert budget.wait_ns(61 * second) == 9 * second
+
+
+@pytest.mark.parametrize("target", ["card", "ram"])
+def test_raw_and_jpeg_are_one_frame_and_its_companion(target: str) -> None:
+    with Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", pairs=True)) as body:
+        camera = open_camera({"port": body.port, "capture_target": target, "delete_after_download": True})
+        camera.start()
+        try:
+            until_state(camera, "ready")
+            for shot in (1, 2):
+                camera.fire(shot)
+                events = until(camera, lambda event: isinstance(event, Companion))
+                assert of_shots(events) == [(Fired, shot), (Arrival, shot), (Companion, shot)]
+                raw, jpeg = [event for event in events if isinstance(event, Arrival | Companion)]
+                assert [one.name.lower().endswith(end) for one, end in ((raw, ".cr2"), (jpeg, ".jpg"))] == [True] * 2
+                assert content(raw) == pattern(shot, SIZE)
+                assert content(jpeg) == thumbnail(shot)
+                camera.release(raw)
+                camera.release(jpeg)
+            camera.fire(3)  # commands are obeyed in order: the deletions come first
+            _ended(until(camera, lambda event: isinstance(event, Companion)))
+            assert body.card == (["IMG_0003.CR2", "IMG_0003.JPG"] if target == "card" else [])
+        finally:
+            camera.stop()
+
+
+def test_no_focus_fails_the_shot_soon_and_takes_the_next(make: Make, body: Body) -> None:
+    camera = make(timeouts={"complete_s": 0.5})
+    camera.start()
+    until_state(camera, "ready")
+    body.fault("no-focus")
+    camera.fire(1)
+    failed = until_shot_ends(camera, 1)[-1]
+    assert isinstance(failed, ShotFailed)
+    assert "focus" in failed.reason
+    camera.fire(2)
+    assert of_shots(_ended(until_shot_ends(camera, 2))) == [(Fired, 2), (Arrival, 2)]
+
+
+def test_a_slow_transfer_is_waited_for(make: Make, body: Body) -> None:
+    camera = make(timeouts={"file_s": 1.0})
+    camera.start()
+    until_state(camera, "ready")
+    body.fault("slow 1.5")
+    camera.fire(1)
+    arrival = until_shot_ends(camera, 1)[-1]
+    assert isinstance(arrival, Arrival)
+    assert content(arrival) == pattern(1, SIZE)
+
+
+@pytest.mark.parametrize("wanted", ["0000000001", "0000000002"])
+def test_of_two_bodies_of_one_model_the_one_with_the_serial_number_is_taken(wanted: str) -> None:
+    numbers = ("0000000001", "0000000002")
+    with (
+        Body.start(BodyOptions(picture="pattern:1000:cr2", serial=numbers[0])) as one,
+        Body.start(BodyOptions(picture="pattern:1000:cr2", serial=numbers[1])) as other,
+    ):
+        camera = open_camera({"port": f"{one.port},{other.port}", "serial": wanted})
+        camera.start()
+        try:
+            until_state(camera, "ready")
+            assert camera.identity is not None
+            assert camera.identity.serial == wanted
+            camera.fire(1)
+            _ended(until_shot_ends(camera, 1))
+            assert [one.releases, other.releases] == [int(wanted == number) for number in numbers]
+        finally:
+            camera.stop()
+
+
+def test_after_a_break_the_same_body_is_taken_again_and_not_its_twin() -> None:
+    with (
+        Body.start(BodyOptions(picture="pattern:1000:cr2", serial="0000000001")) as one,
+        Body.start(BodyOptions(picture="pattern:1000:cr2", serial="0000000002")) as other,
+    ):
+        one.fault("unplug")
+        camera = open_camera({"port": f"{one.port},{other.port}", "timeouts": {"retry_s": 0.1}})
+        camera.start()
+        try:
+            until_state(camera, "ready")
+            assert camera.identity is not None
+            assert camera.identity.serial == "0000000002"
+            one.fault("clear")
+            other.fault("drop")
+            until_state(camera, "faulted")
+            until_state(camera, "ready")
+            assert camera.identity.serial == "0000000002"
+        finally:
+            camera.stop()
+
+
+def test_a_body_that_comes_back_under_another_address_is_found() -> None:
+    with Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", addresses=2)) as body:
+        camera = open_camera({"port": body.port, "timeouts": {"retry_s": 0.1}})
+        camera.start()
+        try:
+            until_state(camera, "ready")
+            before = camera.identity
+            body.ask("move")
+            until_state(camera, "faulted")
+            until_state(camera, "ready")
+            assert before is not None
+            assert camera.identity is not None
+            assert before.serial == camera.identity.serial
+            assert before.port != camera.identity.port
+            camera.fire(1)
+            _ended(until_shot_ends(camera, 1))
+        finally:
+            camera.stop()

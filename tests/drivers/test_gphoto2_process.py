@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import pytest
 
-from dappled.drivers.camera import Arrival, Blob, Event, Fired, Identity, ShotFailed, StateChanged
+from dappled.drivers.camera import (
+    Arrival,
+    Blob,
+    Companion,
+    Event,
+    Fired,
+    Identity,
+    Setting,
+    SettingName,
+    SettingsChanged,
+    ShotFailed,
+    StateChanged,
+)
 from dappled.drivers.camera_channel import Channel, ChannelError, message_event
 from dappled.drivers.gphoto2_process import CameraLoop
 from dappled.drivers.gphoto2_session import (
@@ -16,6 +28,7 @@ from dappled.drivers.gphoto2_session import (
     CameraFile,
     CameraNews,
     CaptureComplete,
+    Fetched,
     FileAdded,
     LostError,
     RefusedError,
@@ -41,11 +54,13 @@ class FakeCamera:
     card: dict[CameraFile, bytes] = field(default_factory=dict)
     coming: list[CameraNews] = field(default_factory=list)
     errors: dict[str, list[SessionError]] = field(default_factory=dict)
+    taken: dict[CameraFile, int] = field(default_factory=dict)
+    shown: tuple[Setting, ...] = ()
     triggered: int = 0
     opened: int = 0
     closed: int = 0
 
-    def open(self, _settings: GPhoto2Settings) -> FakeCamera:
+    def open(self, _settings: GPhoto2Settings, _before: str | None) -> FakeCamera:
         self._stumble("open")
         self.opened += 1
         return self
@@ -59,9 +74,9 @@ class FakeCamera:
         news, self.coming = self.coming, []
         return news
 
-    def fetch(self, file: CameraFile) -> Blob:
+    def fetch(self, file: CameraFile) -> Fetched:
         self._stumble("fetch")
-        return Blob.of(self.card[file])
+        return Fetched(Blob.of(self.card[file]), self.taken.get(file))
 
     def delete(self, file: CameraFile) -> None:
         self._stumble("delete")
@@ -70,6 +85,14 @@ class FakeCamera:
     def files(self) -> frozenset[CameraFile]:
         self._stumble("files")
         return frozenset(file for file in self.card if not file.in_memory)
+
+    def settings(self) -> tuple[Setting, ...]:
+        self._stumble("settings")
+        return self.shown
+
+    def change(self, name: SettingName, value: str) -> None:
+        self._stumble("change")
+        self.shown = tuple(replace(each, value=value) if each.name == name else each for each in self.shown)
 
     def close(self) -> None:
         self.closed += 1
@@ -213,7 +236,7 @@ def test_lost_in_the_trigger_call_fails_the_shot_and_marks_what_follows_as_doubt
     ready.camera.adds(on_card(1), tells=False)  # it had opened
     events = ready.turn(1.0)
     (late,) = arrivals(events)
-    assert late.shot is None
+    assert late.shot == 1
     assert "shot 1" in late.facts["doubt"]
     late.blob.close()
 
@@ -296,6 +319,116 @@ def test_a_bad_file_is_fetched_three_times_and_then_left_on_the_card(ready: Harn
     assert "announced 7 and sent 6" in reason
     assert f"{FOLDER}/IMG_0001.CR2" in reason
     assert arrivals(ready.turn()) == []
+
+
+def shot_on(harness: Harness, shot: int, taken_s: int | None, number: int) -> list[Event]:
+    """A shot whose file is announced at once."""
+    harness.fire(shot)
+    harness.turn()
+    file = on_card(number)
+    harness.camera.adds(file, b"%d" % number)
+    if taken_s is not None:
+        harness.camera.taken[file] = taken_s
+    return harness.turn()
+
+
+@pytest.mark.parametrize("hours_wrong", [0, 1, -24])
+def test_a_late_file_is_told_from_the_next_shot_s_by_the_body_s_own_time(ready: Harness, hours_wrong: int) -> None:
+    def body_s() -> int:
+        return ready.now_ns // 10**9 + 1_700_000_000 + hours_wrong * 3600
+
+    (first,) = arrivals(shot_on(ready, 1, body_s(), 1))
+    first.blob.close()
+    ready.turn(5.0)
+    ready.fire(2)
+    ready.turn()
+    late, taken = on_card(2), body_s()
+    assert list(failures(ready.turn(30.1))) == [2]  # no file, in time
+    ready.fire(3)
+    ready.turn()
+    ready.camera.taken[late] = taken
+    ready.camera.adds(late, b"of shot 2")
+    (came,) = arrivals(ready.turn())
+    assert (came.shot, content(came), "doubt" in came.facts) == (2, b"of shot 2", False)
+    ready.camera.taken[on_card(3)] = body_s()
+    ready.camera.adds(on_card(3), b"of shot 3")
+    (came,) = arrivals(ready.turn())
+    assert (came.shot, content(came), "doubt" in came.facts) == (3, b"of shot 3", False)
+
+
+def test_without_a_body_s_time_a_file_that_may_be_late_is_marked(ready: Harness) -> None:
+    ready.fire(1)
+    ready.turn()
+    ready.turn(30.1)
+    (came,) = arrivals(shot_on(ready, 2, None, 1))
+    assert came.shot == 2
+    assert "shot 1 or 2" in came.facts["doubt"]
+    came.blob.close()
+    (came,) = arrivals(shot_on(ready, 3, None, 2))
+    assert "doubt" not in came.facts  # files come in order
+    came.blob.close()
+
+
+RAW_AND_JPEG = (Setting("image_format", "RAW + Large Fine JPEG", ("RAW", "RAW + Large Fine JPEG")),)
+RAW, JPEG = on_card(1), CameraFile(FOLDER, "IMG_0001.JPG")
+
+
+@pytest.mark.parametrize("order", [(RAW, JPEG), (JPEG, RAW)])
+def test_raw_and_jpeg_are_one_frame_whichever_comes_first(
+    harness: Harness, order: tuple[CameraFile, CameraFile]
+) -> None:
+    harness.camera.shown = RAW_AND_JPEG
+    harness.turn()
+    harness.fire(7)
+    harness.turn()
+    events: list[Event] = []
+    for file in order:
+        harness.camera.adds(file, b"\xff\xd8\xffjpeg" if file == JPEG else b"II*\0raw bytes CR")
+        events += harness.turn()
+    arrival, companion = [event for event in events if isinstance(event, Arrival | Companion)]
+    assert isinstance(arrival, Arrival)
+    assert isinstance(companion, Companion)
+    assert (arrival.shot, arrival.name, companion.shot, companion.name) == (7, RAW.name, 7, JPEG.name)
+    arrival.blob.close()
+    companion.blob.close()
+    assert failures(events) == {}
+
+
+def test_a_jpeg_whose_raw_file_never_comes_is_a_frame(harness: Harness) -> None:
+    harness.camera.shown = RAW_AND_JPEG
+    harness.turn()
+    harness.fire(7)
+    harness.turn()
+    harness.camera.adds(JPEG, b"\xff\xd8\xffjpeg")
+    assert arrivals(harness.turn()) == []
+    (arrival,) = arrivals(harness.turn(2.6))
+    assert (arrival.shot, arrival.name) == (7, JPEG.name)
+    arrival.blob.close()
+
+
+def test_finished_without_a_file_fails_soon(ready: Harness) -> None:
+    ready.fire(1)
+    ready.camera.coming.append(CaptureComplete())
+    ready.turn()
+    ready.turn(2.6)  # the card is searched
+    assert "focus" in failures(ready.turn(2.6))[1]
+
+
+def test_settings_are_read_at_the_start_and_after_a_change(harness: Harness) -> None:
+    harness.camera.shown = (Setting("iso", "100", ("100", "200")),)
+    told = [event for event in harness.turn() if isinstance(event, SettingsChanged)]
+    assert [event.settings for event in told] == [harness.camera.shown]
+    harness.channel.send({"do": "change", "name": "iso", "value": "200"})
+    told = [event for event in harness.turn() if isinstance(event, SettingsChanged)]
+    assert [(event.settings[0].value, event.refused) for event in told] == [("200", "")]
+
+
+def test_a_setting_that_is_refused_is_told(ready: Harness) -> None:
+    ready.camera.errors["change"] = [RefusedError("the dial stands at M")]
+    ready.channel.send({"do": "change", "name": "iso", "value": "200"})
+    (told,) = [event for event in ready.turn() if isinstance(event, SettingsChanged)]
+    assert "iso" in told.refused
+    assert "the dial stands at M" in told.refused
 
 
 def test_another_body_s_card_is_not_taken_for_new(ready: Harness) -> None:

@@ -14,7 +14,7 @@ from dappled.mocks.body import Body, BodyError, BodyOptions, exposer, pattern
 
 def test_a_body_listens_obeys_and_ends() -> None:
     with Body.start(BodyOptions(picture="pattern:1000:jpg", faults=("busy 1",))) as body:
-        assert body.port == f"ptpip:127.0.0.1:{body.tcp_port}:{body.tcp_port}"
+        assert [body.port] == [f"ptpip:127.0.0.1:{port}:{port}" for port in body.tcp_ports]
         assert body.releases == 0
         assert body.card == []
         body.fault("error 2")

@@ -15,7 +15,19 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from dappled.drivers.camera import Arrival, Blob, Event, Fired, Identity, ShotFailed, StateChanged
+from dappled.drivers.camera import (
+    Arrival,
+    Blob,
+    Companion,
+    Deferred,
+    Event,
+    Fired,
+    Identity,
+    Setting,
+    SettingsChanged,
+    ShotFailed,
+    StateChanged,
+)
 
 _MESSAGE_BYTES = 65536
 _FDS = 4
@@ -117,7 +129,7 @@ def _parsed(raw: bytes, flags: int) -> dict[str, Any]:
 
 
 def event_message(event: Event) -> Message:
-    """An event as a message; an arrival's blob travels as the message's only descriptor (still the caller's)."""
+    """An event as a message; a file's blob travels as the message's only descriptor (still the caller's)."""
     match event:
         case StateChanged(state, reason, at_ns, identity):
             who = None if identity is None else asdict(identity)
@@ -126,8 +138,14 @@ def event_message(event: Event) -> Message:
             return Message({"is": "fired", "shot": shot, "called_ns": called_ns, "returned_ns": returned_ns})
         case ShotFailed(shot, reason, at_ns):
             return Message({"is": "failed", "shot": shot, "reason": reason, "ns": at_ns})
-        case Arrival(shot_or_none, name, blob, at_ns, facts):
-            body = {"is": "arrival", "shot": shot_or_none, "name": name, "size": blob.size, "ns": at_ns}
+        case Deferred(shot, reason, at_ns):
+            return Message({"is": "deferred", "shot": shot, "reason": reason, "ns": at_ns})
+        case SettingsChanged(settings, at_ns, refused):
+            each = [asdict(one) for one in settings]
+            return Message({"is": "settings", "settings": each, "ns": at_ns, "refused": refused})
+        case Arrival(shot_or_none, name, blob, at_ns, facts) | Companion(shot_or_none, name, blob, at_ns, facts):
+            kind = "arrival" if isinstance(event, Arrival) else "companion"
+            body = {"is": kind, "shot": shot_or_none, "name": name, "size": blob.size, "ns": at_ns}
             return Message({**body, "facts": dict(facts)}, (blob.fd,))
 
 
@@ -150,8 +168,14 @@ def _event(body: Mapping[str, Any], fds: tuple[int, ...]) -> Event:
             return Fired(body["shot"], body["called_ns"], body["returned_ns"])
         case "failed":
             return ShotFailed(body["shot"], body["reason"], body["ns"])
-        case "arrival":
+        case "deferred":
+            return Deferred(body["shot"], body["reason"], body["ns"])
+        case "settings":
+            read = tuple(Setting(each["name"], each["value"], tuple(each["choices"])) for each in body["settings"])
+            return SettingsChanged(read, body["ns"], body["refused"])
+        case "arrival" | "companion" as kind:
             (fd,) = fds
-            return Arrival(body["shot"], body["name"], Blob(fd, body["size"]), body["ns"], body["facts"])
+            made = Arrival if kind == "arrival" else Companion
+            return made(body["shot"], body["name"], Blob(fd, body["size"]), body["ns"], body["facts"])
         case other:
             raise ValueError(f"nothing is called {other!r}")

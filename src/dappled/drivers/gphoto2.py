@@ -18,7 +18,19 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from dappled.drivers.camera import Arrival, CameraError, Event, ShotFailed, StateChanged
+from dappled.drivers.camera import (
+    Arrival,
+    CameraError,
+    Companion,
+    Event,
+    Identity,
+    Setting,
+    SettingName,
+    SettingsChanged,
+    ShotFailed,
+    StateChanged,
+    check_change,
+)
 from dappled.drivers.camera_channel import Channel, ChannelError, message_event
 from dappled.drivers.gphoto2_settings import GPhoto2Settings, parse_settings
 
@@ -98,6 +110,8 @@ class GPhoto2Camera:
         self._channel: Channel | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._pending: dict[int, None] = {}  # the shots that the process has, in order
+        self._identity: Identity | None = None
+        self._known_settings: tuple[Setting, ...] = ()
 
     def start(self) -> None:
         """Start the camera's process. Raises CameraError when called twice."""
@@ -129,7 +143,27 @@ class GPhoto2Camera:
         except queue.Empty:
             return None
 
-    def release(self, arrival: Arrival) -> None:
+    @property
+    def identity(self) -> Identity | None:
+        """The body that was opened last."""
+        return self._identity
+
+    def settings(self) -> tuple[Setting, ...]:
+        """As the process read them last."""
+        return self._known_settings
+
+    def change(self, name: SettingName, value: str) -> None:
+        """Pass the wish to the process."""
+        check_change(self._known_settings, name, value)
+        with self._lock:
+            if self._channel is None:
+                raise CameraError("the camera's process is not running: nothing can be set now")
+            try:
+                self._channel.send({"do": "change", "name": name, "value": value})
+            except ChannelError as error:
+                raise CameraError(f"{name} was not set: {error}") from None
+
+    def release(self, arrival: Arrival | Companion) -> None:
         """Delete the file from the card where the settings say so."""
         folder = arrival.facts.get("folder")
         if not self._settings.delete_after_download or folder in (None, "/"):
@@ -200,6 +234,10 @@ class GPhoto2Camera:
         if isinstance(event, ShotFailed) or (isinstance(event, Arrival) and event.shot is not None):
             with self._lock:
                 self._pending.pop(event.shot, None)  # type: ignore[arg-type]  # an Arrival's None is excluded above
+        elif isinstance(event, StateChanged):
+            self._identity = event.identity or self._identity
+        elif isinstance(event, SettingsChanged):
+            self._known_settings = event.settings
         self._events.put(event)
 
     def _await_budget(self) -> None:

@@ -1,15 +1,14 @@
 """The camera's own process: it owns libgphoto2 for one long session and obeys messages.
 
 libgphoto2 blocks for seconds, with the GIL held, when a camera goes silent; here that stalls nobody, and the parent
-can always kill it. Commands: {"do": "fire", "shot": n}, {"do": "delete", "folder", "name"}, {"do": "ping"},
-{"do": "stop"}. Answers are the camera's events (`drivers.camera_channel`) and {"is": "pong"}.
+can always kill it. Commands: {"do": "fire", "shot": n}, {"do": "delete", "folder", "name"}, {"do": "change", "name",
+"value"}, {"do": "ping"}, {"do": "stop"}. Answers are the camera's events (`drivers.camera_channel`) and {"is": "pong"}.
 
 One shot is at the camera at a time; further ones wait here in order.
 """
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import signal
@@ -19,10 +18,24 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
-from dappled.drivers.camera import Arrival, Event, Fired, ShotFailed, State, StateChanged
+from dappled.drivers.attribution import BodyClock, Claim, attribute
+from dappled.drivers.camera import (
+    Arrival,
+    Companion,
+    Event,
+    Fired,
+    Setting,
+    SettingName,
+    SettingsChanged,
+    ShotFailed,
+    State,
+    StateChanged,
+)
 from dappled.drivers.camera_channel import Channel, ChannelError, event_message
+from dappled.drivers.child import die_with_parent, raise_priority
+from dappled.drivers.gphoto2_pairs import Pairs, makes_pairs
 from dappled.drivers.gphoto2_session import (
     AbsentError,
     BusyError,
@@ -41,11 +54,12 @@ from dappled.drivers.gphoto2_settings import GPhoto2Settings, parse_settings
 _WAITING = 64
 _SEND_S = 5.0
 _POLL_BUSY_S = 0.005
-_POLL_IDLE_S = 0.2
+_POLL_IDLE_S = 0.5
 _BUSY_RETRY_S = 0.05
 _REOPEN_S = 0.25
 _TRIES = 3
-_PR_SET_PDEATHSIG = 1
+_LATE = 16
+_SETTINGS_S = 1.0
 
 
 @dataclass(slots=True)
@@ -57,7 +71,7 @@ class _Flight:
     fired_ns: int | None = None
     complete_ns: int | None = None
     retry_ns: int = 0
-    looked: bool = False
+    looked_ns: int | None = None
 
 
 @dataclass(slots=True)
@@ -73,7 +87,11 @@ class _Books:
     to_fetch: deque[CameraFile] = field(default_factory=deque)
     tries: dict[CameraFile, int] = field(default_factory=dict)
     known: frozenset[CameraFile] | None = None
-    doubt: str = ""
+    late: deque[Claim] = field(default_factory=lambda: deque(maxlen=_LATE))
+    clock: BodyClock = field(default_factory=BodyClock)
+    pairs: Pairs = field(default_factory=Pairs)
+    settings: tuple[Setting, ...] = ()
+    settings_due_ns: int | None = None
 
 
 class CameraLoop:
@@ -83,7 +101,7 @@ class CameraLoop:
         self,
         channel: Channel,
         settings: GPhoto2Settings,
-        open_camera: Callable[[GPhoto2Settings], Session] = open_session,
+        open_camera: Callable[[GPhoto2Settings, str | None], Session] = open_session,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._channel = channel
@@ -125,6 +143,8 @@ class CameraLoop:
                 self._take(shot)
             case {"do": "delete", "folder": str(folder), "name": str(name)}:
                 self._delete(CameraFile(folder, name))
+            case {"do": "change", "name": str(name), "value": str(value)}:
+                self._change(cast(SettingName, name), value)
             case {"do": "ping"}:
                 self._channel.send({"is": "pong"}, timeout_s=_SEND_S)
             case {"do": "stop"}:
@@ -167,8 +187,11 @@ class CameraLoop:
         self._next_shot(books.session)
         self._drain(books.session)
         self._fetch(books.session)
+        for alone in books.pairs.overdue(self._clock_ns() - _ns(self._timeouts.complete_s)):
+            self._deliver(*alone)
         if self._look_due():
             self._look()
+        self._read_settings(books.session)
         self._show("busy" if books.flight or books.waiting else "ready")
 
     def _open(self) -> None:
@@ -176,7 +199,7 @@ class CameraLoop:
         if books.state is None:
             self._show("starting")
         try:
-            session = self._open_camera(self._settings)
+            session = self._open_camera(self._settings, books.serial)
         except SessionError as error:
             books.open_at_ns = self._clock_ns() + _ns(self._timeouts.retry_s)
             self._show("absent" if isinstance(error, AbsentError) else "faulted", str(error))
@@ -184,6 +207,7 @@ class CameraLoop:
         books.session = session
         if books.serial != session.identity.serial:
             books.serial, books.known = session.identity.serial, None
+        books.settings_due_ns = self._clock_ns()
         self._find_new(session)
 
     def _find_new(self, session: Session) -> None:
@@ -222,9 +246,8 @@ class CameraLoop:
         except RefusedError as error:
             self._end_flight(f"{error}; look at focus, card and mode dial")
         except LostError as error:
-            doubt = "the shutter may have opened all the same"
-            self._books.doubt = f"shot {flight.shot} failed, but {doubt}"
-            self._end_flight(f"{error}; {doubt}")
+            flight.fired_ns = called_ns  # as far as we know
+            self._end_flight(f"{error}; the shutter may have opened all the same", may_come=True)
             raise
         else:
             flight.fired_ns = self._clock_ns()
@@ -245,7 +268,7 @@ class CameraLoop:
             file = books.to_fetch[0]
             began_ns = self._clock_ns()
             try:
-                blob = session.fetch(file)
+                fetched = session.fetch(file)
             except (BusyError, RefusedError) as error:
                 books.to_fetch.popleft()
                 self._retry(file, str(error))
@@ -254,10 +277,15 @@ class CameraLoop:
             books.tries.pop(file, None)
             if books.known is not None and not file.in_memory:
                 books.known |= {file}
-            try:
-                self._deliver(file, blob.fd, Arrival(None, file.name, blob, self._clock_ns()), began_ns)
-            finally:
-                blob.close()
+            now_ns = self._clock_ns()
+            facts = {"folder": file.folder, "name": file.name, "fetch_ms": (now_ns - began_ns) / 1e6}
+            arrival = Arrival(
+                None, true_name(file.name, os.pread(fetched.blob.fd, 65536, 0)), fetched.blob, now_ns, facts
+            )
+            books.settings_due_ns = now_ns + _ns(_SETTINGS_S)
+            if makes_pairs(books.settings) and books.pairs.holds_back(file, arrival, fetched.taken_s):
+                continue
+            self._deliver(file, arrival, fetched.taken_s)
 
     def _retry(self, file: CameraFile, reason: str) -> None:
         books = self._books
@@ -272,25 +300,68 @@ class CameraLoop:
             stays = "" if file.in_memory else f"; it stays on the card as {file.folder}/{file.name}"
             self._end_flight(f"{reason}{stays}")
 
-    def _deliver(self, file: CameraFile, fd: int, arrival: Arrival, began_ns: int) -> None:
-        books = self._books
-        flight = books.flight
-        shot = flight.shot if flight is not None and flight.fired_ns is not None else None
-        fetch_ms = (arrival.monotonic_ns - began_ns) / 1e6
-        facts: dict[str, Any] = {"folder": file.folder, "name": file.name, "fetch_ms": fetch_ms}
-        if books.doubt:
-            facts["doubt"] = books.doubt
-            books.doubt = ""
-        name = true_name(file.name, os.pread(fd, 65536, 0))
-        if shot is not None:
+    def _deliver(self, file: CameraFile, arrival: Arrival, taken_s: int | None) -> None:
+        """Say whose file it is, and close it: a frame, or the companion of the frame before."""
+        try:
+            main = self._books.pairs.main_of(file)
+            if main is not None:
+                self._tell(Companion(main, arrival.name, arrival.blob, arrival.monotonic_ns, arrival.facts))
+                return
+            shot = self._deliver_frame(arrival, taken_s)
+        finally:
+            arrival.blob.close()
+        for companion in self._books.pairs.delivered(file, shot):
+            self._deliver(*companion)
+
+    def _deliver_frame(self, arrival: Arrival, taken_s: int | None) -> int | None:
+        books, flight = self._books, self._books.flight
+        current = None if flight is None or flight.fired_ns is None else Claim(flight.shot, flight.fired_ns)
+        verdict = attribute(books.late, current, taken_s, books.clock)
+        if current is not None and verdict.shot == current.shot:
             books.flight = None
-        self._tell(Arrival(shot, name, arrival.blob, arrival.monotonic_ns, facts))
+            if taken_s is not None and not books.late:
+                books.clock = books.clock.learnt(current, taken_s)
+        left = [] if verdict.doubt else [claim for claim in books.late if claim.shot != verdict.shot]
+        books.late = deque(left, _LATE)  # files come in order: after one in doubt none of the older is expected
+        facts = {**arrival.facts, **({"doubt": verdict.doubt} if verdict.doubt else {})}
+        self._tell(Arrival(verdict.shot, arrival.name, arrival.blob, arrival.monotonic_ns, facts))
+        return verdict.shot
+
+    # --- settings
+
+    def _read_settings(self, session: Session) -> None:
+        """Read them when that is due and no shot is at the camera; tell them where they are others than before."""
+        books = self._books
+        if books.settings_due_ns is None or self._clock_ns() < books.settings_due_ns or books.flight is not None:
+            return
+        books.settings_due_ns = None
+        found = session.settings()
+        if found != books.settings:
+            books.settings = found
+            self._tell(SettingsChanged(found, self._clock_ns()))
+
+    def _change(self, name: SettingName, value: str) -> None:
+        books = self._books
+        reason = "there is no camera to set"
+        try:
+            if books.session is not None:
+                books.session.change(name, value)
+                self._drain(books.session)  # the camera tells what it made of it
+                books.settings = books.session.settings()
+                self._tell(SettingsChanged(books.settings, self._clock_ns()))
+                return
+        except (BusyError, RefusedError) as error:
+            reason = str(error)
+        except LostError as error:
+            reason = str(error)
+            self._lose(reason)
+        self._tell(SettingsChanged(books.settings, self._clock_ns(), f"{name} was not set to {value}: {reason}"))
 
     # --- when the file doesn't come
 
     def _look_due(self) -> bool:
         books, flight = self._books, self._books.flight
-        if flight is None or flight.fired_ns is None or flight.looked or books.to_fetch:
+        if flight is None or flight.fired_ns is None or flight.looked_ns is not None or books.to_fetch:
             return False
         if books.session is None or not books.session.keeps_files:
             return False
@@ -304,19 +375,24 @@ class CameraLoop:
         books = self._books
         if books.session is None or books.flight is None:
             return
-        books.flight.looked = True
         books.session.close()
         books.session = None
         self._open()
+        books.flight.looked_ns = self._clock_ns()
 
     def _bound_flight(self) -> None:
         flight = self._books.flight
         if flight is None:
             return
-        limit_s = self._timeouts.file_s
-        if self._clock_ns() - (flight.fired_ns or flight.since_ns) > _ns(limit_s):
-            self._books.doubt = f"shot {flight.shot} had brought no file"
-            self._end_flight(f"no file came from the camera within {limit_s:g} s of the release")
+        now_ns, limit_s = self._clock_ns(), self._timeouts.file_s
+        if now_ns - (flight.fired_ns or flight.since_ns) > _ns(limit_s):
+            self._end_flight(f"no file came from the camera within {limit_s:g} s of the release", may_come=True)
+        elif flight.complete_ns is not None and flight.looked_ns is not None:
+            searched = self._books.session is not None and not self._books.to_fetch
+            if searched and now_ns - flight.looked_ns > _ns(self._timeouts.complete_s):
+                self._end_flight(
+                    "the camera finished without a file: perhaps it found no focus; look at it and its card"
+                )
 
     def _refuse_waiting(self) -> None:
         """Without a camera, and without a shot that is still hoped for, nobody waits."""
@@ -342,9 +418,12 @@ class CameraLoop:
 
     # --- telling
 
-    def _end_flight(self, reason: str) -> None:
+    def _end_flight(self, reason: str, *, may_come: bool = False) -> None:
+        """The shot at the camera has failed; `may_come`: its file may still come."""
         flight, self._books.flight = self._books.flight, None
         if flight is not None:
+            if may_come and flight.fired_ns is not None:
+                self._books.late.append(Claim(flight.shot, flight.fired_ns))
             self._fail(flight.shot, reason)
 
     def _fail(self, shot: int, reason: str) -> None:
@@ -377,13 +456,6 @@ def _ns(seconds: float) -> int:
     return round(seconds * 1e9)
 
 
-def _die_with_parent(parent: int) -> None:
-    """Ask the kernel to kill this process when the thread that started it ends, however it ends (prctl(2))."""
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        sys.exit(0)  # it ended before we asked
-
-
 def _quiet_library() -> None:
     """libgphoto2 writes to file descriptor 2 whenever a link breaks; our own errors keep the real one."""
     sys.stderr = os.fdopen(os.dup(2), "w", buffering=1)
@@ -395,7 +467,8 @@ def _quiet_library() -> None:
 def main() -> None:
     """Arguments: the socket's descriptor, the parent's process id, the settings as JSON."""
     fd, parent, settings = sys.argv[1:]
-    _die_with_parent(int(parent))
+    die_with_parent(int(parent))
+    raise_priority()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C reaches the whole group; the parent ends us
     _quiet_library()
     channel = Channel(socket.socket(fileno=int(fd)))

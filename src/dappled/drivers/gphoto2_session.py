@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import gphoto2 as gp
 
-from dappled.drivers.camera import Blob, Identity
+from dappled.drivers.camera import Blob, Identity, Setting, SettingName
 from dappled.drivers.gphoto2_settings import CaptureTarget, GPhoto2Settings
 
 _CHUNK_BYTES = 1 << 20
@@ -61,6 +61,15 @@ class CameraFile:
 
 
 @dataclass(frozen=True, slots=True)
+class Fetched:
+    """A file's bytes, and when the body's own clock says that it was made: seconds of a clock that may be wrong, None
+    where the body doesn't say."""
+
+    blob: Blob
+    taken_s: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class FileAdded:
     """The camera announced a file."""
 
@@ -92,8 +101,8 @@ class Session(Protocol):
     def news(self) -> list[CameraNews]:
         """All that happened since the last call. Raises LostError."""
 
-    def fetch(self, file: CameraFile) -> Blob:
-        """A file's bytes. Raises RefusedError, LostError."""
+    def fetch(self, file: CameraFile) -> Fetched:
+        """A file's bytes. Raises BusyError, RefusedError, LostError."""
 
     def delete(self, file: CameraFile) -> None:
         """Delete a file at the camera. Raises RefusedError, LostError."""
@@ -101,9 +110,27 @@ class Session(Protocol):
     def files(self) -> frozenset[CameraFile]:
         """All files on the card, as they were when the session was opened or later. Raises LostError."""
 
+    def settings(self) -> tuple[Setting, ...]:
+        """What can be read of the camera. Raises LostError."""
+
+    def change(self, name: SettingName, value: str) -> None:
+        """Set one of them. Raises BusyError, RefusedError, LostError."""
+
     def close(self) -> None:
         """End the session; never raises."""
 
+
+_WIDGETS: dict[SettingName, tuple[str, ...]] = {
+    "focal_length": ("focallength",),
+    "aperture": ("aperture", "f-number"),
+    "shutter_speed": ("shutterspeed", "shutterspeed2"),
+    "iso": ("iso",),
+    "image_format": ("imageformat", "imagequality"),
+    "capture_target": ("capturetarget",),
+    "battery": ("batterylevel",),
+    "free_shots": ("availableshots",),
+}
+"""What libgphoto2 calls each setting; makers differ."""
 
 _HELD = {gp.GP_ERROR_IO_USB_CLAIM, gp.GP_ERROR_IO_LOCK, gp.GP_ERROR_CAMERA_BUSY, gp.GP_ERROR}
 _GONE = {gp.GP_ERROR_IO, gp.GP_ERROR_IO_USB_FIND, gp.GP_ERROR_MODEL_NOT_FOUND, gp.GP_ERROR_UNKNOWN_PORT}
@@ -119,36 +146,67 @@ _DRAIN = 64
 """Events taken at one go, so that a chattering camera can't keep the process from its commands."""
 
 
-def open_session(settings: GPhoto2Settings) -> GPhoto2Session:
-    """The camera that the settings name, ready to fire. Raises AbsentError, HeldError, LostError."""
-    wrong: list[str] = []
-    candidates = list(_candidates(settings.port))
-    for model, port in candidates:
-        camera = _opened(model, port)
-        session = None
+def open_session(settings: GPhoto2Settings, before: str | None = None) -> GPhoto2Session:
+    """The camera that the settings name, ready to fire; `before` is the serial number of the one that was open before,
+    which is preferred to others. Raises AbsentError, HeldError, LostError."""
+    trouble: list[SessionError] = []
+    spare: GPhoto2Session | None = None
+    others: list[str] = []
+    for model, port in _candidates(settings.port):
         try:
-            session = GPhoto2Session(camera, port, settings.capture_target)
-            if settings.serial is None or settings.serial in session.serials:
-                return session
-            wrong.append(f"{session.identity.model} {session.identity.serial}")
-        except gp.GPhoto2Error as error:
-            _exit(camera)
-            raise _translated(error, "set up") from error
+            session = _session(model, port, settings.capture_target)
+        except SessionError as error:
+            trouble.append(error)
+            continue
+        if before is None or session.identity.serial == before:
+            wanted = settings.serial is None or settings.serial in session.serials
+        else:
+            wanted = settings.serial is not None and settings.serial in session.serials
+        if wanted:
+            if spare is not None:
+                spare.close()
+            return session
+        if settings.serial is None and spare is None:
+            spare = session
+            continue
+        others.append(f"{session.identity.model} {session.identity.serial}")
+        session.close()
+    if spare is not None:
+        return spare
+    raise _nobody(settings, trouble, others)
+
+
+def _nobody(settings: GPhoto2Settings, trouble: list[SessionError], others: list[str]) -> SessionError:
+    for error in trouble:
+        if not isinstance(error, AbsentError):
+            return error
+    if others:
+        return AbsentError(f"no camera with serial number {settings.serial} is here, only {', '.join(others)}")
+    if trouble:
+        return trouble[0]
+    return AbsentError("no camera is on USB: connect it, switch it on, and set its USB mode to PTP or PC connection")
+
+
+def _session(model: str, port: str, target: CaptureTarget) -> GPhoto2Session:
+    camera = _opened(model, port)
+    try:
+        return GPhoto2Session(camera, port, target)
+    except gp.GPhoto2Error as error:
         _exit(camera)
-    if wrong:
-        raise AbsentError(f"no camera with serial number {settings.serial} is here, only {', '.join(wrong)}")
-    raise AbsentError("no camera is on USB: connect it, switch it on, and set its USB mode to PTP or PC connection")
+        raise _translated(error, "set up") from error
 
 
-def _candidates(port: str | None) -> Iterator[tuple[str, str]]:
-    if port is not None and port.startswith("ptpip:"):
-        yield "PTP/IP Camera", port
-        return
-    found = gp.Camera.autodetect()
-    for index in range(found.count()):
-        where = found.get_value(index)
-        if port in (None, "usb:", where):
-            yield found.get_name(index), where
+def _candidates(ports: str | None) -> Iterator[tuple[str, str]]:
+    """(model, port) of all cameras on the ports named: one, or several with commas between; None: all on USB."""
+    for port in [None] if ports is None else [each.strip() for each in ports.split(",")]:
+        if port is not None and port.startswith("ptpip:"):
+            yield "PTP/IP Camera", port
+            continue
+        found = gp.Camera.autodetect()
+        for index in range(found.count()):
+            where = found.get_value(index)
+            if port in (None, "usb:", where):
+                yield found.get_name(index), where
 
 
 def _opened(model: str, port: str) -> Any:
@@ -214,33 +272,35 @@ class GPhoto2Session:
                 raise LostError(_sentence(error, "report what happens")) from error
         return news
 
-    def fetch(self, file: CameraFile) -> Blob:
+    def fetch(self, file: CameraFile) -> Fetched:
         """A file's bytes; from the card in pieces of 1 MiB straight into a memory file."""
         fd = os.memfd_create(file.name, os.MFD_CLOEXEC)
         try:
-            size = self._fill(fd, file)
+            size, taken_s = self._fill(fd, file)
         except gp.GPhoto2Error as error:
             os.close(fd)
             raise _translated(error, f"send {file.name}") from error
         except SessionError:
             os.close(fd)
             raise
-        return Blob(fd, size)
+        return Fetched(Blob(fd, size), taken_s)
 
-    def _fill(self, fd: int, file: CameraFile) -> int:
+    def _fill(self, fd: int, file: CameraFile) -> tuple[int, int | None]:
         if file.in_memory:
             # libgphoto2 fetched it whole with the event, and keeps it until it is deleted.
             size = self._whole(fd, file)
             self._camera.file_delete(file.folder, file.name)
-            return size
-        announced: int = self._camera.file_get_info(file.folder, file.name).file.size
+            return size, None
+        info = self._camera.file_get_info(file.folder, file.name).file
+        announced: int = info.size
+        taken_s: int | None = info.mtime if info.fields & gp.GP_FILE_INFO_MTIME and info.mtime > 0 else None
         got = self._pieces(fd, file, announced) if self._in_pieces else None
         if got is None:
             self._in_pieces = False
             got = self._whole(fd, file)
         if got != announced or not got:
             raise RefusedError(f"the camera announced {announced} bytes of {file.name} and sent {got}")
-        return got
+        return got, taken_s
 
     def _pieces(self, fd: int, file: CameraFile, size: int) -> int | None:
         """Read piece by piece; None where the body can't."""
@@ -289,17 +349,51 @@ class GPhoto2Session:
             raise LostError(_sentence(error, "list its card")) from error
         return frozenset(file for file in found if not file.in_memory)
 
+    def settings(self) -> tuple[Setting, ...]:
+        """What can be read of the camera, by the first of its maker's names for each that the body knows."""
+        try:
+            found = [self._setting(name, widgets) for name, widgets in _WIDGETS.items()]
+        except gp.GPhoto2Error as error:
+            raise LostError(_sentence(error, "tell its settings")) from error
+        return tuple(each for each in found if each is not None)
+
+    def change(self, name: SettingName, value: str) -> None:
+        """Set one of them."""
+        try:
+            widget = self._widget(_WIDGETS[name])
+            if widget is None:
+                raise RefusedError(f"the camera has no setting {name}")
+            widget.set_value(value)
+            self._camera.set_single_config(widget.get_name(), widget)
+        except gp.GPhoto2Error as error:
+            raise _translated(error, f"set {name} to {value}") from error
+        if name == "capture_target":
+            self.keeps_files = "ram" not in value.lower()
+
+    def _setting(self, name: SettingName, widgets: tuple[str, ...]) -> Setting | None:
+        widget = self._widget(widgets)
+        if widget is None:
+            return None
+        settable = widget.get_type() in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU) and not widget.get_readonly()
+        return Setting(name, str(widget.get_value()), tuple(widget.get_choices()) if settable else ())
+
+    def _widget(self, names: tuple[str, ...]) -> Any:
+        """The first of these that the body has; None without any."""
+        for name in names:
+            try:
+                return self._camera.get_single_config(name)
+            except gp.GPhoto2Error as error:
+                if error.code in _LOST:
+                    raise
+        return None
+
     def close(self) -> None:
         """End the session."""
         _exit(self._camera)
 
     def _text(self, name: str) -> str:
-        try:
-            return str(self._camera.get_single_config(name).get_value() or "").strip()
-        except gp.GPhoto2Error as error:
-            if error.code in _LOST:
-                raise
-            return ""  # this body has no such setting
+        widget = self._widget((name,))
+        return "" if widget is None else str(widget.get_value() or "").strip()
 
     def _set_target(self, target: CaptureTarget) -> bool:
         """Bodies forget this between sessions. False where the body has no choice."""

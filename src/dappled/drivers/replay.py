@@ -9,7 +9,19 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.drivers.camera import Arrival, Blob, Event, Fired, Identity, ShotFailed, StateChanged
+from dappled.drivers.camera import (
+    Arrival,
+    Blob,
+    Companion,
+    Event,
+    Fired,
+    Identity,
+    Setting,
+    SettingName,
+    ShotFailed,
+    StateChanged,
+    check_change,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +78,21 @@ class ReplayCamera:
         except queue.Empty:
             return None
 
-    def release(self, arrival: Arrival) -> None:
+    def release(self, arrival: Arrival | Companion) -> None:
         """See Camera: a recording keeps its files."""
+
+    @property
+    def identity(self) -> Identity:
+        """See Camera."""
+        return self._identity
+
+    def settings(self) -> tuple[Setting, ...]:
+        """See Camera: what was recorded is what it is."""
+        return ()
+
+    def change(self, name: SettingName, value: str) -> None:
+        """See Camera."""
+        check_change((), name, value)
 
     def stop(self) -> None:
         """See Camera."""

@@ -3,8 +3,8 @@
     python -m dappled.mocks.body --seed 1 --scale 0.25
 
 prints `port N` once it listens, then obeys lines on its standard input: a fault of `mocks.faults` ("busy 2"), or
-"releases", "card". Every line is answered by one line, `ok …` or `error …`. The end of its input is its own end, so it
-never outlives the process that started it.
+"releases", "card", "move". Every line is answered by one line, `ok …` or `error …`. The end of its input is its own
+end, so it never outlives the process that started it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ class BodyOptions:
     body starts). `scale`: share of the reference sensor that is rendered. `scene`, `law`: as
     `reference_camera` has them. `truth`: a folder for what the simulated camera knows of each shot (000001.npz, and its
     times in seconds since the simulation's start in 000001.json). `delay_s`: how long a pattern or
-    file takes to expose. `card_bytes`: the card's size; a full one refuses to shoot.
+    file takes to expose. `card_bytes`: the card's size; a full one refuses to shoot. `clock_offset_s`: how far the
+    body's own clock is wrong. `pairs`: raw and JPEG of each picture. `addresses`: how many ports it has.
     """
 
     picture: str = "simulated"
@@ -57,6 +58,9 @@ class BodyOptions:
     delay_s: float = 0.0
     serial: str = SERIAL
     card_bytes: int = CARD_BYTES
+    clock_offset_s: float = 0.0
+    pairs: bool = False
+    addresses: int = 1
     faults: tuple[str, ...] = ()
 
     def arguments(self) -> list[str]:
@@ -73,18 +77,21 @@ class BodyOptions:
             "--delay": self.delay_s,
             "--serial": self.serial,
             "--card-bytes": self.card_bytes,
+            "--clock-offset": self.clock_offset_s,
+            "--addresses": self.addresses,
         }
         given = [text for name, value in named.items() if value is not None for text in (name, str(value))]
+        given += ["--pairs"] if self.pairs else []
         return [*given, *(text for fault in self.faults for text in ("--fault", fault))]
 
 
 class Body:
     """A running body. `start` returns once it listens; use it as a context manager or call `stop`."""
 
-    def __init__(self, process: subprocess.Popen[bytes], lines: _Lines, port: int) -> None:
+    def __init__(self, process: subprocess.Popen[bytes], lines: _Lines, ports: list[int]) -> None:
         self._process = process
         self._lines = lines
-        self.tcp_port = port
+        self.tcp_ports = ports
 
     @classmethod
     def start(cls, options: BodyOptions | None = None) -> Body:
@@ -94,19 +101,19 @@ class Body:
         assert process.stdout is not None  # asked for above
         lines = _Lines(process.stdout.fileno())
         try:
-            port = int(lines.next(_START_S).removeprefix("port "))
+            ports = [int(word) for word in lines.next(_START_S).removeprefix("port ").split()]
         except (BodyError, ValueError) as error:
             _end(process)
             raise BodyError(f"the simulated body did not start: {error}") from error
         except BaseException:  # interrupted: it must not be left behind
             _end(process)
             raise
-        return cls(process, lines, port)
+        return cls(process, lines, ports)
 
     @property
     def port(self) -> str:
-        """The body's port as libgphoto2 names it."""
-        return f"ptpip:127.0.0.1:{self.tcp_port}:{self.tcp_port}"
+        """The body's port as libgphoto2 names it; of several addresses all, with commas between."""
+        return ",".join(f"ptpip:127.0.0.1:{port}:{port}" for port in self.tcp_ports)
 
     @property
     def releases(self) -> int:
@@ -222,7 +229,7 @@ def _simulated(options: BodyOptions) -> Expose:
         scale=options.scale,
         scene=options.scene,
         law=options.law,
-        epoch_utc_s=time.time() - (time.monotonic_ns() - start_ns) / 1e9,
+        epoch_utc_s=time.time() + options.clock_offset_s - (time.monotonic_ns() - start_ns) / 1e9,
     )
 
     def expose(trigger_monotonic_ns: int, shot_number: int) -> tuple[bytes, str]:
@@ -237,11 +244,14 @@ def _simulated(options: BodyOptions) -> Expose:
     return expose
 
 
-def _obey(line: str, eos: Eos450d, faults: Faults) -> str:
+def _obey(line: str, eos: Eos450d, responder: Responder, faults: Faults) -> str:
     if line == "releases":
         return f"ok {eos.releases}"
     if line == "card":
         return f"ok {' '.join(eos.names)}"
+    if line == "move":
+        responder.move()
+        return "ok"
     try:
         faults.command(line)
     except ValueError as error:
@@ -262,6 +272,9 @@ def _options(arguments: Sequence[str] | None) -> BodyOptions:
     parser.add_argument("--delay", dest="delay_s", type=float, default=0.0, help="seconds that a pattern or file takes")
     parser.add_argument("--serial", default=SERIAL)
     parser.add_argument("--card-bytes", type=int, default=CARD_BYTES, help="the card lies in memory")
+    parser.add_argument("--clock-offset", dest="clock_offset_s", type=float, default=0.0, help="s the body is wrong by")
+    parser.add_argument("--pairs", action="store_true", help="raw and JPEG of each picture")
+    parser.add_argument("--addresses", type=int, default=1, help="ports that it can be moved between")
     parser.add_argument("--fault", dest="faults", action="append", default=[], help='in force from the start: "busy 2"')
     found = vars(parser.parse_args(arguments))
     return BodyOptions(**{**found, "faults": tuple(found["faults"])})
@@ -277,11 +290,18 @@ def serve(options: BodyOptions, lines: Iterable[str]) -> None:
     faults = Faults(time.monotonic_ns)
     for fault in options.faults:
         faults.command(fault)
-    eos = Eos450d(exposer(options), faults, serial=options.serial, card_bytes=options.card_bytes)
-    responder = Responder(eos, faults)
-    _say(f"port {responder.port}")
+    eos = Eos450d(
+        exposer(options),
+        faults,
+        serial=options.serial,
+        card_bytes=options.card_bytes,
+        wall_s=lambda: time.time() + options.clock_offset_s,
+        pairs=options.pairs,
+    )
+    responder = Responder(eos, faults, addresses=options.addresses)
+    _say(f"port {' '.join(map(str, responder.ports))}")
     for line in lines:
-        _say(_obey(line.strip(), eos, faults))
+        _say(_obey(line.strip(), eos, responder, faults))
     responder.close()
 
 

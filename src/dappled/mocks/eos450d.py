@@ -7,13 +7,16 @@ RemoteReleaseOn, busy while it works on a capture, room on the computer to be an
 
 from __future__ import annotations
 
+import io
 import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
+
+from PIL import Image
 
 from dappled.mocks import ptp
 from dappled.mocks.faults import Faults
@@ -25,6 +28,7 @@ Expose = Callable[[int, int], tuple[bytes, str]]
 MODEL = "Canon EOS 450D"
 SERIAL = "0830412345"
 STORAGE = 0x00020001
+_HUNT_S = 0.3
 CARD_BYTES = 512 << 20
 """A card for about a hundred small frames: it lies in this process' memory."""
 DCIM = 0x20000000
@@ -66,6 +70,10 @@ _CHOICES = {
     Prop.DRIVE_MODE: (0, 1, 0x10),
     Prop.CAPTURE_DESTINATION: (TO_CARD, TO_MEMORY),
 }
+RAW = (1, 16, 6, 0, 4)
+RAW_AND_JPEG = (2, 16, 1, 0, 3, 16, 6, 0, 4)
+_FORMATS = (RAW, RAW_AND_JPEG)
+"""Image formats as the body writes them: how many files, then size of the entry, kind, dimensions, compression."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +125,7 @@ class Eos450d:
         card_bytes: int = CARD_BYTES,
         clock_ns: Callable[[], int] = time.monotonic_ns,
         wall_s: Callable[[], float] = time.time,
+        pairs: bool = False,
     ) -> None:
         self._expose = expose
         self._faults = faults
@@ -145,7 +154,7 @@ class Eos450d:
                 Prop.MODEL_ID: _u32(0x80000176),
                 Prop.AVAILABLE_SHOTS: _u32(100),
                 Prop.CAPTURE_DESTINATION: _u32(TO_CARD),
-                Prop.IMAGE_FORMAT: struct.pack("<5I", 1, 16, 6, 0, 4),
+                Prop.IMAGE_FORMAT: _words(RAW_AND_JPEG if pairs else RAW),
                 Prop.SERIAL_NUMBER: serial.encode() + b"\0",
                 Prop.EVF_OUTPUT: _u32(0),
             },
@@ -229,7 +238,9 @@ class Eos450d:
             for prop, value in self._state.values.items():
                 self._state.events.append(ptp.eos_property(prop, value))
             for prop, values in _CHOICES.items():
-                self._state.events.append(ptp.eos_choices(prop, values))
+                self._state.events.append(ptp.eos_choices(prop, len(values), values))
+            flat = [word for each in _FORMATS for word in each]
+            self._state.events.append(ptp.eos_choices(Prop.IMAGE_FORMAT, len(_FORMATS), flat))
         return Answer()
 
     def _remote_mode(self, request: ptp.Request, _data: bytes) -> Answer:
@@ -256,6 +267,8 @@ class Eos450d:
             return Answer(Code.DEVICE_PROP_NOT_SUPPORTED)
         value = data[8:]
         if prop in _CHOICES and struct.unpack_from("<I", value)[0] not in _CHOICES[Prop(prop)]:
+            return Answer(Code.GENERAL_ERROR)
+        if prop == Prop.IMAGE_FORMAT and value not in map(_words, _FORMATS):
             return Answer(Code.GENERAL_ERROR)
         self._put(prop, value)
         if prop == Prop.CAPTURE_DESTINATION:
@@ -360,7 +373,7 @@ class Eos450d:
         if self._faults.take("error"):
             return Answer(Code.GENERAL_ERROR)
         to_memory = self._state.values[Prop.CAPTURE_DESTINATION][:4] == _u32(TO_MEMORY)
-        full = not to_memory and self._free() < max(self._frame_bytes, 1)
+        full = not to_memory and (self._free() < max(self._frame_bytes, 1) or self._faults.lasts("full"))
         if full or self._state.values[Prop.AVAILABLE_SHOTS][:4] == _u32(0):
             # A real body says OK and parameter 7, which libgphoto2 reads over USB only: its PTP/IP drops parameters.
             return Answer(Code.STORE_FULL)
@@ -368,8 +381,16 @@ class Eos450d:
         self._state.releases += 1
         self._state.events.append(ptp.eos_status(1))
         work = (triggered_ns, self._state.releases, to_memory)
-        threading.Thread(target=self._capture, args=work, name="capture", daemon=True).start()
+        capture = self._hunt if self._faults.take("no-focus") else self._capture
+        threading.Thread(target=capture, args=work, name="capture", daemon=True).start()
         return Answer(parameters=(0,))
+
+    def _hunt(self, _triggered_ns: int, _number: int, _to_memory: bool) -> None:
+        """The autofocus finds nothing, and no picture is taken."""
+        time.sleep(_HUNT_S)
+        with self._lock:
+            self._state.working = False
+            self._state.events.append(ptp.eos_status(0))
 
     def _capture(self, triggered_ns: int, number: int, to_memory: bool) -> None:
         try:
@@ -382,21 +403,39 @@ class Eos450d:
                 self._state.events.append(ptp.eos_status(0))
 
     def _store(self, data: bytes, extension: str, number: int, to_memory: bool) -> None:
-        name = f"IMG_{number % 10000:04d}.{extension.upper()}"
+        stem = f"IMG_{number % 10000:04d}"
+        handle = 2 * number if to_memory else FOLDER + 2 * number
         code = Format.JPEG if extension.lower() in ("jpg", "jpeg") else Format.RAW
-        handle = number if to_memory else FOLDER + number
-        made = StoredObject(handle, 0 if to_memory else FOLDER, name, code, data, int(self._wall_s()))
-        self._state.objects[handle] = made
-        self._frame_bytes = max(self._frame_bytes, len(data))
-        if self._faults.take("no-event"):
-            return
-        if to_memory:
-            record = ptp.eos_object_transfer(handle=handle, code=code, size=len(data), name=name)
-        else:
-            record = ptp.eos_object_added(
-                handle=handle, storage=STORAGE, code=code, size=len(data), parent=FOLDER, name=name
-            )
-        self._state.events.append(record)
+        made = [StoredObject(handle, 0, f"{stem}.{extension.upper()}", code, data, int(self._wall_s()))]
+        if self._state.values[Prop.IMAGE_FORMAT] == _words(RAW_AND_JPEG):
+            made.append(StoredObject(handle + 1, 0, f"{stem}.JPG", Format.JPEG, thumbnail(number), int(self._wall_s())))
+        for each in made:
+            kept = each if to_memory else replace(each, parent=FOLDER)
+            self._state.objects[kept.handle] = kept
+        self._frame_bytes = max(self._frame_bytes, sum(len(each.data) for each in made))
+        if not self._faults.take("no-event"):
+            self._state.events.extend(_announced(each, to_memory) for each in made)
+
+
+def _announced(made: StoredObject, to_memory: bool) -> bytes:
+    size = len(made.data)
+    if to_memory:
+        return ptp.eos_object_transfer(handle=made.handle, code=made.code, size=size, name=made.name)
+    return ptp.eos_object_added(
+        handle=made.handle, storage=STORAGE, code=made.code, size=size, parent=FOLDER, name=made.name
+    )
+
+
+def thumbnail(number: int) -> bytes:
+    """The JPEG beside the raw file of the shot with this number: a small grey picture, its own for each."""
+    file = io.BytesIO()
+    Image.new("L", (64, 48), number % 256).save(file, "JPEG", comment=f"shot {number}")
+    return file.getvalue()
+
+
+def _words(values: Iterable[int]) -> bytes:
+    words = tuple(values)
+    return struct.pack(f"<{len(words)}I", *words)
 
 
 def _u32(value: int) -> bytes:

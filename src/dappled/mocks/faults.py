@@ -1,7 +1,7 @@
 """What goes wrong with a simulated body, said in words while it runs.
 
 Lasting faults take seconds ("busy 2.5"; without a number: until "clear"), counted ones a number of times ("error 3";
-without a number: once), and "drop" happens at once.
+without a number: once), "drop" happens at once, and "unplug" is both: it cuts the links and lasts.
 """
 
 from __future__ import annotations
@@ -10,13 +10,15 @@ import math
 import threading
 from collections.abc import Callable
 
-LASTING = ("busy", "silence", "refuse")
+LASTING = ("busy", "silence", "refuse", "unplug", "slow", "full")
 """busy: a release is answered DeviceBusy. silence: nothing is answered. refuse: no new connection is accepted, as if
-another program held the body."""
+another program held the body. unplug: the links are cut and nobody is there. slow: an object's data come at 2 MB/s.
+full: the card takes no more."""
 
-COUNTED = ("error", "no-event", "short", "drop-transfer")
+COUNTED = ("error", "no-event", "short", "drop-transfer", "unplug-transfer", "no-focus")
 """error: a release is answered GeneralError. no-event: a new object isn't announced. short: an object's data end one
-kilobyte early. drop-transfer: the link is cut in the middle of an object's data."""
+kilobyte early. drop-transfer: the link is cut in the middle of an object's data; unplug-transfer: it is, and stays so
+until "clear". no-focus: a release is answered OK, and no picture is taken."""
 
 
 class Faults:
@@ -42,6 +44,8 @@ class Faults:
             seconds = float(rest[0]) if rest else math.inf
             with self._lock:
                 self._until_ns[name] = self._clock_ns() + seconds * 1e9
+            if name == "unplug":
+                self.drop()
         elif name in COUNTED:
             with self._lock:
                 self._left[name] = int(rest[0]) if rest else 1

@@ -280,9 +280,9 @@ def eos_property(prop: int, value: bytes) -> bytes:
     return _record(EosEvent.PROPERTY_CHANGED, struct.pack("<I", prop) + value.ljust(4, b"\0"))
 
 
-def eos_choices(prop: int, values: Sequence[int]) -> bytes:
-    """A property may have these values."""
-    return _record(EosEvent.CHOICES_CHANGED, struct.pack(f"<III{len(values)}I", prop, 3, len(values), *values))
+def eos_choices(prop: int, count: int, words: Sequence[int]) -> bytes:
+    """A property may have these `count` values, each of one word or more."""
+    return _record(EosEvent.CHOICES_CHANGED, struct.pack(f"<III{len(words)}I", prop, 3, count, *words))
 
 
 def eos_status(status: int) -> bytes:

@@ -17,6 +17,7 @@ from dappled.mocks.faults import Faults
 from dappled.mocks.ptp import Packet
 
 _SILENCE_STEP_S = 0.02
+_SLOW_BYTES = 40_000  # at a time, 50 times a second
 
 
 class Transactions(Protocol):
@@ -30,9 +31,10 @@ class Transactions(Protocol):
 
 
 class Responder:
-    """Serves a body on a port of its own choosing; `close` ends all its threads."""
+    """Serves a body on ports of its own choosing; `close` ends all its threads. The body answers at the first of its
+    `addresses`, at the others nobody is there; `move` takes it to the next one."""
 
-    def __init__(self, body: Transactions, faults: Faults, host: str = "127.0.0.1") -> None:
+    def __init__(self, body: Transactions, faults: Faults, host: str = "127.0.0.1", addresses: int = 1) -> None:
         self._body = body
         self._faults = faults
         faults.drop = self.drop
@@ -42,19 +44,36 @@ class Responder:
         self._event: socket.socket | None = None
         self._taken = False  # by an initiator; until its last transaction has ended
         self._guid = os.urandom(16)
-        self._listener = socket.create_server((host, 0))
-        self.port: int = self._listener.getsockname()[1]
-        self._thread = threading.Thread(target=self._accept, name="ptpip", daemon=True)
-        self._thread.start()
+        self._listeners = [socket.create_server((host, 0)) for _ in range(addresses)]
+        self.ports: list[int] = [each.getsockname()[1] for each in self._listeners]
+        self._at = 0
+        self._threads = [
+            threading.Thread(target=self._accept, args=[number], name="ptpip", daemon=True)
+            for number in range(addresses)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def port(self) -> int:
+        """Where the body answers."""
+        return self.ports[self._at]
+
+    def move(self) -> None:
+        """The body comes back at its next address, as USB bodies do when they are plugged in again."""
+        self._at = (self._at + 1) % len(self.ports)
+        self.drop()
 
     def close(self) -> None:
         """Stop listening and cut the links."""
         self._closed.set()
-        with contextlib.suppress(OSError):
-            self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
+        for listener in self._listeners:
+            with contextlib.suppress(OSError):
+                listener.shutdown(socket.SHUT_RDWR)
+            listener.close()
         self.drop()
-        self._thread.join(5)
+        for thread in self._threads:
+            thread.join(5)
 
     def drop(self) -> None:
         """Cut the links, as a pulled cable does."""
@@ -63,12 +82,15 @@ class Responder:
                 with contextlib.suppress(OSError):
                     link.shutdown(socket.SHUT_RDWR)
 
-    def _accept(self) -> None:
+    def _accept(self, number: int) -> None:
         while not self._closed.is_set():
             try:
-                link, _address = self._listener.accept()
+                link, _address = self._listeners[number].accept()
             except OSError:
                 return  # closed
+            if number != self._at or self._faults.lasts("unplug"):
+                link.close()
+                continue
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             threading.Thread(target=self._greet, args=(link,), name="ptpip-link", daemon=True).start()
 
@@ -130,12 +152,20 @@ class Responder:
             size = len(answer.data)
             link.sendall(ptp.start_data(request.transaction, size) + ptp.end_data_header(request.transaction, size))
             big = size > 65536
-            if big and self._faults.take("drop-transfer"):
+            unplugs = big and self._faults.take("unplug-transfer")
+            if unplugs or (big and self._faults.take("drop-transfer")):
                 link.sendall(answer.data[: size // 2])
-                self.drop()
+                self._faults.command("unplug" if unplugs else "drop")
                 return
-            link.sendall(answer.data)
+            self._send(link, memoryview(answer.data))
         link.sendall(ptp.response(answer.code, request.transaction, answer.parameters))
+
+    def _send(self, link: socket.socket, data: memoryview) -> None:
+        while data and self._faults.lasts("slow"):
+            link.sendall(data[:_SLOW_BYTES])
+            data = data[_SLOW_BYTES:]
+            self._closed.wait(_SILENCE_STEP_S)
+        link.sendall(data)
 
     def _wait_out_silence(self) -> None:
         while self._faults.lasts("silence") and not self._closed.wait(_SILENCE_STEP_S):
