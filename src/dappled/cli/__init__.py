@@ -17,6 +17,7 @@ from dappled.errors import DappledError
 VERBS: dict[str, tuple[str, str]] = {
     "run": ("run", "the daemon: fire, record, tag, decode, publish"),
     "replay": ("replay", "a recorded flight, or a folder of frames, through the same daemon"),
+    "status": ("status", "how the running daemon is"),
     "watch": ("watch", "subscribe: show and save what arrives"),
     "keys": ("keys", "keys for who may subscribe over the network, and the console's token"),
     "trigger": ("trigger", "the ground station's part: ask for frames over MAVLink"),
@@ -27,6 +28,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "mask": ("mask", "the printed mask: make, table, diffraction, design, and plan a flight with it"),
     "flight": ("flight", "recorded flights: list, show, check, report, offload"),
     "geotag": ("geotag", "positions and attitudes for other programs: XMP sidecars, geo.txt, CSV, GeoJSON"),
+    "georeference": ("georeference", "a flight as maps: KMZ overlay, GeoTIFF, footprints, terrain"),
     "config": ("config", "check or show settings"),
     "profiles": ("config", "shipped camera and mask profiles"),
 }

@@ -1,0 +1,74 @@
+"""`dappled status`: how the running daemon is, on one screen."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dappled.cli.common import seconds
+from dappled.config import settings
+from dappled.daemon.subscriber import Subscriber
+from dappled.errors import DappledError
+
+
+class NotRunningError(DappledError):
+    """Nobody publishes there."""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = "example: dappled status --config /etc/dappled/dappled.toml"
+    parser.add_argument("endpoint", nargs="?", help="ZeroMQ endpoint of the stream (default: by --config)")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="the daemon's settings (default: every default)")
+    parser.add_argument("--timeout", type=seconds, default=3.0, metavar="S", help="wait so long for it (default 3)")
+    parser.add_argument("--json", action="store_true", help="the health record as it is published")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    endpoint = arguments.endpoint or settings.load(arguments.config).publish.slices
+    told = health(endpoint, arguments.timeout)
+    if arguments.json:
+        print(json.dumps(told))
+    else:
+        print(screen(told))
+    return 0
+
+
+def health(endpoint: str, timeout_s: float) -> Mapping[str, Any]:
+    """The next health record of the daemon there. Raises NotRunningError after `timeout_s`."""
+    until = time.monotonic() + timeout_s
+    with Subscriber(endpoint, topics=("health",)) as subscriber:
+        while (left := until - time.monotonic()) > 0:
+            message = subscriber.receive(left)
+            if message is not None and message.topic == "health":
+                return message.header
+    raise NotRunningError(
+        f"no daemon was heard on {endpoint} for {timeout_s:g} s; is it running (systemctl status dappled), "
+        "and with these settings (--config)?"
+    )
+
+
+def screen(told: Mapping[str, Any]) -> str:
+    """The record in words."""
+    camera, link, disk, shots = told["camera"], told["link"], told["disk"], told["shots"]
+    free = "unknown" if disk["free_bytes"] is None else f"{disk['free_bytes'] / 1e9:.1f} GB free"
+    reason = f": {camera['reason']}" if camera["reason"] else ""
+    lines = [
+        f"flight    {told['flight']}",
+        f"camera    {camera['state']}{reason}",
+        f"link      {link['urls']} open, {link['packets']} packets, {link['positions']} positions",
+        f"disk      {free}, {disk['folder']}",
+        f"shots     {_counts(shots, 'wished', 'safe', 'failed', 'pending', 'refused')}",
+    ]
+    for stage in told["stages"]:
+        if "waiting" in stage:
+            lines.append(f"{stage['name']:9} {_counts(stage, 'done', 'waiting', 'failed', 'dropped')}")
+    lines += [f"problem   {text}" for text in told["problems"]] or ["all is well"]
+    return "\n".join(lines)
+
+
+def _counts(facts: Mapping[str, Any], *names: str) -> str:
+    return ", ".join(f"{facts[name]} {name}" for name in names)
