@@ -2,7 +2,7 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check test-fast test-slow soak bench lock install uninstall clean
+.PHONY: help setup demo test check test-fast test-slow soak bench lock arm64 install uninstall clean
 PREFIX ?= /usr/local
 
 help: ## show this list
@@ -41,6 +41,9 @@ lock: setup ## resolve the two locks anew from pyproject.toml: everything, and w
 	  --no-header --all-extras --group dev pyproject.toml -o requirements.lock; \
 	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header -c requirements.lock \
 	  --no-annotate pyproject.toml -o requirements-onboard.lock
+
+arm64: setup ## whether the onboard set installs on a Raspberry Pi, and its size
+	@$(BIN)/python tools/arm64.py
 
 install: ## the service under PREFIX (default /usr/local): environment, unit, udev rule, settings
 	@$(PYTHON) tools/install.py install --prefix $(PREFIX) $(if $(DESTDIR),--destdir $(DESTDIR)) $(if $(SYSCONFDIR),--sysconfdir $(SYSCONFDIR))

@@ -56,7 +56,9 @@ def install(place: Place, python: str, in_system: bool) -> int:
     uv = find_uv() or fetch_uv()
     real = os.path.realpath(python)
     if in_system and real.startswith(("/home/", "/root/")):
-        print(f"{real} lies in a home folder, which the service may not see: use PYTHON=/usr/bin/python3", file=sys.stderr)
+        print(
+            f"{real} lies in a home folder, which the service may not see: use PYTHON=/usr/bin/python3", file=sys.stderr
+        )
         return 1
     home = place.prefix / "lib/dappled"
     environment(uv, python, place.at(home))
