@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 
 import pytest
 from hypothesis import given
@@ -10,7 +11,9 @@ from hypothesis import strategies as st
 
 from dappled.daemon.clock import RecordedClock
 from dappled.daemon.component import CameraFacts, Captured, Component, Storage
+from dappled.daemon.knobs import Knobs, OwnKnob, code
 from dappled.daemon.shutter import Shutter
+from dappled.drivers.camera import Setting, SettingName, check_change
 from dappled.drivers.mavlink import Message, Packet, mavlink
 from dappled.drivers.mavlink_framing import pack
 
@@ -19,13 +22,35 @@ GCS = (255, 190)
 AUTOPILOT = (1, 1)
 
 
+class Body:
+    """A body's settings: it takes a change when the test lets it."""
+
+    def __init__(self) -> None:
+        self.now = {"iso": Setting("iso", "100", ("100", "200", "400")), "aperture": Setting("aperture", "5.6")}
+        self.asked: list[tuple[str, str]] = []
+
+    def settings(self) -> tuple[Setting, ...]:
+        return tuple(self.now.values())
+
+    def change(self, name: SettingName, value: str) -> None:
+        check_change(self.settings(), name, value)
+        self.asked.append((name, value))
+
+    def take(self, name: SettingName, value: str) -> None:
+        self.now[name] = Setting(name, value, self.now[name].choices)
+
+
 class Rig:
     """A component whose links are a list."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, feedback_is_shot: bool = False) -> None:
+        self.body = Body()
+        self.decode = "on"
+        own = OwnKnob("LF_DECODE", "Decode in flight", lambda: self.decode, ("on", "off"), self._decode)
         self.system_id, self.component_id = 1, 100
         self.packer = mavlink.MAVLink(None)
         self.copies = 1
+        self.trusted = True
         self.sent: list[Message] = []
         self.fired: list[int] = []
         self.obstacle: str | None = None
@@ -43,21 +68,30 @@ class Rig:
             self,
             self.shutter,
             self.clock,
-            facts=lambda: CameraFacts("Canon", "EOS 450D", (0, 1, 0), 50.0, None, None, 4272, 2848),
+            Knobs(self.body, (own,)),
+            feedback_is_shot=feedback_is_shot,
+            facts=lambda: CameraFacts("Canon", "EOS 450D", (0, 1, 0), 50.0, 22.2, 14.8, 4272, 2848),
             storage=lambda: Storage(2**34, 2**33, 2**33),
             lookup=lambda index: Captured(index, ok=index != 3) if index < 5 else None,
             healthy=lambda: self.well,
         )
 
+    def _decode(self, value: str) -> None:
+        self.decode = value
+
     def send(self, message: Message, link: int | None = None) -> bool:
         self.sent.append(message)
         return True
+
+    def of(self, kind: str) -> list[Message]:
+        """What was sent of this type."""
+        return [m for m in self.sent if m.get_type() == kind]
 
     def hear(self, message: Message, sender: tuple[int, int] = GCS, link: int = 0) -> None:
         self.packer.srcSystem, self.packer.srcComponent = sender
         raw = pack(message, self.packer, version_1=False)
         for _ in range(self.copies):
-            self.component.on_packet(Packet(0, 0, link, message, raw))
+            self.component.on_packet(Packet(0, 0, link, message, raw, trusted=self.trusted))
 
     def command(self, name: int, *p: float, target: tuple[int, int] = (1, 100), confirmation: int = 0) -> int | None:
         """Its MAV_RESULT, None for no acknowledgement."""
@@ -131,6 +165,9 @@ def test_a_refusal_says_why_and_pushes_the_status() -> None:
         (mavlink.MAV_CMD_REQUEST_MESSAGE, (260, NAN), "CAMERA_SETTINGS"),
         (mavlink.MAV_CMD_REQUEST_MESSAGE, (261,), "STORAGE_INFORMATION"),
         (mavlink.MAV_CMD_REQUEST_MESSAGE, (262,), "CAMERA_CAPTURE_STATUS"),
+        (mavlink.MAV_CMD_REQUEST_MESSAGE, (269, 1), "VIDEO_STREAM_INFORMATION"),
+        (mavlink.MAV_CMD_REQUEST_MESSAGE, (271,), "CAMERA_FOV_STATUS"),
+        (mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, (262,), "MESSAGE_INTERVAL"),
         (mavlink.MAV_CMD_REQUEST_CAMERA_INFORMATION, (0,), "CAMERA_INFORMATION"),
         (mavlink.MAV_CMD_REQUEST_CAMERA_SETTINGS, (1,), "CAMERA_SETTINGS"),
         (mavlink.MAV_CMD_REQUEST_STORAGE_INFORMATION, (0, 1), "STORAGE_INFORMATION"),
@@ -158,12 +195,14 @@ def test_past_images_are_answered_failures_too_and_a_missing_index_means_the_las
 
 def test_refused_by_name_and_silent_on_broadcasts() -> None:
     rig = Rig()
-    for command in (mavlink.MAV_CMD_VIDEO_START_CAPTURE, mavlink.MAV_CMD_DO_SET_CAM_TRIGG_DIST):
+    for command in (mavlink.MAV_CMD_VIDEO_START_CAPTURE, 206, 214, 2003, 2505):
         assert rig.command(command, NAN) == mavlink.MAV_RESULT_UNSUPPORTED
         assert rig.command(command, NAN, target=(0, 0)) is None
     assert rig.command(mavlink.MAV_CMD_SET_CAMERA_MODE, 0, 1) == mavlink.MAV_RESULT_DENIED
     assert rig.command(mavlink.MAV_CMD_STORAGE_FORMAT, 1, 1, 1) == mavlink.MAV_RESULT_DENIED
+    assert rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 270) == mavlink.MAV_RESULT_UNSUPPORTED
     assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, target=(2, 100)) is None
+    assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, target=(1, 101)) is None
     assert not rig.fired
 
 
@@ -201,8 +240,153 @@ def test_heartbeats_time_requests_and_streams_come_in_time_and_none_while_faulte
     assert "HEARTBEAT" not in rig.tick(1.5)
 
 
+def extended(rig: Rig, name: bytes, value: int, kind: int = mavlink.MAV_PARAM_EXT_TYPE_UINT32) -> list[int]:
+    """The results that follow a PARAM_EXT_SET at once."""
+    rig.sent.clear()
+    rig.hear(mavlink.MAVLink_param_ext_set_message(1, 100, name, struct.pack("<I", value), kind))
+    return [m.param_result for m in rig.of("PARAM_EXT_ACK")]
+
+
+def test_settings_are_listed_read_and_match_the_definition_that_is_served() -> None:
+    rig = Rig()
+    rig.hear(mavlink.MAVLink_param_ext_request_list_message(1, 100))
+    listed = [(m.param_id, m.param_index, m.param_count) for m in rig.of("PARAM_EXT_VALUE")]
+    assert listed == [("CAM_ISO", 0, 3), ("CAM_APERTURE", 1, 3), ("LF_DECODE", 2, 3)]
+    rig.sent.clear()
+    rig.hear(mavlink.MAVLink_param_ext_request_read_message(1, 100, b"CAM_ISO", -1))
+    rig.hear(mavlink.MAVLink_param_ext_request_read_message(1, 100, b"", 2))
+    rig.hear(mavlink.MAVLink_param_ext_request_read_message(1, 100, b"NOT_THERE", -1))
+    assert [m.param_id for m in rig.sent] == ["CAM_ISO", "LF_DECODE"]
+    assert struct.unpack("<I", rig.sent[0]._param_value_raw[:4]) == (100,)
+
+
+def test_a_setting_of_ours_takes_effect_at_once() -> None:
+    rig = Rig()
+    assert extended(rig, b"LF_DECODE", code("off")) == [mavlink.PARAM_ACK_ACCEPTED]
+    assert rig.decode == "off"
+    assert extended(rig, b"LF_DECODE", 12345) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
+    assert extended(rig, b"LF_DECODE", code("on"), 1) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
+    assert extended(rig, b"NO_SUCH", 1) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
+
+
+def test_a_bodys_setting_is_in_progress_until_the_body_has_it_and_a_retry_asks_it_once() -> None:
+    rig = Rig()
+    rig.tick(4)
+    assert extended(rig, b"CAM_ISO", 400) == [mavlink.PARAM_ACK_IN_PROGRESS]
+    assert extended(rig, b"CAM_ISO", 400) == [mavlink.PARAM_ACK_IN_PROGRESS]
+    assert rig.body.asked == [("iso", "400")]
+    rig.body.take("iso", "400")
+    rig.sent.clear()
+    rig.component.settings_changed()
+    assert [m.param_result for m in rig.of("PARAM_EXT_ACK")] == [mavlink.PARAM_ACK_ACCEPTED]
+    assert extended(rig, b"CAM_ISO", 400) == [mavlink.PARAM_ACK_ACCEPTED]
+
+
+@pytest.mark.parametrize("silent", [True, False])
+def test_a_body_that_will_not_or_does_not_answer_has_failed_in_words(silent: bool) -> None:
+    rig = Rig()
+    rig.tick(4)
+    assert extended(rig, b"CAM_ISO", 200) == [mavlink.PARAM_ACK_IN_PROGRESS]
+    if silent:
+        rig.tick(5.1)
+    else:
+        rig.sent.clear()
+        rig.component.settings_changed("the dial stands on Auto")
+    (ack,) = rig.of("PARAM_EXT_ACK")
+    assert ack.param_result == mavlink.PARAM_ACK_FAILED
+    assert struct.unpack("<I", ack._param_value_raw[:4].ljust(4, b"\0")) == (100,)
+    said = b"".join(m._text_raw for m in rig.of("STATUSTEXT")).decode()
+    assert ("5 s" if silent else "dial stands on Auto") in said
+    assert extended(rig, b"CAM_APERTURE", 8) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
+
+
+def test_a_packet_on_two_links_is_one_packet_and_is_answered_on_both() -> None:
+    rig = Rig()
+    rig.tick(4)
+    rig.packer.srcSystem, rig.packer.srcComponent = GCS
+    message = mavlink.MAVLink_command_long_message(1, 100, mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 0, 1, 0, 0, 0, 0)
+    raws = [message.pack(rig.packer), message.pack(rig.packer, force_mavlink1=True)]
+    for link, raw in enumerate(raws):  # one link speaks version 1: the same packet all the same
+        rig.component.on_packet(Packet(0, 0, link, mavlink.MAVLink(None).decode(bytearray(raw)), raw))
+    assert rig.fired == [5]
+    assert [m.result for m in rig.of("COMMAND_ACK")] == [mavlink.MAV_RESULT_ACCEPTED] * 2
+
+
+def test_an_unsigned_packet_on_a_signed_link_is_heard_and_not_obeyed() -> None:
+    rig = Rig()
+    rig.tick(4)
+    rig.trusted = False
+    assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, 0) is None
+    rig.hear(mavlink.MAVLink_camera_trigger_message(1, 1), AUTOPILOT)
+    rig.hear(mavlink.MAVLink_param_ext_set_message(1, 100, b"LF_DECODE", struct.pack("<I", code("off")), 5))
+    assert (rig.fired, rig.decode, rig.of("COMMAND_ACK")) == ([], "on", [])
+
+
+@pytest.mark.parametrize("counts", [True, False])
+def test_feedback_is_a_shot_only_where_the_autopilot_fires(counts: bool) -> None:
+    rig = Rig(feedback_is_shot=counts)
+    rig.tick(4)
+    feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+    rig.hear(feedback, AUTOPILOT)
+    rig.hear(feedback, (9, 1))  # somebody else's autopilot
+    assert rig.fired == ([5] if counts else [])
+
+
+def test_zoom_and_focus_by_hand_are_refused_in_words() -> None:
+    rig = Rig()
+    rig.tick(4)
+    assert rig.command(mavlink.MAV_CMD_SET_CAMERA_ZOOM, 3, 35) == mavlink.MAV_RESULT_DENIED
+    assert "by hand" in rig.of("STATUSTEXT")[0].text
+    assert rig.command(mavlink.MAV_CMD_SET_CAMERA_FOCUS, 0, 1) == mavlink.MAV_RESULT_DENIED
+    assert "by hand" in rig.of("STATUSTEXT")[0].text
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "wanted"),
+    [(3, 33.0, "35"), (3, 1e9, "55"), (2, 0.0, "18"), (2, 100.0, "55"), (0, 1.0, "35"), (0, -1.0, "18"),
+     (4, 63.0, "18"), (1, 1.0, None), (2, 101.0, None), (3, NAN, None), (4, 200.0, None)],
+)  # fmt: skip
+def test_a_lens_that_can_be_set_zooms_to_the_nearest_focal_length(kind: int, value: float, wanted: str | None) -> None:
+    rig = Rig()
+    rig.tick(4)
+    rig.body.now["focal_length"] = Setting("focal_length", "24", ("18", "24", "35", "55"))
+    result = rig.command(mavlink.MAV_CMD_SET_CAMERA_ZOOM, kind, value)
+    assert result == (mavlink.MAV_RESULT_DENIED if wanted is None else mavlink.MAV_RESULT_ACCEPTED)
+    assert rig.body.asked == ([] if wanted is None else [("focal_length", wanted)])
+    rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 260)
+    assert rig.of("CAMERA_SETTINGS")[0].zoomLevel == pytest.approx(100 / 3, abs=0.01)
+    rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 259)
+    assert rig.of("CAMERA_INFORMATION")[0].flags & mavlink.CAMERA_CAP_FLAGS_HAS_BASIC_ZOOM
+
+
+def test_field_of_view_from_lens_and_sensor() -> None:
+    rig = Rig()
+    rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 271)
+    (view,) = rig.of("CAMERA_FOV_STATUS")
+    assert view.hfov == pytest.approx(math.degrees(2 * math.atan(22.2 / 100)), abs=1e-3)
+    assert view.lat_camera == view.lat_image == 2**31 - 1
+    assert math.isnan(view.q[0])
+
+
+def test_the_same_line_is_said_once_in_ten_seconds_and_a_long_one_in_pieces() -> None:
+    rig = Rig()
+    rig.tick(4)
+    text = "the camera is absent: nothing is on the bus; plug it in, switch it on and set it to PTP"
+    for _ in range(3):
+        rig.component.say(text)
+    pieces = rig.of("STATUSTEXT")
+    assert "".join(m.text for m in pieces) == text
+    assert [m.chunk_seq for m in pieces] == list(range(len(pieces)))
+    assert len({m.id for m in pieces}) == 1
+    rig.clock.advance(11)
+    rig.component.say(text)
+    assert len(rig.of("STATUSTEXT")) == 2 * len(pieces)
+
+
 @given(
-    st.sampled_from([2000, 2001, 203, 511, 512, 521, 522, 525, 526, 527, 529, 530, 531, 2002, 206, 2500, 0, 65535]),
+    st.sampled_from(
+        [2000, 2001, 203, 511, 512, 521, 522, 525, 526, 527, 529, 530, 531, 532, 510, 2002, 206, 2500, 0, 65535]
+    ),
     st.lists(st.one_of(st.floats(width=32), st.integers(-3, 300).map(float)), min_size=7, max_size=7),
     st.integers(0, 255),
     st.booleans(),

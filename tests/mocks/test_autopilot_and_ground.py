@@ -15,8 +15,10 @@ from dappled.daemon.clock import SystemClock
 from dappled.daemon.component import CameraFacts, Captured, Component
 from dappled.daemon.ground_client import GroundClient, GroundError
 from dappled.daemon.interpolation import turn_rad
+from dappled.daemon.knobs import Knobs
 from dappled.daemon.shutter import Shutter
 from dappled.daemon.telemetry import Telemetry
+from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink import MavlinkLinks, Packet
 from dappled.mocks.autopilot import Autopilot, BootTime
 from dappled.mocks.ground import GroundStation
@@ -45,11 +47,18 @@ class Camera:
             self.links,
             self.shutter,
             self.clock,
+            Knobs(self),
             facts=lambda: CameraFacts("dappled", "test", (0, 1, 0)),
             storage=lambda: None,
             lookup=self.done.get,
         )
         self._worker = threading.Thread(target=self._work)
+
+    def settings(self) -> tuple[Setting, ...]:
+        return ()
+
+    def change(self, name: SettingName, value: str) -> None:
+        raise AssertionError
 
     @property
     def url(self) -> str:
@@ -65,7 +74,14 @@ class Camera:
         self.component.on_packet(packet)
 
     def _work(self) -> None:
-        while (index := self.fired.get()) is not None:
+        while True:
+            try:
+                index = self.fired.get(timeout=0.02)
+            except queue.Empty:
+                self.component.tick()
+                continue
+            if index is None:
+                return
             threading.Event().wait(0.02)
             captured = Captured(index, ok=index != 2, utc_ns=self.clock.utc_ns())
             self.done[index] = captured
@@ -75,11 +91,9 @@ class Camera:
     def __enter__(self) -> Camera:
         self.links.start()
         self._worker.start()
-        self.component.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.component.stop()
         self.shutter.stop()
         self.links.stop()
         self.fired.put(None)

@@ -1,10 +1,11 @@
-"""What the camera says of itself, as MAVLink messages 259 to 263. Pure: values in, messages out."""
+"""What the camera says of itself, as MAVLink messages 259 to 263, 269 and 271. Pure: values in, messages out."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
+from dappled.daemon.field_of_view import FieldOfView
 from dappled.drivers.mavlink import Message, mavlink
 from dappled.flight.records import Pose
 
@@ -46,9 +47,14 @@ class Captured:
     url: str = ""
 
 
-def information(facts: CameraFacts, boot_ms: int) -> Message:
-    """CAMERA_INFORMATION (259): takes photographs, and has modes (photo, survey)."""
+def information(
+    facts: CameraFacts, boot_ms: int, *, zooms: bool = False, definition: tuple[int, str] | None = None
+) -> Message:
+    """CAMERA_INFORMATION (259): takes photographs, has modes (photo, survey), and zooms where the lens can be set.
+
+    `definition`: version and address of the camera definition file."""
     major, minor, patch = (min(255, max(0, part)) for part in facts.firmware)
+    version, uri = definition or (0, "")
     return mavlink.MAVLink_camera_information_message(
         boot_ms,
         _text(facts.vendor, 32),
@@ -60,15 +66,39 @@ def information(facts: CameraFacts, boot_ms: int) -> Message:
         facts.columns or 0,
         facts.rows or 0,
         0,
-        mavlink.CAMERA_CAP_FLAGS_CAPTURE_IMAGE | mavlink.CAMERA_CAP_FLAGS_HAS_MODES,
-        0,
-        b"",
+        mavlink.CAMERA_CAP_FLAGS_CAPTURE_IMAGE
+        | mavlink.CAMERA_CAP_FLAGS_HAS_MODES
+        | (mavlink.CAMERA_CAP_FLAGS_HAS_BASIC_ZOOM if zooms else 0),
+        version,
+        uri.encode(),
     )
 
 
-def settings(mode: int, boot_ms: int) -> Message:
-    """CAMERA_SETTINGS (260). Zoom and focus can't be read: NaN."""
-    return mavlink.MAVLink_camera_settings_message(boot_ms, mode, _NAN, _NAN)
+def settings(mode: int, zoom_percent: float, boot_ms: int) -> Message:
+    """CAMERA_SETTINGS (260). NaN for a zoom that can't be read; focus never can."""
+    return mavlink.MAVLink_camera_settings_message(boot_ms, mode, zoom_percent, _NAN)
+
+
+def fov_status(view: FieldOfView, pose: Pose | None, boot_ms: int) -> Message:
+    """CAMERA_FOV_STATUS (271). Unknown: position INT32_MAX, angles and `q` NaN."""
+    camera = image = (UNKNOWN_INT32,) * 3
+    if pose is not None:
+        camera = _place(pose.latitude_rad, pose.longitude_rad, pose.altitude_msl_m)
+    if view.ground is not None:
+        image = _place(*view.ground)
+    return mavlink.MAVLink_camera_fov_status_message(
+        boot_ms,
+        *camera,
+        *image,
+        view.attitude or (_NAN,) * 4,
+        _or_nan(None if view.width_rad is None else math.degrees(view.width_rad)),
+        _or_nan(None if view.height_rad is None else math.degrees(view.height_rad)),
+    )
+
+
+def no_video() -> Message:
+    """VIDEO_STREAM_INFORMATION (269): there are no streams."""
+    return mavlink.MAVLink_video_stream_information_message(0, 0, 0, 0, 0.0, 0, 0, 0, 0, 0, b"", b"")
 
 
 def storage(disk: Storage | None, boot_ms: int) -> Message:
@@ -115,19 +145,15 @@ def image_captured(captured: Captured, boot_ms: int) -> Message:
     Unknown: time 0, position INT32_MAX (no place on Earth), `q` NaN.
     """
     pose = captured.pose
-    latitude = longitude = altitude = height = UNKNOWN_INT32
-    q = (_NAN, _NAN, _NAN, _NAN)
+    place, height, q = (UNKNOWN_INT32,) * 3, UNKNOWN_INT32, (_NAN,) * 4
     if pose is not None:
-        latitude, longitude = _degrees_e7(pose.latitude_rad), _degrees_e7(pose.longitude_rad)
-        altitude, height = _millimetres(pose.altitude_msl_m), _millimetres(pose.height_above_home_m)
-        q = pose.attitude or q
+        place = _place(pose.latitude_rad, pose.longitude_rad, pose.altitude_msl_m)
+        height, q = _millimetres(pose.height_above_home_m), pose.attitude or q
     return mavlink.MAVLink_camera_image_captured_message(
         boot_ms,
         0 if captured.utc_ns is None else max(0, captured.utc_ns // 1000),
         0,
-        latitude,
-        longitude,
-        altitude,
+        *place,
         height,
         q,
         captured.index,
@@ -142,6 +168,10 @@ def _text(text: str, length: int) -> bytes:
 
 def _or_nan(value: float | None) -> float:
     return _NAN if value is None else value
+
+
+def _place(latitude_rad: float | None, longitude_rad: float | None, altitude_m: float | None) -> tuple[int, int, int]:
+    return _degrees_e7(latitude_rad), _degrees_e7(longitude_rad), _millimetres(altitude_m)
 
 
 def _degrees_e7(angle_rad: float | None) -> int:

@@ -1,0 +1,43 @@
+"""The daemon's MAVLink links as they are configured, with their signing keys."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import cast
+
+from dappled.config.schema import ConfigError
+from dappled.config.settings import Settings
+from dappled.daemon.clock import Clock
+from dappled.drivers.mavlink import MavlinkLinks, Packet
+from dappled.drivers.mavlink_signing import Signing, Unsigned, signing
+
+TIME_FILE = ".mavlink-signing"
+
+
+def configured(
+    settings: Settings, clock: Clock, *, tap: Callable[[int, bytes], int], on_packet: Callable[[Packet], None]
+) -> MavlinkLinks:
+    """All links of the settings, not yet open. Raises ConfigError, LinkError, SigningError."""
+    wanted = settings.mavlink
+    return MavlinkLinks(
+        wanted.url,
+        system_id=wanted.system_id,
+        component_id=wanted.component_id,
+        tap=tap,
+        on_packet=on_packet,
+        clock=clock,
+        signing=_signing(settings, clock),
+    )
+
+
+def _signing(settings: Settings, clock: Clock) -> Signing | None:
+    keys, links = settings.mavlink.keys, len(settings.mavlink.url)
+    if len(keys) not in (0, 1, links):
+        raise ConfigError(
+            f'[mavlink] keys names {len(keys)} files for {links} links; name one for each link ("" for none), or one'
+        )
+    each = keys * links if len(keys) == 1 else keys or ("",) * links
+    files = [Path(key) if key else None for key in each]
+    time_file = Path(settings.record.directory) / TIME_FILE
+    return signing(files, time_file, clock, cast(Unsigned, settings.mavlink.unsigned))

@@ -1,0 +1,41 @@
+"""Lines for the pilot: STATUSTEXT, in pieces where a sentence is longer, and not the same one again and again."""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+
+from dappled.drivers.mavlink import Message, mavlink
+
+PIECE_BYTES = 50
+LONGEST_BYTES = 4 * PIECE_BYTES
+AGAIN_NS = 10 * 10**9
+_REMEMBERED = 32
+
+
+class PilotLines:
+    """Sentences to messages. The same sentence is said at most once in ten seconds."""
+
+    def __init__(self) -> None:
+        self._numbers = itertools.cycle(range(1, 65536))
+        self._said: deque[tuple[str, int]] = deque(maxlen=_REMEMBERED)
+
+    def messages(self, text: str, severity: int, now_ns: int) -> list[Message]:
+        """The messages that say it; none where it was just said. Time is monotonic."""
+        if any(said == text and now_ns - at_ns < AGAIN_NS for said, at_ns in list(self._said)):
+            return []
+        self._said.append((text, now_ns))
+        return list(_pieces(text, severity, next(self._numbers)))
+
+
+def _pieces(text: str, severity: int, number: int) -> list[Message]:
+    """One message up to 50 bytes; more carry a number and count up, and the last one is not full."""
+    raw = text.encode("ascii", "replace")  # what ground stations can be trusted to show
+    if len(raw) <= PIECE_BYTES:
+        return [mavlink.MAVLink_statustext_message(severity, raw)]
+    if len(raw) >= LONGEST_BYTES:
+        raw = raw[: LONGEST_BYTES - 4] + b"..."
+    pieces = [raw[start : start + PIECE_BYTES] for start in range(0, len(raw), PIECE_BYTES)]
+    if len(pieces[-1]) == PIECE_BYTES:
+        pieces.append(b"")
+    return [mavlink.MAVLink_statustext_message(severity, piece, number, at) for at, piece in enumerate(pieces)]
