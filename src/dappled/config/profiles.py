@@ -26,6 +26,17 @@ class RawShape:
 
 
 @dataclass(frozen=True, slots=True)
+class Lens:
+    """The lens at one focal length, as `dappled calibrate --lens` found it: `v_mm` from perspective centre to sensor,
+    the principal point (y, x) in mm from the sensor's middle, OpenCV's five distortion numbers (k1, k2, p1, p2, k3)."""
+
+    focal_length_mm: float
+    v_mm: float
+    principal_point_mm: tuple[float, float] = (0.0, 0.0)
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
 class CameraProfile:
     """What must be known of a body to predict carriers. `law` is a name in `dappled.decode.carriers.LAWS`."""
 
@@ -36,6 +47,14 @@ class CameraProfile:
     mask_distance_mm: float
     focal_length_mm: tuple[float, float] | None
     raw: tuple[RawShape, ...]
+    lenses: tuple[Lens, ...] = ()
+
+    def lens(self, focal_length_mm: float) -> Lens | None:
+        """The lens as calibrated within 2 % of a focal length; None where nobody did."""
+        nearest = min(self.lenses, key=lambda lens: abs(lens.focal_length_mm - focal_length_mm), default=None)
+        if nearest is None or abs(nearest.focal_length_mm / focal_length_mm - 1) > 0.02:
+            return None
+        return nearest
 
     def sensor(self, shape: tuple[int, int]) -> Sensor:
         """The sensor geometry of frames of this shape. Raises ConfigError for a shape the profile doesn't know."""
@@ -65,6 +84,7 @@ class _CameraTable:
     law: str = setting("fd", "carrier law", choices=tuple(LAWS))
     mask_distance_mm: float = setting(1.0, "mask to sensor", unit="mm", low=1e-3, high=100)
     raw: tuple[dict, ...] = setting((), "raw shapes")  # type: ignore[type-arg]  # each is built from a table of its own
+    lens: tuple[dict, ...] = setting((), "calibrated lenses")  # type: ignore[type-arg]  # likewise
     description: str = setting("", "one line")
     models: tuple[str, ...] = setting((), "model names as EXIF and libgphoto2 write them")
     focal_length_mm: tuple[float, float] | None = setting(None, "shortest and longest", unit="mm", low=0.1, high=10_000)
@@ -76,6 +96,16 @@ class _RawTable:
     row_mm: tuple[float, float] = setting((0.0, 0.0), "one row down, as (y, x)", unit="mm", low=-1, high=1)
     column_mm: tuple[float, float] = setting((0.0, 0.0), "one column right, as (y, x)", unit="mm", low=-1, high=1)
     name: str = setting("", "which shape this is")
+
+
+@dataclass(frozen=True, slots=True)
+class _LensTable:
+    focal_length_mm: float = setting(0.0, "as EXIF says it", unit="mm", low=0.1, high=10_000)
+    v_mm: float = setting(0.0, "perspective centre to sensor", unit="mm", low=0.1, high=10_000)
+    principal_point_mm: tuple[float, float] = setting((0.0, 0.0), "(y, x) from the middle", unit="mm", low=-50, high=50)
+    distortion: tuple[float, float, float, float, float] = setting(
+        (0.0, 0.0, 0.0, 0.0, 0.0), "OpenCV's k1, k2, p1, p2, k3", low=-1000, high=1000
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +131,12 @@ def camera(name: str) -> CameraProfile:
         if not any(raw.row_mm) or not any(raw.column_mm) or not all(raw.shape):
             raise ConfigError(f"{source.name}: [[raw]] {raw.name!r} needs shape, row_mm and column_mm")
         shapes.append(RawShape(raw.name, Sensor(raw.shape, raw.row_mm, raw.column_mm)))
+    lenses = []
+    for entry in table.lens:
+        lens = build(_LensTable, entry, source, "lens")
+        if not (lens.focal_length_mm and lens.v_mm):
+            raise ConfigError(f"{source.name}: [[lens]] needs focal_length_mm and v_mm")
+        lenses.append(Lens(lens.focal_length_mm, lens.v_mm, lens.principal_point_mm, lens.distortion))
     return CameraProfile(
         _stem(name),
         table.description,
@@ -109,6 +145,7 @@ def camera(name: str) -> CameraProfile:
         table.mask_distance_mm,
         table.focal_length_mm,
         tuple(shapes),
+        tuple(lenses),
     )
 
 
