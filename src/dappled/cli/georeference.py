@@ -1,0 +1,177 @@
+"""`dappled georeference`: a recorded flight as maps."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from dappled.daemon import inputs
+from dappled.drivers.darkroom import Recipe
+from dappled.errors import DappledError
+from dappled.flight import layout
+from dappled.products import drawings, earth, georeference
+from dappled.products.georeference import Options, Progress, Survey
+from dappled.products.photographs import Mounting
+
+KINDS = ("kmz", "cog", "footprints")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "examples:\n"
+        "  dappled georeference ~/flights/20261121T101503Z-0a1b2c3d --as kmz\n"
+        "  dappled georeference FLIGHT --as cog footprints --terrain n41_w092_1arc_v3.dt2 --refine neighbours\n"
+        "Writes into FLIGHT/maps unless -o says otherwise. The recording is never touched."
+    )
+    parser.add_argument("flight", type=Path, help="flight folder")
+    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for the maps (default: FLIGHT/maps)")
+    parser.add_argument("--as", dest="kinds", nargs="+", choices=KINDS, default=["kmz", "cog", "footprints"],
+                        help="what to make (default: kmz cog footprints)")  # fmt: skip
+    parser.add_argument("--each", action="store_true", help="a kmz or cog of each frame too, in frames/")
+    parser.add_argument("--quad", action="store_true", help="each frame's kmz as a LatLonQuad: the view itself")
+    add_placing(parser)
+    parser.add_argument("--json", action="store_true", help="the report as JSON")
+
+
+def add_placing(parser: argparse.ArgumentParser) -> None:
+    """Arguments that say how frames are decoded and placed."""
+    ground = parser.add_argument_group("ground")
+    ground.add_argument("--ground", type=float, metavar="M",
+                        help="flat ground, metres above sea level (default: home's)")  # fmt: skip
+    ground.add_argument("--terrain", type=Path, metavar="FILE", help="terrain raster: DTED, GeoTIFF …")
+    ground.add_argument("--terrain-heights", choices=("sea-level", "ellipsoid"), default="sea-level",
+                        help="what the raster's heights count from (default: sea-level)")  # fmt: skip
+    ground.add_argument("--geoid", metavar="FILE|M",
+                        help="geoid grid (.gtx, .tif), or metres of sea level above the ellipsoid")  # fmt: skip
+    camera = parser.add_argument_group("camera")
+    camera.add_argument("--camera", metavar="P", help="camera profile (default: the flight's)")
+    camera.add_argument("--mask", metavar="P", help="mask profile (default: the flight's)")
+    camera.add_argument("--calibration", metavar="FILE", help="mask calibration (default: the flight's)")
+    camera.add_argument("--focal-length", type=float, metavar="MM", help="where frames don't say")
+    camera.add_argument("--f-number", type=float, metavar="N", help="where frames don't say")
+    camera.add_argument("--view", default="mean", metavar="VIEW",
+                        help="mean, ground (all views, refocused there), or row,column of one")  # fmt: skip
+    camera.add_argument("--grey", action="store_true", help="in grey (default: in colour where the frames have it)")
+    camera.add_argument("--lever-arm", nargs=3, type=float, metavar=("F", "R", "D"),
+                        help="antenna to camera, metres forward, right, down (default: the flight's)")  # fmt: skip
+    camera.add_argument("--mount", nargs=9, type=float, metavar="R",
+                        help="camera axes to body, row by row (default: the flight's)")  # fmt: skip
+    camera.add_argument("--focus", type=float, default=float("inf"), metavar="M",
+                        help="distance that the lens was focused at (default: infinity)")  # fmt: skip
+    maps = parser.add_argument_group("map")
+    maps.add_argument("--crs", metavar="EPSG:N", help="projection in metres (default: the UTM zone)")
+    maps.add_argument("--gsd", type=float, metavar="M", help="metres a map cell (default: the frames' own)")
+    maps.add_argument("--frames", metavar="N,A-B", help="only these frames")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    folder = layout.open_folder(arguments.flight)
+    output = arguments.output or folder.path / "maps"
+    facts = layout.read_facts(folder)
+    with ExitStack() as stack:
+        progress = stack.enter_context(Bar())
+        made = georeference.survey(folder.path, recipe(folder.path, facts, arguments), options(facts, arguments),
+                                   progress, stack)  # fmt: skip
+        files = _draw(made, output, arguments)
+    report = georeference.write_report(made, output, files)
+    if arguments.json:
+        print(report.read_text(), end="")
+    else:
+        print(f"{len(made.photographs)} frames on {made.projection.name}, {made.gsd_m:g} m a cell, {made.ground.name}")
+        for path in (*files, report):
+            print(path)
+    for _, why in made.left:
+        print(why, file=sys.stderr)
+    return 0
+
+
+def _draw(made: Survey, output: Path, arguments: argparse.Namespace) -> list[Path]:
+    files: list[Path] = []
+    gain = drawings.gain_of(made)
+    if "kmz" in arguments.kinds:
+        files.append(drawings.mosaic_kmz(made, output / "mosaic.kmz", gain))
+    if "cog" in arguments.kinds:
+        files.append(drawings.mosaic_cog(made, output / "mosaic.tif", gain))
+    if arguments.each:
+        for one in made.photographs:
+            beside = output / "frames" / one.name
+            if "kmz" in arguments.kinds:
+                files.append(drawings.frame_kmz(made, one, beside.with_suffix(".kmz"), gain, quad=arguments.quad))
+            if "cog" in arguments.kinds:
+                files.append(drawings.frame_cog(made, one, beside.with_suffix(".tif"), gain))
+    if "footprints" in arguments.kinds:
+        files.append(georeference.write_footprints(made, output))
+    return files
+
+
+def recipe(flight: Path, facts: Mapping[str, Any], arguments: argparse.Namespace) -> Recipe:
+    """How the flight was decoded, with what the arguments say instead."""
+    given = {name: getattr(arguments, name) for name in ("camera", "mask", "calibration")}
+    made = inputs.of_flight(flight, facts, given)
+    if made is None:
+        raise DappledError(f"{flight} names no mask: give --camera and --mask")
+    return replace(made, workers=2, colour=not arguments.grey)
+
+
+def options(facts: Mapping[str, Any], arguments: argparse.Namespace) -> Options:
+    """The arguments of `add_placing`, with the flight's own mounting where they don't give one."""
+    recorded = facts.get("settings", {}).get("pose", {})
+    plain = Mounting()
+    lever = arguments.lever_arm or recorded.get("lever_arm_m") or plain.lever_m
+    mount = arguments.mount or recorded.get("mount") or plain.mount
+    ellipsoidal = arguments.terrain_heights == "ellipsoid"
+    return Options(
+        mounting=Mounting((float(lever[0]), float(lever[1]), float(lever[2])), tuple(map(float, mount))),
+        ground_m=arguments.ground,
+        terrain=arguments.terrain,
+        terrain_geoid=earth.geoid(arguments.geoid) if ellipsoidal else None,
+        crs=arguments.crs,
+        gsd_m=arguments.gsd,
+        view=arguments.view,
+        focus_m=arguments.focus,
+        focal_length_mm=arguments.focal_length,
+        f_number=arguments.f_number,
+        frames=None if arguments.frames is None else numbers(arguments.frames),
+    )
+
+
+def numbers(text: str) -> frozenset[int]:
+    """Frames named as "0,3-5". Raises DappledError."""
+    found: set[int] = set()
+    for word in text.split(","):
+        first, dash, last = word.partition("-")
+        try:
+            found.update(range(int(first), int(last if dash else first) + 1))
+        except ValueError:
+            raise DappledError(f"--frames {text}: write numbers as 0,3-5") from None
+    return frozenset(found)
+
+
+class Bar:
+    """A progress bar on a terminal's stderr, one for each stretch of work."""
+
+    def __init__(self) -> None:
+        self._bar: tqdm[Any] | None = None
+        self._what = ""
+
+    def __enter__(self) -> Progress:
+        return self.show
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def show(self, what: str, done: int, total: int) -> None:
+        """So much of it is done."""
+        if self._bar is None or what != self._what:
+            self.__exit__()
+            self._bar = tqdm(total=total, desc=what, unit="frame", disable=not sys.stderr.isatty(), leave=False)
+            self._what = what
+        self._bar.update(done - self._bar.n)

@@ -1,0 +1,27 @@
+"""The libraries of the ground extra, imported where they are needed; the onboard install leaves them out."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from dappled.errors import DappledError
+
+_PACKAGES = {"cv2": "opencv-python-headless", "distributed": "distributed"}
+_EXTRAS = {"distributed": "cluster"}
+
+
+class MissingExtraError(DappledError):
+    """A library of an extra is not installed; one sentence."""
+
+
+def need(module: str) -> Any:
+    """Import an optional module. Raises MissingExtraError saying what to install."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        root = module.partition(".")[0]
+        extra = _EXTRAS.get(root, "ground")
+        raise MissingExtraError(
+            f"this needs {_PACKAGES.get(root, root)}: install it with pip install 'dappled[{extra}]'"
+        ) from error

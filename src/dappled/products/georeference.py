@@ -1,0 +1,200 @@
+"""From a recorded flight to maps: frames decoded, placed, refined where asked for, and drawn."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dappled.drivers.darkroom import Darkroom, Recipe
+from dappled.errors import DappledError
+from dappled.flight import durable
+from dappled.products import footprints, maps, photographs
+from dappled.products.earth import Geoid, Projection, utm
+from dappled.products.ground import Flat, Ground
+from dappled.products.ground import load as load_ground
+from dappled.products.maps import MapError
+from dappled.products.photographs import Mounting, Photograph, Station
+
+Progress = Callable[[str, int, int], None]  # what, done, of
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How a flight is mapped; None leaves a choice to what the flight says.
+
+    `ground_m` above sea level is that of home; `terrain` a raster file, whose heights are ellipsoidal where
+    `terrain_geoid` is given. `gsd_m` is the finest of the frames'. `view` is "mean", "ground" (all views, refocused on
+    the ground) or "v,u". `focus_m` is where the lens was focused. `frames` names the frames by number.
+    """
+
+    mounting: Mounting = field(default_factory=Mounting)
+    ground_m: float | None = None
+    terrain: Path | None = None
+    terrain_geoid: Geoid | None = None
+    crs: str | None = None
+    gsd_m: float | None = None
+    view: str = "mean"
+    focus_m: float = float("inf")
+    focal_length_mm: float | None = None
+    f_number: float | None = None
+    frames: frozenset[int] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """A flight's photographs on one map. `left` names the frames that are not among them, with the reason."""
+
+    flight: str
+    photographs: tuple[Photograph, ...]
+    projection: Projection
+    ground: Ground
+    gsd_m: float
+    focus_m: float
+    left: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...] = ()
+    facts: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def tags(self) -> dict[str, str]:
+        """What map files say of themselves."""
+        return {
+            "DAPPLED_FLIGHT": self.flight,
+            "DAPPLED_GROUND": self.ground.name,
+            "DAPPLED_HEIGHTS": "metres above mean sea level, as the autopilot's",
+            "DAPPLED_FRAMES": ",".join(one.name for one in self.photographs),
+        }
+
+
+def survey(flight: Path, recipe: Recipe, options: Options, progress: Progress, stack: ExitStack) -> Survey:
+    """Decode and place a flight's frames. Frames that can't be are left out and named; `stack` keeps the pictures'
+    scratch folder. Raises DappledError where nothing is left, or the call itself is wrong."""
+    stations, left = photographs.stations(flight, options.mounting)
+    if options.frames is not None:
+        stations = [one for one in stations if one.frame.index in options.frames]
+        left = [pair for pair in left if int(Path(pair[0]).stem) in options.frames]
+    if not stations:
+        raise DappledError(f"no frame of {flight} can be put on a map: " + (left[0][1] if left else "it has none"))
+    first = stations[0].camera
+    projection = Projection(options.crs or utm(first.latitude_deg, first.longitude_deg))
+    projection.at(first.latitude_deg, first.longitude_deg)
+    level = _level(stations, options)
+    scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-maps-")))
+    darkroom = Darkroom(recipe)
+    darkroom.check()
+    taken: list[Photograph] = []
+    for number, station in enumerate(stations):
+        progress("decode", number, len(stations))
+        try:
+            one = take(flight, station, darkroom, projection, options)
+            one.eye.check_horizon(station.frame.name)
+            maps.footprint(one.eye, Flat(level))
+        except DappledError as error:
+            left.append((station.frame.name, str(error)))
+            continue
+        taken.append(_shelved(one, scratch))
+    progress("decode", len(stations), len(stations))
+    if not taken:
+        raise DappledError(f"no frame of {flight} can be put on a map: {left[0][1]}")
+    ground = _ground(taken, projection, level, options)
+    kept: list[Photograph] = []
+    for one in taken:
+        try:
+            maps.footprint(one.eye, ground)
+            kept.append(one)
+        except MapError as error:
+            left.append((one.name, f"frame {one.name}: {error}"))
+    if not kept:
+        raise DappledError(f"no frame of {flight} can be put on a map: {left[-1][1]}")
+    gsd_m = options.gsd_m or _two_digits(min(one.eye.gsd_m(_below(one, ground)) for one in kept))
+    return Survey(flight.name, tuple(kept), projection, ground, gsd_m, options.focus_m, tuple(left))
+
+
+def take(flight: Path, station: Station, darkroom: Darkroom, projection: Projection, options: Options) -> Photograph:
+    """One frame, decoded and placed. Raises DappledError."""
+    made = darkroom.develop(
+        flight / station.frame.name,
+        focal_length_mm=options.focal_length_mm or station.tag.focal_length_mm,
+        f_number=options.f_number or station.tag.f_number,
+        views=True,
+    )
+    field, gains = made.light_field, photographs.true_colours(made.raw)
+    if gains is not None and field.views.ndim == 5:
+        field = replace(field, views=field.views * gains.astype(np.float32))
+    profile = darkroom.camera(made.raw.camera_model or "")
+    return photographs.photograph(station, field, profile, projection, view=options.view, focus_m=options.focus_m)
+
+
+def _shelved(one: Photograph, scratch: Path) -> Photograph:
+    """The photograph with its pictures in files, mapped and not held: a flight has many."""
+    np.save(scratch / f"{one.name}.npy", one.image)
+    kept = replace(one, image=np.load(scratch / f"{one.name}.npy", mmap_mode="r"))
+    if one.views is None:
+        return kept
+    np.save(scratch / f"{one.name}-views.npy", one.views)
+    return replace(kept, views=np.load(scratch / f"{one.name}-views.npy", mmap_mode="r"))
+
+
+def _level(stations: Sequence[Station], options: Options) -> float:
+    """The flat ground's height above sea level."""
+    if options.ground_m is not None:
+        return options.ground_m
+    homes = [one.ground_m for one in stations if one.ground_m is not None]
+    if not homes and options.terrain is None:
+        raise DappledError(
+            "the flight doesn't know how high it flew: give the ground's height with --ground or --terrain"
+        )
+    return float(np.median(homes)) if homes else min(one.camera.altitude_msl_m for one in stations) - 1.0
+
+
+def _ground(taken: Sequence[Photograph], projection: Projection, level: float, options: Options) -> Ground:
+    if options.terrain is None:
+        return Flat(level)
+    met = np.concatenate([maps.footprint(one.eye, Flat(level))[:, :2] for one in taken])
+    centres = np.array([one.eye.centre[:2] for one in taken])
+    low, high = np.concatenate([met, centres]).min(axis=0), np.concatenate([met, centres]).max(axis=0)
+    margin = 0.25 * float(np.max(high - low)) + 5.0  # hills lie elsewhere than flat ground
+    bounds = (low[0] - margin, low[1] - margin, high[0] + margin, high[1] + margin)
+    return load_ground(options.terrain, projection, bounds, geoid=options.terrain_geoid)
+
+
+def _below(one: Photograph, ground: Ground) -> float:
+    middle = np.array([[(one.eye.shape[1] - 1) / 2, (one.eye.shape[0] - 1) / 2]])
+    return float(ground.meet(one.eye, middle)[0, 2])
+
+
+def _two_digits(value: float) -> float:
+    """A length with two digits: a map's step that a person can read."""
+    return float(f"{value:.1e}")
+
+
+def write_footprints(made: Survey, output: Path) -> Path:
+    """footprints.geojson."""
+    features = [
+        footprints.feature(one, made.ground, made.projection, made.facts.get(one.name, {})) for one in made.photographs
+    ]
+    path = output / "footprints.geojson"
+    durable.write_file(path, footprints.collection(features))
+    return path
+
+
+def write_report(made: Survey, output: Path, files: Sequence[Path]) -> Path:
+    """report.json: what was mapped onto what, what was left out, and how each frame was refined."""
+    facts = {
+        "flight": made.flight,
+        "crs": made.projection.name,
+        "ground": made.ground.name,
+        "gsd_m": made.gsd_m,
+        "frames": [{"name": one.name, **made.facts.get(one.name, {})} for one in made.photographs],
+        "left_out": [{"name": name, "why": why} for name, why in made.left],
+        "notes": list(made.notes),
+        "files": [path.name for path in files],
+    }
+    path = output / "report.json"
+    durable.write_file(path, (json.dumps(facts, indent=1, allow_nan=False) + "\n").encode())
+    return path

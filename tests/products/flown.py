@@ -1,0 +1,161 @@
+"""A short simulated flight with everything that only the simulation knows: poses, relief, the ground's true picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from dappled.config import profiles
+from dappled.daemon.interpolation import metres_per_radian
+from dappled.decode.calibration import CalibrationFrame, calibrate
+from dappled.decode.plane import to_plane
+from dappled.drivers import rawfile
+from dappled.drivers.darkroom import Recipe
+from dappled.flight import recording
+from dappled.flight.records import Pose, Tag
+from dappled.mocks import terrain
+from dappled.mocks.flyover import Terrain
+from dappled.mocks.masked_camera import MaskedCamera, SensorModel, Truth, reference_camera
+from dappled.mocks.path import Path as FlightPath
+from dappled.mocks.path import TruePose
+from dappled.mocks.terrain import TEXEL_M
+from tests.flight.makers import deliver, wish
+
+START_NS = 1_795_256_103_000_000_000
+CAMERA, MASK = "reference-36mm", "reference-5x5"
+F_NUMBER = 14.8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Flown:
+    """The flight on disk, how to decode it, and the truth of each frame."""
+
+    folder: Path
+    recipe: Recipe
+    path: FlightPath
+    truths: tuple[Truth, ...]
+    ground: terrain.Ground
+
+    def to_geodetic(self, north_m: NDArray[np.float64], east_m: NDArray[np.float64]) -> tuple[
+        NDArray[np.float64], NDArray[np.float64]
+    ]:
+        """(latitude, longitude) in degrees of places near home, as the simulated path counts them."""
+        per_north, per_east = metres_per_radian(math.radians(self.path.home_latitude_deg), self.path.home_altitude_msl_m)
+        return (
+            self.path.home_latitude_deg + np.degrees(north_m / per_north),
+            self.path.home_longitude_deg + np.degrees(east_m / per_east),
+        )
+
+
+def half_camera(seed: int, path: FlightPath) -> MaskedCamera:
+    """The reference camera with the inner half of its sensor."""
+    return reference_camera(seed, scale=0.5, path=path)
+
+
+def fly(
+    folder: Path,
+    *,
+    seed: int = 3,
+    times_s: Sequence[float] = (1.0, 1.6, 2.2),
+    path: FlightPath | None = None,
+    told: Callable[[int, TruePose], TruePose] = lambda _, pose: pose,
+    noise: bool = True,
+) -> Flown:
+    """Frames triggered at these times; the ledger gets the pose that `told` makes of each true one."""
+    path = path or FlightPath(seed)
+    camera = half_camera(seed, path)
+    if not noise:
+        camera = replace(camera, sensor=replace(camera.sensor, shot_noise=False, read_noise_e=0.0))
+    scene = camera.scene
+    assert isinstance(scene, Terrain)
+    begun = recording.begin(folder / "flights", lambda: START_NS)
+    truths = []
+    for index, time_s in enumerate(times_s):
+        exposure = camera.expose(time_s, index, f_number=F_NUMBER)
+        truth = exposure.truth
+        assert truth.pose is not None
+        truths.append(truth)
+        wish(begun, index)
+        frame = deliver(begun, index, exposure.file, f"IMG_{index:04d}.DNG")
+        pose = as_recorded(told(index, truth.pose))
+        begun.ledger.add_tag(
+            Tag(index, pose.utc_ns, 10_000, "hot shoe", 50.0, F_NUMBER, 0.001, 100, CAMERA, MASK, frame.sha256, pose)
+        )
+    begun.close()
+    calibration = calibration_file(folder, camera.sensor, seed)
+    recipe = Recipe(camera=CAMERA, mask=MASK, calibration=str(calibration))
+    return Flown(begun.folder.path, recipe, path, tuple(truths), scene.ground)
+
+
+def as_recorded(true: TruePose) -> Pose:
+    """A pose as the daemon would have noted it."""
+    utc_ns = START_NS + round(true.t_s * 1e9)
+    return Pose(
+        source="interpolated",
+        utc_ns=utc_ns,
+        boot_us=None,
+        latitude_rad=math.radians(true.latitude_deg),
+        longitude_rad=math.radians(true.longitude_deg),
+        altitude_msl_m=true.altitude_msl_m,
+        height_above_home_m=-true.position_ned_m[2],
+        velocity_ned_m_s=true.velocity_ned_m_s,
+        attitude=true.attitude,
+        position_sigma_m=0.02,
+        attitude_sigma_rad=0.001,
+        age_ms=1.0,
+        telemetry_packets=1,
+    )
+
+
+def calibration_file(folder: Path, sensor: SensorModel, seed: int) -> Path:
+    """What `dappled calibrate` makes of a bench frame of the same body."""
+    bench = reference_camera(seed, scale=0.5, scene="white")
+    raw = rawfile.read(replace(bench, sensor=sensor).bench_frame().file, "bench frame")
+    profile = profiles.camera(CAMERA)
+    plane = to_plane(raw.mosaic, black=raw.black, white=raw.white, cfa=raw.cfa)
+    assert raw.focal_length_mm is not None
+    assert raw.f_number is not None
+    found = calibrate(
+        [CalibrationFrame(plane, raw.focal_length_mm, raw.f_number)],
+        sensor=profile.sensor((plane.shape[0], plane.shape[1])),
+        mask=profiles.mask(MASK).mask,
+        law=profile.law,
+        mask_distance_mm=profile.mask_distance_mm,
+    )
+    path = folder / "calibration.toml"
+    path.write_text(tomli_w.dumps(found.to_dict()), encoding="utf-8")
+    return path
+
+
+def true_ground(truth: Truth, row: int, column: int) -> NDArray[np.float64]:
+    """(north, east, height above home) that a sample of the truth's views shows."""
+    assert truth.pose is not None
+    assert truth.depth_m is not None
+    shape = truth.depth_m.shape
+    row, column = row % shape[0], column % shape[1]
+    rows, columns = 1388, 1844
+    y = (truth.grid[0, 0] * row - (rows - 1) / 2) * 0.01 / 50.0
+    x = (truth.grid[1, 1] * column - (columns - 1) / 2) * 0.01 / 50.0
+    w, a, b, c = truth.pose.attitude
+    turn = np.array(
+        [
+            [1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b)],
+            [2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a)],
+            [2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b)],
+        ]
+    )
+    ned = np.array(truth.pose.position_ned_m) + turn @ np.array([-y, x, 1.0]) * float(truth.depth_m[row, column])
+    return np.array([ned[0], ned[1], -ned[2]])
+
+
+def relief_nodes(ground: terrain.Ground) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """(north of rows, east of columns, heights above home) of the landscape's one period."""
+    n = len(ground.relief)
+    axis = (np.arange(n) - n // 2) * TEXEL_M
+    return -axis, axis, ground.relief.astype(np.float64)
