@@ -90,6 +90,8 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
         manager.ready(time.monotonic_ns())
         print(f"flight {service.folder}", file=sys.stderr)
         print(f"stream {settings.publish.slices}", file=sys.stderr)
+        if service.console_url:
+            print(f"console {service.console_url}", file=sys.stderr)
         goal = _Goal(service, told, arguments.frames, arguments.seconds, ask)
         problems = _Problems(service, manager)
 

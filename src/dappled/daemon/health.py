@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from dappled.config.settings import Settings
+from dappled.daemon import wire
+from dappled.daemon.boot_clock import BootClock
 from dappled.daemon.publisher import PublisherStatistics
 from dappled.daemon.shutter import ShutterStatistics
 from dappled.daemon.street import Street
@@ -15,6 +18,7 @@ from dappled.daemon.telemetry import TelemetryStatistics
 from dappled.drivers.mavlink import LinkStatistics
 from dappled.errors import DappledError
 from dappled.flight import layout
+from dappled.flight.records import Pose
 
 SILENT_NS = 5 * 10**9
 
@@ -31,6 +35,9 @@ def record(
     telemetry: TelemetryStatistics,
     publisher: PublisherStatistics,
     folder: Path,
+    clock: BootClock | None = None,
+    vehicle: Pose | None = None,
+    decoding: bool = False,
 ) -> dict[str, Any]:
     """The facts of a `health` message; `problems` are sentences, none when all is well."""
     problems = [f"the {name} thread has ended: restart dappled" for name in street.dead()]
@@ -66,6 +73,34 @@ def record(
         },
         "stages": [*stages, {"name": "publish", "sent": dict(publisher.sent), "dropped": dict(publisher.dropped)}],
         "problems": problems,
+        "interval_s": shutter.interval_s,
+        "clock": None if clock is None else {"source": clock.source, "sigma_ms": clock.sigma_ns / 1e6},
+        "vehicle": None if vehicle is None or vehicle.latitude_rad is None else _place(vehicle),
+        "decode": {
+            "mask": settings.mask.profile,
+            "calibration": settings.decode.calibration,
+            "running": decoding,
+        },
+        "min_free_bytes": settings.record.min_free_mb * 1_000_000,
+    }
+
+
+def _place(pose: Pose) -> dict[str, float | None]:
+    """Where the vehicle is, for a map."""
+
+    def degrees(value: float | None) -> float | None:
+        return None if value is None else math.degrees(value)
+
+    speed = pose.velocity_ned_m_s
+    return {
+        "latitude_deg": degrees(pose.latitude_rad),
+        "longitude_deg": degrees(pose.longitude_rad),
+        "altitude_msl_m": pose.altitude_msl_m,
+        "height_above_home_m": pose.height_above_home_m,
+        "yaw_deg": degrees(wire.euler(pose.attitude)[2]) if pose.attitude else None,
+        "speed_m_s": math.hypot(*speed) if speed else None,
+        "position_sigma_m": pose.position_sigma_m,
+        "age_ms": pose.age_ms,
     }
 
 

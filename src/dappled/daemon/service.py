@@ -23,15 +23,18 @@ from dappled.daemon.books import LiveBook
 from dappled.daemon.cameras import open_camera
 from dappled.daemon.clock import Clock, SystemClock
 from dappled.daemon.component import CameraFacts, Captured, Component, Storage
+from dappled.daemon.console import acts
+from dappled.daemon.console import process as console_process
 from dappled.daemon.development import DevelopmentError, WorkerDeveloper
 from dappled.daemon.knobs import Knobs, OwnKnob
+from dappled.daemon.logbook import Logbook, of_story
 from dappled.daemon.publisher import Publisher, Reply
 from dappled.daemon.reload import merge
 from dappled.daemon.shutter import Shutter, Verdict, Wish
 from dappled.daemon.street import Names, Story, Street, Watchers
 from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency, Exposure
 from dappled.daemon.telemetry import Telemetry
-from dappled.drivers.camera import Camera, Identity, StateChanged
+from dappled.drivers.camera import Camera, Identity, SettingsChanged, StateChanged
 from dappled.drivers.darkroom import Recipe
 from dappled.drivers.mavlink import Packet, mavlink
 from dappled.errors import DappledError, report
@@ -72,6 +75,9 @@ class Service:
         self._said: set[str] = set()
         self._focal_length_mm: float | None = None
         self._began_monotonic_ns = self._clock.monotonic_ns()
+        self._logbook = Logbook(self._clock.utc_ns)
+        self._recipe: Recipe | None = None
+        self.console_url = ""
 
     # life
 
@@ -80,6 +86,7 @@ class Service:
         with ExitStack() as stack:
             names, recipe = inputs.recipe(self.settings)
             camera = open_camera(self.settings.camera)
+            door = console_process.open_door(self.settings, stack)
             self._publisher = Publisher(
                 self.settings.publish.slices,
                 self.settings.publish.ask,
@@ -87,6 +94,7 @@ class Service:
                 high_water_mark=self.settings.publish.high_water_mark,
                 keys=curve.server(self.settings.publish.keys, self.settings.publish.clients),
                 mode=int(self.settings.publish.socket_mode, 8),
+                private=door.private if door else "",
             )
             stack.callback(self._publisher.stop)
             self._links = links.configured(self.settings, self._clock, tap=self._log_packet, on_packet=self._packet)
@@ -100,6 +108,11 @@ class Service:
             stack.callback(self._links.stop)  # before the recording closes: packets are logged there
             self._begin_street(camera, names, self._developer(recipe, stack), stack)
             self._begin_component(self._knobs(camera, names, recipe))
+            if door:
+                self.console_url = door.url
+                console_process.begin(
+                    door, self.settings, stack, recipe=self._recipe, act=self._act, logbook=self._logbook
+                )
             self._started = True
             self._stack = stack.pop_all()
         for text in self._recording.recovered:
@@ -109,7 +122,7 @@ class Service:
         assert self._recording is not None
         if recipe is None:
             return None
-        kept = inputs.keep(recipe, self._recording.folder.path)
+        kept = self._recipe = inputs.keep(recipe, self._recording.folder.path)
         developer = WorkerDeveloper(kept)
         stack.callback(developer.close)
         threading.Thread(target=_warm_up, args=[developer], name="decoder warm-up", daemon=True).start()
@@ -126,7 +139,9 @@ class Service:
             publisher=self._publisher,
             latency=BodyLatency(self.settings.camera.latency_ms, self.settings.camera.latency_sigma_ms, LATENCY_SOURCE),
             names=names,
-            watchers=Watchers(self._settled, self._story_tagged, self._outside.finished, self._camera_changed),
+            watchers=Watchers(
+                self._settled, self._story_tagged, self._finished, self._camera_changed, self._settings_changed
+            ),
             decode_queue=self.settings.decode.queue,
             preview_interval_s=self.settings.publish.preview_interval_s,
         )
@@ -210,6 +225,10 @@ class Service:
         """A wish from this side of the links: a console, or a test."""
         return self._shutter.wish(wish)
 
+    def _act(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        """What the console asks for."""
+        return acts.act(request, self._shutter, self._logbook)
+
     def reload(self, wanted: Settings) -> list[str]:
         """Take from these settings what can change in flight; a sentence for each change, taken or refused."""
         self.settings, told = merge(self.settings, wanted)
@@ -245,6 +264,9 @@ class Service:
             telemetry=self._telemetry.statistics(),
             publisher=self._publisher.statistics(),
             folder=self.folder,
+            clock=self._telemetry.boot_clock(),
+            vehicle=self._telemetry.pose_at(self._clock.utc_ns(), 0.0),
+            decoding=self._recipe is not None,
         )
 
     # wishes
@@ -289,8 +311,15 @@ class Service:
         self._shutter.settled(index, ok)
         self._outside.settled(index, ok)
 
+    def _finished(self, story: Story) -> None:
+        self._logbook.add(*of_story(story))
+        self._outside.finished(story)
+
     def _camera_changed(self, change: StateChanged) -> None:
         log.info("camera %s %s", change.state, change.reason)
+        if change.state != "busy" and not (change.state == "ready" and self._identity):
+            reason = f": {change.reason}" if change.reason else ""
+            self._logbook.add(f"camera {change.state}{reason}", "info" if change.state == "ready" else "warning")
         self._changed()
         if change.identity not in (None, self._identity) and self._recording is not None:
             who = self._identity = change.identity
@@ -300,6 +329,11 @@ class Service:
             except DappledError as error:
                 report(log, "camera", error)
         self._outside.camera(change)
+
+    def _settings_changed(self, change: SettingsChanged) -> None:
+        if self._component is not None:
+            self._component.settings_changed(change.refused)
+        self._outside.settings(change)
 
     def _changed(self) -> None:
         if self._component is not None:
@@ -330,11 +364,14 @@ class Service:
         index = story.shot.index
         if story.tag is not None and story.frame is not None:
             captured = Captured(index, True, story.tag.utc_ns, story.tag.pose, story.frame.name)
+        elif story.where is not None:  # exposed; its file stays at the camera for now
+            exposure, pose = story.where
+            captured = Captured(index, True, exposure.utc_ns, pose)
         else:
             captured = Captured(index, story.frame is not None, url=story.frame.name if story.frame else "")
         if self._component is not None:
             self._component.announce(captured)
-            if story.frame is None:
+            if not captured.ok:
                 self._component.say(f"image {index} failed: {story.problem}", mavlink.MAV_SEVERITY_ERROR)
         if story.tag is not None:
             self._focal_length_mm = story.tag.focal_length_mm or self._focal_length_mm
@@ -361,12 +398,13 @@ class Service:
             root = Path(self.settings.record.directory)
             with LedgerReader.open(layout.FlightFolder(root / entry.flight).ledger) as ledger:
                 tag = ledger.tag(index)
+                ok = entry.state == "safe" or index in ledger.following()
         except DappledError as error:  # such as an old flight that was moved away
             report(log, f"image {index} can't be looked up", error)
             return None
         if tag is None:
-            return Captured(index, entry.state == "safe", url=entry.frame or "")
-        return Captured(index, entry.state == "safe", tag.utc_ns, tag.pose, entry.frame or "")
+            return Captured(index, ok, url=entry.frame or "")
+        return Captured(index, ok, tag.utc_ns, tag.pose, entry.frame or "")
 
     def _camera_facts(self) -> CameraFacts:
         who = self._street.identity

@@ -143,7 +143,10 @@ class Subscriber:
 
 
 class AsyncSubscriber:
-    """The same for asyncio: `async with AsyncSubscriber(endpoint, ask) as stream`, `await stream.receive(1.0)`."""
+    """The same for asyncio: `async with AsyncSubscriber(endpoint, ask) as stream`, `await stream.receive(1.0)`.
+
+    Without `recover` gaps are only counted, also where there is somebody to ask.
+    """
 
     def __init__(
         self,
@@ -152,13 +155,14 @@ class AsyncSubscriber:
         *,
         topics: Collection[str] = wire.TOPICS,
         from_start: bool = False,
+        recover: bool = True,
         high_water_mark: int = 8,
         answer_timeout_s: float = 30.0,
         keys: ClientKeys | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._clock = clock
-        self.gaps = Gaps(can_ask=bool(ask), from_start=from_start, answer_timeout_s=answer_timeout_s)
+        self.gaps = Gaps(can_ask=bool(ask) and recover, from_start=from_start, answer_timeout_s=answer_timeout_s)
         self._sockets = _Sockets(
             zmq.asyncio.Context(), endpoint, ask, topics=topics, high_water_mark=high_water_mark, keys=keys
         )

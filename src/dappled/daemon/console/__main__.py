@@ -1,0 +1,114 @@
+"""The console's process: `python -m dappled.daemon.console CHANNEL_FD LISTENER_FD`. Ends when the daemon does."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+
+from dappled.daemon import journal
+from dappled.daemon.console import app, background
+from dappled.daemon.console.access import Access
+from dappled.daemon.console.control import Control
+from dappled.daemon.console.feed import Feed
+from dappled.daemon.console.hub import Hub
+from dappled.daemon.console.studio import Studio
+from dappled.drivers.camera_channel import Channel
+from dappled.drivers.darkroom import Recipe
+from dappled.errors import DappledError
+
+NICENESS = 15  # below the decoder's 10: looking comes last
+_CONNECTIONS = 64
+log = logging.getLogger(__name__)
+
+
+def main() -> int:
+    """Serve until the daemon ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C is the daemon's to act on
+    logging.basicConfig(level=logging.WARNING, handlers=[journal.handler()])
+    os.nice(NICENESS)
+    channel = Channel(socket.socket(fileno=int(sys.argv[1])))
+    listener = socket.socket(fileno=int(sys.argv[2]))
+    first = channel.receive(10)
+    if first is None:
+        return 1
+    asyncio.run(_serve(channel, listener, first.body))
+    return 0
+
+
+async def _serve(channel: Channel, listener: socket.socket, setup: Mapping[str, Any]) -> None:
+    recipe = setup["recipe"]
+    hub, studio = Hub(), Studio(None if recipe is None else Recipe(**recipe), setup["mount"])
+    parts = app.Parts(
+        feed=Feed(
+            setup["endpoint"],
+            setup["ask"],
+            tell=hub.tell,
+            thumb=studio.thumb,
+            corners=studio.corners,
+            watched=lambda: parts.watched(),  # noqa: PLW0108  # the parts are made around it
+        ),
+        hub=hub,
+        studio=studio,
+        control=Control(channel),
+        access=Access(setup["token"], setup["hosts"]),
+        background=_background(setup["map"]),
+    )
+    server = uvicorn.Server(
+        uvicorn.Config(
+            app.make(parts),
+            log_config=None,
+            access_log=False,
+            lifespan="off",
+            ws="none",
+            http="h11",
+            loop="asyncio",
+            server_header=False,
+            timeout_keep_alive=10,
+            timeout_graceful_shutdown=1,
+            limit_concurrency=_CONNECTIONS,
+            h11_max_incomplete_event_size=16_384,
+        )
+    )
+    tasks = [asyncio.create_task(parts.feed.run()), asyncio.create_task(app.follow_log(parts))]
+    watcher = asyncio.create_task(_until_gone(parts.control, server))
+    await server.serve(sockets=[listener])
+    for task in (*tasks, watcher):
+        task.cancel()
+    await asyncio.gather(*tasks, watcher, return_exceptions=True)
+
+
+async def _until_gone(control: Control, server: uvicorn.Server) -> None:
+    """End the server when the daemon is gone: asked every second, as nothing else would tell."""
+    loop = asyncio.get_running_loop()
+    while not control.gone.is_set():
+        await asyncio.sleep(1.0)
+        try:
+            await loop.run_in_executor(None, control.ask, {"do": "nothing"})
+        except DappledError as error:
+            log.info("%s", error)
+    server.should_exit = True
+    threading.Timer(3.0, os._exit, [1]).start()  # a browser that never lets go must not keep the process
+
+
+def _background(file: str) -> background.Background | None:
+    if not file:
+        return None
+    try:
+        return background.load(Path(file))
+    except DappledError as error:
+        log.warning("%s", error)
+        return None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,369 @@
+"""The console's web application: one page, its events, its pictures, and the few things that may be asked of it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from dappled.daemon.console import access, kml, pictures
+from dappled.daemon.console.access import Access, Refusal
+from dappled.daemon.console.background import Background
+from dappled.daemon.console.control import Control, ControlError
+from dappled.daemon.console.feed import Feed, FeedError
+from dappled.daemon.console.footprint import Rectified
+from dappled.daemon.console.hub import Hub
+from dappled.daemon.console.studio import Studio, StudioError
+from dappled.errors import DappledError
+
+GLOBE_S = 30.0  # a virtual globe that asked this long ago still watches
+_PICTURES = ("thumb.jpg", "mean.jpg", "slices.jpg", "spectrum.jpg", "views.jpg", "views.json", "depth.png")
+_SHIFT_PX = 8.0
+_MAP_PX, _KML_PX = 320, 1024
+
+
+@dataclass(slots=True)
+class Parts:
+    """What the application is made of. `workers` makes pictures, one at a time; `askers` wait for the daemon."""
+
+    feed: Feed
+    hub: Hub
+    studio: Studio
+    control: Control
+    access: Access
+    background: Background | None
+    globe_s: float = -1e9
+    workers: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, "pictures"))
+    askers: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2, "questions"))
+
+    def watched(self) -> bool:
+        """Whether anybody looks."""
+        return len(self.hub) > 0 or time.monotonic() - self.globe_s < GLOBE_S
+
+
+def make(parts: Parts) -> ASGIApp:
+    """The application, behind its rules."""
+    static = str(resources.files("dappled.daemon.console") / "static")
+    routes = [
+        Route("/", _page(Path(static) / "index.html")),
+        Mount("/static", StaticFiles(directory=static)),
+        Route("/api/login", _login(parts), methods=["POST"]),
+        Route("/api/events", _events(parts)),
+        Route("/api/state", _state(parts)),
+        Route("/api/shoot", _act(parts, _shoot), methods=["POST"]),
+        Route("/api/interval", _act(parts, _interval), methods=["POST"]),
+        Route("/api/interval/stop", _act(parts, _stop), methods=["POST"]),
+        Route("/api/frames/{frame:int}/{name}", _picture(parts)),
+        Route("/api/map", _map(parts)),
+        Route("/kml", _kml_link(parts)),
+        Route("/kml/latest.kml", _kml_latest(parts)),
+        Route("/kml/{frame:int}.png", _kml_picture(parts)),
+    ]
+    return _Guard(Starlette(routes=routes, exception_handlers={DappledError: _told}), parts.access)
+
+
+class _Guard:
+    """Every request is judged first, and every answer gets the headers that keep browsers strict."""
+
+    def __init__(self, inner: ASGIApp, rules: Access) -> None:
+        self._inner, self._rules = inner, rules
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        query = scope["query_string"].decode("latin-1")
+
+        async def strictly(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                more = [(name.encode(), value.encode()) for name, value in access.HEADERS.items()]
+                if not any(name == b"cache-control" for name, _ in message["headers"]):
+                    more.append((b"cache-control", b"no-store"))
+                message = {**message, "headers": [*message["headers"], *more]}
+            await send(message)
+
+        refusal = self._rules.judge(access.Request(scope["method"], scope["path"], headers, query))
+        if refusal is not None:
+            await _refused(refusal)(scope, receive, strictly)
+        else:
+            await self._inner(scope, receive, strictly)
+
+
+Endpoint = Callable[[Request], Any]
+
+
+def _page(file: Path) -> Endpoint:
+    async def page(_: Request) -> Response:
+        return FileResponse(file)
+
+    return page
+
+
+def _login(parts: Parts) -> Endpoint:
+    async def login(request: Request) -> Response:
+        body = await _body(request)
+        token = body.get("token")
+        refusal = parts.access.try_token(token if isinstance(token, str) else "")
+        if refusal is not None:
+            return _refused(refusal)
+        answer = JSONResponse({"ok": True})
+        answer.set_cookie(access.COOKIE, str(token), httponly=True, samesite="strict", max_age=7 * 86400)
+        return answer
+
+    return login
+
+
+def _events(parts: Parts) -> Endpoint:
+    async def events(_: Request) -> Response:
+        if parts.hub.full:
+            return _refused(Refusal(503, "too many pages are open: close one"))
+        feed = parts.feed
+        first = [_about(parts), feed.state(), *(feed.frame_event(index) for index in feed.frames), {"is": "ready"}]
+        if log := await _log(parts, 0):
+            first.append(log)
+        return StreamingResponse(_stream(parts.hub.listen(first)), media_type="text/event-stream")
+
+    return events
+
+
+async def _stream(events: AsyncIterator[str]) -> AsyncIterator[str]:
+    async for text in events:
+        yield text
+
+
+def _state(parts: Parts) -> Endpoint:
+    async def state(_: Request) -> Response:
+        hub, rules = parts.hub, parts.access
+        own = {"pages": len(hub), "events_dropped": hub.dropped, "refused": rules.refused}
+        return JSONResponse({**parts.feed.state(), "console": own, "newest": parts.feed.newest()})
+
+    return state
+
+
+def _about(parts: Parts) -> dict[str, Any]:
+    background = parts.background
+    return {
+        "is": "about",
+        "start": parts.feed.start,
+        "map": None if background is None else background.bounds(),
+    }
+
+
+async def _log(parts: Parts, after: int) -> dict[str, Any] | None:
+    """The daemon's log lines after a number, as an event; None where there are none."""
+    try:
+        answer = await _ask(parts, {"do": "log", "after": after})
+    except ControlError:
+        return None
+    return {"is": "log", "lines": answer["lines"]} if answer.get("lines") else None
+
+
+async def follow_log(parts: Parts) -> None:
+    """Tell pages the log's new lines, as long as there are pages."""
+    after = 0
+    while True:
+        await asyncio.sleep(0.7)
+        if not len(parts.hub):
+            continue
+        event = await _log(parts, after)
+        if event is not None:
+            after = event["lines"][-1]["number"]
+            parts.hub.tell(event)
+
+
+def _act(parts: Parts, question: Callable[[Mapping[str, Any]], dict[str, Any]]) -> Endpoint:
+    async def act(request: Request) -> Response:
+        answer = await _ask(parts, question(await _body(request)))
+        answer.pop("number", None)
+        return JSONResponse(answer, status_code=200 if answer.get("ok") else 409)
+
+    return act
+
+
+def _shoot(body: Mapping[str, Any]) -> dict[str, Any]:
+    return {"do": "shoot", "sequence": _whole(body, "sequence", 0, 2**31)}
+
+
+def _interval(body: Mapping[str, Any]) -> dict[str, Any]:
+    seconds = body.get("interval_s")
+    if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds <= 86400:
+        raise StudioError("interval_s is a number of seconds from 0 to 86400")
+    count, sequence = _whole(body, "count", 0, 10**6), _whole(body, "sequence", 0, 2**31)
+    return {"do": "interval", "sequence": sequence, "interval_s": seconds, "count": count}
+
+
+def _stop(_: Mapping[str, Any]) -> dict[str, Any]:
+    return {"do": "stop interval"}
+
+
+def _whole(body: Mapping[str, Any], name: str, low: int, high: int) -> int:
+    value = body.get(name)
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        raise StudioError(f"{name} is a whole number from {low} to {high}")
+    return value
+
+
+async def _ask(parts: Parts, question: Mapping[str, Any]) -> dict[str, Any]:
+    return await asyncio.get_running_loop().run_in_executor(parts.askers, parts.control.ask, question)
+
+
+def _picture(parts: Parts) -> Endpoint:
+    async def picture(request: Request) -> Response:
+        frame, name = request.path_params["frame"], request.path_params["name"]
+        seen = parts.feed.frames.get(frame)
+        if seen is None:
+            raise FeedError(f"there is no frame {frame} here")
+        if name == "thumb.jpg" and seen.thumb is not None:
+            return _file(await _make(parts, pictures.jpeg, seen.thumb), name)
+        if name == "map.json":
+            return await _on_map(parts, frame)
+        if name == "map.png":
+            return _file(await _rectified_png(parts, frame, _MAP_PX), name)
+        if name == "depth.png":
+            if seen.depth is None:
+                raise FeedError(f"frame {frame} has no depth (any more)")
+            return _file(await _make(parts, parts.studio.depth, seen.depth), name)
+        message = await parts.feed.slices(frame)
+        studio = parts.studio
+        if name == "refocus.jpg":
+            return _file(await _make(parts, studio.refocused, message, _shift(request)), name)
+        makers: dict[str, Callable[..., Any]] = {
+            "thumb.jpg": lambda one: pictures.jpeg(studio.thumb(one)),
+            "mean.jpg": studio.mean,
+            "slices.jpg": studio.slices,
+            "spectrum.jpg": studio.spectrum,
+            "views.jpg": lambda one: studio.views(one)[1],
+            "views.json": lambda one: json.dumps(studio.views(one)[0]).encode(),
+        }
+        if name not in makers:
+            raise FeedError(f"a frame has {', '.join(_PICTURES)}, no {name}")
+        return _file(await _make(parts, makers[name], message), name)
+
+    return picture
+
+
+async def _make(parts: Parts, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Make a picture on the one thread for that."""
+    return await asyncio.get_running_loop().run_in_executor(parts.workers, function, *arguments)
+
+
+def _shift(request: Request) -> float:
+    try:
+        shift = float(request.query_params.get("shift", "0"))
+    except ValueError:
+        shift = float("nan")
+    if not abs(shift) <= _SHIFT_PX:  # NaN too
+        raise StudioError(f"shift is a number of pixels from {-_SHIFT_PX:g} to {_SHIFT_PX:g}")
+    return shift
+
+
+async def _rectified(parts: Parts, frame: int, longest_side: int, *, sharp: bool = False) -> Rectified | None:
+    seen = parts.feed.frames.get(frame)
+    if seen is None:
+        raise FeedError(f"there is no frame {frame} here")
+    picture, header = seen.thumb, dict(seen.tag)
+    if sharp or picture is None:
+        message = await parts.feed.slices(frame)
+        header["frame_shape"] = message.header["frame_shape"]
+        picture = await _make(parts, parts.studio.full, message)
+    found: Rectified | None = await _make(parts, parts.studio.rectified, header, picture, longest_side)
+    return found
+
+
+async def _rectified_png(parts: Parts, frame: int, longest_side: int, *, sharp: bool = False) -> bytes:
+    one = await _rectified(parts, frame, longest_side, sharp=sharp)
+    if one is None:
+        raise FeedError(f"where frame {frame} lies on the ground is not known")
+    made: bytes = await _make(parts, pictures.png, one.picture)
+    return made
+
+
+async def _on_map(parts: Parts, frame: int) -> Response:
+    one = await _rectified(parts, frame, _MAP_PX)
+    if one is None:
+        raise FeedError(f"where frame {frame} lies on the ground is not known")
+    return JSONResponse({"north": one.north, "south": one.south, "east": one.east, "west": one.west})
+
+
+def _map(parts: Parts) -> Endpoint:
+    async def background(_: Request) -> Response:
+        if parts.background is None:
+            raise FeedError("no map is named in console.map")
+        return FileResponse(parts.background.file, headers={"cache-control": "private, max-age=3600"})
+
+    return background
+
+
+def _kml_link(parts: Parts) -> Endpoint:
+    async def link(request: Request) -> Response:
+        parts.globe_s = time.monotonic()
+        return Response(kml.network_link(_absolute(request, "/kml/latest.kml")), media_type=kml.MEDIA_TYPE)
+
+    return link
+
+
+def _kml_latest(parts: Parts) -> Endpoint:
+    async def latest(request: Request) -> Response:
+        parts.globe_s = time.monotonic()
+        frame, one = parts.feed.newest(), None
+        if frame is not None:
+            try:
+                one = await _rectified(parts, frame, _MAP_PX)
+            except FeedError:  # not decoded: the track is shown all the same
+                one = None
+        picture = _absolute(request, f"/kml/{frame}.png")
+        return Response(kml.latest(f"frame {frame}", picture, one, parts.feed.track()), media_type=kml.MEDIA_TYPE)
+
+    return latest
+
+
+def _kml_picture(parts: Parts) -> Endpoint:
+    async def picture(request: Request) -> Response:
+        parts.globe_s = time.monotonic()
+        return _file(await _rectified_png(parts, request.path_params["frame"], _KML_PX, sharp=True), "x.png")
+
+    return picture
+
+
+def _absolute(request: Request, path: str) -> str:
+    token = request.query_params.get("token")
+    tail = f"?token={token}" if token else ""
+    return f"{request.url.scheme}://{request.headers['host']}{path}{tail}"
+
+
+def _file(data: bytes, name: str) -> Response:
+    kind = {"jpg": "image/jpeg", "png": "image/png", "json": "application/json"}[name.rpartition(".")[2]]
+    return Response(data, media_type=kind)
+
+
+async def _body(request: Request) -> dict[str, Any]:
+    try:
+        body = json.loads(await request.body() or b"{}")
+    except (ValueError, RecursionError):
+        body = None
+    if not isinstance(body, dict):
+        raise StudioError("a request's body is one JSON object")
+    return body
+
+
+def _refused(refusal: Refusal) -> Response:
+    return JSONResponse({"error": refusal.text}, status_code=refusal.status)
+
+
+async def _told(_: Request, error: Exception) -> Response:
+    """A failure as its one sentence."""
+    status = 504 if isinstance(error, ControlError) else 404 if isinstance(error, FeedError) else 422
+    return JSONResponse({"error": str(error)}, status_code=status)

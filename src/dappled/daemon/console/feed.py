@@ -1,0 +1,224 @@
+"""What the console knows: the stream's messages as they come, and older slices asked for again."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.daemon import preflight, wire
+from dappled.daemon.subscriber import AsyncSubscriber
+from dappled.daemon.wire import Message
+from dappled.errors import DappledError, report
+
+log = logging.getLogger(__name__)
+FRAMES, STACK_BYTES = 400, 72_000_000
+_ASK_S = 20.0
+
+Event = dict[str, Any]
+
+
+class FeedError(DappledError):
+    """Something is not there; one sentence."""
+
+
+@dataclass(slots=True)
+class Seen:
+    """One frame: its tag as published, a small picture of it once its slices came, its depth where there is one."""
+
+    tag: dict[str, Any]
+    thumb: NDArray[np.uint8] | None = None
+    depth: Message | None = None
+    corners: list[tuple[float, float]] | None = None
+
+
+class Feed:
+    """Owns what came. `tell` is called with each event for the pages; `thumb` and `corners` make what a frame's place
+    on the map needs. All on one event loop."""
+
+    def __init__(
+        self,
+        endpoint: str,
+        ask: str,
+        *,
+        tell: Callable[[Event], None],
+        thumb: Callable[[Message], NDArray[np.uint8]],
+        corners: Callable[[dict[str, Any]], list[tuple[float, float]] | None],
+        watched: Callable[[], bool],
+    ) -> None:
+        self._endpoints, self._tell, self._thumb, self._corners = (endpoint, ask), tell, thumb, corners
+        self._watched = watched
+        self.health: dict[str, Any] | None = None
+        self.start: dict[str, Any] | None = None
+        self.frames: OrderedDict[int, Seen] = OrderedDict()
+        self._stacks: OrderedDict[int, Message] = OrderedDict()
+        self._asked: dict[int, asyncio.Future[Message]] = {}
+        self._stream: AsyncSubscriber | None = None
+        self._bytes = self._sized = 0
+
+    async def run(self) -> None:
+        """Receive for ever. Slices are listened to only while somebody watches."""
+        topics = [topic for topic in wire.TOPICS if topic not in ("slices", "preview", "depth")]
+        async with AsyncSubscriber(*self._endpoints, topics=topics, high_water_mark=3, recover=False) as stream:
+            self._stream = stream
+            if self._endpoints[1]:
+                await stream.ask({"get": "start"})
+            listening = False
+            while True:
+                if self._watched() != listening:
+                    listening = not listening
+                    for topic in ("slices", "depth"):
+                        stream.listen(topic, listening)
+                message = await stream.receive(0.5)
+                if message is not None:
+                    try:
+                        self._take(message)
+                    except (KeyError, TypeError, ValueError, DappledError) as error:  # not what the schema says
+                        report(log, f"a {message.topic} message was passed over", error)
+
+    async def slices(self, frame: int) -> Message:
+        """The slices of a frame: those kept, or decoded again by the daemon. Raises FeedError."""
+        if (kept := self._stacks.get(frame)) is not None:
+            self._stacks.move_to_end(frame)
+            return kept
+        if self._stream is None or frame not in self.frames:
+            raise FeedError(f"there is no frame {frame} here")
+        waiting = self._asked.get(frame)
+        if waiting is None:
+            waiting = self._asked[frame] = asyncio.get_running_loop().create_future()
+            await self._stream.ask({"get": "slices", "frame": frame})
+        try:
+            return await asyncio.wait_for(asyncio.shield(waiting), _ASK_S)
+        except TimeoutError:
+            self._asked.pop(frame, None)
+            raise FeedError(f"the slices of frame {frame} did not come: the decoder is busy") from None
+
+    def newest(self) -> int | None:
+        """The last frame whose slices came; else the last one."""
+        if self._stacks:
+            return max(self._stacks)
+        return next(reversed(self.frames), None)
+
+    @property
+    def frame_bytes(self) -> float | None:
+        """What a frame takes on disk, the mean so far."""
+        return self._bytes / self._sized if self._sized else None
+
+    def state(self) -> Event:
+        """The newest state as an event."""
+        health = self.health
+        if health is None:
+            return {"is": "state", "health": None, "checks": [], "verdict": None}
+        checks = preflight.checks(health, frame_bytes=self.frame_bytes)
+        return {
+            "is": "state",
+            "health": health,
+            "checks": [{"name": one.name, "state": one.state, "text": one.text} for one in checks],
+            "verdict": preflight.verdict(checks),
+        }
+
+    def frame_event(self, index: int) -> Event:
+        """A frame as an event."""
+        seen = self.frames[index]
+        return {
+            "is": "frame",
+            "tag": seen.tag,
+            "thumb": seen.thumb is not None,
+            "depth": seen.depth is not None,
+            "corners": seen.corners,
+        }
+
+    def track(self) -> list[tuple[float, float, float]]:
+        """(longitude, latitude, altitude) of the frames that have a place, in order."""
+        poses = [seen.tag["pose"] for seen in self.frames.values()]
+        return [
+            (pose["longitude_deg"], pose["latitude_deg"], pose["altitude_msl_m"] or 0.0)
+            for pose in poses
+            if pose["latitude_deg"] is not None
+        ]
+
+    def _take(self, message: Message) -> None:
+        header = dict(message.header)
+        match message.topic:
+            case "health":
+                self.health = header
+                self._tell(self.state())
+            case "start":
+                self._begin(header)
+            case "frame":
+                self._frame(header)
+            case "slices":
+                self._slices(message)
+            case "depth":
+                self._depth(message)
+            case "end":
+                self._tell({"is": "end", "shots": header.get("shots")})
+            case "error":
+                asked = header.get("asked") or {}
+                self._answer(asked.get("frame"), FeedError(str(header.get("error"))))
+
+    def _begin(self, header: dict[str, Any]) -> None:
+        self.start = header
+        self._tell({"is": "start", "start": header})
+
+    def _frame(self, header: dict[str, Any]) -> None:
+        index = header["frame"]
+        self.frames[index] = Seen(header, corners=self._corners(header))
+        while len(self.frames) > FRAMES:
+            self.frames.popitem(last=False)
+        self._bytes += header["size"]
+        self._sized += 1
+        self._tell(self.frame_event(index))
+
+    def _slices(self, message: Message) -> None:
+        index = message.header["frame"]
+        self._stacks[index] = message
+        self._stacks.move_to_end(index)
+        while len(self._stacks) > 1 and sum(_bytes(one) for one in self._stacks.values()) > STACK_BYTES:
+            self._stacks.popitem(last=False)
+        self._answer(index, message)
+        seen = self.frames.get(index)
+        if seen is not None and seen.thumb is None:
+            seen.thumb = self._thumb(message)
+            seen.corners = self._corners({**seen.tag, "frame_shape": message.header.get("frame_shape")})
+        if seen is not None:
+            self._tell({**self.frame_event(index), "slices": _facts(message)})
+
+    def _depth(self, message: Message) -> None:
+        seen = self.frames.get(message.header["frame"])
+        if seen is not None:
+            for older in self.frames.values():
+                older.depth = None  # one at a time is kept
+            seen.depth = message
+            self._tell(self.frame_event(message.header["frame"]))
+
+    def _answer(self, frame: Any, answer: Message | FeedError) -> None:
+        waiting = self._asked.pop(frame, None)
+        if waiting is None or waiting.done():
+            return
+        if isinstance(answer, FeedError):
+            waiting.set_exception(answer)
+        else:
+            waiting.set_result(answer)
+
+
+def _facts(message: Message) -> dict[str, Any]:
+    header = message.header
+    shape = header["arrays"][0]["shape"]
+    return {
+        "shape": shape,
+        **{
+            name: header.get(name)
+            for name in ("carriers", "carriers_from", "carriers_found", "grid", "frame_shape", "predicted", "law")
+        },
+    }
+
+
+def _bytes(message: Message) -> int:
+    return memoryview(message.body).nbytes

@@ -1,0 +1,194 @@
+"""Pictures of one frame for the page, made from its slices alone: what a browser can show, in 8 bits."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import fft
+
+Grey = NDArray[np.uint8]
+Colour = NDArray[np.uint8]
+MOSAIC_PX = 2560  # of a views' mosaic; every WebGL2 takes 2048, phones of the last ten years 4096
+_DEPTH_STOPS = np.array(  # dark violet to yellow, even in lightness: after viridis
+    [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=np.float64
+)
+_UNKNOWN = 205
+
+
+@dataclass(frozen=True, slots=True)
+class ViewSet:
+    """Views float32 (V, U, h, w), linear, and their aperture points (V, U, 2) in shares of the aperture."""
+
+    views: NDArray[np.float32]
+    offsets: NDArray[np.float64]
+    source: str
+
+
+def small(image: NDArray[np.floating], longest_side: int) -> NDArray[np.float32]:
+    """An image (h, w) averaged down by a whole number to at most this size."""
+    step = max(1, -(-max(image.shape) // longest_side))
+    height, width = (side // step * step for side in image.shape)
+    blocks = image[:height, :width].reshape(height // step, step, width // step, step)
+    out: NDArray[np.float32] = blocks.mean(axis=(1, 3), dtype=np.float32)
+    return out
+
+
+def shown(image: NDArray[np.floating]) -> Grey:
+    """A linear image for the eye: from 0 to its 99.5th percentile, sRGB."""
+    return encoded(image / level(image))
+
+
+def level(image: NDArray[np.floating]) -> float:
+    """What is shown as white."""
+    return max(float(np.quantile(image, 0.995)), 1e-9)
+
+
+def encoded(linear: NDArray[np.floating]) -> Grey:
+    """Linear 0 to 1 as sRGB bytes, as a browser decodes them."""
+    value = np.clip(linear, 0, 1)
+    coded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
+    grey: Grey = np.rint(255 * coded).astype(np.uint8)
+    return grey
+
+
+def decoded(coded: Grey) -> NDArray[np.float32]:
+    """sRGB bytes as linear 0 to 1."""
+    value = coded / np.float32(255)
+    linear: NDArray[np.float32] = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return linear.astype(np.float32)
+
+
+def spectrum(slices: NDArray[np.complex64], carriers: Sequence[Sequence[float]], grid: Sequence[Sequence[float]],
+             size: tuple[int, int]) -> Grey:  # fmt: skip
+    """uint8 `size` (H, W), DC in the middle, −½ to ½ cycles/pixel on both axes: the bands that the slices were cut
+    from, put back in their places. Log magnitude, each pixel the largest of its bins; what no slice covers is 0.
+
+    `carriers` rows [ky, kx, fy, fx]; `grid` leads from a slice's samples to the frame's, so a band is 1/grid wide.
+    """
+    out = np.zeros(size, dtype=np.float32)
+    tall, wide = (max(2, round(side / step)) for side, step in zip(size, (grid[0][0], grid[1][1]), strict=True))
+    window = np.hanning(slices.shape[1])[:, None] * np.hanning(slices.shape[2])
+    for image, (_, _, fy, fx) in zip(slices, carriers, strict=True):
+        mean = image.mean() if fy == fx == 0 else 0
+        band = np.abs(fft.fftshift(fft.fft2((image - mean) * window.astype(np.float32))))
+        tile = _pooled(band, (tall, wide))
+        for sign in (1, -1):
+            top = round((0.5 + sign * fy) * size[0] - tall / 2)
+            left = round((0.5 + sign * fx) * size[1] - wide / 2)
+            _lay(out, tile if sign > 0 else tile[::-1, ::-1], top, left)
+    seen = out > 0
+    if not seen.any():
+        return np.zeros(size, dtype=np.uint8)
+    log = np.log(out, where=seen, out=np.zeros_like(out))
+    low, high = np.quantile(log[seen], [0.05, 0.9998])
+    grey: Grey = np.where(seen, np.clip((log - low) / max(high - low, 1e-9), 0, 1) * 235 + 20, 0).astype(np.uint8)
+    return grey
+
+
+def views_mosaic(made: ViewSet) -> tuple[Grey, tuple[int, int]]:
+    """All views side by side, one common scale, sRGB; and the (height, width) of one, which is even out to 8 px, so
+    that a JPEG's blocks never hold two views."""
+    v, u, height, width = made.views.shape
+    step = max(1, -(-max(v * height, u * width) // MOSAIC_PX))
+    height, width = height // step // 8 * 8, width // step // 8 * 8
+    out = np.empty((v * height, u * width), dtype=np.uint8)
+    white = level(made.views[v // 2, u // 2])
+    for row in range(v):
+        for column in range(u):
+            view = made.views[row, column][: height * step, : width * step]
+            mean = view.reshape(height, step, width, step).mean(axis=(1, 3))
+            out[row * height : (row + 1) * height, column * width : (column + 1) * width] = encoded(mean / white)
+    return out, (height, width)
+
+
+def refocused(mosaic: Grey, tile: tuple[int, int], offsets: NDArray[np.float64], shift_px: float) -> Grey:
+    """The views of a mosaic, each moved by `shift_px` × its aperture offset × views an axis, and averaged (Eq 28).
+
+    `shift_px` is the disparity, in tile pixels between neighbouring views, that comes into focus. Bilinear, in linear
+    light; what lies beyond a view's edge counts for nothing. The page's shader does the same.
+    """
+    v, u = offsets.shape[:2]
+    linear = decoded(mosaic)
+    total, weight = np.zeros(tile, dtype=np.float32), np.zeros(tile, dtype=np.float32)
+    for row in range(v):
+        for column in range(u):
+            view = linear[row * tile[0] : (row + 1) * tile[0], column * tile[1] : (column + 1) * tile[1]]
+            dy, dx = shift_px * v * offsets[row, column, 0], shift_px * u * offsets[row, column, 1]
+            moved, there = _moved(view, float(dy), float(dx))
+            total += moved
+            weight += there
+    return encoded(total / np.maximum(weight, 1e-6))
+
+
+def depth_colours(disparity: NDArray[np.float32], sigma: NDArray[np.float32] | None) -> Colour:
+    """uint8 (h, w, 3): near to far from yellow to violet; grey where it is not known (NaN, or σ above a quarter of
+    the range)."""
+    known = np.isfinite(disparity)
+    if sigma is not None:
+        known &= np.isfinite(sigma)
+    if not known.any():
+        return np.full((*disparity.shape, 3), _UNKNOWN, dtype=np.uint8)
+    low, high = np.quantile(disparity[known], [0.02, 0.98])
+    span = max(float(high - low), 1e-6)
+    if sigma is not None:
+        known &= np.where(known, sigma, np.inf) < span / 4 + 1e-6
+    place = np.clip((np.where(known, disparity, low) - low) / span, 0, 1) * (len(_DEPTH_STOPS) - 1)
+    colours = np.stack(
+        [np.interp(place, range(len(_DEPTH_STOPS)), _DEPTH_STOPS[:, channel]) for channel in range(3)], axis=-1
+    )
+    picture: Colour = np.where(known[..., None], np.rint(colours), _UNKNOWN).astype(np.uint8)
+    return picture
+
+
+def jpeg(picture: NDArray[np.uint8], quality: int = 85) -> bytes:
+    """A JPEG file."""
+    return _file(picture, "JPEG", quality=quality)
+
+
+def png(picture: NDArray[np.uint8]) -> bytes:
+    """A PNG file."""
+    return _file(picture, "PNG", compress_level=3)
+
+
+def _file(picture: NDArray[np.uint8], kind: str, **options: int) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, kind, **options)
+    return file.getvalue()
+
+
+def _pooled(band: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.floating]:
+    """The largest value for each pixel of `size`; repeated where there are more pixels than values."""
+    for axis in (0, 1):
+        n, wanted = band.shape[axis], size[axis]
+        starts = np.arange(wanted) * n // wanted
+        band = np.maximum.reduceat(band, starts, axis=axis) if wanted <= n else np.take(band, starts, axis=axis)
+    return band
+
+
+def _lay(out: NDArray[np.float32], tile: NDArray[np.floating], top: int, left: int) -> None:
+    """Put a tile down where it lies on the picture; the larger value stays."""
+    bottom, right = min(top + tile.shape[0], out.shape[0]), min(left + tile.shape[1], out.shape[1])
+    y, x = max(top, 0), max(left, 0)
+    if y < bottom and x < right:
+        part = out[y:bottom, x:right]
+        np.maximum(part, tile[y - top : bottom - top, x - left : right - left], out=part)
+
+
+def _moved(view: NDArray[np.float32], dy: float, dx: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """out(y, x) = view(y + dy, x + dx), and 1 where that lies between the view's outermost samples."""
+    for axis, shift in ((0, dy), (1, dx)):
+        n = view.shape[axis]
+        at = np.clip(np.arange(n) + shift, 0, n - 1)
+        low = np.minimum(at.astype(int), max(n - 2, 0))
+        part = (at - low).astype(np.float32)
+        part = part[:, None] if axis == 0 else part[None, :]
+        view = np.take(view, low, axis) * (1 - part) + np.take(view, np.minimum(low + 1, n - 1), axis) * part
+    rows = np.arange(view.shape[0]) + dy
+    columns = np.arange(view.shape[1]) + dx
+    inside = ((rows >= 0) & (rows <= view.shape[0] - 1))[:, None] & ((columns >= 0) & (columns <= view.shape[1] - 1))
+    return view, inside.astype(np.float32)

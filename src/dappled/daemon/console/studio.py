@@ -1,0 +1,196 @@
+"""The darkroom of the console: makes what the page asks for of one frame, once, and keeps the last pictures."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.config import profiles
+from dappled.daemon.console import footprint, pictures
+from dappled.daemon.console.footprint import Rectified
+from dappled.daemon.console.pictures import ViewSet
+from dappled.daemon.wire import Message
+from dappled.decode.carriers import Carrier, Lattice
+from dappled.decode.decoder import MaskDecoder
+from dappled.decode.pictures import slice_mosaic
+from dappled.decode.slices import Slices
+from dappled.drivers.darkroom import Darkroom, Recipe
+from dappled.errors import DappledError
+
+Made = TypeVar("Made")
+KEPT_BYTES = 24_000_000
+SPECTRUM_PX = 880
+SLICES_PX = 1600
+
+
+class StudioError(DappledError):
+    """A picture can't be made of this frame; one sentence."""
+
+
+class Studio:
+    """Works on one thread. A frame is given as its `slices` message; `mount` leads from camera to body axes."""
+
+    def __init__(self, recipe: Recipe | None, mount: Sequence[float]) -> None:
+        self._darkroom = None if recipe is None else Darkroom(recipe)
+        self._mount = mount
+        self._kept: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
+        self._bytes = 0
+
+    def slices(self, message: Message) -> bytes:
+        """The mosaic of the slices' magnitudes (Fig 43), JPEG."""
+        return self._once(
+            message,
+            "slices",
+            lambda: pictures.jpeg(
+                slice_mosaic(_stack(message), np.array(message.header["carriers"]), longest_side=SLICES_PX), 82
+            ),
+        )
+
+    def spectrum(self, message: Message) -> bytes:
+        """The spectrum of the frame as far as its slices reach, JPEG; see `pictures.spectrum`."""
+
+        def make() -> bytes:
+            header = message.header
+            tall, wide = header["frame_shape"]
+            scale = SPECTRUM_PX / max(tall, wide)
+            size = (round(tall * scale), round(wide * scale))
+            return pictures.jpeg(pictures.spectrum(_stack(message), header["carriers"], header["grid"], size), 88)
+
+        return self._once(message, "spectrum", make)
+
+    def mean(self, message: Message, longest_side: int = 1280) -> bytes:
+        """The slice of (0, 0): the frame as a photograph without parallax, JPEG."""
+        return self._once(
+            message, f"mean {longest_side}", lambda: pictures.jpeg(pictures.shown(_mean(message, longest_side)))
+        )
+
+    def thumb(self, message: Message) -> NDArray[np.uint8]:
+        """The same, small, uint8."""
+        return pictures.shown(_mean(message, 256))
+
+    def full(self, message: Message) -> NDArray[np.uint8]:
+        """The same, as large as it is, uint8."""
+        return pictures.shown(_stack(message)[0].real)
+
+    def views(self, message: Message) -> tuple[dict[str, Any], bytes]:
+        """The views' mosaic as a JPEG, and its layout: how many, how large, their aperture offsets, where the phases
+        came from. Raises StudioError where this frame has none."""
+
+        def make() -> tuple[dict[str, Any], bytes]:
+            made = self._views(message)
+            mosaic, tile = pictures.views_mosaic(made)
+            layout = {
+                "views": list(made.offsets.shape[:2]),
+                "tile": list(tile),
+                "offsets": np.round(made.offsets, 6).tolist(),
+                "source": made.source,
+            }
+            return layout, pictures.jpeg(mosaic, 92)
+
+        return self._once(message, "views", make)
+
+    def refocused(self, message: Message, shift_px: float) -> bytes:
+        """The frame focused where neighbouring views differ by `shift_px` of their mosaic's pixels, JPEG. For browsers
+        without WebGL."""
+
+        def mosaic() -> tuple[NDArray[np.uint8], tuple[int, int], NDArray[np.float64]]:
+            made = self._views(message)
+            return *pictures.views_mosaic(made), made.offsets
+
+        picture, tile, offsets = self._once(message, "mosaic", mosaic)
+        return pictures.jpeg(pictures.refocused(picture, tile, offsets, shift_px))
+
+    def depth(self, message: Message) -> bytes:
+        """A `depth` message in colours, PNG."""
+        arrays = message.arrays()
+        return self._once(
+            message,
+            "depth",
+            lambda: pictures.png(pictures.depth_colours(arrays["disparity"], arrays.get("sigma"))),
+        )
+
+    def corners(self, header: Mapping[str, Any]) -> list[tuple[float, float]] | None:
+        """A frame's footprint on flat ground; see `footprint.corners`."""
+        one = self._geometry(header)
+        return None if one is None else footprint.corners(one)
+
+    def rectified(self, header: Mapping[str, Any], picture: NDArray[np.uint8], longest_side: int) -> Rectified | None:
+        """A frame's picture north up; None where its place is not known."""
+        one = self._geometry(header)
+        return None if one is None else footprint.rectify(one, picture, longest_side)
+
+    def _geometry(self, header: Mapping[str, Any]) -> footprint.Geometry | None:
+        try:
+            camera = profiles.camera(header["camera"])
+        except DappledError:
+            return None  # a body without a profile has no known chip
+        return footprint.geometry(header["pose"], self._chip(camera, header), header["focal_length_mm"], self._mount)
+
+    def _chip(self, camera: profiles.CameraProfile, header: Mapping[str, Any]) -> tuple[float, float] | None:
+        shape = header.get("frame_shape")
+        known = [raw.sensor.size_mm for raw in camera.raw if shape is None or list(raw.sensor.shape) == list(shape)]
+        return known[0] if known else None
+
+    def _views(self, message: Message) -> ViewSet:
+        header = message.header
+        if self._darkroom is None:
+            raise StudioError("no mask is named: frames are not decoded")
+        if self._darkroom.recipe.mask == profiles.LENSLET:
+            raise StudioError("the views of a lenslet frame are made on the ground: dappled decode")
+        rows, columns = header["frame_shape"]
+        decoder = self._darkroom.decoder((rows, columns), header["camera"], colours=header["mosaic"])
+        assert isinstance(decoder, MaskDecoder)
+        orders = np.array([row[:2] for row in header["carriers"]])
+        frequencies = np.array([row[2:] for row in header["carriers"]])
+        vectors, *_ = np.linalg.lstsq(orders, frequencies, rcond=None)
+        grid = np.array(header["grid"])
+        slices = Slices(
+            _stack(message),
+            tuple(Carrier(int(ky), int(kx), fy, fx) for ky, kx, fy, fx in header["carriers"]),
+            grid,
+            float(1 / (grid[0, 0] * grid[1, 1])),
+        )
+        made = decoder.views(
+            slices,
+            Lattice(tuple(vectors[0].tolist()), tuple(vectors[1].tolist())),
+            header["carriers_from"],
+            focal_length_mm=header["focal_length_mm"],
+            f_number=header["f_number"],
+            noise_rms=header["noise_rms"] or 0.0,
+        )
+        if not made[0].size:
+            raise StudioError(
+                "this frame has no views: without a calibration they need carriers that show in it, and its f-number"
+            )
+        return ViewSet(made[0], made[1], made[2])
+
+    def _once(self, message: Message, kind: str, make: Callable[[], Made]) -> Made:
+        key = (message.header["flight"], message.header["frame"], kind)
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            found: Made = self._kept[key]
+            return found
+        made = self._kept[key] = make()
+        self._bytes += _size(made)
+        while self._bytes > KEPT_BYTES and len(self._kept) > 1:
+            self._bytes -= _size(self._kept.popitem(last=False)[1])
+        return made
+
+
+def _stack(message: Message) -> NDArray[np.complex64]:
+    stack: NDArray[np.complex64] = message.arrays()["slices"]
+    return stack
+
+
+def _mean(message: Message, longest_side: int) -> NDArray[np.float32]:
+    return pictures.small(_stack(message)[0].real, longest_side)
+
+
+def _size(made: Any) -> int:
+    parts = made if isinstance(made, tuple) else (made,)
+    return sum(part.nbytes if isinstance(part, np.ndarray) else len(part) if isinstance(part, bytes) else 200
+               for part in parts)  # fmt: skip

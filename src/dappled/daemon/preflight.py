@@ -1,0 +1,116 @@
+"""Go or no-go: what a health record says about each thing that a flight needs, in words for a person on the field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+State = Literal["go", "caution", "no-go"]
+_SURE_M, _SLOW_CLOCK_MS, _FRESH_MS = 5.0, 50.0, 3000.0
+_FRAME_BYTES = 20e6  # until a flight has shown its own
+_EARLIEST_UTC_NS = 1_700_000_000 * 10**9  # a machine that thinks it is before 2023 has no clock
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing: "go" is ready, "caution" flies with a loss that the text names, "no-go" brings no good frame."""
+
+    name: str
+    state: State
+    text: str
+
+
+def verdict(checks: Sequence[Check]) -> State:
+    """The worst of them."""
+    states = {check.state for check in checks}
+    return "no-go" if "no-go" in states else "caution" if "caution" in states else "go"
+
+
+def checks(health: Mapping[str, Any], *, frame_bytes: float | None = None) -> list[Check]:
+    """The checks of one health record. `frame_bytes` is what a frame of this flight takes, None before the first."""
+    return [
+        _camera(health["camera"]),
+        _disk(health, frame_bytes or _FRAME_BYTES, known=frame_bytes is not None),
+        _link(health),
+        _position(health.get("vehicle")),
+        _clock(health),
+        _decoding(health),
+        _service(health["problems"]),
+    ]
+
+
+def _camera(camera: Mapping[str, Any]) -> Check:
+    state, reason = camera["state"], camera.get("reason") or ""
+    if state in ("ready", "busy"):
+        return Check("Camera", "go", "ready" if state == "ready" else "taking a frame")
+    if state == "starting":
+        return Check("Camera", "caution", "starting")
+    return Check("Camera", "no-go", f"{state}: {reason}" if reason else state)
+
+
+def _disk(health: Mapping[str, Any], frame_bytes: float, *, known: bool) -> Check:
+    free, least = health["disk"]["free_bytes"], health.get("min_free_bytes") or 0
+    if free is None:
+        return Check("Disk", "no-go", "the flight's folder can't be read")
+    frames = max(0, int((free - least) / frame_bytes))
+    count = f"{frames:,}".replace(",", " ")
+    text = f"{free / 1e9:.1f} GB free, room for {'' if known else 'some '}{count} frames"
+    if free < least:
+        return Check("Disk", "no-go", f"nearly full: {free / 1e6:.0f} MB left, shots are refused")
+    return Check("Disk", "go" if frames >= 100 else "caution", text)
+
+
+def _link(health: Mapping[str, Any]) -> Check:
+    link = health["link"]
+    if not link["urls"]:
+        return Check("Autopilot", "caution", "no link is configured: frames have no poses")
+    silent = sum("MAVLink" in text for text in health["problems"])
+    age_ms = (health.get("vehicle") or {}).get("age_ms")
+    if age_ms is not None and age_ms < _FRESH_MS:
+        return Check("Autopilot", "go", f"heard; {silent} of {link['urls']} links silent" if silent else "heard")
+    if silent >= link["urls"]:
+        return Check("Autopilot", "no-go", "silent for more than 5 s")
+    return Check("Autopilot", "caution", "heard, but tells no position")
+
+
+def _position(vehicle: Mapping[str, Any] | None) -> Check:
+    if vehicle is None or vehicle["latitude_deg"] is None:
+        return Check("Position", "caution", "unknown: frames have no place")
+    sigma, yaw = vehicle["position_sigma_m"], vehicle["yaw_deg"]
+    text = "accuracy unknown" if sigma is None else f"±{sigma:.1f} m"
+    if yaw is None:
+        return Check("Position", "caution", f"{text}, attitude unknown")
+    return Check("Position", "go" if sigma is not None and sigma <= _SURE_M else "caution", text)
+
+
+def _clock(health: Mapping[str, Any]) -> Check:
+    if health["utc_ns"] < _EARLIEST_UTC_NS:
+        return Check("Clock", "no-go", "this machine does not know the date")
+    clock = health.get("clock")
+    if clock is None:
+        return Check("Clock", "caution", "the autopilot's clock is unknown")
+    how = "synchronised" if clock["source"] == "timesync" else "by packet arrival"
+    state: State = "go" if clock["sigma_ms"] <= _SLOW_CLOCK_MS else "caution"
+    return Check("Clock", state, f"{how}, ±{clock['sigma_ms']:.1f} ms")
+
+
+def _decoding(health: Mapping[str, Any]) -> Check:
+    decode = health.get("decode") or {"mask": "", "calibration": "", "running": False}
+    if not decode["mask"]:
+        return Check("Decoding", "caution", "no mask is named: frames are kept, not decoded")
+    if not decode["running"]:
+        return Check("Decoding", "caution", "off: frames are kept, not decoded")
+    behind = [text for text in health["problems"] if "fell behind" in text]
+    if behind:
+        return Check("Decoding", "caution", behind[0])
+    if not decode["calibration"]:
+        return Check("Decoding", "caution", f"{decode['mask']}, not calibrated: carriers by the law alone")
+    return Check("Decoding", "go", f"{decode['mask']}, calibrated")
+
+
+def _service(problems: Sequence[str]) -> Check:
+    ended = [text for text in problems if "has ended" in text]
+    if ended:
+        return Check("Service", "no-go", ended[0])
+    return Check("Service", "go", "all parts at work")
