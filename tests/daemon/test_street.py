@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
-from dappled.drivers.camera import CameraError, Event
+from dappled.drivers.camera import Blob, CameraError, Companion, Deferred, Event
 from dappled.flight import check, summary
 from dappled.flight.records import ShotState
 from tests.daemon.fakes import arrival, eventually, failed, fired, good, rig
@@ -245,3 +248,68 @@ def test_every_wish_is_one_shot_and_every_shot_ends_once(plan: list[tuple[list[t
         assert counted.succeeded + counted.failed == len(plan)
         for index, state in states(flight).items():
             assert [ok for shot, ok in one.settled if shot == index][-1] is (state == "safe")
+
+
+def with_companion(shot: int) -> list[Event | Exception]:
+    jpeg = Companion(shot, "IMG_0001.JPG", Blob.of(b"jpeg"), time.monotonic_ns())
+    return [fired(shot), arrival(shot, name="IMG_0001.CR2"), jpeg]
+
+
+def test_a_companion_stands_beside_its_frame_in_the_record(tmp_path: Path) -> None:
+    with rig(tmp_path, with_companion) as one:
+        index = one.wish(1).index
+        assert index is not None
+        one.ended(index)
+        eventually(lambda: one.camera.released == [index, index], "both copies at the camera may go")
+        (companion,) = one.flight.ledger.companions()
+        assert (companion.index, companion.name, companion.size) == (index, f"frames/{index:06d}.jpg", 4)
+        assert (one.flight.folder.path / companion.name).read_bytes() == b"jpeg"
+        assert one.flight.ledger.strays() == []
+        path = one.flight.folder.path
+    assert check.check(path).problems == ()
+
+
+def deferred(shot: int) -> list[Event | Exception]:
+    return [fired(shot), Deferred(shot, "it is on the card", time.monotonic_ns())]
+
+
+def test_a_shot_whose_file_follows_is_told_where_it_was_and_has_failed_until_then(tmp_path: Path) -> None:
+    with rig(tmp_path, deferred) as one:
+        index = one.wish(1).index
+        assert index is not None
+        story = one.ended(index)
+        assert story.where is not None
+        assert one.tagged == [index]
+        assert one.settled == [(index, False)]
+        assert one.flight.ledger.following() == {index}
+        assert f"follows: {story.follows}" in one.events()
+        one.camera.say(arrival(index))
+        eventually(lambda: one.flight.ledger.tag(index), "the tag of the file that came after all")
+        assert one.flight.ledger.following() == set()
+        assert one.flight.ledger.frame(index) is not None
+        assert len(one.stories) == 1
+        path = one.flight.folder.path
+    assert check.check(path).problems == ()
+
+
+def test_a_zoom_that_changed_is_told(tmp_path: Path) -> None:
+    frames = [jpeg_at(10.0), jpeg_at(10.0), jpeg_at(24.0)]
+
+    def zooming(shot: int) -> list[Event | Exception]:
+        return [fired(shot), arrival(shot, frames[shot], name=f"DSCF000{shot}.JPG")]
+
+    with rig(tmp_path, zooming) as one:
+        for number in range(3):
+            index = one.wish(number).index
+            assert index is not None
+            one.ended(index)
+        told = [text for text in one.events() if text.startswith("zoom")]
+    assert told == ["zoom: the focal length is 24 mm; it was 10 mm at frame 1"]
+
+
+def jpeg_at(focal_length_mm: float) -> bytes:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0x920A] = focal_length_mm
+    file = io.BytesIO()
+    Image.new("L", (64, 48)).save(file, "JPEG", exif=exif)
+    return file.getvalue()

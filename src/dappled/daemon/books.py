@@ -65,6 +65,17 @@ class LiveBook:
         self._index(index)
         return frame
 
+    def follows(self, index: int, reason: str) -> None:
+        """See Book."""
+        self._enter(index)
+        self._recording.ledger.follows(index, reason)
+        self._index(index)
+
+    def companion(self, index: int, name: str, blob: Blob) -> None:
+        """See Book."""
+        recorder = self._recording.recorder
+        recorder.record_companion(index, name, blob, arrived_utc_ns=self._clock.utc_ns())
+
     def path(self, frame: Frame) -> str:
         """See Book."""
         return str(self._recording.folder.path / frame.name)
@@ -144,6 +155,12 @@ class ReplayBook:
         if (found, blob.size) != (frame.sha256, frame.size):
             self.differences.append(f"frame {index}: {frame.name} is not the file that was recorded")
         return frame
+
+    def follows(self, index: int, reason: str) -> None:
+        """See Book: the file has come by now, or it is replayed as failed."""
+
+    def companion(self, index: int, name: str, blob: Blob) -> None:
+        """See Book: a replay brings frames only."""
 
     def path(self, frame: Frame) -> str:
         """See Book."""

@@ -21,7 +21,20 @@ from dappled.daemon.publisher import Publisher
 from dappled.daemon.stages import Stage
 from dappled.daemon.tagger import BodyLatency, Exposure
 from dappled.drivers import rawfile
-from dappled.drivers.camera import Arrival, Blob, Camera, Event, Fired, Identity, ShotFailed, State, StateChanged
+from dappled.drivers.camera import (
+    Arrival,
+    Blob,
+    Camera,
+    Companion,
+    Deferred,
+    Event,
+    Fired,
+    Identity,
+    SettingsChanged,
+    ShotFailed,
+    State,
+    StateChanged,
+)
 from dappled.drivers.darkroom import camera_name
 from dappled.errors import DappledError, report, sentence
 from dappled.flight.entries import Result
@@ -49,6 +62,12 @@ class Book(Protocol):
     def record(self, index: int | None, name: str, blob: Blob) -> Frame:
         """Make a file safe; when this returns it is."""
 
+    def follows(self, index: int, reason: str) -> None:
+        """A shot was fired, and its file stays at the camera for now."""
+
+    def companion(self, index: int, name: str, blob: Blob) -> None:
+        """Make a file safe that stands beside a frame."""
+
     def path(self, frame: Frame) -> str:
         """Where the frame's file stands."""
 
@@ -70,7 +89,8 @@ PoseSource = Callable[[int, Exposure], tuple[Exposure, Pose]]
 class Story:
     """One shot on its way down the street, for those who watch: filled in as it goes. Times in milliseconds.
 
-    `over`: its watchers were told that it is finished.
+    `over`: its watchers were told that it is finished. `follows` says, for a shot whose file stays at the camera, how
+    it will come; `where` is then when and where it was exposed, as far as that is known without the file.
     """
 
     shot: Shot
@@ -80,19 +100,28 @@ class Story:
     developed: Developed | None = None
     problem: str = ""
     doubt: str = ""
+    follows: str = ""
+    where: tuple[Exposure, Pose] | None = None
     ms: dict[str, float] = field(default_factory=dict)
     over: bool = False
+
+    @property
+    def open(self) -> bool:
+        """Whether its file is waited for."""
+        return self.frame is None and not self.follows
 
 
 @dataclass(frozen=True, slots=True)
 class Watchers:
     """Who is told what: `settled` when a shot is safe (True) or failed, `tagged` when its tag is known or there will be
-    none, `finished` once, when nothing more is expected of it, `camera` at every change of the camera's state."""
+    none, `finished` once, when nothing more is expected of it, `camera` at every change of the camera's state,
+    `settings` at every change of its settings."""
 
     settled: Callable[[int, bool], None] = lambda index, ok: None
     tagged: Callable[[Story], None] = lambda story: None
     finished: Callable[[Story], None] = lambda story: None
     camera: Callable[[StateChanged], None] = lambda change: None
+    settings: Callable[[SettingsChanged], None] = lambda change: None
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,8 +155,11 @@ class Street:
         self._preview_interval_s, self._last_preview = preview_interval_s, -1e9
         self._stories: dict[int, Story] = {}
         self._given_up: dict[int, Story] = {}
+        self._following: dict[int, Story] = {}
+        self._zoom: tuple[int, float] | None = None  # the tag thread's: frame, focal length
         self._unfired: deque[ShotFailed] = deque()
         self._camera_clock = CameraClock()  # the tag thread's
+        self.decoding = True  # off: frames are recorded and tagged, and decoded on the ground
         self.camera_state: State = "starting"
         self.camera_reason = ""
         self.identity: Identity | None = None
@@ -205,7 +237,7 @@ class Street:
         until = time.monotonic() + 1
         while (event := self._next_event(0.0)) is not None and time.monotonic() < until:
             self._handle(event)
-        for index in [story.shot.index for story in list(self._stories.values()) if story.frame is None]:
+        for index in [story.shot.index for story in list(self._stories.values()) if story.open]:
             self._handle(ShotFailed(index, "the flight ended before its file came", time.monotonic_ns()))
 
     def _next_event(self, timeout_s: float) -> Event | None:
@@ -228,12 +260,18 @@ class Street:
                 self._shot_failed(event.shot, event.reason)
             elif isinstance(event, Arrival):
                 self._arrived(event)
+            elif isinstance(event, Companion):
+                self._accompanied(event)
+            elif isinstance(event, Deferred):
+                self._deferred(event)
+            elif isinstance(event, SettingsChanged):
+                self._call(self._watchers.settings, event)
         except Exception as error:  # noqa: BLE001  # one event that goes wrong must not end the capture
             report(log, "capture", error)
 
     def _in_hand(self) -> bool:
         """Whether a shot is with the camera, and still worth waiting for."""
-        waiting = any(story.frame is None for story in list(self._stories.values()))
+        waiting = any(story.open for story in list(self._stories.values()))
         return waiting and time.monotonic() < self._give_up_at
 
     def _state_changed(self, change: StateChanged) -> None:
@@ -263,7 +301,7 @@ class Street:
     def _arrived(self, arrival: Arrival) -> None:
         began = time.monotonic_ns()
         index = arrival.shot
-        story = None if index is None else self._stories.get(index) or self._given_up.get(index)
+        story = None if index is None else self._story(index)
         try:
             frame = self._book.record(index, arrival.name, arrival.blob)
         except Exception as error:
@@ -276,6 +314,8 @@ class Street:
         self._call(self._camera.release, arrival)
         if story is None or story.frame is not None:
             return
+        if story.follows:  # that one came to its end without the file, or is about to
+            story = self._stories[frame.index] = Story(story.shot, story.fired, ms=story.ms, over=True)
         story.frame = frame
         if doubt := arrival.facts.get("doubt"):
             story.doubt = str(doubt)
@@ -283,12 +323,36 @@ class Street:
         if story.fired:
             story.ms["trigger to file"] = (arrival.monotonic_ns - story.fired.returned_monotonic_ns) / 1e6
         story.ms["record"] = (time.monotonic_ns() - began) / 1e6
-        if self._given_up.pop(frame.index, None):
+        if self._following.pop(frame.index, None):
+            self._note("followed", f"its file has come: {arrival.name}", frame.index)
+        elif self._given_up.pop(frame.index, None):
             self._note("late", f"its file came after all; it had failed: {story.problem}", frame.index)
             story.problem = ""
             self._stories[frame.index] = story
         self._call(self._watchers.settled, frame.index, True)
         self._tag.put(story)
+
+    def _story(self, index: int) -> Story | None:
+        return self._stories.get(index) or self._given_up.get(index) or self._following.get(index)
+
+    def _accompanied(self, companion: Companion) -> None:
+        try:
+            self._book.companion(companion.shot, companion.name, companion.blob)
+        finally:
+            companion.blob.close()
+        self._call(self._camera.release, companion)
+
+    def _deferred(self, event: Deferred) -> None:
+        """The end of a shot whose file comes later: where it was exposed can be told now."""
+        try:
+            self._book.follows(event.shot, event.reason)
+        finally:
+            story = self._stories.get(event.shot)
+            if story is not None and story.frame is None:
+                story.follows = event.reason
+                self._following[event.shot] = story
+                self._call(self._watchers.settled, event.shot, False)
+                self._tag.put(story)
 
     def _fail(self, story: Story, reason: str) -> None:
         """The end of a shot without a frame, for now: see `GIVEN_UP`."""
@@ -306,9 +370,14 @@ class Street:
     def _tag_one(self, story: Story) -> None:
         began = time.monotonic_ns()
         frame = story.frame
-        assert frame is not None
+        if frame is None:
+            story.where = self._poses(story.shot.index, self._expected(story, tagger.Settings()))
+            self._call(self._watchers.tagged, story)
+            self._finish(story)
+            return
         settings = self._settings(frame)
-        exposure, pose = self._poses(frame.index, self._expected(story, frame, settings))
+        self._watch_zoom(frame, settings)
+        exposure, pose = self._poses(frame.index, self._expected(story, settings))
         if story.fired and (told := camera_clock.shown(settings.taken)):
             self._camera_clock = self._camera_clock.learnt(*told, exposure)
         if story.doubt:
@@ -320,7 +389,7 @@ class Street:
         self._call(self._watchers.tagged, story)
         if self._publisher:
             self._publisher.publish("frame", frame_header(story.tag, frame, self._names.law or None))
-        if self._developer is None:
+        if self._developer is None or not self.decoding:
             self._finish(story)
         else:
             self._decode.put(story)
@@ -335,7 +404,18 @@ class Street:
             facts.focal_length_mm, facts.f_number, facts.exposure_s, facts.iso, facts.model or "", facts.taken
         )
 
-    def _expected(self, story: Story, frame: Frame, settings: tagger.Settings) -> Exposure:
+    def _watch_zoom(self, frame: Frame, settings: tagger.Settings) -> None:
+        """A zoom that was changed in mid-flight moves every carrier: it is told."""
+        if settings.focal_length_mm is None:
+            return
+        if self._zoom is not None and self._zoom[1] != settings.focal_length_mm:
+            before, was_mm = self._zoom
+            text = f"the focal length is {settings.focal_length_mm:g} mm; it was {was_mm:g} mm at frame {before}"
+            log.warning("zoom: %s", text)
+            self._note("zoom", text, frame.index)
+        self._zoom = (frame.index, settings.focal_length_mm)
+
+    def _expected(self, story: Story, settings: tagger.Settings) -> Exposure:
         """When the frame was exposed, as far as trigger call and file tell: by the trigger call and the body's latency;
         by the camera's own clock, where the driver never said when it fired; else by the wish."""
         if story.fired is not None:
@@ -345,9 +425,9 @@ class Street:
         told = camera_clock.shown(settings.taken)
         by_camera = told and camera_clock.exposure_from_camera(self._camera_clock, *told, settings.exposure_s)
         if by_camera:
-            self._note("untimed", "the driver never said when it fired: the camera's clock is used", frame.index)
+            self._note("untimed", "the driver never said when it fired: the camera's clock is used", story.shot.index)
             return by_camera
-        self._note("untimed", "the driver never said when it fired: the wish's time is used", frame.index)
+        self._note("untimed", "the driver never said when it fired: the wish's time is used", story.shot.index)
         return tagger.mid_exposure(story.shot.wished_utc_ns, self._latency, settings.exposure_s)
 
     # decode and publish
@@ -399,7 +479,8 @@ class Street:
         self._finish(story)
 
     def _finish(self, story: Story) -> None:
-        self._stories.pop(story.shot.index, None)
+        if self._stories.get(story.shot.index) is story:
+            del self._stories[story.shot.index]
         if not story.over:
             story.over = True
             self._call(self._watchers.finished, story)

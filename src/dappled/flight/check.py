@@ -9,11 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.flight import durable, layout, lock, telemetry_log, wishes
-from dappled.flight.entries import Stray
 from dappled.flight.errors import FlightError
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
-from dappled.flight.records import Frame
 from dappled.flight.recovery import SIDECAR
 
 
@@ -66,13 +64,9 @@ def check(path: Path) -> Report:
     return Report(folder.name, files, size, packets, tuple(problems), tuple(notes))
 
 
-def _acknowledged(ledger: LedgerReader) -> list[Frame | Stray]:
-    return [*ledger.frames(), *ledger.strays()]
-
-
 def _files(folder: FlightFolder, ledger: LedgerReader, *, pruned: bool) -> Iterator[tuple[int, str | None]]:
     """(bytes read, problem) for every file that the ledger acknowledges; in a pruned flight it may be gone."""
-    for row in _acknowledged(ledger):
+    for row in ledger.files():
         path = folder.path / row.name
         if pruned and not path.exists():
             continue
@@ -92,7 +86,7 @@ def _files(folder: FlightFolder, ledger: LedgerReader, *, pruned: bool) -> Itera
 
 def _names(folder: FlightFolder, ledger: LedgerReader, closed: bool) -> Iterator[str]:
     """Files that no row acknowledges. While a flight is recorded, one may be on its way."""
-    known = {row.name for row in _acknowledged(ledger)}
+    known = {row.name for row in ledger.files()}
     try:
         names = sorted(os.listdir(folder.frames))
     except OSError as error:

@@ -43,6 +43,10 @@ CREATE TABLE strays (
     name TEXT PRIMARY KEY, camera_name TEXT NOT NULL, size INTEGER NOT NULL, sha256 TEXT NOT NULL,
     arrived_utc_ns INTEGER NOT NULL, reason TEXT NOT NULL
 ) STRICT;
+CREATE TABLE companions (             -- the JPEG beside a raw frame
+    name TEXT PRIMARY KEY, idx INTEGER NOT NULL REFERENCES frames (idx),
+    camera_name TEXT NOT NULL, size INTEGER NOT NULL, sha256 TEXT NOT NULL, arrived_utc_ns INTEGER NOT NULL
+) STRICT;
 CREATE TABLE poses (idx INTEGER PRIMARY KEY REFERENCES frames (idx), sha256 TEXT NOT NULL, record TEXT NOT NULL) STRICT;
 CREATE TABLE tags (idx INTEGER PRIMARY KEY REFERENCES frames (idx), sha256 TEXT NOT NULL, record TEXT NOT NULL) STRICT;
 CREATE TABLE results (
@@ -116,6 +120,23 @@ class LedgerReader:
     def frame(self, index: int) -> Frame | None:
         rows = self._rows("SELECT * FROM frames WHERE idx = ?", index)
         return Frame(*rows[0]) if rows else None
+
+    def companions(self) -> list[Frame]:
+        """Files beside frames, such as the JPEG of a raw frame; each has the index of its frame."""
+        if not self._rows("SELECT 1 FROM sqlite_master WHERE name = 'companions'"):
+            return []  # recorded before there were any
+        columns = "idx, name, camera_name, size, sha256, arrived_utc_ns"
+        return [Frame(*row) for row in self._rows(f"SELECT {columns} FROM companions ORDER BY name")]  # noqa: S608  constant
+
+    def files(self) -> list[Frame | Stray]:
+        """Every file that has a row: frames, companions, strays."""
+        return [*self.frames(), *self.companions(), *self.strays()]
+
+    def following(self) -> frozenset[int]:
+        """Shots that were fired and whose files stayed at the camera: failed for now, until they are picked up."""
+        told = "SELECT idx FROM events WHERE kind = 'follows'"
+        rows = self._rows(f"SELECT idx FROM shots WHERE state = 'failed' AND idx IN ({told})")  # noqa: S608  constant
+        return frozenset(row[0] for row in rows)
 
     def strays(self) -> list[Stray]:
         return [Stray(*row) for row in self._rows("SELECT * FROM strays ORDER BY name")]
@@ -282,6 +303,19 @@ class Ledger(LedgerReader):
             self._db.execute("INSERT INTO frames VALUES (?, ?, ?, ?, ?, ?)", values)
             if before == "failed":
                 self._event("late", f"the file {frame.camera_name} came after the shot had been given up", frame.index)
+
+    def follows(self, index: int, reason: str) -> None:
+        """The shot was fired and its file stays at the camera: it has failed until the file is picked up."""
+        with self._transaction():
+            self._advance(index, "failed", reason)
+            self._event("follows", reason, index)
+
+    def add_companion(self, companion: Frame) -> None:
+        """A file beside a frame, durable under its name."""
+        with self._transaction():
+            one = companion
+            values = (one.name, one.index, one.camera_name, one.size, one.sha256, one.arrived_utc_ns)
+            self._db.execute("INSERT INTO companions VALUES (?, ?, ?, ?, ?, ?)", values)
 
     def add_stray(self, stray: Stray) -> None:
         """A file that belongs to no shot, or is one too many, durable under its name."""

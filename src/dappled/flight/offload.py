@@ -115,7 +115,7 @@ def _hash_on_disk(path: Path) -> str:
 def _prune(folder: FlightFolder, target: Path, utc_ns: Callable[[], int]) -> int:
     """Remove the frames and strays that the ledger acknowledges. The ledger says so before the first one goes."""
     with Ledger(folder.ledger, utc_ns) as ledger:
-        names = [frame.name for frame in ledger.frames()] + [stray.name for stray in ledger.strays()]
+        names = [row.name for row in ledger.files()]
         ledger.set_fact(FACT, {"destination": str(target.absolute()), "utc_ns": utc_ns(), "files": len(names)})
         ledger.add_event(FACT, f"{len(names)} files were copied to {target}, verified, and removed here")
     try:

@@ -66,6 +66,17 @@ class Recorder:
         self._ledger.safe(frame)
         return frame
 
+    def record_companion(self, index: int, camera_name: str, blob: Bytes, *, arrived_utc_ns: int) -> Frame:
+        """Make a file safe that stands beside the frame of a shot, under the same number. Raises FlightError where the
+        shot has no frame, or has such a file."""
+        if self._ledger.frame(index) is None:
+            raise FlightError(f"{camera_name} goes with shot {index}, which has no frame: it was not recorded")
+        name = layout.frame_name(index, camera_name)
+        sha256 = self._write(name, camera_name, blob)
+        companion = Frame(index, name, camera_name, blob.size, sha256, arrived_utc_ns)
+        self._ledger.add_companion(companion)
+        return companion
+
     def record_stray(self, camera_name: str, blob: Bytes, reason: str, *, arrived_utc_ns: int) -> Stray:
         """Make a file safe that belongs to no shot. `reason` is a sentence. Raises FlightError."""
         taken = {PurePosixPath(stray.name).stem for stray in self._ledger.strays()}

@@ -7,6 +7,7 @@ still open is failed with a reason. Nothing that was acknowledged is touched. Al
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -30,6 +31,9 @@ def recover(root: Path, index: ImageIndex, utc_ns: Callable[[], int]) -> list[st
     Returns sentences.
     """
     report: list[str] = []
+    for path in layout.unmade(root):
+        shutil.rmtree(path, ignore_errors=True)
+        report.append(f"the half-made flight folder {path.name} was removed: nothing had been recorded in it")
     sealed = index.sealed()
     for folder in layout.flights(root):
         if folder.name in sealed:
@@ -116,7 +120,7 @@ def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
     """Files under a final name are whole: the rename came after their fsync."""
     if not folder.frames.is_dir():
         return []
-    known = {frame.name for frame in ledger.frames()} | {stray.name for stray in ledger.strays()}
+    known = {row.name for row in ledger.files()}
     report = []
     for file_name in sorted(os.listdir(folder.frames)):
         name = f"frames/{file_name}"
