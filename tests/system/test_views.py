@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -9,40 +10,67 @@ import tomli_w
 
 from dappled.cli.calibrate import from_frames
 from dappled.drivers.darkroom import Darkroom, Recipe
-from dappled.mocks.masked_camera import reference_camera
-from tests.system.quality import score
+from dappled.mocks.masked_camera import MaskedCamera, reference_camera
+from tests.system.quality import Score, score
 
 CAMERA, MASK = "reference-36mm", "reference-5x5"
 
 
-@pytest.mark.parametrize("seed", [3, 4, 5])
-def test_views_beat_30_db_and_the_mean_over_views_by_5(seed: int, tmp_path: Path) -> None:
-    camera = reference_camera(seed, scale=0.5, scene="bench")
-    (tmp_path / "bench.dng").write_bytes(camera.bench_frame().file)
-    calibration = from_frames(Darkroom(Recipe(CAMERA, MASK)), [tmp_path / "bench.dng"])
-    (tmp_path / "calibration.toml").write_text(tomli_w.dumps(calibration.to_dict()))
+@dataclass(frozen=True)
+class Wanted:
+    """Least PSNR of the views in dB, and by how much they beat the mean over views."""
+
+    views_db: float
+    above_mean_db: float
+
+
+NOISE_FREE, RAW_SNR_100 = Wanted(48, 18), Wanted(35, 8)
+
+
+def _score(camera: MaskedCamera, folder: Path, *, least_disparity_px: float) -> Score:
+    """One frame decoded with a calibration on the stopped-down bench frame of the same camera."""
+    (folder / "bench.dng").write_bytes(camera.bench_frame().file)
+    calibration = from_frames(Darkroom(Recipe(CAMERA, MASK)), [folder / "bench.dng"])
+    (folder / "calibration.toml").write_text(tomli_w.dumps(calibration.to_dict()))
     exposure = camera.expose(0.0, 0)
-    (tmp_path / "frame.dng").write_bytes(exposure.file)
-    darkroom = Darkroom(Recipe(CAMERA, MASK, calibration=str(tmp_path / "calibration.toml")))
-    found = darkroom.develop(tmp_path / "frame.dng").light_field
-    reached = score(found, exposure.truth, least_disparity_px=3.0, pixel_mm=camera.sensor.pitch_mm)
-    assert reached.pixels > 10_000
-    assert reached.views_db >= 30
-    assert reached.views_db >= reached.mean_db + 5
+    (folder / "frame.dng").write_bytes(exposure.file)
+    darkroom = Darkroom(Recipe(CAMERA, MASK, calibration=str(folder / "calibration.toml"), workers=2))
+    found = darkroom.develop(folder / "frame.dng").light_field
+    assert found.attributes["carriers_from"] == "calibrated"
+    return score(found, exposure.truth, least_disparity_px=least_disparity_px, pixel_mm=camera.sensor.pitch_mm)
+
+
+def _without_noise(camera: MaskedCamera) -> MaskedCamera:
+    return replace(camera, sensor=replace(camera.sensor, shot_noise=False, read_noise_e=0.0))
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+@pytest.mark.parametrize("mono", [False, True])
+def test_views_of_the_reference_camera(seed: int, mono: bool, tmp_path: Path) -> None:
+    """Neighbouring views 3 px apart or more; with noise the raw signal is 110 times its noise at the mean level."""
+    camera = reference_camera(seed, scale=0.5, scene="bench")
+    camera = replace(camera, sensor=replace(camera.sensor, mono=mono))
+    for seen, wanted in ((_without_noise(camera), NOISE_FREE), (camera, RAW_SNR_100)):
+        reached = _score(seen, tmp_path, least_disparity_px=3.0)
+        assert reached.pixels > 10_000
+        assert reached.views_db >= wanted.views_db, reached
+        assert reached.views_db >= reached.mean_db + wanted.above_mean_db, reached
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [21, 22])
+def test_views_of_the_reference_camera_on_the_full_sensor(seed: int, tmp_path: Path) -> None:
+    camera = reference_camera(seed, scene="bench")
+    for seen, wanted in ((_without_noise(camera), NOISE_FREE), (camera, RAW_SNR_100)):
+        reached = _score(seen, tmp_path, least_disparity_px=3.0)
+        assert reached.views_db >= wanted.views_db, reached
+        assert reached.views_db >= reached.mean_db + wanted.above_mean_db, reached
 
 
 @pytest.mark.parametrize("seed", [6, 7])
-def test_views_of_a_scene_without_parallax_are_no_worse_than_their_mean(seed: int, tmp_path: Path) -> None:
-    (tmp_path / "bench.dng").write_bytes(reference_camera(seed, scale=0.5, scene="bench").bench_frame().file)
-    calibration = from_frames(Darkroom(Recipe(CAMERA, MASK)), [tmp_path / "bench.dng"])
-    (tmp_path / "calibration.toml").write_text(tomli_w.dumps(calibration.to_dict()))
-    camera = reference_camera(seed, scale=0.5, scene="terrain")
-    exposure = camera.expose(0.0, 0)
-    (tmp_path / "frame.dng").write_bytes(exposure.file)
-    darkroom = Darkroom(Recipe(CAMERA, MASK, calibration=str(tmp_path / "calibration.toml")))
-    found = darkroom.develop(tmp_path / "frame.dng").light_field
-    reached = score(found, exposure.truth, least_disparity_px=0.0, pixel_mm=camera.sensor.pitch_mm)
-    assert reached.views_db >= reached.mean_db - 0.3, reached
+def test_views_of_a_scene_with_hardly_any_parallax_are_no_worse_than_their_mean(seed: int, tmp_path: Path) -> None:
+    reached = _score(reference_camera(seed, scale=0.5, scene="terrain"), tmp_path, least_disparity_px=0.0)
+    assert reached.views_db >= reached.mean_db, reached
 
 
 def test_the_mask_s_installation_is_found(tmp_path: Path) -> None:

@@ -31,8 +31,8 @@ from dappled.decode.masks import Order
 
 Views = NDArray[np.float32]
 _SHARED = 1e3  # variance of what all views share, over that of what one view has alone
-_MODEL_ERROR = 0.06  # share of the common image in a coefficient: transfer, aperture, ringing at the frame's end
-_COLOURED = 4.0  # residue in a whole band over what its finest detail says: chroma is stronger in coarse detail
+_MODEL_ERROR = 0.45  # over the root of a slice's shorter side: the frame's end rings in a share of each slice
+_COLOURED = 0.3  # of a band's finest detail is taken for chroma; all of it would take parallax for chroma, too
 _SMALLEST_NOISE = 1e-9  # relative variance of a coefficient: float32 and its transforms
 
 
@@ -185,18 +185,20 @@ def from_slices(
     rotation_rad: float,
     aperture: Aperture,
     noise_variance: float,
-    model_error: float = _MODEL_ERROR,
+    model_error: float | None = None,
     colours: bool = False,
 ) -> tuple[Views, NDArray[np.float64]]:
     """(views float32 (V, U, h, w), view_offsets float64 (V, U, 2)) of a masked frame.
 
     `slices` complex64 (K, h, w) with DC first and no carrier together with its conjugate; `transfers` (K,) their T_k
     (T_0 = 1); `noise_variance` of a slice pixel; `model_error` the relative error of what all views share, in a
-    coefficient. With `colours` the frame was a colour mosaic: what chroma a band holds is measured in its finest detail
-    and counts as noise, and where orders tell nothing views fall back to the image that they share; detail that is
-    parallax is lost with it. The offsets are shares of the frame's own aperture.
+    coefficient (None: what the frame's end rings). With `colours` the frame was a colour mosaic: what chroma a band
+    holds is guessed from its finest detail and counts as noise, and where orders tell nothing views fall back to the
+    image that they share. The offsets are shares of the frame's own aperture.
     """
     angular = angular_frequencies(orders, kappa_cycles, rotation_rad)
+    if model_error is None:
+        model_error = _MODEL_ERROR / math.sqrt(min(slices.shape[1:]))
     # What all views share comes through a carrier with the aperture's transform of it, and its error with that.
     shared = np.abs(transfers * aperture.transform(angular)) ** 2 * float(np.mean(slices[0].real ** 2))
     noise = noise_variance + model_error**2 * shared * np.any(angular != 0, axis=1)

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL = 1, 2, 3, 4, 5, 7, 10
+COLOUR_FILTERS, LINEAR_RAW = 32803, 34892
+_OF_COLOUR = {33421, 33422, 50710, 50711, 50721, 50728, 50778}  # tags of a colour filter array and its colours
 RGGB = bytes((0, 1, 1, 2))
 # XYZ to linear sRGB: the simulated sensor has sRGB's primaries.
 COLOUR_MATRIX = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
@@ -42,21 +44,21 @@ class _Entry(NamedTuple):
     data: bytes
 
 
-def encode(raw: NDArray[np.uint16], *, black: int, white: int, exif: Exif) -> bytes:
-    """A DNG file of an RGGB plane (H, W). Raises ValueError for a plane of another shape."""
+def encode(raw: NDArray[np.uint16], *, black: int, white: int, exif: Exif, mono: bool = False) -> bytes:
+    """A DNG file of an RGGB plane (H, W), or of one without colours. Raises ValueError for a plane of another shape."""
     if raw.ndim != 2 or raw.shape[0] % 2 or raw.shape[1] % 2:
         raise ValueError(f"a Bayer plane has two even sides, not shape {raw.shape}")
     height, width = raw.shape
     taken = datetime.fromtimestamp(exif.taken_utc_ns // 1_000_000_000, UTC).strftime("%Y:%m:%d %H:%M:%S")
 
     def folder(strip: int, exif_at: int) -> list[_Entry]:
-        return [
+        entries = [
             _numbers(254, LONG, 0),  # NewSubfileType: the main image
             _numbers(256, LONG, width),
             _numbers(257, LONG, height),
             _numbers(258, SHORT, 16),  # BitsPerSample
             _numbers(259, SHORT, 1),  # Compression: none
-            _numbers(262, SHORT, 32803),  # Photometric: colour filter array
+            _numbers(262, SHORT, LINEAR_RAW if mono else COLOUR_FILTERS),  # Photometric
             _text(271, exif.make),
             _text(272, exif.model),
             _numbers(273, LONG, strip),
@@ -81,6 +83,7 @@ def encode(raw: NDArray[np.uint16], *, black: int, white: int, exif: Exif) -> by
             _fractions(50728, RATIONAL, *(Fraction(1),) * 3),  # AsShotNeutral
             _numbers(50778, SHORT, 21),  # CalibrationIlluminant1: D65
         ]
+        return [entry for entry in entries if not (mono and entry.tag in _OF_COLOUR)]
 
     shot = [
         _fractions(33434, RATIONAL, Fraction(exif.exposure_s).limit_denominator(100_000)),

@@ -34,7 +34,7 @@ LATENCY_S, LATENCY_SPREAD_S = 0.060, 0.015
 
 @dataclass(frozen=True, slots=True)
 class SensorModel:
-    """The chip: an RGGB mosaic whose three colours are balanced, 14 bits in 16.
+    """The chip: an RGGB mosaic whose three colours are balanced (`mono`: without colour filters), 14 bits in 16.
 
     `shot_noise` and `read_noise_e` (electrons rms) are there to be switched off.
     """
@@ -46,6 +46,7 @@ class SensorModel:
     full_well_e: float = 30_000.0
     shot_noise: bool = True
     read_noise_e: float = 6.0
+    mono: bool = False
 
     @property
     def chip(self) -> Sensor:
@@ -245,7 +246,7 @@ class MaskedCamera:
             taken_utc_ns=round((self.epoch_utc_s + middle_t_s) * 1e9),
         )
         return Exposure(
-            file=dng.encode(raw, black=self.sensor.black, white=self.sensor.white, exif=exif),
+            file=dng.encode(raw, black=self.sensor.black, white=self.sensor.white, exif=exif, mono=self.sensor.mono),
             mid_exposure_t_s=middle_t_s,
             latency_s=latency_s,
             raw=raw,
@@ -273,7 +274,10 @@ class MaskedCamera:
         shift = np.array(self.installed.shift_mm) * self.optics.mask.frequency_per_mm
         origin = 2 * np.pi * (k @ shift - k @ lattice.matrix() @ centre)
         angular = lens.angular_phases(self.optics, self.installed, orders, points_mm)
-        return synthesis.mosaic(radiance, grid, lattice, angular=angular, weights=weights, origin_phase=origin)
+        sites = synthesis.GREY if self.sensor.mono else synthesis.SITES
+        return synthesis.mosaic(
+            radiance, grid, lattice, angular=angular, weights=weights, origin_phase=origin, sites=sites
+        )
 
     def _truth(
         self,

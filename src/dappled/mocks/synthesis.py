@@ -24,7 +24,9 @@ from dappled.decode.masks import Order
 
 MARGIN = 24  # view samples outside the frame on each side
 FADE = 22  # of which so many fade
-SITES = (((0, 0), 0), ((0, 1), 1), ((1, 0), 1), ((1, 1), 2))  # RGGB: (row, column) parity and channel
+Sites = tuple[tuple[tuple[int, int], int], ...]
+SITES: Sites = (((0, 0), 0), ((0, 1), 1), ((1, 0), 1), ((1, 1), 2))  # RGGB: (row, column) parity and channel
+GREY: Sites = tuple((parity, 1) for parity, _ in SITES)  # no colour filters: every pixel sees the same channel
 PASS, STOP = 0.82, 0.95  # the views' low-pass, as shares of half the carrier spacing
 WORKERS = 2
 
@@ -91,17 +93,19 @@ def mosaic(
     angular: NDArray[np.complex128],
     weights: dict[Order, float],
     origin_phase: NDArray[np.float64],
+    sites: Sites = SITES,
 ) -> NDArray[np.float32]:
-    """The masked Bayer frame (H, W) of views `radiance` (J, 3, h, w) on the grid, in the views' scale (DC weight 1).
+    """The masked frame (H, W) of views `radiance` (J, 3, h, w) on the grid, in the views' scale (DC weight 1).
 
-    `weights` are the carriers' real coefficients for DC and the upper half of the orders, `angular` (K, J) the phases
-    of each aperture point there, `origin_phase` (K,) the carriers' phase in radians at pixel (0, 0).
+    A Bayer mosaic unless `sites` say otherwise. `weights` are the carriers' real coefficients for DC and the upper half
+    of the orders, `angular` (K, J) the phases of each aperture point there, `origin_phase` (K,) the carriers' phase in
+    radians at pixel (0, 0).
     """
     orders = list(weights)
     real, imaginary = _angular_slices(radiance, angular)
     shifted = np.empty(radiance.shape[1:], dtype=np.complex64)
     half = grid.fine[0] // 2, grid.fine[1] // 2
-    spectra = np.zeros((len(SITES), *half), dtype=np.complex64)
+    spectra = np.zeros((len(sites), *half), dtype=np.complex64)
     fade = grid.fade()
     matrix = lattice.matrix()
     rows, columns = grid.places()
@@ -126,11 +130,11 @@ def mosaic(
                 line = box * at[0].response[parity_y][:, None]
                 for parity_x in (0, 1):
                     site = 2 * parity_y + parity_x
-                    if SITES[site][1] == channel:
+                    if sites[site][1] == channel:
                         _add(spectra[site], line * at[1].response[parity_x], at)
     planes = fft.ifft2(spectra, norm="forward", overwrite_x=True, workers=WORKERS).real
     frame = np.empty(grid.fine, dtype=np.float32)
-    for ((parity_y, parity_x), _), plane in zip(SITES, planes, strict=True):
+    for ((parity_y, parity_x), _), plane in zip(sites, planes, strict=True):
         frame[parity_y::2, parity_x::2] = plane
     top = MARGIN * grid.step
     return frame[top : top + grid.frame[0], top : top + grid.frame[1]]
