@@ -219,6 +219,10 @@ def test_asyncio_recovers_what_was_lost(endpoint: str) -> None:
     one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer, capacity=100)
     one.start()
     one.publish("slices", {"frame": 40, "arrays": []}, b"")
+    deadline = time.monotonic() + 20
+    while one.statistics().sent["slices"] < 1:  # nobody listens yet
+        assert time.monotonic() < deadline
+        threading.Event().wait(0.002)
     got, gaps, recovered = asyncio.run(frames())
     assert (got[0], 40 in got) == (41, True)
     assert (gaps >= 1, recovered >= 1) == (True, True)
