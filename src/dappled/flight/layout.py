@@ -98,14 +98,17 @@ def create(root: Path, utc_ns: int | None, facts: Mapping[str, Any] | None = Non
     else:
         start = datetime.fromtimestamp(utc_ns // 1_000_000_000, UTC).strftime("%Y%m%dT%H%M%SZ")
     folder = FlightFolder(root / f"{start}-{secrets.token_hex(4)}")
+    made = FlightFolder(durable.temporary(folder.path))
     try:
         durable.make_folder(root)
-        folder.path.mkdir()
-        durable.make_folder(folder.frames)
-        write_facts(folder, facts or {})
+        made.path.mkdir()
+        durable.make_folder(made.frames)
+        write_facts(made, facts or {})
+        made.path.rename(folder.path)
         durable.sync_folder(root)
     except OSError as error:
-        shutil.rmtree(folder.path, ignore_errors=True)
+        for path in (made.path, folder.path):
+            shutil.rmtree(path, ignore_errors=True)
         raise disk_error("make the flight folder", folder.path, error) from error
     return folder
 
@@ -123,15 +126,23 @@ def open_folder(path: Path) -> FlightFolder:
     return folder
 
 
+def unmade(root: Path) -> list[Path]:
+    """Flight folders under `root` that were never wholly made: their temporary names. Raises FlightError."""
+    return [root / name for name in _folders(root) if durable.is_temporary(name)]
+
+
 def flights(root: Path) -> list[FlightFolder]:
     """All flights under `root`, by name; an empty list when there is no such folder. Raises FlightError."""
+    return [FlightFolder(root / name) for name in _folders(root) if _FLIGHT_NAME.fullmatch(name)]
+
+
+def _folders(root: Path) -> list[str]:
     try:
-        names = sorted(entry.name for entry in os.scandir(root) if entry.is_dir(follow_symlinks=False))
+        return sorted(entry.name for entry in os.scandir(root) if entry.is_dir(follow_symlinks=False))
     except FileNotFoundError:
         return []
     except OSError as error:
         raise disk_error("list the flights in", root, error) from error
-    return [FlightFolder(root / name) for name in names if _FLIGHT_NAME.fullmatch(name)]
 
 
 def free_bytes(path: Path) -> int:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dappled.flight import layout, recovery
+from dappled.flight import durable, layout, recovery
 from dappled.flight.errors import disk_error
 from dappled.flight.index import Entry, ImageIndex, open_or_rebuild
 from dappled.flight.layout import FlightFolder
@@ -101,6 +101,7 @@ def begin(
         journal = WishJournal(folder.journal)
         stack.callback(journal.close)
         telemetry = TelemetryLog(folder.telemetry)
+        _make_names_sure(folder)
         for text in recovered:
             ledger.add_event("recovery", text)
         recorder = Recorder(folder, ledger)
@@ -109,3 +110,10 @@ def begin(
         )
         stack.pop_all()
     return opened
+
+
+def _make_names_sure(folder: FlightFolder) -> None:
+    try:
+        durable.sync_folder(folder.path)
+    except OSError as error:
+        raise disk_error("make the flight folder", folder.path, error) from error
