@@ -99,7 +99,8 @@ def main() -> None:
 
     if not same_python(python):
         run("venv", "--quiet", "--clear", "--python", sys.executable, str(VENV))
-    run("pip", "sync", "--quiet", "--require-hashes", "--python", python, "requirements.lock")
+    # Compiled once, here: without bytecode every process of the tests would compile MAVLink's dialect anew, in 100 MB.
+    run("pip", "sync", "--quiet", "--compile-bytecode", "--require-hashes", "--python", python, "requirements.lock")
     run("pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--python", python, "--editable", ".")
     STAMP.write_text(wish())
 

@@ -118,7 +118,8 @@ def environment(uv: str, python: str, home: Path) -> None:
 
 def call(*words: str) -> None:
     """Run a command that must succeed; its errors stand on stderr."""
-    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL, env=environment)
 
 
 def next_steps(place: Place, in_system: bool) -> str:

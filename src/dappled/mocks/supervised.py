@@ -76,12 +76,7 @@ class Supervised:
 
     def children(self) -> dict[int, str]:
         """Its child processes: number → command line."""
-        found = {}
-        for task in Path(f"/proc/{self.pid}/task").iterdir():
-            for child in (task / "children").read_text(encoding="ascii").split():
-                line = Path(f"/proc/{child}/cmdline").read_bytes().replace(b"\0", b" ")
-                found[int(child)] = line.decode(errors="replace")
-        return found
+        return children_of(self.pid)
 
     def resources(self) -> Resources:
         """What it holds now."""
@@ -104,3 +99,13 @@ class Supervised:
         assert self._process is not None
         self._process.terminate()
         return self._process.wait(END_S)
+
+
+def children_of(pid: int) -> dict[int, str]:
+    """The child processes of a process: number → command line."""
+    found = {}
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        for child in (task / "children").read_text(encoding="ascii").split():
+            line = Path(f"/proc/{child}/cmdline").read_bytes().replace(b"\0", b" ")
+            found[int(child)] = line.decode(errors="replace")
+    return found
