@@ -17,7 +17,8 @@ import pytest
 
 from dappled.drivers.camera import Arrival, CameraError, Companion, Fired, ShotFailed, StateChanged
 from dappled.drivers.camera_channel import Channel
-from dappled.drivers.gphoto2 import GPhoto2Camera, RestartBudget, open_camera, spawn_process
+from dappled.drivers.gphoto2 import GPhoto2Camera, RestartBudget, Spawn, open_camera, spawn_process
+from dappled.drivers.gphoto2_before import Before
 from dappled.drivers.gphoto2_settings import GPhoto2Settings, parse_settings
 from dappled.mocks.body import Body, BodyOptions, pattern
 from dappled.mocks.eos450d import thumbnail
@@ -343,9 +344,9 @@ def test_stop_does_not_wait_for_a_silent_body(make: Make, body: Body) -> None:
 
 def _recorded(
     started: list[subprocess.Popen[bytes]],
-) -> Callable[[GPhoto2Settings], tuple[subprocess.Popen[bytes], Channel]]:
-    def spawn(settings: GPhoto2Settings) -> tuple[subprocess.Popen[bytes], Channel]:
-        process, channel = spawn_process(settings)
+) -> Spawn:
+    def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
+        process, channel = spawn_process(settings, before)
         started.append(process)
         return process, channel
 
@@ -372,11 +373,36 @@ def test_a_crash_of_the_process_fails_its_shots_and_is_made_good(body: Body) -> 
         camera.stop()
 
 
+def test_what_a_dead_process_had_fired_is_fetched_by_the_next_one(body: Body) -> None:
+    """Also when its file was on the card before the next process looked there for the first time."""
+    started: list[subprocess.Popen[bytes]] = []
+    camera = GPhoto2Camera(parse_settings({"port": body.port}), spawn=_recorded(started))
+    camera.start()
+    try:
+        until_state(camera, "ready")
+        camera.fire(1)
+        _ended(until_shot_ends(camera, 1))
+        body.fault("no-event")
+        camera.fire(2)
+        until(camera, lambda event: isinstance(event, Fired) and event.shot == 2)
+        started[0].send_signal(signal.SIGKILL)
+        until(camera, lambda event: isinstance(event, ShotFailed) and event.shot == 2)
+        arrival = until_shot_ends(camera, 2)[-1]
+        assert isinstance(arrival, Arrival)
+        assert content(arrival) == pattern(2, SIZE)
+        camera.fire(3)
+        arrival = until_shot_ends(camera, 3)[-1]
+        assert isinstance(arrival, Arrival)
+        assert content(arrival) == pattern(3, SIZE)
+    finally:
+        camera.stop()
+
+
 def test_a_process_that_keeps_dying_is_not_started_for_ever(body: Body) -> None:
     started: list[subprocess.Popen[bytes]] = []
 
-    def spawn(settings: GPhoto2Settings) -> tuple[subprocess.Popen[bytes], Channel]:
-        process, channel = _recorded(started)(settings)
+    def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
+        process, channel = _recorded(started)(settings, before)
         process.kill()
         return process, channel
 
@@ -395,7 +421,8 @@ def test_the_process_dies_with_its_parent(body: Body) -> None:
         "import sys\n"
         "from dappled.drivers.gphoto2 import spawn_process\n"
         "from dappled.drivers.gphoto2_settings import parse_settings\n"
-        "process, channel = spawn_process(parse_settings({'port': sys.argv[1]}))\n"
+        "from dappled.drivers.gphoto2_before import Before\n"
+        "process, channel = spawn_process(parse_settings({'port': sys.argv[1]}), Before())\n"
         "while channel.receive(30).body.get('state') != 'ready': pass\n"
         "print(process.pid, flush=True)\n"
         "sys.stdin.read()\n"

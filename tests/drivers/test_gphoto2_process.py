@@ -86,6 +86,9 @@ class FakeCamera:
         self._stumble("files")
         return frozenset(file for file in self.card if not file.in_memory)
 
+    def taken_s(self, file: CameraFile) -> int | None:
+        return self.taken.get(file)
+
     def settings(self) -> tuple[Setting, ...]:
         self._stumble("settings")
         return self.shown

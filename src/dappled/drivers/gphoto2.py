@@ -16,13 +16,16 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
+from dappled.drivers.attribution import Claim
 from dappled.drivers.camera import (
     Arrival,
     CameraError,
     Companion,
     Event,
+    Fired,
     Identity,
     Setting,
     SettingName,
@@ -32,13 +35,14 @@ from dappled.drivers.camera import (
     check_change,
 )
 from dappled.drivers.camera_channel import Channel, ChannelError, message_event
+from dappled.drivers.gphoto2_before import LATE, Before
 from dappled.drivers.gphoto2_settings import GPhoto2Settings, parse_settings
 
 _PING_S = 1.0
 _STOP_S = 1.2
 _KILL_S = 0.6
 
-Spawn = Callable[[GPhoto2Settings], tuple["subprocess.Popen[bytes]", Channel]]
+Spawn = Callable[[GPhoto2Settings, Before], tuple["subprocess.Popen[bytes]", Channel]]
 
 
 def open_camera(settings: Mapping[str, Any]) -> GPhoto2Camera:
@@ -67,7 +71,7 @@ class RestartBudget:
         self._spent_ns.append(now_ns)
 
 
-def spawn_process(settings: GPhoto2Settings) -> tuple[subprocess.Popen[bytes], Channel]:
+def spawn_process(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
     """Start the camera's process; it dies with the calling thread."""
     channel, other = Channel.pair()
     with other:
@@ -79,6 +83,7 @@ def spawn_process(settings: GPhoto2Settings) -> tuple[subprocess.Popen[bytes], C
                 str(other.fileno()),
                 str(os.getpid()),
                 json.dumps(settings.to_json()),
+                json.dumps(before.to_json()),
             ],
             pass_fds=(other.fileno(),),
             stdin=subprocess.DEVNULL,
@@ -109,7 +114,8 @@ class GPhoto2Camera:
         self._lock = threading.Lock()  # guards the three below
         self._channel: Channel | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._pending: dict[int, None] = {}  # the shots that the process has, in order
+        self._pending: dict[int, int | None] = {}  # the shots that the process has, in order, and when it fired them
+        self._before = Before()  # the supervising thread's
         self._identity: Identity | None = None
         self._known_settings: tuple[Setting, ...] = ()
 
@@ -130,7 +136,7 @@ class GPhoto2Camera:
                 except ChannelError as error:
                     reason = f"the camera's process did not take the shot: {error}"
                 else:
-                    self._pending[shot] = None
+                    self._pending[shot] = None  # not fired yet
                     return
             else:
                 reason = "the camera's process is not running"
@@ -190,13 +196,15 @@ class GPhoto2Camera:
 
     def _supervise(self) -> None:
         while not self._stopping.is_set():
-            process, channel = self._spawn(self._settings)
+            process, channel = self._spawn(self._settings, self._before)
             with self._lock:
                 self._process, self._channel = process, channel
             reason = self._serve(process, channel)
             with self._lock:
                 self._process = self._channel = None
-                pending, self._pending = list(self._pending), {}
+                pending, self._pending = self._pending, {}
+            fired = [Claim(shot, fired_ns) for shot, fired_ns in pending.items() if fired_ns is not None]
+            self._before = replace(self._before, late=(*self._before.late, *fired)[-LATE:])
             channel.close()
             _end(process)
             stopped = self._stopping.is_set()
@@ -231,14 +239,29 @@ class GPhoto2Camera:
             return f"the camera's process ended unexpectedly ({error}); it starts again"
 
     def _pass_on(self, event: Event) -> None:
-        if isinstance(event, ShotFailed) or (isinstance(event, Arrival) and event.shot is not None):
+        if isinstance(event, Fired):
+            with self._lock:
+                self._pending[event.shot] = event.called_monotonic_ns
+        elif isinstance(event, ShotFailed) or (isinstance(event, Arrival) and event.shot is not None):
             with self._lock:
                 self._pending.pop(event.shot, None)  # type: ignore[arg-type]  # an Arrival's None is excluded above
         elif isinstance(event, StateChanged):
             self._identity = event.identity or self._identity
+            if event.identity is not None:
+                self._before = replace(self._before, serial=event.identity.serial)
         elif isinstance(event, SettingsChanged):
             self._known_settings = event.settings
+        if isinstance(event, Arrival | Companion):
+            self._learn(event)
         self._events.put(event)
+
+    def _learn(self, event: Arrival | Companion) -> None:
+        """What the next process should know, should this one die."""
+        before, facts = self._before, event.facts
+        late = tuple(claim for claim in before.late if claim.shot != event.shot)
+        seen = (*before.seen, (str(facts.get("folder")), str(facts.get("name"))))[-2 * LATE :]
+        offsets_s = tuple(facts.get("body_offsets_s", before.offsets_s))
+        self._before = replace(before, late=late, offsets_s=offsets_s, seen=seen)
 
     def _await_budget(self) -> None:
         now_ns = self._clock_ns()

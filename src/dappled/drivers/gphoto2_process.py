@@ -17,7 +17,6 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Any, cast
 
 from dappled.drivers.attribution import BodyClock, Claim, attribute
@@ -26,7 +25,6 @@ from dappled.drivers.camera import (
     Companion,
     Event,
     Fired,
-    Setting,
     SettingName,
     SettingsChanged,
     ShotFailed,
@@ -35,7 +33,9 @@ from dappled.drivers.camera import (
 )
 from dappled.drivers.camera_channel import Channel, ChannelError, event_message
 from dappled.drivers.child import die_with_parent, raise_priority
-from dappled.drivers.gphoto2_pairs import Pairs, makes_pairs
+from dappled.drivers.gphoto2_before import LATE, Before
+from dappled.drivers.gphoto2_books import AtCamera, Books
+from dappled.drivers.gphoto2_pairs import makes_pairs
 from dappled.drivers.gphoto2_session import (
     AbsentError,
     BusyError,
@@ -58,40 +58,7 @@ _POLL_IDLE_S = 0.5
 _BUSY_RETRY_S = 0.05
 _REOPEN_S = 0.25
 _TRIES = 3
-_LATE = 16
 _SETTINGS_S = 1.0
-
-
-@dataclass(slots=True)
-class _Flight:
-    """The shot that is at the camera."""
-
-    shot: int
-    since_ns: int
-    fired_ns: int | None = None
-    complete_ns: int | None = None
-    retry_ns: int = 0
-    looked_ns: int | None = None
-
-
-@dataclass(slots=True)
-class _Books:
-    """All that the loop remembers."""
-
-    session: Session | None = None
-    serial: str | None = None
-    state: tuple[State, str] | None = None
-    open_at_ns: int = 0
-    waiting: deque[int] = field(default_factory=deque)
-    flight: _Flight | None = None
-    to_fetch: deque[CameraFile] = field(default_factory=deque)
-    tries: dict[CameraFile, int] = field(default_factory=dict)
-    known: frozenset[CameraFile] | None = None
-    late: deque[Claim] = field(default_factory=lambda: deque(maxlen=_LATE))
-    clock: BodyClock = field(default_factory=BodyClock)
-    pairs: Pairs = field(default_factory=Pairs)
-    settings: tuple[Setting, ...] = ()
-    settings_due_ns: int | None = None
 
 
 class CameraLoop:
@@ -103,13 +70,16 @@ class CameraLoop:
         settings: GPhoto2Settings,
         open_camera: Callable[[GPhoto2Settings, str | None], Session] = open_session,
         clock_ns: Callable[[], int] = time.monotonic_ns,
+        before: Before | None = None,
     ) -> None:
         self._channel = channel
         self._settings = settings
         self._timeouts = settings.timeouts
         self._open_camera = open_camera
         self._clock_ns = clock_ns
-        self._books = _Books()
+        before = before or Before()
+        self._seen = frozenset(before.seen)
+        self._books = Books(serial=before.serial, late=deque(before.late, LATE), clock=BodyClock(before.offsets_s))
 
     def run(self) -> None:
         """Step until told to stop, or until the parent is gone (ChannelError)."""
@@ -217,23 +187,38 @@ class CameraLoop:
             return
         found = session.files()
         if books.known is None:
-            books.known = found
-            return
+            books.known = found - self._of_late_shots(session, found)
         queued = set(books.to_fetch)
         books.to_fetch.extend(sorted(found - books.known - queued, key=lambda file: (file.folder, file.name)))
+
+    def _of_late_shots(self, session: Session, found: frozenset[CameraFile]) -> frozenset[CameraFile]:
+        """Of a card that was never seen before: the files of shots that an earlier process fired, by the body's clock.
+
+        They are among the last."""
+        books = self._books
+        if not books.late or not books.clock.offsets_s:
+            return frozenset()
+        unseen = (file for file in found if (file.folder, file.name) not in self._seen)
+        last = sorted(unseen, key=lambda file: (file.folder, file.name))[-LATE:]
+        times = {file: session.taken_s(file) for file in last}
+        return frozenset(
+            file
+            for file, taken_s in times.items()
+            if taken_s is not None and any(books.clock.fits(claim, taken_s) for claim in books.late)
+        )
 
     def _next_shot(self, session: Session) -> None:
         books = self._books
         if books.flight is None:
             if not books.waiting:
                 return
-            books.flight = _Flight(books.waiting.popleft(), self._clock_ns())
+            books.flight = AtCamera(books.waiting.popleft(), self._clock_ns())
             self._show("busy")
         flight = books.flight
         if flight.fired_ns is None and self._clock_ns() >= flight.retry_ns:
             self._trigger(session, flight)
 
-    def _trigger(self, session: Session, flight: _Flight) -> None:
+    def _trigger(self, session: Session, flight: AtCamera) -> None:
         called_ns = self._clock_ns()
         try:
             session.trigger()
@@ -322,8 +307,9 @@ class CameraLoop:
             if taken_s is not None and not books.late:
                 books.clock = books.clock.learnt(current, taken_s)
         left = [] if verdict.doubt else [claim for claim in books.late if claim.shot != verdict.shot]
-        books.late = deque(left, _LATE)  # files come in order: after one in doubt none of the older is expected
+        books.late = deque(left, LATE)  # files come in order: after one in doubt none of the older is expected
         facts = {**arrival.facts, **({"doubt": verdict.doubt} if verdict.doubt else {})}
+        facts["body_offsets_s"] = list(books.clock.offsets_s)
         self._tell(Arrival(verdict.shot, arrival.name, arrival.blob, arrival.monotonic_ns, facts))
         return verdict.shot
 
@@ -465,15 +451,15 @@ def _quiet_library() -> None:
 
 
 def main() -> None:
-    """Arguments: the socket's descriptor, the parent's process id, the settings as JSON."""
-    fd, parent, settings = sys.argv[1:]
+    """Arguments: the socket's descriptor, the parent's process id, settings and `Before` as JSON."""
+    fd, parent, settings, before = sys.argv[1:]
     die_with_parent(int(parent))
     raise_priority()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C reaches the whole group; the parent ends us
     _quiet_library()
     channel = Channel(socket.socket(fileno=int(fd)))
     try:
-        CameraLoop(channel, parse_settings(json.loads(settings))).run()
+        CameraLoop(channel, parse_settings(json.loads(settings)), before=Before.of_json(json.loads(before))).run()
     except ChannelError:
         sys.exit(0)  # the parent is gone, or closed the channel
 

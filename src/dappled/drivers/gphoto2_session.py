@@ -104,6 +104,9 @@ class Session(Protocol):
     def fetch(self, file: CameraFile) -> Fetched:
         """A file's bytes. Raises BusyError, RefusedError, LostError."""
 
+    def taken_s(self, file: CameraFile) -> int | None:
+        """When a file on the card was made, by the body's clock. Raises LostError."""
+
     def delete(self, file: CameraFile) -> None:
         """Delete a file at the camera. Raises RefusedError, LostError."""
 
@@ -293,7 +296,7 @@ class GPhoto2Session:
             return size, None
         info = self._camera.file_get_info(file.folder, file.name).file
         announced: int = info.size
-        taken_s: int | None = info.mtime if info.fields & gp.GP_FILE_INFO_MTIME and info.mtime > 0 else None
+        taken_s = _time(info)
         got = self._pieces(fd, file, announced) if self._in_pieces else None
         if got is None:
             self._in_pieces = False
@@ -328,6 +331,15 @@ class GPhoto2Session:
             while offset < len(view):
                 offset += os.pwrite(fd, view[offset:], offset)
             return len(view)
+
+    def taken_s(self, file: CameraFile) -> int | None:
+        """When it was made, by the body's clock; None also for a file that is gone."""
+        try:
+            return _time(self._camera.file_get_info(file.folder, file.name).file)
+        except gp.GPhoto2Error as error:
+            if error.code in _LOST:
+                raise LostError(_sentence(error, f"tell of {file.name}")) from error
+            return None
 
     def delete(self, file: CameraFile) -> None:
         """Delete a file on the card."""
@@ -410,6 +422,10 @@ class GPhoto2Session:
                 raise
             return False
         return True
+
+
+def _time(info: Any) -> int | None:
+    return info.mtime if info.fields & gp.GP_FILE_INFO_MTIME and info.mtime > 0 else None
 
 
 def _names(found: Any) -> list[str]:
