@@ -152,7 +152,7 @@ def test_a_damaged_ledger_does_not_keep_the_next_flight_down(flights: Path, flig
     flight.folder.ledger.write_bytes(b"damage" * 1000)
     second = begin_later(flights)
     assert second.next_index == 5  # the journal and the frame's name say so
-    assert "could not be put in order" in second.recovered[0]
+    assert "the ledger was damaged" in second.recovered[0]
     assert (flight.folder.path / "frames/000004.cr2").read_bytes() == b"raw"
     second.close()
 

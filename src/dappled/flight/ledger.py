@@ -373,6 +373,18 @@ class Ledger(LedgerReader):
                 raise
 
 
+def ledger_damage(path: Path) -> str | None:
+    """What SQLite finds wrong with the content of a ledger; None where it is whole, missing, or can't be looked at."""
+    if not path.is_file():
+        return None
+    try:
+        with LedgerReader.open(path) as ledger:
+            return next(iter(ledger.damage()), None)
+    except FlightError as error:
+        code = getattr(error.__cause__, "sqlite_errorname", "") or ""
+        return str(error) if code.startswith(("SQLITE_NOTADB", "SQLITE_CORRUPT")) else None
+
+
 def _shot_row(row: Sequence[Any]) -> ShotRow:
     index, source, kind, sequence, utc_ns, monotonic_ns, state, reason, called, returned = row
     shot = Shot(index, Cause(source, kind, sequence), utc_ns, monotonic_ns)

@@ -16,7 +16,7 @@ from dappled.flight.entries import Stray
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.index import ImageIndex
 from dappled.flight.layout import FlightFolder
-from dappled.flight.ledger import Ledger
+from dappled.flight.ledger import Ledger, ledger_damage
 from dappled.flight.records import Frame
 from dappled.flight.wishes import WishJournal
 
@@ -51,7 +51,7 @@ def recover_flight(folder: FlightFolder, utc_ns: Callable[[], int]) -> list[str]
 
     Raises FlightError or OSError when ledger or disk don't allow it.
     """
-    report = _remove_parts(folder)
+    report = _remove_parts(folder) + _move_damaged_ledger(folder)
     with Ledger(folder.ledger, utc_ns) as ledger:
         report += _enter_wishes(folder, ledger)
         report += _adopt(folder, ledger)
@@ -82,6 +82,20 @@ def close_ledger(
         ledger.set_fact("telemetry_bytes", telemetry.size)
         ledger.set_fact("telemetry_sha256", telemetry.sha256)
     ledger.set_fact("closed_utc_ns", utc_ns)
+
+
+def _move_damaged_ledger(folder: FlightFolder) -> list[str]:
+    """A ledger that SQLite finds damaged makes room for a new one, which journal and frames will fill."""
+    damage = ledger_damage(folder.ledger)
+    if damage is None:
+        return []
+    aside = folder.ledger.with_name(folder.ledger.name + ".damaged")
+    os.replace(folder.ledger, aside)
+    for suffix in ("-wal", "-shm"):
+        folder.ledger.with_name(folder.ledger.name + suffix).unlink(missing_ok=True)
+    durable.sync_folder(folder.path)
+    lost = "it is made anew from shots.jsonl and frames, without poses, tags and times of firing"
+    return [f"the ledger was damaged ({damage}) and moved to {aside.name}; {lost}"]
 
 
 def _remove_parts(folder: FlightFolder) -> list[str]:
