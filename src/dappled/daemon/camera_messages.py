@@ -1,4 +1,4 @@
-"""What the camera says of itself, as MAVLink messages 259 to 263, 269 and 271. Pure: values in, messages out."""
+"""What the camera says of itself, as MAVLink messages 259 to 263 and 271. Pure: values in, messages out."""
 
 from __future__ import annotations
 
@@ -94,11 +94,6 @@ def fov_status(view: FieldOfView, pose: Pose | None, boot_ms: int) -> Message:
         _or_nan(None if view.width_rad is None else math.degrees(view.width_rad)),
         _or_nan(None if view.height_rad is None else math.degrees(view.height_rad)),
     )
-
-
-def no_video() -> Message:
-    """VIDEO_STREAM_INFORMATION (269): there are no streams."""
-    return mavlink.MAVLink_video_stream_information_message(0, 0, 0, 0, 0.0, 0, 0, 0, 0, 0, b"", b"")
 
 
 def storage(disk: Storage | None, boot_ms: int) -> Message:

@@ -6,6 +6,7 @@ burst complete, padding (u8 each), offset u32, 239 bytes of data.
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections.abc import Callable, Mapping
@@ -19,6 +20,7 @@ IDLE_NS = 60 * 10**9
 BURST = 32  # packets of one burst: 7.5 kB, which a radio's buffer takes
 _HEADER = struct.Struct("<HBBBBBxI")
 _PAYLOAD_BYTES = 251
+_ADDRESS = re.compile(r"^\[;comp=\d+\]")
 _Client = tuple[int, int]
 
 
@@ -52,7 +54,7 @@ class FtpServer:
     def __init__(self, files: Callable[[], Mapping[str, bytes]]) -> None:
         self._files = files
         self._sessions: dict[int, _Session] = {}
-        self._last: dict[_Client, tuple[_Request, list[Message]]] = {}  # a retry gets the same answer again
+        self._last: dict[tuple[_Client, int], tuple[_Request, list[Message]]] = {}  # a retry gets the same answer
 
     def answer(self, message: Message, now_ns: int) -> list[Message]:
         """What to send back for a FILE_TRANSFER_PROTOCOL message. Time is monotonic."""
@@ -60,16 +62,17 @@ class FtpServer:
         request = _parse(bytes(message.payload))
         if request is None or request.opcode >= _ACK:  # an answer is nothing to be answered
             return []
-        if client in self._last and self._last[client][0] == request:
-            return self._last[client][1]
+        known = self._last.get((client, request.session))
+        if known is not None and known[0] == request:
+            return known[1]
         self._sessions = {at: one for at, one in self._sessions.items() if now_ns - one.used_ns < IDLE_NS}
         replies = self._act(request, client, now_ns)
         messages = [
             mavlink.MAVLink_file_transfer_protocol_message(message.target_network, *client, _bytes(request, at, reply))
             for at, reply in enumerate(replies)
         ]
-        self._last.pop(client, None)
-        self._last[client] = (request, messages)
+        self._last.pop((client, request.session), None)
+        self._last[client, request.session] = (request, messages)
         if len(self._last) > SESSIONS:
             self._last.pop(next(iter(self._last)))
         return messages
@@ -112,9 +115,10 @@ class FtpServer:
         data = self._files().get(_name(request.data))
         if data is None:
             return [_refusal(_NOT_FOUND)]
-        free = next((at for at in range(SESSIONS) if at not in self._sessions), None)
-        if free is None:
+        if len(self._sessions) >= SESSIONS:
             return [_refusal(_NO_SESSIONS)]
+        # The server names a session, says the protocol; MAVProxy, as ArduPilot, has named it already.
+        free = next(at for at in (request.session, *range(SESSIONS)) if at not in self._sessions)
         self._sessions[free] = _Session(client, data, now_ns)
         return [_Reply(session=free, data=struct.pack("<I", len(data)))]
 
@@ -188,8 +192,9 @@ def _bytes(request: _Request, at: int, reply: _Reply) -> bytes:
 
 
 def _name(data: bytes) -> str:
-    """The file's name in a path: folders are none here."""
-    return data.split(b"\0", 1)[0].decode("utf-8", "replace").lstrip("/")
+    """The file's name in a path: there are no folders. MAVSDK leaves the address "[;comp=100]" in front of it."""
+    path = data.split(b"\0", 1)[0].decode("utf-8", "replace")
+    return _ADDRESS.sub("", path).lstrip("/")
 
 
 def _crc32(data: bytes) -> int:

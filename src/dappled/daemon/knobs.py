@@ -19,7 +19,7 @@ _BODY: dict[SettingName, tuple[str, str]] = {
     "battery": ("CAM_BATTERY", "Battery"),
 }
 _SETTINGS = {name: setting for setting, (name, _) in _BODY.items()}
-_NUMBER_LIMIT = 2**31
+_WORDS_FROM = 2**30
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,8 +92,9 @@ class Knobs:
 
 
 def code(value: str) -> int:
-    """A value in words as the number that stands for it on the wire: a whole number as itself ("400"), anything else
-    ("1/500") as its CRC-32 with the highest bit set. So a number means the same whatever else may be chosen."""
-    if value.isascii() and value.isdigit() and int(value) < _NUMBER_LIMIT:
+    """A value in words as the number that stands for it on the wire: a whole number below 2³⁰ as itself ("400"),
+    anything else ("1/500") as 30 bits of its CRC-32 above that. So a number means the same whatever else may be
+    chosen, and fits a signed 32-bit integer, which is what MAVSDK reads."""
+    if value.isascii() and value.isdigit() and int(value) < _WORDS_FROM:
         return int(value)
-    return zlib.crc32(value.encode()) | _NUMBER_LIMIT
+    return zlib.crc32(value.encode()) >> 2 | _WORDS_FROM

@@ -21,7 +21,7 @@ DOWN = (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class Telling:
-    """Messages 259 to 262, 269 and 271, and the definition file. `pose()` is the vehicle's of now, None while unknown;
+    """Messages 259 to 262 and 271, and the definition file. `pose()` is the vehicle's of now, None while unknown;
     `mount` turns camera axes to body axes (nine numbers, row by row)."""
 
     def __init__(
@@ -46,7 +46,6 @@ class Telling:
             mavlink.MAVLINK_MSG_ID_STORAGE_INFORMATION: self.disk,
             mavlink.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS: self.status,
             mavlink.MAVLINK_MSG_ID_CAMERA_FOV_STATUS: self.view,
-            mavlink.MAVLINK_MSG_ID_VIDEO_STREAM_INFORMATION: camera_messages.no_video,
         }
 
     def about(self, message_id: int) -> Message | None:
