@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import rasterio
 import tomli_w
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from dappled.config import profiles
 from dappled.daemon.interpolation import metres_per_radian
@@ -24,7 +26,7 @@ from dappled.mocks.flyover import Terrain
 from dappled.mocks.masked_camera import MaskedCamera, SensorModel, Truth, reference_camera
 from dappled.mocks.path import Path as FlightPath
 from dappled.mocks.path import TruePose
-from dappled.mocks.terrain import TEXEL_M
+from dappled.mocks.terrain import DETAIL_TEXEL_M, EXTENT_M, TEXEL_M
 from tests.flight.makers import deliver, wish
 
 START_NS = 1_795_256_103_000_000_000
@@ -42,11 +44,13 @@ class Flown:
     truths: tuple[Truth, ...]
     ground: terrain.Ground
 
-    def to_geodetic(self, north_m: NDArray[np.float64], east_m: NDArray[np.float64]) -> tuple[
-        NDArray[np.float64], NDArray[np.float64]
-    ]:
+    def to_geodetic(
+        self, north_m: NDArray[np.float64], east_m: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(latitude, longitude) in degrees of places near home, as the simulated path counts them."""
-        per_north, per_east = metres_per_radian(math.radians(self.path.home_latitude_deg), self.path.home_altitude_msl_m)
+        per_north, per_east = metres_per_radian(
+            math.radians(self.path.home_latitude_deg), self.path.home_altitude_msl_m
+        )
         return (
             self.path.home_latitude_deg + np.degrees(north_m / per_north),
             self.path.home_longitude_deg + np.degrees(east_m / per_east),
@@ -154,8 +158,37 @@ def true_ground(truth: Truth, row: int, column: int) -> NDArray[np.float64]:
     return np.array([ned[0], ned[1], -ned[2]])
 
 
-def relief_nodes(ground: terrain.Ground) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """(north of rows, east of columns, heights above home) of the landscape's one period."""
-    n = len(ground.relief)
-    axis = (np.arange(n) - n // 2) * TEXEL_M
-    return -axis, axis, ground.relief.astype(np.float64)
+def write_relief(flown: Flown, path: Path) -> Path:
+    """The landscape's true heights above sea level as a GeoTIFF in degrees."""
+    heights = flown.ground.relief[None] + np.float32(flown.path.home_altitude_msl_m)
+    return _write(flown, path, heights, TEXEL_M)
+
+
+def write_base_map(flown: Flown, path: Path, step_m: float = 0.025) -> Path:
+    """The landscape's true picture, as an orthophoto would show it."""
+    n = round(EXTENT_M / step_m)
+    index = (np.arange(n) + 0.5 - 0.5 * TEXEL_M / step_m) * step_m / TEXEL_M  # cell centres, in landscape texels
+    at = np.stack(np.meshgrid(index, index, indexing="ij"))
+    smooth = ndimage.gaussian_filter(flown.ground.detail, 0.3 * step_m / DETAIL_TEXEL_M, mode="wrap")
+    detail = ndimage.map_coordinates(smooth, at * (TEXEL_M / DETAIL_TEXEL_M), order=1, mode="grid-wrap")
+    texture = 1 + detail * ndimage.map_coordinates(flown.ground.roughness, at, order=1, mode="grid-wrap")
+    colours = np.stack(
+        [ndimage.map_coordinates(plane, at, order=1, mode="grid-wrap") * texture for plane in flown.ground.albedo]
+    )
+    eight = np.clip(255 * np.sqrt(np.clip(colours, 0, None) / 0.4), 0, 255).astype(np.uint8)
+    return _write(flown, path, eight, step_m)
+
+
+def _write(flown: Flown, path: Path, values: NDArray[np.generic], step_m: float) -> Path:
+    rows, columns = values.shape[1:]
+    # the first texel's centre lies half the extent north and west of home
+    north = np.array([EXTENT_M / 2 + TEXEL_M / 2, EXTENT_M / 2 + TEXEL_M / 2 - step_m])
+    east = np.array([-EXTENT_M / 2 - TEXEL_M / 2, -EXTENT_M / 2 - TEXEL_M / 2 + step_m])
+    latitude, longitude = flown.to_geodetic(north, east)
+    transform = rasterio.Affine(longitude[1] - longitude[0], 0, longitude[0], 0, latitude[1] - latitude[0], latitude[0])
+    with rasterio.open(
+        path, "w", driver="GTiff", width=columns, height=rows, count=len(values), dtype=values.dtype, crs="EPSG:4326",
+        transform=transform,
+    ) as target:  # fmt: skip
+        target.write(values)
+    return path

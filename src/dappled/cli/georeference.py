@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -37,6 +38,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--each", action="store_true", help="a kmz or cog of each frame too, in frames/")
     parser.add_argument("--quad", action="store_true", help="each frame's kmz as a LatLonQuad: the view itself")
     add_placing(parser)
+    better = parser.add_argument_group("refinement")
+    better.add_argument("--refine", nargs="+", default=[], metavar="WITH",
+                        help="neighbours (frames against each other), a base map (GeoTIFF …), or both")  # fmt: skip
+    better.add_argument("--gcp", type=Path, metavar="CSV",
+                        help="control points: name, frame, column, row, latitude, longitude, altitude")  # fmt: skip
+    better.add_argument("--search", type=float, default=5.0, metavar="M",
+                        help="how far off frames are looked for on the base map (default: 5 m)")  # fmt: skip
+    better.add_argument("--pose-sigma", nargs=2, type=float, metavar=("M", "DEG"),
+                        help="how well poses are known, 1 σ (default: as recorded)")  # fmt: skip
     parser.add_argument("--json", action="store_true", help="the report as JSON")
 
 
@@ -79,6 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
         progress = stack.enter_context(Bar())
         made = georeference.survey(folder.path, recipe(folder.path, facts, arguments), options(facts, arguments),
                                    progress, stack)  # fmt: skip
+        made = _refined(made, arguments, progress)
         files = _draw(made, output, arguments)
     report = georeference.write_report(made, output, files)
     if arguments.json:
@@ -87,9 +98,27 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{len(made.photographs)} frames on {made.projection.name}, {made.gsd_m:g} m a cell, {made.ground.name}")
         for path in (*files, report):
             print(path)
-    for _, why in made.left:
+    for why in (*(why for _, why in made.left), *made.notes):
         print(why, file=sys.stderr)
     return 0
+
+
+def _refined(made: Survey, arguments: argparse.Namespace, progress: Progress) -> Survey:
+    rasters = [Path(word) for word in arguments.refine if word != "neighbours"]
+    if len(rasters) > 1:
+        raise DappledError(f"--refine takes one base map, not {len(rasters)}")
+    if not arguments.refine and arguments.gcp is None:
+        return made
+    sigmas = arguments.pose_sigma
+    return georeference.refined(
+        made,
+        base=rasters[0] if rasters else None,
+        neighbours="neighbours" in arguments.refine,
+        control=arguments.gcp,
+        search_m=arguments.search,
+        sigmas=None if sigmas is None else (sigmas[0], math.radians(sigmas[1])),
+        progress=progress,
+    )
 
 
 def _draw(made: Survey, output: Path, arguments: argparse.Namespace) -> list[Path]:

@@ -15,7 +15,8 @@ import numpy as np
 from dappled.drivers.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError
 from dappled.flight import durable
-from dappled.products import footprints, maps, photographs
+from dappled.products import footprints, maps, photographs, refine
+from dappled.products.basemap import BaseMap
 from dappled.products.earth import Geoid, Projection, utm
 from dappled.products.ground import Flat, Ground
 from dappled.products.ground import load as load_ground
@@ -113,6 +114,40 @@ def survey(flight: Path, recipe: Recipe, options: Options, progress: Progress, s
         raise DappledError(f"no frame of {flight} can be put on a map: {left[-1][1]}")
     gsd_m = options.gsd_m or _two_digits(min(one.eye.gsd_m(_below(one, ground)) for one in kept))
     return Survey(flight.name, tuple(kept), projection, ground, gsd_m, options.focus_m, tuple(left))
+
+
+def refined(
+    made: Survey,
+    *,
+    base: Path | None = None,
+    neighbours: bool = False,
+    control: Path | None = None,
+    search_m: float = 5.0,
+    sigmas: tuple[float, float] | None = None,
+    progress: Progress = lambda *_: None,
+) -> Survey:
+    """The survey with poses refined; what became of each frame is in its facts. Raises DappledError where a base map or
+    control points can't be used at all."""
+    raster = None if base is None else BaseMap(base, made.projection, made.gsd_m)
+    if raster is not None:
+        raster.check(np.concatenate([maps.footprint(one.eye, made.ground)[:, :2] for one in made.photographs]))
+    points = [] if control is None else refine.read_control(control, made.projection)
+    photos, judged = refine.refine(
+        made.photographs,
+        made.ground,
+        base=raster,
+        neighbours=neighbours,
+        control=points,
+        search_m=search_m,
+        sigmas=sigmas,
+        progress=progress,
+    )
+    facts = {
+        one.name: {**made.facts.get(one.name, {}), **said.facts()} for one, said in zip(photos, judged, strict=True)
+    }
+    kept = [f"frame {one.name} keeps its recorded pose: {said.why}" for one, said in zip(photos, judged, strict=True)
+            if said.why is not None]  # fmt: skip
+    return replace(made, photographs=tuple(photos), facts=facts, notes=(*made.notes, *kept))
 
 
 def take(flight: Path, station: Station, darkroom: Darkroom, projection: Projection, options: Options) -> Photograph:

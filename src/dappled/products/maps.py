@@ -162,7 +162,11 @@ def smoothed(image: Image, eye: Eye, grid: MapGrid, ground: Ground) -> Image:
     middle = np.array([[(eye.shape[1] - 1) / 2, (eye.shape[0] - 1) / 2]])
     level = float(ground.meet(eye, middle)[0, 2])
     step_m = grid.step_y * math.radians(1) * 6378137.0 if grid.crs == GEODETIC else grid.step_y
-    ratio = step_m / eye.gsd_m(level) if math.isfinite(level) else 0.0
+    return smoothed_to(image, step_m / eye.gsd_m(level) if math.isfinite(level) else 1.0)
+
+
+def smoothed_to(image: Image, ratio: float) -> Image:
+    """The image, smoothed to be sampled at every `ratio`-th of its pixels; as it is below 1.5."""
     if ratio < 1.5:
         return image
     cv2 = need("cv2")
