@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from dappled.flight import layout, lock, recording, recovery, wishes
+from dappled.flight import layout, lock, recording, recovery, summary, wishes
 from dappled.flight.check import check
 from dappled.flight.entries import Stray
 from dappled.flight.errors import FlightError
-from dappled.flight.index import Entry, ImageIndex
+from dappled.flight.index import Entry, ImageIndex, in_order
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.recording import Recording
 from tests.flight.conftest import START_UTC_NS
@@ -248,3 +248,57 @@ def test_strays_are_told_apart_from_what_is_adopted(flights: Path, flight: Recor
         (stray,) = ledger.strays()
         assert isinstance(stray, Stray)
         assert stray.size == 2
+
+
+def test_a_flight_without_utc_is_named_by_boot_and_put_right_later(flights: Path) -> None:
+    uptime_ns = 60 * 10**9  # this machine thinks that it is 1970
+    flight = recording.begin(flights, lambda: uptime_ns, utc_known=False)
+    name = flight.folder.name
+    assert name.startswith("boot")
+    wish(flight, 0)
+    frame = deliver(flight, 0, b"raw")
+    flight.note_image(0)
+    assert flight.index.flights() == {name: None}
+    assert flight.index.utc_correction_ns(name) is None
+    assert flight.ledger.utc_correction_ns() is None
+    correction_ns = START_UTC_NS - uptime_ns
+    flight.learn_utc(correction_ns, 10**6, "SYSTEM_TIME")
+    assert flight.index.flights() == {name: START_UTC_NS}
+    flight.close()
+    assert flight.folder.path.name == name
+    (flights / "index.sqlite").unlink()  # the ledger knows it too
+    second = begin_later(flights)
+    assert second.index.flights() == {name: START_UTC_NS, second.folder.name: LATER_UTC_NS}
+    assert second.index.utc_correction_ns(name) == correction_ns
+    assert second.index.utc_correction_ns(second.folder.name) == 0
+    assert second.index.lookup(0) == Entry(0, name, frame.name, "safe")
+    second.close()
+    assert summary.report(flight.folder.path).began_utc_ns == START_UTC_NS
+    with LedgerReader.open(flight.folder.ledger) as ledger:
+        assert [event.kind for event in ledger.events()] == ["utc"]
+
+
+def test_a_flight_that_never_learnt_utc_says_so(flights: Path) -> None:
+    flight = recording.begin(flights, lambda: 5, utc_known=False)
+    flight.close()
+    assert summary.report(flight.folder.path).began_utc_ns is None
+    assert summary.show(flight.folder.path).utc_correction_ns is None
+    assert check(flight.folder.path).problems == ()
+
+
+@pytest.mark.parametrize("step_s", [3600, -3600])
+def test_flights_stand_in_the_order_they_were_flown_when_the_clock_was_stepped(flights: Path, step_s: int) -> None:
+    """The image index goes on, and the last flight is the last one flown."""
+    names = []
+    for number in range(3):
+        begun = recording.begin(flights, lambda step=number: START_UTC_NS + step * step_s * 10**9)  # type: ignore[misc]  # bound now
+        wish(begun, begun.next_index)
+        deliver(begun, begun.next_index, b"raw")
+        begun.close()
+        names.append(begun.folder.name)
+    assert [folder.name for folder in in_order(flights)] == names
+    (flights / "index.sqlite").write_bytes(b"damaged")
+    assert sorted(names) == [folder.name for folder in in_order(flights)]
+    last = begin_later(flights)
+    assert last.next_index == 3
+    last.close()

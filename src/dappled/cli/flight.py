@@ -15,7 +15,7 @@ from typing import Any
 from tqdm import tqdm
 
 from dappled.config import settings
-from dappled.flight import check, layout, offload, summary
+from dappled.flight import check, index, offload, summary
 from dappled.flight.errors import FlightError
 
 
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def last_flight() -> Path:
     """The newest flight in the configured folder. Raises FlightError when there is none."""
-    found = layout.flights(_flights())
+    found = index.in_order(_flights())
     if not found:
         raise FlightError(f"there is no flight in {_flights()} yet; name one, or record one with `dappled run`")
     return found[-1].path
@@ -71,7 +71,8 @@ def _list(folder: Path, as_json: bool) -> int:
         else:
             b = one.balance
             state = "" if b.closed else "  (open)"
-            print(f"{one.name}  {b.frames} frames, {b.failed} failed, {b.size / 1e6:.1f} MB{state}")
+            began = "UTC not known" if b.began_utc_ns is None else _utc(b.began_utc_ns)[:16].replace("T", " ")
+            print(f"{one.name}  {began}  {b.frames} frames, {b.failed} failed, {b.size / 1e6:.1f} MB{state}")
     if not found:
         print(f"no flights in {folder}", file=sys.stderr)
     return 0
@@ -83,10 +84,16 @@ def _show(flight: Path, as_json: bool) -> int:
         print(json.dumps(_plain(found), indent=2))
         return 0
     print(f"{found.name}")
+    if found.utc_correction_ns is None:
+        print("UTC was never known in this flight: times count from an unknown moment")
     for line in found.lines:
         shot = line.row.shot
-        time = datetime.fromtimestamp(shot.wished_utc_ns / 1e9, UTC).strftime("%H:%M:%S.%f")[:-3]
-        words = [f"{shot.index:6d}", time, shot.cause.source, line.row.state]
+        words = [
+            f"{shot.index:6d}",
+            _utc(shot.wished_utc_ns + (found.utc_correction_ns or 0))[11:23],
+            shot.cause.source,
+            line.row.state,
+        ]
         if line.row.reason:
             words.append(line.row.reason)
         if line.frame:
@@ -149,6 +156,11 @@ def _offload(flight: Path, destination: Path, prune: bool, as_json: bool) -> int
         if done.pruned:
             print(f"{done.pruned} frames removed from {flight}; its ledger stays")
     return 0
+
+
+def _utc(utc_ns: int) -> str:
+    """2026-11-21T10:15:03.123456"""
+    return datetime.fromtimestamp(utc_ns / 1e9, UTC).strftime("%Y-%m-%dT%H:%M:%S.%f")
 
 
 def _plain(value: Any) -> dict[str, Any]:

@@ -58,6 +58,11 @@ class MavlinkSettings:
 @dataclass(frozen=True, slots=True)
 class RecordSettings:
     directory: str = setting("~/flights", "Folder that holds one folder a flight")
+    utc: str = setting(
+        "auto",
+        "Who knows UTC: the system; the autopilot (learnt in flight, folders named by boot); auto judges the system",
+        choices=("auto", "system", "autopilot"),
+    )
     min_free_mb: int = setting(500, "Below this free space new shots are refused", unit="MB", low=0, high=10_000_000)
 
 

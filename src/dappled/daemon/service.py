@@ -17,7 +17,7 @@ import dappled
 from dappled.config import profiles
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.daemon import curve, health, inputs, links
+from dappled.daemon import curve, health, inputs, links, utc
 from dappled.daemon.answers import Answers
 from dappled.daemon.books import LiveBook
 from dappled.daemon.cameras import open_camera
@@ -33,7 +33,8 @@ from dappled.daemon.reload import merge
 from dappled.daemon.shutter import Shutter, Verdict, Wish
 from dappled.daemon.street import Names, Story, Street, Watchers
 from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency, Exposure
-from dappled.daemon.telemetry import Telemetry
+from dappled.daemon.telemetry import Telemetry, UtcCorrection
+from dappled.daemon.utc import UtcLearner
 from dappled.drivers.camera import Camera, Identity, SettingsChanged, StateChanged
 from dappled.drivers.darkroom import Recipe
 from dappled.drivers.mavlink import Packet, mavlink
@@ -74,6 +75,7 @@ class Service:
         self._notes: deque[tuple[str, str]] = deque(maxlen=1000)
         self._said: set[str] = set()
         self._focal_length_mm: float | None = None
+        self._chip = _sensor(settings, "")
         self._began_monotonic_ns = self._clock.monotonic_ns()
         self._logbook = Logbook(self._clock.utc_ns)
         self._recipe: Recipe | None = None
@@ -100,9 +102,14 @@ class Service:
             self._links = links.configured(self.settings, self._clock, tap=self._log_packet, on_packet=self._packet)
             self._links.open()
             stack.callback(self._links.stop)
+            utc_known = utc.known(self.settings.record.utc, self._clock.utc_ns())
             self._recording = flights.begin(
-                Path(self.settings.record.directory), self._clock.utc_ns, self._facts(names, recipe)
+                Path(self.settings.record.directory),
+                self._clock.utc_ns,
+                self._facts(names, recipe),
+                utc_known=utc_known,
             )
+            self._utc = UtcLearner(known=utc_known, note=self._learn_utc)
             stack.callback(self._remove_litter)
             stack.callback(self._close_recording)
             stack.callback(self._links.stop)  # before the recording closes: packets are logged there
@@ -211,6 +218,7 @@ class Service:
             record = self.health()
             self._publisher.publish("health", record)
             self._tell_pilot(record["problems"])
+            self._look_for_utc()
 
     def ask_to_stop(self) -> None:
         """End `run` soon; safe in a signal handler."""
@@ -323,6 +331,7 @@ class Service:
         self._changed()
         if change.identity not in (None, self._identity) and self._recording is not None:
             who = self._identity = change.identity
+            self._chip = _sensor(self.settings, who.model)
             facts = {"make": who.make, "model": who.model, "serial": who.serial, "port": who.port}
             try:
                 self._recording.add_facts({"camera": facts})
@@ -351,6 +360,17 @@ class Service:
         if self._component is not None:
             self._component.on_packet(packet)
 
+    def _look_for_utc(self) -> None:
+        try:
+            self._utc.look(self._telemetry.utc_correction())
+        except DappledError as error:
+            report(log, "UTC", error)
+
+    def _learn_utc(self, found: UtcCorrection) -> None:
+        assert self._recording is not None
+        log.info("UTC is %+.3f s from this machine's, by %s", found.correction_ns / 1e9, found.source)
+        self._recording.learn_utc(found.correction_ns, found.sigma_ns, found.source)
+
     def _pose(self, index: int, exposure: Exposure) -> tuple[Exposure, Pose]:
         """The pose once telemetry from after the exposure is there, or `pose.wait_ms` after it as it is then."""
         give_up_ns = exposure.utc_ns + round(self.settings.pose.wait_ms * 1e6)
@@ -363,10 +383,10 @@ class Service:
     def _story_tagged(self, story: Story) -> None:
         index = story.shot.index
         if story.tag is not None and story.frame is not None:
-            captured = Captured(index, True, story.tag.utc_ns, story.tag.pose, story.frame.name)
+            captured = Captured(index, True, self._utc.utc_ns(story.tag.utc_ns), story.tag.pose, story.frame.name)
         elif story.where is not None:  # exposed; its file stays at the camera for now
             exposure, pose = story.where
-            captured = Captured(index, True, exposure.utc_ns, pose)
+            captured = Captured(index, True, self._utc.utc_ns(exposure.utc_ns), pose)
         else:
             captured = Captured(index, story.frame is not None, url=story.frame.name if story.frame else "")
         if self._component is not None:
@@ -399,23 +419,24 @@ class Service:
             with LedgerReader.open(layout.FlightFolder(root / entry.flight).ledger) as ledger:
                 tag = ledger.tag(index)
                 ok = entry.state == "safe" or index in ledger.following()
+                correction_ns = ledger.utc_correction_ns()
         except DappledError as error:  # such as an old flight that was moved away
             report(log, f"image {index} can't be looked up", error)
             return None
         if tag is None:
             return Captured(index, ok, url=entry.frame or "")
-        return Captured(index, ok, tag.utc_ns, tag.pose, entry.frame or "")
+        utc_ns = None if correction_ns is None else tag.utc_ns + correction_ns
+        return Captured(index, ok, utc_ns, tag.pose, entry.frame or "")
 
     def _camera_facts(self) -> CameraFacts:
         who = self._street.identity
         major, minor, patch = (int(part) for part in dappled.__version__.split(".")[:3])
-        chip = _sensor(self.settings)
         return CameraFacts(
             vendor=who.make if who else "dappled",
             model=who.model if who else "masked camera",
             firmware=(major, minor, patch),
             focal_length_mm=self._focal_length_mm,
-            **chip,
+            **self._chip,
         )
 
     def _storage(self) -> Storage | None:
@@ -475,14 +496,16 @@ def _warm_up(developer: WorkerDeveloper) -> None:
         log.warning("decoding will fail: %s", error)
 
 
-def _sensor(settings: Settings) -> dict[str, Any]:
-    """Sensor size and pixels of the configured camera, for CAMERA_INFORMATION; nothing where that isn't known."""
-    if settings.camera.profile == "auto":
-        return {}
+def _sensor(settings: Settings, model: str) -> dict[str, Any]:
+    """Sensor size and pixels of the camera, for CAMERA_INFORMATION; nothing where they aren't known."""
+    name = settings.camera.profile
     try:
-        chip = profiles.camera(settings.camera.profile).raw[0].sensor
+        profile = profiles.camera_for_model(model) if name == "auto" else profiles.camera(name)
     except DappledError:
+        profile = None
+    if profile is None:
         return {}
+    chip = profile.raw[0].sensor
     height_mm, width_mm = chip.size_mm
     return {
         "sensor_width_mm": width_mm,

@@ -10,7 +10,7 @@ import os
 import sqlite3
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, cast
@@ -23,14 +23,15 @@ from dappled.flight.records import ShotState
 
 FILE_NAME = "index.sqlite"
 _APPLICATION_ID = 0x44505049  # "DPPI"
-_VERSION = 1
+_VERSION = 2
 _SCHEMA = f"""
 BEGIN IMMEDIATE;
 PRAGMA application_id={_APPLICATION_ID};
 PRAGMA user_version={_VERSION};
 CREATE TABLE flights (
     number INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, start_utc_ns INTEGER, sealed INTEGER NOT NULL DEFAULT 0,
-    highest INTEGER                    -- image index that anything in a sealed flight mentions, strays too
+    highest INTEGER,                   -- image index that anything in a sealed flight mentions, strays too
+    utc_correction_ns INTEGER          -- to be added to every utc_ns of this flight; NULL: UTC was never known
 ) STRICT;
 CREATE TABLE images (
     idx INTEGER PRIMARY KEY, flight TEXT NOT NULL REFERENCES flights (name), frame TEXT, state TEXT NOT NULL
@@ -89,13 +90,16 @@ class ImageIndex:
         with self._lock:
             self._db.close()
 
-    def add_flight(self, name: str, start_utc_ns: int | None) -> None:
-        """A flight begins. A start that is not known is told later by calling this again."""
+    def add_flight(self, name: str, start_utc_ns: int | None, utc_correction_ns: int | None = 0) -> None:
+        """A flight begins, at this UTC. Where that is not known (None), it is told later by calling this again, with
+        what must be added to the flight's own stamps."""
         self._execute(
-            "INSERT INTO flights (name, start_utc_ns) VALUES (?, ?) ON CONFLICT (name) DO UPDATE "
-            "SET start_utc_ns = coalesce(excluded.start_utc_ns, start_utc_ns)",
+            "INSERT INTO flights (name, start_utc_ns, utc_correction_ns) VALUES (?, ?, ?) ON CONFLICT (name) DO UPDATE "
+            "SET start_utc_ns = coalesce(excluded.start_utc_ns, start_utc_ns), "
+            "utc_correction_ns = coalesce(excluded.utc_correction_ns, utc_correction_ns)",
             name,
             start_utc_ns,
+            None if start_utc_ns is None else utc_correction_ns,
         )
 
     def put(self, entry: Entry) -> None:
@@ -122,15 +126,22 @@ class ImageIndex:
         """The flights in the order they were flown, with their start in UTC nanoseconds where known."""
         return dict(self._execute("SELECT name, start_utc_ns FROM flights ORDER BY number"))
 
+    def utc_correction_ns(self, name: str) -> int | None:
+        """What to add to a flight's stamps to have UTC: 0 where its machine knew; None where nobody did."""
+        rows = self._execute("SELECT utc_correction_ns FROM flights WHERE name = ?", name)
+        return rows[0][0] if rows else None
+
     def sealed(self) -> set[str]:
         """Flights that are closed and wholly indexed."""
         return {row[0] for row in self._execute("SELECT name FROM flights WHERE sealed")}
 
     def take_in(self, folder: FlightFolder, *, seal: bool) -> list[str]:
         """Index all shots of a flight from its ledger; `seal` says that no more will come. Returns problems."""
-        self.add_flight(folder.name, None)
         problems: list[str] = []
         with LedgerReader.open(folder.ledger) as ledger:
+            correction_ns, began_utc_ns = ledger.utc_correction_ns(), ledger.facts().get("began_utc_ns")
+            start_utc_ns = None if correction_ns is None or began_utc_ns is None else began_utc_ns + correction_ns
+            self.add_flight(folder.name, start_utc_ns, correction_ns)
             frames = {frame.index: frame.name for frame in ledger.frames()}
             for row in ledger.shots():
                 index = row.shot.index
@@ -182,6 +193,20 @@ def open_or_rebuild(root: Path) -> tuple[ImageIndex, list[str]]:
         except OSError as second:
             raise disk_error("move away the damaged index", path, second) from second
         return ImageIndex(root), [f"{error}; it was moved to {aside.name} and made anew from the flights"]
+
+
+def in_order(root: Path) -> list[FlightFolder]:
+    """All flights under `root` in the order they were flown, which their names needn't tell: the clock may have been
+    set back, or not known. Those that no index knows come first, by name. Raises FlightError."""
+    known: list[str] = []
+    if (root / FILE_NAME).is_file():
+        try:
+            with closing(sqlite3.connect(f"{(root / FILE_NAME).absolute().as_uri()}?mode=rw", uri=True)) as index:
+                known = [row[0] for row in index.execute("SELECT name FROM flights ORDER BY number")]
+        except sqlite3.Error:  # damaged, or not to be written: the names have to do
+            known = []
+    place = {name: number for number, name in enumerate(known)}
+    return sorted(layout.flights(root), key=lambda folder: place.get(folder.name, -1))
 
 
 def highest_in(folder: FlightFolder) -> int | None:

@@ -178,6 +178,14 @@ class LedgerReader:
         """What holds for the whole flight: telemetry_sha256, closed_utc_ns …"""
         return {key: json.loads(value) for key, value in self._rows("SELECT key, value FROM facts")}
 
+    def utc_correction_ns(self) -> int | None:
+        """What to add to every `utc_ns` of this flight to have UTC: 0 where the machine knew it, None where nobody ever
+        told."""
+        facts = self.facts()
+        if "utc_correction" in facts:
+            return int(facts["utc_correction"]["correction_ns"])
+        return 0 if facts.get("utc_known", True) else None
+
     def damage(self) -> list[str]:
         """What SQLite finds wrong with the file; empty when it is whole."""
         try:

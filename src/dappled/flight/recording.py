@@ -59,6 +59,15 @@ class Recording:
         except OSError as error:
             raise disk_error("write", self.folder.settings, error) from error
 
+    def learn_utc(self, correction_ns: int, sigma_ns: int, source: str) -> None:
+        """UTC is known now: this is to be added to every stamp of this flight, those before it too. Nothing is renamed
+        or stamped anew; ledger and index say it. Raises FlightError."""
+        fact = {"correction_ns": correction_ns, "sigma_ns": sigma_ns, "source": source}
+        self.ledger.set_fact("utc_correction", fact)
+        self.ledger.add_event("utc", f"UTC is {correction_ns / 1e9:+.3f} s from this machine's, by {source}")
+        began_utc_ns = self.ledger.facts()["began_utc_ns"]
+        self.index.add_flight(self.folder.name, began_utc_ns + correction_ns, correction_ns)
+
     def close(self) -> list[str]:
         """End the flight: nobody notes, records or logs any more. Shots still open are failed; returns sentences.
 
@@ -83,7 +92,8 @@ def begin(
 ) -> Recording:
     """Lock the flights folder, put earlier flights in order, and begin a new one.
 
-    `facts` goes to flight.toml. Raises FlightError when another daemon records there, or the disk refuses.
+    `facts` goes to flight.toml. `utc_known` False: `utc_ns` counts from somewhere, the flight is named by boot, and
+    `learn_utc` may tell later what to add. Raises FlightError when another daemon records there, or the disk refuses.
     """
     with ExitStack() as stack:
         lock = FlightsLock(root)
@@ -92,11 +102,14 @@ def begin(
         stack.callback(index.close)
         recovered += recovery.recover(root, index, utc_ns)
         next_index = index.next_index()
-        start_utc_ns = utc_ns() if utc_known else None
+        began_utc_ns = utc_ns()
+        start_utc_ns = began_utc_ns if utc_known else None
         folder = layout.create(root, start_utc_ns, facts)
         stack.callback(shutil.rmtree, folder.path, ignore_errors=True)  # a flight that could not begin
         ledger = Ledger(folder.ledger, utc_ns)
         stack.callback(ledger.close)
+        ledger.set_fact("began_utc_ns", began_utc_ns)
+        ledger.set_fact("utc_known", utc_known)
         index.add_flight(folder.name, start_utc_ns)
         journal = WishJournal(folder.journal)
         stack.callback(journal.close)

@@ -18,7 +18,7 @@ from dappled.flight.records import Frame, Tag
 @dataclass(frozen=True, slots=True)
 class Balance:
     """The books of a flight: every wish that became a shot is safe, failed or still open; `refused` ones became none.
-    `by_source` counts shots."""
+    `by_source` counts shots. `began_utc_ns` is None where nobody ever knew UTC."""
 
     flight: str
     wishes: int
@@ -33,6 +33,7 @@ class Balance:
     by_source: Mapping[str, int]
     closed: bool
     refused: int = 0
+    began_utc_ns: int | None = None
 
     @property
     def balanced(self) -> bool:
@@ -54,7 +55,8 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """A flight, whole: settings, facts, a line for every shot, strays and events."""
+    """A flight, whole: settings, facts, a line for every shot, strays and events. `utc_correction_ns` is to be added to
+    every `utc_ns`; None where nobody ever knew UTC."""
 
     name: str
     settings: Mapping[str, Any]
@@ -62,6 +64,7 @@ class Flight:
     lines: tuple[Line, ...]
     strays: tuple[Stray, ...]
     events: tuple[Event, ...]
+    utc_correction_ns: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +81,8 @@ def report(path: Path) -> Balance:
     """The balance of a flight, also while it is recorded. Raises FlightError."""
     folder = layout.open_folder(path)
     with LedgerReader.open(folder.ledger) as ledger:
-        shots, frames = ledger.shots(), ledger.frames()
+        shots, frames, facts = ledger.shots(), ledger.frames(), ledger.facts()
+        correction_ns = ledger.utc_correction_ns()
         states = Counter(row.state for row in shots)
         return Balance(
             flight=folder.name,
@@ -92,8 +96,11 @@ def report(path: Path) -> Balance:
             strays=len(ledger.strays()),
             size=sum(frame.size for frame in frames),
             by_source=dict(sorted(Counter(row.shot.cause.source for row in shots).items())),
-            closed="closed_utc_ns" in ledger.facts(),
+            closed="closed_utc_ns" in facts,
             refused=sum(event.kind == "refused" for event in ledger.events()),
+            began_utc_ns=None
+            if correction_ns is None or "began_utc_ns" not in facts
+            else facts["began_utc_ns"] + correction_ns,
         )
 
 
@@ -114,6 +121,7 @@ def show(path: Path) -> Flight:
             lines=lines,
             strays=tuple(ledger.strays()),
             events=tuple(ledger.events()),
+            utc_correction_ns=ledger.utc_correction_ns(),
         )
 
 
