@@ -1,0 +1,188 @@
+"""Which picked-up file belongs to which shot: by order, count and the time that the camera wrote into the file.
+
+The camera's clock is off by something constant that nobody knows, and shows whole seconds. Shots and files are matched
+in order, so that one offset explains as many pairs as possible. A pair is sure when every such best matching has it;
+what remains is in doubt, and is listed, never guessed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+WINDOW_S = 1.6
+"""How far offsets of true pairs lie apart: the whole second that the camera shows, and the spread of its latency."""
+_GRID_S = 0.1
+PLAUSIBLE_S = 26 * 3600.0
+"""A camera's clock is off by a time zone, a summer time, a forgotten minute; by more it was never set."""
+
+
+@dataclass(frozen=True, slots=True)
+class FiredShot:
+    """A shot that waits for its file. `fired_s`: when the shutter was released, seconds of any clock."""
+
+    index: int
+    fired_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class DatedFile:
+    """A file that waits for its shot. `taken_s`: the camera's time as if it were UTC; None where the file says none."""
+
+    name: str
+    taken_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Matching:
+    """`pairs` are sure. `shots` and `files` are left over; each one in doubt has a sentence in `doubts`.
+
+    `offset_s` is the camera's clock minus that of the shots, None where no pair is sure.
+    """
+
+    pairs: tuple[tuple[int, str], ...]
+    shots: tuple[int, ...]
+    files: tuple[str, ...]
+    doubts: tuple[str, ...]
+    offset_s: float | None = None
+
+
+def match(
+    shots: Sequence[FiredShot],
+    files: Sequence[DatedFile],
+    *,
+    offset_s: float | None = None,
+    plausible_s: float = PLAUSIBLE_S,
+) -> Matching:
+    """Match shots and files. `offset_s`, where it is known, is the camera's clock minus the shots'; else every offset
+    up to `plausible_s` may be it. Files without a time stay in doubt."""
+    shots = sorted(shots, key=lambda shot: (shot.fired_s, shot.index))
+    dated = sorted((f for f in files if f.taken_s is not None), key=lambda f: (f.taken_s, f.name))
+    doubts = [
+        f"{f.name} says no time: name its shot with --pair, or take all by --by-order"
+        for f in files
+        if f.taken_s is None
+    ]
+    fired = np.array([shot.fired_s for shot in shots], dtype=np.float64)
+    taken = np.array([f.taken_s for f in dated], dtype=np.float64)
+    if not len(fired) or not len(taken):
+        return _left(shots, files, (), doubts, None)
+    offsets = taken[None, :] - fired[:, None]
+    starts = _starts(offsets, offset_s, plausible_s)
+    if not len(starts):
+        days = abs(float(np.median(offsets))) / 86400
+        doubts.append(f"the camera's clock is {days:.0f} days away from the flight's: were these files made in it?")
+        return _left(shots, files, (), doubts, None)
+    sure, possible = _best(offsets, starts)
+    doubts += _doubts(shots, dated, sure, possible)
+    pairs = tuple((shots[i].index, dated[j].name) for i, j in sure)
+    middle = float(np.median([offsets[i, j] for i, j in sure])) if sure else None
+    return _left(shots, files, pairs, doubts, middle)
+
+
+def in_order(shots: Sequence[FiredShot], files: Sequence[DatedFile]) -> tuple[tuple[int, str], ...] | None:
+    """Pairs by order alone, where there are as many shots as files; None where there are not."""
+    if len(shots) != len(files):
+        return None
+    by_time = sorted(shots, key=lambda shot: (shot.fired_s, shot.index))
+    by_name = sorted(files, key=lambda f: f.name)
+    return tuple((shot.index, f.name) for shot, f in zip(by_time, by_name, strict=True))
+
+
+def seconds(taken: str | None) -> float | None:
+    """EXIF's time, ISO 8601 without a zone, as seconds, as if it were UTC; None for none."""
+    try:
+        return None if taken is None else datetime.fromisoformat(taken[:26]).replace(tzinfo=UTC).timestamp()
+    except ValueError:
+        return None
+
+
+def _starts(offsets: NDArray[np.float64], known_s: float | None, plausible_s: float) -> NDArray[np.float64]:
+    """Where a window of offsets may begin, on a grid, the most crowded window first."""
+    flat = np.sort(offsets.ravel())
+    near = flat[np.abs(flat - known_s) <= WINDOW_S] if known_s is not None else flat[np.abs(flat) <= plausible_s]
+    starts = np.unique(np.floor(near / _GRID_S) * _GRID_S)
+    crowd = np.searchsorted(flat, starts + WINDOW_S, "right") - np.searchsorted(flat, starts, "left")
+    return starts[np.argsort(-crowd, kind="stable")]
+
+
+def _best(offsets: NDArray[np.float64], starts: NDArray[np.float64]) -> tuple[list[tuple[int, int]], NDArray[np.bool_]]:
+    """(pairs that all best matchings share, pairs that some have)."""
+    best = 0
+    found: list[tuple[set[tuple[int, int]], NDArray[np.bool_]]] = []
+    for start_s in starts:
+        fits = (offsets >= start_s) & (offsets <= start_s + WINDOW_S)
+        bound = min(int(fits.any(axis=1).sum()), int(fits.any(axis=0).sum()))
+        if bound < best or bound == 0:
+            continue
+        length, forced, possible = _chains(fits)
+        if length > best:
+            best, found = length, []
+        if length == best:
+            found.append((forced, possible))
+    shared = set.intersection(*(forced for forced, _ in found)) if found else set()
+    anywhere = np.logical_or.reduce([possible for _, possible in found]) if found else np.zeros(offsets.shape, bool)
+    return sorted(shared), anywhere
+
+
+def _chains(fits: NDArray[np.bool_]) -> tuple[int, set[tuple[int, int]], NDArray[np.bool_]]:
+    """The longest matchings in order: their length, the pairs that all of them have, and those that any has.
+
+    A pair with `before` pairs at most before it and `after` at most after it is in a longest one when before + 1 +
+    after is the whole length. Each longest one has exactly one pair with each number of pairs before it, so a pair that
+    is alone with its number is in all of them.
+    """
+    before, after = _longest(fits), _longest(fits[::-1, ::-1])[::-1, ::-1]
+    length = int(before[-1, -1])
+    rank = before[:-1, :-1]
+    possible = fits & (rank + 1 + after[1:, 1:] == length)
+    ranks = rank[possible]
+    alone = np.bincount(ranks, minlength=length) == 1 if len(ranks) else np.zeros(0, bool)
+    forced = {(int(i), int(j)) for i, j in zip(*np.nonzero(possible), strict=True) if alone[rank[i, j]]}
+    return length, forced, possible
+
+
+def _longest(fits: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(n + 1, m + 1): the most pairs in order among the first i shots and the first j files."""
+    n, m = fits.shape
+    table = np.zeros((n + 1, m + 1), dtype=np.int64)
+    for i in range(n):
+        step = np.maximum(table[i, 1:], table[i, :-1] + fits[i])
+        table[i + 1, 1:] = np.maximum.accumulate(step)
+    return table
+
+
+def _doubts(
+    shots: Sequence[FiredShot], files: Sequence[DatedFile], sure: list[tuple[int, int]], possible: NDArray[np.bool_]
+) -> list[str]:
+    settled = {j for _, j in sure}
+    sentences = []
+    for j, one in enumerate(files):
+        if j in settled:
+            continue
+        candidates = [str(shots[i].index) for i in np.nonzero(possible[:, j])[0]]
+        if candidates:
+            which = " or ".join(candidates[:4]) + (" …" if len(candidates) > 4 else "")
+            sentences.append(f"{one.name} may be of shot {which}: order, count and time leave that open")
+    return sentences
+
+
+def _left(
+    shots: Sequence[FiredShot],
+    files: Sequence[DatedFile],
+    pairs: tuple[tuple[int, str], ...],
+    doubts: Sequence[str],
+    offset_s: float | None,
+) -> Matching:
+    indices, names = {index for index, _ in pairs}, {name for _, name in pairs}
+    return Matching(
+        pairs,
+        tuple(shot.index for shot in shots if shot.index not in indices),
+        tuple(f.name for f in files if f.name not in names),
+        tuple(doubts),
+        offset_s,
+    )
