@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,14 +16,15 @@ from dappled.cli import common
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
 from dappled.decode import pictures
-from dappled.decode.carriers import LAWS, Carrier, Lattice
+from dappled.decode.carriers import Carrier, Lattice
+from dappled.decode.decoder import CarriersFrom
 from dappled.decode.lattice import FoundLattice, find_lattice
 from dappled.decode.masks import Mask, Order
-from dappled.decode.peaks import Measured
+from dappled.decode.peaks import Measured, measure
 from dappled.decode.plane import Plane
+from dappled.decode.prediction import crossed_orders, lattice_rotation
 from dappled.decode.slices import default_size
 from dappled.decode.spectrum import Spectrum, padded_shape
-from dappled.drivers import rawfile
 from dappled.drivers.darkroom import Darkroom, DarkroomError
 
 
@@ -34,6 +36,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     common.frames(parser, "?")
     common.add_recipe(parser)
+    parser.add_argument(
+        "--crossed", action="store_true", help="also the orders between harmonics that the pattern doesn't ask for"
+    )
     parser.add_argument("--shape", type=int, nargs=2, metavar=("H", "W"), help="predict only, for frames of this size")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the spectrum with its boxes")
     parser.add_argument("--json", action="store_true", help="as JSON")
@@ -50,6 +55,13 @@ class Table:
     rows: Sequence[tuple[Carrier, Measured | None]]
     main: frozenset[Order]
     found: FoundLattice | None = None
+    carriers_from: CarriersFrom | None = None
+    rotation_rad: float | None = None
+
+    @property
+    def seen(self) -> int:
+        """How many carriers the frame shows, the mean and suspect ones left out."""
+        return sum(m is not None and not m.suspect and (c.ky, c.kx) != (0, 0) for c, m in self.rows)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -81,17 +93,19 @@ def _predicted(arguments: argparse.Namespace) -> Table:
         raise ConfigError("without a frame --shape, --camera and --mask say what to predict for")
     if not arguments.focal_length or arguments.focal_length <= 0:
         raise ConfigError("without a frame --focal-length says, in mm, what to predict for")
-    camera, mask = profiles.camera(arguments.camera), profiles.mask(arguments.mask).mask
-    shape = (arguments.shape[0], arguments.shape[1])
-    law = arguments.law or camera.law
-    lattice = LAWS[law](mask, camera.sensor(shape), camera.mask_distance_mm, arguments.focal_length)
-    rows = [(carrier, None) for carrier in lattice.carriers(mask.orders())]
-    return Table(shape, law, arguments.focal_length, lattice, rows, _main(mask))
+    camera = profiles.camera(arguments.camera)
+    darkroom = Darkroom(common.recipe(arguments))
+    decoder = darkroom.mask_decoder((arguments.shape[0], arguments.shape[1]), next(iter(camera.models), ""))
+    mask = decoder.mask
+    lattice = decoder.lattice_at(arguments.focal_length)
+    orders = sorted([*mask.orders(), *(crossed_orders(mask) if arguments.crossed else [])])
+    rows = [(carrier, None) for carrier in lattice.carriers(orders)]
+    return Table(decoder.sensor.shape, decoder.law, arguments.focal_length, lattice, rows, _main(mask))
 
 
 def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
     darkroom = Darkroom(common.recipe(arguments))
-    raw = rawfile.read(arguments.frames)
+    raw = darkroom.read(arguments.frames)
     with darkroom.naming(arguments.frames):
         plane = darkroom.plane(raw)
         shape = (plane.shape[0], plane.shape[1])
@@ -99,19 +113,29 @@ def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
             found = find_lattice(Spectrum.of(plane, workers=2))
             pairs = list(zip(found.carriers, found.measured, strict=True))
             rows = _both_halves([(Carrier(0, 0, 0.0, 0.0), measure_mean()), *pairs])
-            return plane, Table(shape, "found", None, found.lattice, rows, frozenset(found.orders), found)
+            main = frozenset(found.orders) | {(0, 0)}
+            return plane, Table(shape, "found", None, found.lattice, rows, main, found, "found", found.rotation_rad)
         decoder = darkroom.mask_decoder(shape, raw.camera_model or "")
         length = arguments.focal_length or raw.focal_length_mm
         if length is None:
             raise DarkroomError(f"{arguments.frames} doesn't say its focal length: give --focal-length MM")
-        spectrum = decoder.transform(plane, length)
+        spectrum = Spectrum.of(plane, workers=2)
         predicted = decoder.predict(length)
-        _, seen, _ = decoder.locate(spectrum, length, predicted)
+        used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
         known = {(c.ky, c.kx): m for c, m in zip(predicted, seen, strict=True)}
         lattice = decoder.lattice_at(length)
-        halves = lattice.carriers(decoder.mask.half_orders())
+        mask = decoder.mask
+        halves = lattice.carriers(mask.half_orders())
+        if arguments.crossed:
+            between = [order for order in crossed_orders(mask) if order > (0, 0)]
+            halves += lattice.carriers(between)
+            near = measure(spectrum, used.carriers(between), 2.0)
+            known |= dict(zip(between, near, strict=True))
         rows = _both_halves([(c, known.get((c.ky, c.kx))) for c in halves])
-        return plane, Table(shape, decoder.law, length, lattice, rows, _main(decoder.mask))
+        turned = lattice_rotation(used, decoder.sensor)
+        return plane, Table(
+            shape, decoder.law, length, lattice, rows, _main(mask), carriers_from=carriers_from, rotation_rad=turned
+        )
 
 
 def measure_mean() -> Measured:
@@ -164,9 +188,11 @@ def _as_json(table: Table) -> dict[str, Any]:
         "focal_length_mm": table.focal_length_mm,
         "carriers": carriers,
     }
+    if table.carriers_from is not None:
+        whole["carriers_from"] = table.carriers_from
+        whole["rotation_rad"] = table.rotation_rad
     if table.found:
         whole["pitch_px"] = list(table.found.spacing_px)
-        whole["rotation_rad"] = table.found.rotation_rad
     return whole
 
 
@@ -175,19 +201,40 @@ def _as_text(table: Table) -> str:
     for carrier, seen in table.rows:
         row, column = carrier.index(table.shape)
         line = f"{carrier.ky:3d} {carrier.kx:3d} {row:9.2f} {column:9.2f}"
+        if (carrier.ky, carrier.kx) not in table.main:
+            line += " x"
         if not carrier.on_sensor:
             line += "   off the sensor"
         elif seen is not None:
             at = Carrier(0, 0, seen.fy, seen.fx).index(table.shape)
-            line += f"   {at[0]:9.2f} {at[1]:9.2f} {seen.strength:8.4f}{'  suspect' if seen.suspect else ''}"
+            line += f"   {at[0]:9.2f} {at[1]:9.2f} {seen.strength:8.4f}"
+            line += "  suspect: a simple fraction of the frame, where sensor artefacts stand" if seen.suspect else ""
         lines.append(line)
-    seen_count = sum(m is not None for _, m in table.rows)
+    if any((c.ky, c.kx) not in table.main for c, _ in table.rows):
+        lines.append("x: a crossed order, between the two diagonals of harmonics")
+    lines.append(_summary(table))
+    return "\n".join(lines)
+
+
+def _summary(table: Table) -> str:
+    """What was found, in a sentence."""
     if table.found:
         pitch = " × ".join(f"{p:.2f}" for p in table.found.spacing_px)
-        lines.append(f"a lattice of {pitch} px, turned by {table.found.rotation_rad * 57.29578:.2f}°, residual "
-                     f"{table.found.residual_bins:.2f} bins; {seen_count} carriers")  # fmt: skip
-    else:
-        lines.append(
-            f"law {table.law}, focal length {table.focal_length_mm:g} mm; {seen_count} of {len(table.rows)} seen"
+        return (
+            f"a lattice of {pitch} px, turned by {math.degrees(table.found.rotation_rad):.2f}°, "
+            f"residual {table.found.residual_bins:.2f} bins; {table.seen} carriers"
         )
-    return "\n".join(lines)
+    start = f"law {table.law}, focal length {table.focal_length_mm:g} mm"
+    if table.carriers_from is None:
+        return f"{start}; predicted only"
+    there = sum(c.on_sensor for c, _ in table.rows) - 1
+    if table.carriers_from == "measured" and table.rotation_rad is not None:
+        turned = math.degrees(table.rotation_rad)
+        return f"{start}; {table.seen} of {there} carriers seen, on a lattice turned by {turned:.3f}°"
+    whose = "calibration's" if table.carriers_from == "calibrated" else "law's"
+    if table.seen == 0:
+        return (
+            f"{start}; no carriers in this frame: it is no frame from behind this mask, or was taken near the mask's "
+            f"ideal aperture, where flat parts show none; a decode uses the {whose} prediction"
+        )
+    return f"{start}; {table.seen} of {there} carriers seen, too few or weak: a decode uses the {whose} prediction"

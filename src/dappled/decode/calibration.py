@@ -20,6 +20,7 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.lattice import candidates, fit, residual_bins
 from dappled.decode.masks import Mask, Order
 from dappled.decode.peaks import Measured, measure
+from dappled.decode.prediction import lattice_rotation
 from dappled.decode.slices import default_size, extract
 from dappled.decode.spectrum import Spectrum
 from dappled.decode.views import Aperture, angular_frequencies, kappa, transfer
@@ -373,8 +374,7 @@ def _distance(
     to_sensor = np.array([sensor.row_mm, sensor.column_mm])  # (row, column) steps as (y, x) mm
     per_mm = lattice.matrix() @ np.linalg.inv(to_sensor).T  # rows: cycles/mm along y and x
     size = math.sqrt(abs(float(np.linalg.det(per_mm))))
-    turns = math.atan2(per_mm[0, 1], per_mm[0, 0]), math.atan2(-per_mm[1, 0], per_mm[1, 1])
-    rotation = (turns[0] + turns[1]) / 2
+    rotation = lattice_rotation(lattice, sensor)
     if law == "geometric":
         distance = (1 - size / mask.frequency_per_mm) * focal_length_mm
     else:
@@ -411,4 +411,4 @@ def _pair(values: Sequence[float]) -> tuple[float, float]:
 
 
 def _turn(cycles: float) -> float:
-    return cycles - round(cycles)
+    return float(cycles - round(cycles))

@@ -11,6 +11,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from dappled.decode.carriers import LAWS, Lattice, Sensor
 from dappled.decode.errors import DecodeError
 from dappled.decode.masks import Mask, Order
@@ -69,6 +71,14 @@ def lattice_of(
     c, s = math.cos(rotation_rad), math.sin(rotation_rad)
     (ay, ax), (by, bx) = upright.ky, upright.kx
     return Lattice((c * ay + s * by, c * ax + s * bx), (-s * ay + c * by, -s * ax + c * bx))
+
+
+def lattice_rotation(lattice: Lattice, sensor: Sensor) -> float:
+    """How far a mask sits turned, rad from the row axis to the column axis: the mean turn of its two steps in mm."""
+    to_sensor = np.array([sensor.row_mm, sensor.column_mm])  # (row, column) steps as (y, x) mm
+    per_mm = lattice.matrix() @ np.linalg.inv(to_sensor).T  # rows: cycles/mm along y and x
+    turns = math.atan2(per_mm[0, 1], per_mm[0, 0]), math.atan2(-per_mm[1, 0], per_mm[1, 1])
+    return (turns[0] + turns[1]) / 2
 
 
 def contrast(mask_distance_mm: float, frequency_per_mm: float, wavelength_nm: float = 550.0) -> float:
