@@ -54,7 +54,7 @@ def _disk(health: Mapping[str, Any], frame_bytes: float, *, known: bool) -> Chec
     if free is None:
         return Check("Disk", "no-go", "the flight's folder can't be read")
     frames = max(0, int((free - least) / frame_bytes))
-    count = f"{frames:,}".replace(",", " ")
+    count = f"{frames:,}".replace(",", "\u202f")  # a thin space that doesn't break
     text = f"{free / 1e9:.1f} GB free, room for {'' if known else 'some '}{count} frames"
     if free < least:
         return Check("Disk", "no-go", f"nearly full: {free / 1e6:.0f} MB left, shots are refused")
@@ -78,7 +78,7 @@ def _position(vehicle: Mapping[str, Any] | None) -> Check:
     if vehicle is None or vehicle["latitude_deg"] is None:
         return Check("Position", "caution", "unknown: frames have no place")
     sigma, yaw = vehicle["position_sigma_m"], vehicle["yaw_deg"]
-    text = "accuracy unknown" if sigma is None else f"±{sigma:.1f} m"
+    text = "accuracy unknown" if sigma is None else _about(sigma, "m")
     if yaw is None:
         return Check("Position", "caution", f"{text}, attitude unknown")
     return Check("Position", "go" if sigma is not None and sigma <= _SURE_M else "caution", text)
@@ -92,7 +92,7 @@ def _clock(health: Mapping[str, Any]) -> Check:
         return Check("Clock", "caution", "the autopilot's clock is unknown")
     how = "synchronised" if clock["source"] == "timesync" else "by packet arrival"
     state: State = "go" if clock["sigma_ms"] <= _SLOW_CLOCK_MS else "caution"
-    return Check("Clock", state, f"{how}, ±{clock['sigma_ms']:.1f} ms")
+    return Check("Clock", state, f"{how}, {_about(clock['sigma_ms'], 'ms')}")
 
 
 def _decoding(health: Mapping[str, Any]) -> Check:
@@ -114,3 +114,8 @@ def _service(problems: Sequence[str]) -> Check:
     if ended:
         return Check("Service", "no-go", ended[0])
     return Check("Service", "go", "all parts at work")
+
+
+def _about(sigma: float, unit: str) -> str:
+    """One sigma with two figures: ±0.024 m, ±1.3 m, ±12 m."""
+    return f"±{sigma:.{0 if sigma >= 10 else 1 if sigma >= 1 else 2 if sigma >= 0.095 else 3}f} {unit}"

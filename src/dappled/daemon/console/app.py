@@ -30,7 +30,17 @@ from dappled.daemon.console.studio import Studio, StudioError
 from dappled.errors import DappledError
 
 GLOBE_S = 30.0  # a virtual globe that asked this long ago still watches
-_PICTURES = ("thumb.jpg", "mean.jpg", "slices.jpg", "spectrum.jpg", "views.jpg", "views.json", "depth.png")
+_PICTURES = (
+    "thumb.jpg",
+    "mean.jpg",
+    "slices.jpg",
+    "spectrum.jpg",
+    "views.jpg",
+    "views.json",
+    "refocus.jpg",
+    "depth.png",
+    "map.png",
+)
 _SHIFT_PX = 8.0
 _MAP_PX, _KML_PX = 320, 1024
 
@@ -228,8 +238,6 @@ def _picture(parts: Parts) -> Endpoint:
             raise FeedError(f"there is no frame {frame} here")
         if name == "thumb.jpg" and seen.thumb is not None:
             return _file(await _make(parts, pictures.jpeg, seen.thumb), name)
-        if name == "map.json":
-            return await _on_map(parts, frame)
         if name == "map.png":
             return _file(await _rectified_png(parts, frame, _MAP_PX), name)
         if name == "depth.png":
@@ -289,13 +297,6 @@ async def _rectified_png(parts: Parts, frame: int, longest_side: int, *, sharp: 
         raise FeedError(f"where frame {frame} lies on the ground is not known")
     made: bytes = await _make(parts, pictures.png, one.picture)
     return made
-
-
-async def _on_map(parts: Parts, frame: int) -> Response:
-    one = await _rectified(parts, frame, _MAP_PX)
-    if one is None:
-        raise FeedError(f"where frame {frame} lies on the ground is not known")
-    return JSONResponse({"north": one.north, "south": one.south, "east": one.east, "west": one.west})
 
 
 def _map(parts: Parts) -> Endpoint:

@@ -30,12 +30,14 @@ class FeedError(DappledError):
 
 @dataclass(slots=True)
 class Seen:
-    """One frame: its tag as published, a small picture of it once its slices came, its depth where there is one."""
+    """One frame: its tag as published; once its slices came a small picture, and what they say of carriers; its depth
+    where there is one."""
 
     tag: dict[str, Any]
     thumb: NDArray[np.uint8] | None = None
     depth: Message | None = None
     corners: list[tuple[float, float]] | None = None
+    slices: dict[str, Any] | None = None
 
 
 class Feed:
@@ -132,6 +134,7 @@ class Feed:
             "thumb": seen.thumb is not None,
             "depth": seen.depth is not None,
             "corners": seen.corners,
+            "slices": seen.slices,
         }
 
     def track(self) -> list[tuple[float, float, float]]:
@@ -184,11 +187,13 @@ class Feed:
             self._stacks.popitem(last=False)
         self._answer(index, message)
         seen = self.frames.get(index)
-        if seen is not None and seen.thumb is None:
+        if seen is None:
+            return
+        if seen.thumb is None:
             seen.thumb = self._thumb(message)
+            seen.slices = _facts(message)
             seen.corners = self._corners({**seen.tag, "frame_shape": message.header.get("frame_shape")})
-        if seen is not None:
-            self._tell({**self.frame_event(index), "slices": _facts(message)})
+        self._tell(self.frame_event(index))
 
     def _depth(self, message: Message) -> None:
         seen = self.frames.get(message.header["frame"])

@@ -1,0 +1,266 @@
+// One frame, seen as refocused picture, views, slices, spectrum or depth.
+import { element, fixed, svg } from "./format.js";
+import { Refocus, sharpest } from "./refocus.js";
+
+const TABS = ["refocus", "views", "slices", "spectrum", "depth"];
+const $ = (id) => document.getElementById(id);
+
+export class Stage {
+  constructor() {
+    this.tab = "refocus";
+    this.frame = null;     // {tag, slices, thumb, depth}
+    this.layout = null;
+    this.bitmap = null;
+    this.turn = 0;         // of loading: an older one that comes late is thrown away
+    try {
+      this.refocus = new Refocus($("gl"));
+      $("gl").addEventListener("webglcontextlost", (event) => { event.preventDefault(); this.refocus = null; this.load(); });
+    } catch {
+      this.refocus = null;   // the server makes the picture then
+    }
+    for (const name of TABS) $(`tab-${name}`).addEventListener("click", () => this.choose(name));
+    document.querySelector(".tabs").addEventListener("keydown", (event) => this.arrow(event));
+    $("shift").addEventListener("input", () => this.draw());
+    $("autofocus").addEventListener("click", () => this.focusAt(0.5, 0.5));
+    for (const id of ["gl", "picture"]) $(id).addEventListener("click", (event) => {
+      const box = event.currentTarget.getBoundingClientRect();
+      this.focusAt((event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height);
+    });
+    new ResizeObserver(() => this.size()).observe($("frame-box"));
+    this.tabs();
+  }
+
+  set(frame) {
+    const same = this.frame && frame && this.frame.tag.frame === frame.tag.frame && this.frame.tag.flight === frame.tag.flight;
+    const ready = Boolean(frame?.thumb) === Boolean(this.frame?.thumb) && Boolean(frame?.depth) === Boolean(this.frame?.depth);
+    this.frame = frame;
+    if (same && ready && this.aspect) return;
+    this.tabs();
+    this.load();
+  }
+
+  choose(name) {
+    this.tab = name;
+    this.tabs();
+    this.load();
+  }
+
+  arrow(event) {
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    if (!step) return;
+    const open = TABS.filter((name) => !$(`tab-${name}`).hidden);
+    const next = open[(open.indexOf(this.tab) + step + open.length) % open.length];
+    this.choose(next);
+    $(`tab-${next}`).focus();
+  }
+
+  tabs() {
+    show($("tab-depth"), Boolean(this.frame?.depth));
+    if (this.tab === "depth" && !this.frame?.depth) this.tab = "refocus";
+    for (const name of TABS) {
+      const chosen = name === this.tab;
+      $(`tab-${name}`).setAttribute("aria-selected", String(chosen));
+      $(`tab-${name}`).tabIndex = chosen ? 0 : -1;
+    }
+    $("panel").setAttribute("aria-labelledby", `tab-${this.tab}`);
+    $("focus").toggleAttribute("data-off", this.tab !== "refocus");
+  }
+
+  async load() {
+    const turn = ++this.turn, { frame, tab } = this;
+    if (!frame) return;
+    const index = frame.tag.frame, base = `/api/frames/${index}/`;
+    $("which").textContent = `frame ${index}`;
+    try {
+      if (tab === "refocus") await this.loadViews(base, turn);
+      else await this.loadPicture(`${base}${{ views: "views.jpg", slices: "slices.jpg", spectrum: "spectrum.jpg", depth: "depth.png" }[tab]}`, tab, turn);
+    } catch (error) {
+      if (turn === this.turn) await this.fall(base, turn, error.message);
+    }
+  }
+
+  // Without views there is still the picture that all of them share.
+  async fall(base, turn, why) {
+    if (this.tab === "refocus") {
+      this.layout = this.bitmap = null;
+      try {
+        await this.loadPicture(`${base}mean.jpg`, "mean", turn);
+        if (turn === this.turn) $("caption").textContent = `The mean picture. ${why}`;
+        return;
+      } catch { /* not decoded at all: the sentence stands alone */ }
+    }
+    if (turn !== this.turn) return;
+    for (const id of ["gl", "picture", "overlay"]) show($(id), false);
+    show($("empty"), true);
+    $("empty").textContent = why;
+    $("caption").textContent = "";
+  }
+
+  async loadViews(base, turn) {
+    const layout = await (await good(fetch(`${base}views.json`))).json();
+    const drawn = this.refocus && this.refocus.fits(layout);
+    let bitmap = null;
+    if (drawn) {
+      const blob = await (await good(fetch(`${base}views.jpg`))).blob();
+      bitmap = await createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
+    }
+    if (turn !== this.turn) return;
+    this.layout = layout;
+    this.bitmap = bitmap;
+    this.aspect = layout.tile[1] / layout.tile[0];
+    show($("empty"), false);
+    show($("overlay"), false);
+    if (drawn) {
+      this.refocus.show(layout, bitmap);
+      show($("picture"), false);
+      show($("gl"), true);
+      $("caption").textContent = `${layout.views[0]} × ${layout.views[1]} views of ${layout.tile[1]} × ${layout.tile[0]} px, phases from the ${layout.source}. Tap where it should be sharp.`;
+    } else {
+      show($("gl"), false);
+      $("caption").textContent = `${layout.views[0]} × ${layout.views[1]} views, phases from the ${layout.source}. This browser has no WebGL2: the vehicle makes the picture.`;
+    }
+    this.size();
+    this.draw();
+  }
+
+  async loadPicture(url, kind, turn) {
+    const blob = await (await good(fetch(url))).blob();
+    if (turn !== this.turn) return;
+    const picture = $("picture");
+    await place(picture, blob);
+    if (turn !== this.turn) return;
+    picture.dataset.kind = kind;
+    picture.alt = `${kind} of frame ${this.frame.tag.frame}`;
+    show(picture, true);
+    show($("gl"), false);
+    show($("empty"), false);
+    this.aspect = picture.naturalWidth / picture.naturalHeight;
+    this.size();
+    this.overlay(kind);
+  }
+
+  draw() {
+    const shift = Number($("shift").value);
+    $("shift-text").textContent = `${shift > 0 ? "+" : ""}${fixed(shift, 2)} px`;
+    if (this.tab !== "refocus" || !this.layout) return;
+    if (this.bitmap && this.refocus) this.refocus.draw(shift);
+    else this.ask(shift);
+  }
+
+  // Without WebGL: one picture at a time, the newest wish next.
+  async ask(shift) {
+    this.wanted = shift;
+    if (this.asking) return;
+    this.asking = true;
+    try {
+      while (this.wanted !== null && this.tab === "refocus" && this.layout) {
+        const next = this.wanted;
+        this.wanted = null;
+        await this.loadPicture(`/api/frames/${this.frame.tag.frame}/refocus.jpg?shift=${next}`, "refocus", this.turn);
+        $("caption").textContent = `Views from the ${this.layout?.source}. This browser has no WebGL2: the vehicle makes the picture.`;
+      }
+    } catch (error) {
+      $("caption").textContent = error.message;
+    } finally {
+      this.asking = false;
+    }
+  }
+
+  focusAt(x, y) {
+    if (this.tab !== "refocus" || !this.layout || !this.bitmap) return;
+    const [height, width] = this.layout.tile;
+    $("shift").value = sharpest(this.layout, this.bitmap, x * width, y * height);
+    this.draw();
+  }
+
+  size() {
+    const box = $("frame-box"), aspect = this.aspect ?? 4 / 3;
+    const width = Math.min(box.clientWidth, box.clientHeight * aspect);
+    box.style.setProperty("--w", `${Math.floor(width)}px`);
+    box.style.setProperty("--h", `${Math.floor(width / aspect)}px`);
+  }
+
+  overlay(kind) {
+    const facts = this.frame?.slices, paper = $("overlay");
+    paper.replaceChildren();
+    show(paper, false);
+    $("caption").replaceChildren();
+    if (kind === "slices" && facts) this.labels(paper, facts);
+    else if (kind === "spectrum" && facts) this.carriers(paper, facts);
+    else if (kind === "views") $("caption").textContent = "Each view through its own part of the aperture, on one scale.";
+    else if (kind === "depth") $("caption").textContent = "Violet is small, yellow large disparity; grey is not known.";
+  }
+
+  labels(paper, facts) {
+    const all = facts.carriers.flatMap(([ky, kx]) => [[ky, kx], [-ky, -kx]]);
+    const ys = [...new Set(all.map((k) => k[0]))].sort((a, b) => a - b), xs = [...new Set(all.map((k) => k[1]))].sort((a, b) => a - b);
+    paper.setAttribute("viewBox", `0 0 ${1000 * this.aspect} 1000`);
+    const has = new Set(all.map(String));
+    for (const [row, ky] of ys.entries()) for (const [column, kx] of xs.entries()) {
+      if (!has.has(String([ky, kx]))) continue;
+      const text = svg("text", { x: (column / xs.length) * 1000 * this.aspect + 8, y: (row / ys.length) * 1000 + 26, fill: "#ffe14d", "font-size": 20, stroke: "#000", "stroke-width": 4, "paint-order": "stroke" });
+      text.textContent = `${signed(ky)}, ${signed(kx)}`;
+      paper.append(text);
+    }
+    show(paper, true);
+    $("caption").textContent = `${facts.shape[0]} slices of ${facts.shape[2]} × ${facts.shape[1]} px by their orders (ky, kx), each on its own scale; the other half is their mirror.`;
+  }
+
+  carriers(paper, facts) {
+    const wide = 1000 * this.aspect, size = [1000 / facts.grid[0][0], wide / facts.grid[1][1]];
+    paper.setAttribute("viewBox", `0 0 ${wide} 1000`);
+    const at = (fy, fx) => [(0.5 + fx) * wide, (0.5 + fy) * 1000];
+    const predicted = facts.predicted?.length ? facts.predicted : facts.carriers.map((row) => ({ at: row, seen: null }));
+    for (const [, , fy, fx] of facts.carriers) for (const sign of [1, -1]) {
+      const [x, y] = at(sign * fy, sign * fx);
+      paper.append(svg("rect", { x: x - size[1] / 2, y: y - size[0] / 2, width: size[1], height: size[0], fill: "none", stroke: "#ff6a5e", "stroke-width": 1.2, opacity: 0.75 }));
+    }
+    let seen = 0;
+    for (const one of predicted) for (const sign of [1, -1]) {
+      const [ky, kx, fy, fx] = one.at, [x, y] = at(sign * fy, sign * fx);
+      const cross = svg("path", { d: `M${x - 11} ${y}h22M${x} ${y - 11}v22`, stroke: "#ffe14d", "stroke-width": 2, fill: "none" });
+      cross.append(svg("title", {}, `order ${signed(sign * ky)}, ${signed(sign * kx)}`));
+      paper.append(cross);
+      if (one.seen && (ky || kx)) {
+        const [sx, sy] = at(sign * one.seen[0], sign * one.seen[1]);
+        paper.append(svg("circle", { cx: sx, cy: sy, r: 15, stroke: "#5fe08b", "stroke-width": 2.4, fill: "none" }));
+        seen += 1;
+      }
+    }
+    show(paper, true);
+    const wanted = 2 * (predicted.length - 1);
+    $("caption").replaceChildren(
+      key("M6 0v12M0 6h12", "#ffe14d", "predicted"), key("M6 1a5 5 0 1 0 .01 0", "#5fe08b", `seen, ${seen} of ${wanted}`), key("M1 1h10v10H1z", "#ff6a5e", "band of a slice"),
+      `Slices were cut at the ${{ measured: "carriers seen", calibrated: "calibration's carriers", predicted: "carriers that the law predicts", found: "lattice found in the frame" }[facts.carriers_from] ?? "carriers"}.`,
+    );
+  }
+}
+
+function key(path, colour, text) {
+  const picture = svg("svg", { viewBox: "0 0 12 12" }, svg("path", { d: path, stroke: colour, "stroke-width": 2, fill: "none" }));
+  return element("span", { class: "key" }, picture, text);
+}
+
+// An SVG element has no `hidden` of its own: the attribute does for both.
+function show(one, visible) {
+  one.toggleAttribute("hidden", !visible);
+}
+
+const signed = (n) => (n > 0 ? `+${n}` : n < 0 ? `−${-n}` : "0");
+
+async function good(asked) {
+  const answer = await asked;
+  if (answer.ok) return answer;
+  let text = `the vehicle answered ${answer.status}`;
+  try { text = (await answer.json()).error ?? text; } catch { /* no sentence came */ }
+  throw new Error(text);
+}
+
+function place(picture, blob) {
+  const url = URL.createObjectURL(blob);
+  return new Promise((resolve, reject) => {
+    picture.onload = () => { URL.revokeObjectURL(url); resolve(); };
+    picture.onerror = () => { URL.revokeObjectURL(url); reject(new Error("the picture can't be shown")); };
+    picture.src = url;
+  });
+}
