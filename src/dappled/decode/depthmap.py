@@ -1,0 +1,148 @@
+"""A depth map as a value, and how the peak of a likelihood becomes a disparity with its uncertainty."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from dappled.decode.errors import DecodeError
+
+Volume = NDArray[np.float32]
+Map = NDArray[np.float32]
+# Measured on simulated masked frames (SNR 100 and 50, windows 5 to 15): what scatters more than the noise alone, and
+# what the window's edge adds as the picture moves across it.
+_SCATTER = 1.25
+_EDGE, _EDGE_SHARE = 0.001, 0.0045  # px/view, and of the disparity
+_LEAST_CONFIDENCE = 0.5
+_MOST_DISPARITIES = 400
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthMap:
+    """Disparities float32 (h, w) of the middle view's pixels with their standard errors; both NaN where unknown.
+
+    In pixels from view to view, 0 at the focus, larger for what is nearer. `confidence` (h, w), 0 to 1: how far the
+    answer stands out from all others that were looked at.
+    """
+
+    disparity: Map
+    sigma: Map
+    confidence: Map
+    method: str
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Where the disparity is known."""
+        return np.isfinite(self.disparity)
+
+    def known_share(self) -> float:
+        """The share of pixels whose disparity is known."""
+        return float(self.known.mean())
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """Which disparities are looked at, from `low` to `high`, `step` apart, and the window (px a side) that a pixel is
+    judged by. Windows are boxes smoothed once more: their effective size is `window`."""
+
+    low: float
+    high: float
+    step: float
+    window: int = 13
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        """Raises DecodeError for a range or a window that is none."""
+        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high and self.step > 0):
+            raise DecodeError(f"disparities from {self.low:g} to {self.high:g} by {self.step:g} are no range")
+        if (self.high - self.low) / self.step > _MOST_DISPARITIES:
+            count = (self.high - self.low) / self.step
+            raise DecodeError(f"{count:.0f} disparities are too many: narrow {self.low:g} to {self.high:g}")
+        if self.window < 3 or self.window % 2 == 0:
+            raise DecodeError(f"a window of {self.window} px won't do: it must be odd, and 3 or more")
+
+    def disparities(self) -> NDArray[np.float64]:
+        """All of them, at least five, rising."""
+        count = max(5, math.ceil((self.high - self.low) / self.step - 1e-9) + 1)
+        return np.linspace(self.low, self.high, count)
+
+
+def box(window: int) -> int:
+    """The side of the box that, used twice, is as wide as a window."""
+    half = (window + 1) // 2
+    return half if half % 2 else half - 1
+
+
+def windowed(volume: Volume, window: int) -> tuple[Volume, float]:
+    """(the volume summed over smooth windows, its middle sample weighing 1; variance over information).
+
+    With weights w the variance of an estimate from independent samples is Σw²/(Σw)² of one sample's: the second value
+    is Σw²/Σw, by which the inverse curvature is to be multiplied.
+    """
+    side = box(window)
+    made = volume
+    for axis in (-2, -1):
+        for _ in range(2):
+            made = ndimage.uniform_filter1d(made, side, axis=axis)
+    made *= np.float32(side * side)  # a triangle of base 2·side−1 and height 1 sums to `side`
+    one = np.convolve(np.ones(side), np.ones(side)) / side
+    return made, float((one**2).sum() / one.sum()) ** 2
+
+
+def peaked(likelihood: Volume, disparities: NDArray[np.float64], start: NDArray[np.intp]) -> tuple[Map, Map]:
+    """(disparity, curvature) of the peak nearest to `start` (h, w), an index into `disparities` (evenly spaced).
+
+    A quartic through five samples (a parabola is biased by hundredths of a pixel), at most one and a half steps away.
+    The curvature is minus the second derivative there, 0 where there is no peak.
+    """
+    step = float(disparities[1] - disparities[0])
+    middle = np.clip(start, 2, len(disparities) - 3)
+    a, b, c, d, e = (np.take_along_axis(likelihood, (middle + k)[None], axis=0)[0] for k in (-2, -1, 0, 1, 2))
+    c1 = (a - 8 * b + 8 * d - e) / 12
+    c2 = (-a + 16 * b - 30 * c + 16 * d - e) / 24
+    c3 = (-a + 2 * b - 2 * d + e) / 12
+    c4 = (a - 4 * b + 6 * c - 4 * d + e) / 24
+    x = np.clip((start - middle).astype(np.float32), -2, 2)
+    tiny = np.float32(-1e-20)
+    for _ in range(6):
+        slope = c1 + x * (2 * c2 + x * (3 * c3 + x * 4 * c4))
+        bend = np.minimum(2 * c2 + x * (6 * c3 + x * 12 * c4), tiny)
+        x = np.clip(x - np.clip(slope / bend, -0.5, 0.5), -2, 2)
+    bend = 2 * c2 + x * (6 * c3 + x * 12 * c4)
+    at_end = (np.abs(x) >= 2) | (np.abs(middle + x - start) > 1.5)
+    curvature = np.where(at_end, 0, np.maximum(-bend, 0)) / step**2
+    disparity = disparities[middle].astype(np.float32) + x * np.float32(step)
+    return disparity.astype(np.float32), curvature.astype(np.float32)
+
+
+def confidence(likelihood: Volume, best: Map, samples: float) -> Map:
+    """0 to 1: by how much the best likelihood exceeds the mean over all disparities, against what chance does.
+
+    The likelihood of `samples` independent samples of noise alone scatters by √(samples/2).
+    """
+    margin = (best - likelihood.mean(axis=0)) / np.float32(4 * math.sqrt(samples / 2))
+    made: Map = 1 - np.exp(-(np.maximum(margin, 0) ** 2))
+    return made.astype(np.float32)
+
+
+def judged(
+    disparity: Map, curvature: Map, sure: Map, *, spread: float, method: str, most_sigma: float = 0.25
+) -> DepthMap:
+    """The map: standard errors from curvatures of the likelihood, unknown where these or the confidence won't do.
+
+    `spread` is variance over information, from `windowed`.
+    """
+    with np.errstate(divide="ignore"):
+        noise = np.float32(_SCATTER**2 * spread) / curvature
+    edge = _EDGE + _EDGE_SHARE * np.abs(disparity)
+    sigma = np.sqrt(noise + edge**2)
+    known = (sure >= _LEAST_CONFIDENCE) & (sigma <= most_sigma)
+    unknown = np.float32(np.nan)
+    return DepthMap(
+        np.where(known, disparity, unknown).astype(np.float32), np.where(known, sigma, unknown).astype(np.float32),
+        sure.astype(np.float32), method,
+    )  # fmt: skip

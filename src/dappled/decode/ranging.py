@@ -1,0 +1,165 @@
+"""From disparity to metres and back (Eq 5), by focus and focal length or by targets at known distances.
+
+A point at Z moves over the sensor by S = gain/Z + offset pixels (columns) from one end of the aperture to the other:
+by Eq 5, gain = A·f/pitch and offset = −gain/(distance in focus), A the aperture's side, f the lens' distance from the
+sensor. A disparity of 1 is `ViewStack.sensor_px_per_disparity` of these.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.decode.depthmap import DepthMap, Map
+from dappled.decode.errors import DecodeError
+from dappled.decode.viewstack import ViewStack
+
+_FARTHEST_SIGMAS = 2.0  # a shift that is not clear of infinity by so many standard errors has no distance
+_FRESH_DISTANCES = 1.01  # targets whose distances differ by less tell the offset only
+
+
+@dataclass(frozen=True, slots=True)
+class Ranging:
+    """S = `gain_px_m`/Z + `offset_px`, for a lens at `f_number` (None: the scale doesn't depend on it, as under
+    lenslets). `source` says in words where it is from."""
+
+    gain_px_m: float
+    offset_px: float
+    f_number: float | None = None
+    source: str = "calibration"
+
+    def __post_init__(self) -> None:
+        """Raises DecodeError for numbers that are no lens."""
+        if not (math.isfinite(self.gain_px_m) and self.gain_px_m > 0 and math.isfinite(self.offset_px)):
+            raise DecodeError(f"a gain of {self.gain_px_m:g} px·m and an offset of {self.offset_px:g} px are no lens")
+
+    @classmethod
+    def of_lens(cls, focal_length_mm: float, f_number: float, pixel_mm: float, focus_m: float = math.inf) -> Ranging:
+        """By Eq 5 for a lens focused at `focus_m`, f-number and focal length as the frame says them."""
+        if not (focal_length_mm > 0 and f_number > 0 and pixel_mm > 0 and focus_m > focal_length_mm * 1e-3):
+            raise DecodeError(
+                f"focal length {focal_length_mm:g} mm, f/{f_number:g}, pixels of {pixel_mm:g} mm and a focus at "
+                f"{focus_m:g} m are no camera"
+            )
+        sensor_m = 1e-3 / (1 / focal_length_mm - 1e-3 / focus_m)  # Eq 3
+        gain = focal_length_mm / f_number * sensor_m / pixel_mm
+        return cls(gain, -gain / focus_m, f_number, "focal length, f-number and focus")
+
+    def at(self, f_number: float | None) -> Ranging:
+        """The same lens at another f-number."""
+        if self.f_number is None or f_number is None:
+            return self
+        scale = self.f_number / f_number
+        return Ranging(self.gain_px_m * scale, self.offset_px * scale, f_number, self.source)
+
+    def disparity(self, distance_m: float, stack: ViewStack) -> float:
+        """The disparity of what is so far away, inf allowed. Raises DecodeError for a distance of 0 or less."""
+        if not distance_m > 0:
+            raise DecodeError(f"a distance of {distance_m:g} m is none: it must be above 0")
+        return (self.gain_px_m / distance_m + self.offset_px) / _scale(stack)
+
+    def distances(self, depth: DepthMap, stack: ViewStack) -> DistanceMap:
+        """The map in metres. Unknown where the disparity is, and where it can't be told from infinity's."""
+        beyond = depth.disparity * np.float32(_scale(stack)) - np.float32(self.offset_px)
+        error = depth.sigma * np.float32(_scale(stack))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            known = beyond > _FARTHEST_SIGMAS * error
+            distance = np.where(known, np.float32(self.gain_px_m) / beyond, np.float32(np.nan))
+            # Eq 5: σ_Z = Z²·σ_S/gain
+            sigma = distance**2 * error / np.float32(self.gain_px_m)
+        return DistanceMap(distance.astype(np.float32), sigma.astype(np.float32))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for a file."""
+        return {
+            "gain_px_m": self.gain_px_m,
+            "offset_px": self.offset_px,
+            "f_number": self.f_number,
+            "source": self.source,
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Ranging:
+        """The inverse of `to_dict`. Raises DecodeError."""
+        try:
+            f_number = values.get("f_number")
+            return cls(
+                float(values["gain_px_m"]), float(values["offset_px"]), None if f_number is None else float(f_number),
+                str(values.get("source", "calibration")),
+            )  # fmt: skip
+        except (KeyError, TypeError, ValueError) as error:
+            raise DecodeError(f"the ranging is incomplete or wrong ({error}): calibrate with targets anew") from error
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DistanceMap:
+    """Distances from the lens along its axis and their standard errors, float32 (h, w), m; NaN where unknown."""
+
+    distance_m: Map
+    sigma_m: Map
+
+    def nearest_m(self, share: float = 0.01) -> float | None:
+        """The distance that `share` of the known pixels are nearer than; None where fewer than a tenth are known."""
+        known = np.isfinite(self.distance_m)
+        if known.mean() < 0.1:
+            return None
+        return float(np.quantile(self.distance_m[known], share))
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A target at a known distance and the shift S that it was seen at, both with their errors' part left out."""
+
+    distance_m: float
+    shift_px: float
+
+
+def fit_targets(targets: Sequence[Target], *, f_number: float | None, lens: Ranging | None = None) -> Ranging:
+    """The ranging that targets at known distances show, least squares in 1/Z.
+
+    One distance alone tells the offset (the focus); the gain is then that of `lens`. Raises DecodeError without it.
+    """
+    if not targets:
+        raise DecodeError("no target was seen")
+    inverse = np.array([1 / t.distance_m for t in targets])
+    shifts = np.array([t.shift_px for t in targets])
+    if not np.all(np.isfinite(inverse) & (inverse > 0)):
+        raise DecodeError("targets must stand at distances above 0 m")
+    if inverse.max() / inverse.min() < _FRESH_DISTANCES:
+        if lens is None:
+            raise DecodeError(
+                "targets at one distance tell where the focus is, not the scale: add one at another distance"
+            )
+        gain = lens.gain_px_m
+        return Ranging(gain, float(np.mean(shifts - gain * inverse)), f_number, f"{len(targets)} target(s), lens' gain")
+    design = np.column_stack([inverse, np.ones_like(inverse)])
+    gain, offset = np.linalg.lstsq(design, shifts, rcond=None)[0]
+    if gain <= 0:
+        raise DecodeError("nearer targets were seen with smaller shifts: are the distances in the order of the frames?")
+    return Ranging(float(gain), float(offset), f_number, f"{len(targets)} targets")
+
+
+def target_shift(depth: DepthMap, stack: ViewStack, share: float = 0.25) -> float:
+    """The shift S of what fills the picture's middle (`share` of its height and width): the median, each pixel counting
+    by its variance. Raises DecodeError where less than a tenth of it is known."""
+    height, width = depth.disparity.shape
+    cut = tuple(slice(round(n * (1 - share) / 2), max(round(n * (1 + share) / 2), 1)) for n in (height, width))
+    values, sigma = depth.disparity[cut].ravel(), depth.sigma[cut].ravel()
+    known = np.isfinite(values)
+    if known.mean() < 0.1:
+        raise DecodeError("the target in the picture's middle has too little texture: hang a printed page there")
+    order = np.argsort(values[known])
+    weight: NDArray[np.float64] = np.cumsum(1 / sigma[known][order].astype(np.float64) ** 2)
+    middle = values[known][order][int(np.searchsorted(weight, weight[-1] / 2))]
+    return float(middle) * _scale(stack)
+
+
+def _scale(stack: ViewStack) -> float:
+    if stack.sensor_px_per_disparity is None:
+        raise DecodeError("views from a folder have no sensor: only relative depth is to be had from them")
+    return stack.sensor_px_per_disparity
