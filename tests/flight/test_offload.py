@@ -102,3 +102,9 @@ def test_the_command(closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["flight", "offload", str(tmp_path / "disk"), str(closed), "--prune"]) == 0
     assert "6 files copied and verified" in capsys.readouterr().out
     assert layout.flights(tmp_path / "disk")[0].name == closed.name
+
+
+def test_a_flight_without_a_frame_is_brought_home_too(flight: Recording, tmp_path: Path) -> None:
+    flight.close()
+    done = go(flight.folder.path, tmp_path / "disk", prune=True)
+    assert check(done.destination).problems == ()

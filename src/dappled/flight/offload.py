@@ -54,6 +54,7 @@ def offload(
         done, length = _bring(source, goal)
         copied, there, size = copied + done, there + (not done), size + length
         progress(length)
+    durable.make_folder(FlightFolder(target).frames)  # also of a flight without a frame
     found = check.check(target)
     if found.problems:
         raise FlightError(
