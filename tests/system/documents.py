@@ -1,0 +1,165 @@
+"""A stage on which the documents' commands are run as they are printed: the files that they name, and a live daemon."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import tomli_w
+
+from dappled.config import settings as configuration
+from dappled.daemon.ground_client import GroundClient
+from dappled.drivers.mavlink import mavlink
+from dappled.mocks.masked_camera import reference_camera
+from dappled.mocks.simulation import Simulation, World
+
+ROOT = Path(__file__).resolve().parents[2]
+FENCED = re.compile(r"^```(sh|console|bash)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+INDENTED = re.compile(r"(?:^ {4}\S.*\n)+", re.MULTILINE)
+OURS = re.compile(r"^(dappled|make|python|sudo dappled|uv|pip) ")
+
+
+def commands(document: Path) -> list[str]:
+    """Every command of ours in a document, as printed, comments and continued lines resolved."""
+    text = document.read_text(encoding="utf-8")
+    blocks = [match[2] for match in FENCED.finditer(text)]
+    outside = FENCED.sub("", text)
+    blocks += [re.sub(r"^ {4}", "", match[0], flags=re.MULTILINE) for match in INDENTED.finditer(outside)]
+    lines = []
+    for block in blocks:
+        for line in block.replace("\\\n", " ").splitlines():
+            bare = re.sub(r"\s+#\s.*$", "", line).removeprefix("$ ").strip()
+            if OURS.match(bare):
+                lines.append(bare)
+    return lines
+
+
+SUBSTITUTES = {"white-f22.cr2 --mask mask-2": "white.dng --camera reference-36mm --mask reference-5x5"}
+"""What a real camera would have made, and what stands for it here."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Where commands run. `port` is that of a live daemon's ground link."""
+
+    folder: Path
+    environment: dict[str, str]
+    port: str
+
+    def run(self, command: str) -> str | None:
+        """Run it; None when it went well, else what it said."""
+        if command.startswith("make "):
+            return self._make(command)
+        words = command.replace("127.0.0.1:14550", f"127.0.0.1:{self.port}").removeprefix("sudo ")
+        for printed, ours in SUBSTITUTES.items():
+            words = words.replace(printed, ours)
+        environment = self.environment
+        if re.match(r"dappled( --\S+)* run ", words + " ") and "--frames" not in words:
+            words += " --for 1"  # else it flies until somebody ends it
+            environment = environment | {"RUNTIME_DIRECTORY": str(self.folder / "own")}  # the live one's is taken
+        try:
+            done = subprocess.run(
+                ["/bin/bash", "-c", words],
+                cwd=self.folder,
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=120,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            return f"{command}\n  has not ended after 120 s"
+        no_go = words.startswith("dappled doctor") and done.returncode == 1 and done.stdout  # a finding, no failure
+        return (
+            None
+            if done.returncode == 0 or no_go
+            else f"{command}\n  exit {done.returncode}: {done.stderr.strip()[-600:]}"
+        )
+
+    def _make(self, command: str) -> str | None:
+        """The target is there; running it is what other tests and CI do."""
+        done = subprocess.run(["/bin/sh", "-c", f"{command} -n"], cwd=ROOT, capture_output=True, text=True, check=False)
+        return None if done.returncode == 0 else f"{command}: {done.stderr}"
+
+
+@contextmanager
+def stage(folder: Path, short: Path) -> Iterator[Stage]:
+    """Files by the names that documents use, and a live simulated daemon. `short` is for sockets."""
+    environment = {
+        **os.environ,
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "HOME": str(folder),
+        "XDG_RUNTIME_DIR": str(short),
+        "RUNTIME_DIRECTORY": "",
+    }
+    dappled = [sys.executable, "-m", "dappled"]
+    _files(folder)
+    flown = [*dappled, "run", "--simulate", "--frames", "3", "--config", "dappled.toml"]
+    subprocess.run(flown, cwd=folder, env=environment, check=True, capture_output=True)
+    flight = next((folder / "flights").glob("*Z-*"))
+    (folder / "FLIGHT").symlink_to(flight)
+    frame = sorted((flight / "frames").glob("*.dng"))[-1]
+    for name in ("frame.dng", "FRAME"):
+        shutil.copy(frame, folder / name)
+    shutil.copy(flight / "inputs/calibration.toml", folder / "calibration.toml")
+    designed = [*dappled, "mask", "diffraction", "--mask", "mask-1", "--json"]
+    spots = json.loads(subprocess.run(designed, check=True, capture_output=True).stdout)["impulses"]
+    rows = "".join(f"{spot['x_mm']:.2f},{spot['y_mm']:.2f}\n" for spot in spots)
+    (folder / "bench.csv").write_text("x_mm,y_mm\n" + rows, encoding="utf-8")
+    live = folder / "live"
+    live.mkdir()
+    with Simulation(World(), configuration.load(None), live) as settings:
+        tables = configuration.to_tables(settings)
+        tables["record"]["directory"] = str(live / "flights")
+        tables["publish"] |= {"slices": f"ipc://{short}/dappled/slices", "ask": f"ipc://{short}/dappled/slices.ask"}
+        (live / "live.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
+        daemon = subprocess.Popen(
+            [*dappled, "run", "--config", "live.toml"], cwd=live, env=environment, stderr=subprocess.DEVNULL
+        )
+        try:
+            ground = settings.mavlink.url[1].rpartition(":")[2]
+            with GroundClient(f"udpout:127.0.0.1:{ground}", system_id=254) as client, shooting(client):
+                yield Stage(folder, environment, ground)
+        finally:
+            daemon.terminate()
+            daemon.wait(20)
+
+
+@contextmanager
+def shooting(client: GroundClient) -> Iterator[None]:
+    """A photograph every few seconds, so that there is something to watch."""
+    client.find_camera(60)
+    ended = threading.Event()
+
+    def shoot() -> None:
+        sequence = 0
+        while not ended.wait(3.0):
+            sequence += 1
+            client.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, sequence)
+
+    thread = threading.Thread(target=shoot, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join(10)
+
+
+def _files(folder: Path) -> None:
+    (folder / "dappled.toml").write_text('[record]\ndirectory = "flights"\n', encoding="utf-8")
+    white = reference_camera(1, scale=0.5, scene="white").bench_frame().file
+    for name in ("white.dng", "white-f22.dng", "bench.dng"):
+        (folder / name).write_bytes(white)
+    (folder / "density.csv").write_text(
+        "level,density\n" + "".join(f"{i * 17},{i * 0.2:.2f}\n" for i in range(16)), encoding="utf-8"
+    )
