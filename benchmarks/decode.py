@@ -23,6 +23,7 @@ from scipy import fft
 from dappled.config import profiles
 from dappled.decode import plane as planes
 from dappled.decode.decoder import MaskDecoder
+from dappled.decode.exposure import developer
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.spectrum import padded_shape
 from dappled.decode.views import Aperture, from_slices, transfer
@@ -32,6 +33,7 @@ LENSLETS = (3280, 3280)
 BAYER = np.array([[0, 1], [1, 2]])
 BLACK, WHITE = 1024, 15360
 Mosaic = NDArray[np.uint16]
+DEVELOPER = developer(SHAPE, black=BLACK, white=WHITE, cfa=BAYER, reference=[1])
 
 
 def main() -> None:
@@ -91,9 +93,8 @@ def masked(workers: int) -> MaskDecoder:
 
 def slices(decoder: MaskDecoder, mosaic: Mosaic, length: float, workers: int) -> Any:
     """The mosaic to slices."""
-    plane = planes.to_plane(mosaic, black=BLACK, white=WHITE, cfa=BAYER, workers=workers)
-    planes.even_colours(plane, BAYER, [1], workers=workers)
-    return decoder.decode_reported(plane, focal_length_mm=length, views=False)
+    exposure = DEVELOPER.expose(mosaic, workers=workers)
+    return decoder.decode_reported(exposure, focal_length_mm=length, views=False)
 
 
 def views(decoder: MaskDecoder, mosaic: Mosaic, workers: int) -> Callable[[], Any]:

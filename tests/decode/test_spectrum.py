@@ -6,13 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.decode.errors import DecodeError
+from dappled.decode.exposure import Laid
 from dappled.decode.spectrum import Spectrum, hann, padded_shape
 
 PLANE = np.random.default_rng(3).random((37, 45)).astype(np.float32)
 
 
 def _whole(plane: np.ndarray) -> np.ndarray:
-    return np.fft.fft2(plane - plane.mean(dtype=np.float64), padded_shape((plane.shape[0], plane.shape[1])))
+    return np.fft.fft2(plane - Laid(plane).level, padded_shape((plane.shape[0], plane.shape[1])))
 
 
 @given(row=st.integers(-60, 60), column=st.integers(-70, 70), height=st.integers(1, 38), width=st.integers(1, 40))
@@ -55,7 +56,7 @@ def test_hann_is_the_window_in_the_pixels() -> None:
     spectrum = Spectrum.of(plane)
     assert spectrum.padded == (size, size)
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(size) / size)
-    expected = np.fft.fft2((plane - plane.mean()) * np.outer(window, window))
+    expected = np.fft.fft2((plane - Laid(plane).level) * np.outer(window, window))
     np.testing.assert_allclose(hann(spectrum.block(4, 4, 7, 7)), expected[5:10, 5:10], atol=1e-3)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -22,9 +22,11 @@ from dappled.decode.lattice import fit, residual_bins
 from dappled.decode.lightfield import LightField
 from dappled.decode.masks import Mask, Order
 from dappled.decode.peaks import Measured, measure
-from dappled.decode.plane import Plane
+from dappled.decode.plan import Plans
 from dappled.decode.slices import Slices, default_size, extract
 from dappled.decode.spectrum import Spectrum, padded_shape
+from dappled.decode.threads import each
+from dappled.decode.transform import Source, Transform
 from dappled.decode.views import Aperture, Views, angular_frequencies, from_slices, kappa, transfer
 
 CarriersFrom = Literal["measured", "calibrated", "predicted", "found"]
@@ -57,20 +59,20 @@ class DecodeReport:
 
     @property
     def found(self) -> int:
-        """How many carriers were seen, the mean (0, 0) included."""
-        return sum(m is not None for m in self.measured)
+        """How many carriers were seen, the mean (0, 0) included; suspect ones don't count."""
+        return sum(m is not None and not m.suspect for m in self.measured)
 
 
 class Decoder(Protocol):
     """What decodes the planes of one camera."""
 
     def decode(
-        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None
+        self, plane: Source, *, focal_length_mm: float | None = None, f_number: float | None = None
     ) -> LightField:
-        """The light field of a plane float32 (H, W). Raises DecodeError."""
+        """The light field of a plane float32 (H, W), or of an exposure. Raises DecodeError."""
 
     def decode_reported(
-        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None, views: bool = True
+        self, plane: Source, *, focal_length_mm: float | None = None, f_number: float | None = None, views: bool = True
     ) -> tuple[LightField, DecodeReport]:
         """`decode`, and which carriers it used; without `views` only the slices."""
 
@@ -84,6 +86,7 @@ class MaskDecoder:
     known to (half of the EXIF rounding): it widens the search. `size` of the slices in bins of the padded transform;
     None: as large as the spacing allows. Views need a calibration, or a frame that shows its carriers; else only the
     slices are there, and `views` has the shape (0, 0, h, w). `colours` says that the planes are colour mosaics.
+    `plans` keep buffers from frame to frame.
     """
 
     sensor: Sensor
@@ -96,6 +99,7 @@ class MaskDecoder:
     focal_sigma_mm: float = 0.05
     workers: int = 1
     colours: bool = False
+    plans: Plans = field(default_factory=Plans, repr=False)
 
     def __post_init__(self) -> None:
         """Raises DecodeError for an unknown law, or another camera's calibration."""
@@ -118,13 +122,13 @@ class MaskDecoder:
         return [c for c in self.lattice_at(focal_length_mm).carriers(self.mask.half_orders()) if c.on_sensor]
 
     def decode(
-        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None
+        self, plane: Source, *, focal_length_mm: float | None = None, f_number: float | None = None
     ) -> LightField:
         """The light field of a plane float32 (H, W) of the sensor's shape, 1.0 = sensor white."""
         return self.decode_reported(plane, focal_length_mm=focal_length_mm, f_number=f_number)[0]
 
     def decode_reported(
-        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None, views: bool = True
+        self, plane: Source, *, focal_length_mm: float | None = None, f_number: float | None = None, views: bool = True
     ) -> tuple[LightField, DecodeReport]:
         """`decode`, and which carriers it used. Without `views`, or an f-number, only the slices are made."""
         if focal_length_mm is None:
@@ -138,11 +142,13 @@ class MaskDecoder:
             raise DecodeError(
                 f"all carriers but the mean fall off the sensor at {focal_length_mm} mm: wrong mask, law or length?"
             )
-        spectrum = self.transform(plane, focal_length_mm)
-        lattice, measured, carriers_from = self.locate(spectrum, focal_length_mm, predicted)
-        used = [c for c in lattice.carriers([(c.ky, c.kx) for c in predicted]) if c.on_sensor]
-        slices = self.cut(spectrum, lattice, used)
-        noise = spectrum.noise_rms()
+        with self.plans.lend(self.sensor.shape) as plan:
+            reach = self._reach(predicted, focal_length_mm)
+            spectrum = plan.spectrum(plane, workers=self.workers, largest_fx=reach)
+            lattice, measured, carriers_from = self.locate(spectrum, focal_length_mm, predicted)
+            used = [c for c in lattice.carriers([(c.ky, c.kx) for c in predicted]) if c.on_sensor]
+            slices = plan.cut(spectrum, used, self.slice_size(lattice), workers=self.workers)
+            noise = spectrum.noise_rms(self.workers)
         if views:
             made, offsets, views_from, told = self.views(
                 slices, lattice, carriers_from, focal_length_mm=focal_length_mm, f_number=f_number, noise_rms=noise
@@ -158,16 +164,19 @@ class MaskDecoder:
             "calibrated": self.calibration is not None,
             "transfers": told,
         }
-        return light_field(slices, made, offsets, plane=plane, report=report, facts=facts), report
+        return light_field(slices, made, offsets, shape=plane.shape, report=report, facts=facts), report
 
-    def transform(self, plane: Plane, focal_length_mm: float) -> Spectrum:
+    def transform(self, plane: Source, focal_length_mm: float) -> Spectrum:
         """The spectrum as far out as this focal length's slices and searches need it."""
-        predicted = self.predict(focal_length_mm)
+        largest = self._reach(self.predict(focal_length_mm), focal_length_mm)
+        return Transform(self.sensor.shape).apply(plane, workers=self.workers, largest_fx=largest)
+
+    def _reach(self, predicted: Sequence[Carrier], focal_length_mm: float) -> float:
+        """The largest frequency along columns that slices and searches ask for, in cycles/pixel."""
         reach = max(abs(c.fx) for c in predicted) * (1 + _ROTATION)
         width = self.slice_size(self.lattice_at(focal_length_mm))[1]
         wide = padded_shape(self.sensor.shape)[1]
-        largest = reach + max(width / 2, max(self._radii(predicted, focal_length_mm)) + 8) / wide
-        return Spectrum.of(plane, workers=self.workers, largest_fx=min(0.5, largest))
+        return min(0.5, reach + max(width / 2, max(self._radii(predicted, focal_length_mm)) + 8) / wide)
 
     def slice_size(self, lattice: Lattice) -> tuple[int, int]:
         """(height, width) of the bands in bins of the padded transform."""
@@ -178,13 +187,24 @@ class MaskDecoder:
     ) -> tuple[Lattice, list[Measured | None], CarriersFrom]:
         """The lattice to use, what was seen near each predicted carrier, and which of the two it came from."""
         lattice = self.lattice_at(focal_length_mm)
-        measured = measure(spectrum, predicted, self._radii(predicted, focal_length_mm))
+        radii = self._radii(predicted, focal_length_mm)
+        measured: list[Measured | None] = [None] * len(predicted)
+
+        def look(k: int) -> None:
+            measured[k] = measure(spectrum, [predicted[k]], radii[k])[0]
+
+        each(look, range(len(predicted)), self.workers)
         least = _STRONGER if self.calibration is not None else _STRONG
         own = _own_lattice(spectrum, predicted, measured, least)
         if own is None:
             if self.calibration is not None:
                 return lattice, measured, "calibrated"
-            return lattice, measured, "predicted"
+            # Wide searches find a fence's or a roof's own period, too: peaks on no common lattice are no carriers.
+            kept = [
+                m if m is not None and (m.suspect or (c.ky, c.kx) == (0, 0)) else None
+                for c, m in zip(predicted, measured, strict=True)
+            ]
+            return lattice, kept, "predicted"
         at_own = measure(spectrum, own.carriers([(c.ky, c.kx) for c in predicted]), 2.0)
         return own, at_own, "measured"
 
@@ -330,14 +350,14 @@ def light_field(
     views: Views,
     offsets: NDArray[np.float64],
     *,
-    plane: Plane,
+    shape: tuple[int, ...],
     report: DecodeReport,
     facts: Mapping[str, Any],
 ) -> LightField:
     """The light field's value, its attributes the facts and what the report says in numbers and words."""
     rows = np.array([(c.ky, c.kx, c.fy, c.fx) for c in slices.carriers], dtype=np.float64)
     attributes = {
-        "shape": [int(side) for side in plane.shape],
+        "shape": [int(side) for side in shape],
         **facts,
         "carriers_from": report.carriers_from,
         "views_from": report.views_from,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,10 @@ from dappled.decode.decoder import DecodeReport, light_field, no_views
 from dappled.decode.errors import DecodeError
 from dappled.decode.lattice import FoundLattice, find_lattice
 from dappled.decode.lightfield import LightField
-from dappled.decode.plane import Plane
-from dappled.decode.slices import Slices, default_size, extract
+from dappled.decode.plan import Plan, Plans
+from dappled.decode.slices import Slices, default_size
 from dappled.decode.spectrum import Spectrum
+from dappled.decode.transform import Source
 from dappled.decode.views import Aperture, Views, from_lenslet_slices
 
 _MOST_VIEWS = 15  # per axis
@@ -49,16 +50,18 @@ class LensletDecoder:
     views_per_axis: int | None = None
     workers: int = 1
     rolloff: float | None = None
+    plans: Plans = field(default_factory=Plans, repr=False)
 
     @classmethod
     def with_white(
-        cls, white_plane: Plane, *, views_per_axis: int | None = None, workers: int = 1, rolloff: float | None = None
+        cls, white_plane: Source, *, views_per_axis: int | None = None, workers: int = 1, rolloff: float | None = None
     ) -> LensletDecoder:
         """A decoder that knows a white frame (float32 (H, W)). Raises NoLattice where that shows no lenslets."""
         shape = (white_plane.shape[0], white_plane.shape[1])
-        spectrum = Spectrum.of(white_plane, workers=workers)
+        plan = Plan(shape)
+        spectrum = plan.spectrum(white_plane, workers=workers)
         found = find_lattice(spectrum)
-        slices = _cut(spectrum, found, workers)
+        slices = _cut(plan, spectrum, found, workers)
         origin = lenslet_origin(slices)
         count = views_per_axis or views_carried(found)
         views = from_lenslet_slices(slices.values, slices.carriers, origin, offsets_px(found.lattice, count), rolloff)
@@ -66,13 +69,13 @@ class LensletDecoder:
         return cls(shape, white, count, workers, rolloff)
 
     def decode(
-        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None
+        self, plane: Source, *, focal_length_mm: float | None = None, f_number: float | None = None
     ) -> LightField:
         """The light field of a plane float32 (H, W). Raises DecodeError, NoLattice."""
         return self.decode_reported(plane, focal_length_mm=focal_length_mm, f_number=f_number)[0]
 
     def decode_reported(
-        self, plane: Plane, *, focal_length_mm: float | None = None, f_number: float | None = None, views: bool = True
+        self, plane: Source, *, focal_length_mm: float | None = None, f_number: float | None = None, views: bool = True
     ) -> tuple[LightField, DecodeReport]:
         """`decode`, and which carriers it used; without `views` only the slices.
 
@@ -80,9 +83,11 @@ class LensletDecoder:
         """
         if plane.shape != self.shape:
             raise DecodeError(f"the frame is {plane.shape} px, this decoder is made for {self.shape}")
-        spectrum = Spectrum.of(plane, workers=self.workers)
-        found = self.white.found if self.white is not None else find_lattice(spectrum)
-        slices = _cut(spectrum, found, self.workers)
+        with self.plans.lend(self.shape) as plan:
+            spectrum = plan.spectrum(plane, workers=self.workers)
+            found = self.white.found if self.white is not None else find_lattice(spectrum)
+            slices = _cut(plan, spectrum, found, self.workers)
+            noise_rms = spectrum.noise_rms(self.workers)
         if self.white is not None:
             origin = at_corner(self.white.origin, found.lattice, self.shape)
         else:
@@ -103,7 +108,7 @@ class LensletDecoder:
             used=slices.carriers,
             carriers_from="calibrated" if self.white is not None else "found",
             views_from="none" if not views else "white" if self.white is not None else "frame",
-            noise_rms=spectrum.noise_rms(),
+            noise_rms=noise_rms,
         )
         facts: dict[str, Any] = {
             "law": "found",
@@ -112,7 +117,7 @@ class LensletDecoder:
             "lenslet_pitch_px": list(found.spacing_px),
             "lattice_rotation_rad": found.rotation_rad,
         }
-        return light_field(slices, made, offsets, plane=plane, report=report, facts=facts), report
+        return light_field(slices, made, offsets, shape=plane.shape, report=report, facts=facts), report
 
 
 def views_carried(found: FoundLattice) -> int:
@@ -168,11 +173,11 @@ def _reach(found: FoundLattice) -> float:
     return max(math.hypot(c.fy, c.fx) for c in found.carriers)
 
 
-def _cut(spectrum: Spectrum, found: FoundLattice, workers: int) -> Slices:
+def _cut(plan: Plan, spectrum: Spectrum, found: FoundLattice, workers: int) -> Slices:
     """Slices of all carriers of the half plane as far out as any was verified, bands going round at Nyquist."""
     carriers = carriers_within(found.lattice, 1.01 * _reach(found))
     size = default_size(found.lattice, spectrum.padded, "cell")
-    return extract(spectrum, carriers, size, lattice=found.lattice, window="cell", wrap=True, workers=workers)
+    return plan.cut(spectrum, carriers, size, lattice=found.lattice, window="cell", wrap=True, workers=workers)
 
 
 def carriers_within(lattice: Lattice, reach: float) -> list[Carrier]:

@@ -71,7 +71,7 @@ def _measure_one(spectrum: Spectrum, fy: float, fx: float, radius: float, promin
     reach = math.ceil(radius)
     around = max(reach, 6)  # the surroundings that a peak must stand above
     top, left = round(row) - around, round(column) - around
-    if left + 2 * around + 2 > spectrum.half.shape[1] and spectrum.half.shape[1] < spectrum.padded[1] // 2 + 1:
+    if left + 2 * around + 2 > spectrum.columns and spectrum.columns < spectrum.padded[1] // 2 + 1:
         return None
     raw = spectrum.block(top - 1, left - 1, 2 * around + 3, 2 * around + 3)
     windowed = hann(raw)

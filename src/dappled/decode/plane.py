@@ -36,22 +36,11 @@ def to_plane(
     colours of this frame the same mean, with gain 1 for the commonest colour. Raises DecodeError for a frame that
     holds no picture: wrong shape, NaN, constant, black or saturated.
     """
-    check_shape(mosaic)
-    if dark is not None and dark.shape != mosaic.shape:
-        raise DecodeError(f"the dark frame is {_size(dark)}, the frame {_size(mosaic)}: take a dark frame of its size")
     pattern = np.zeros((1, 1), dtype=np.intp) if cfa is None else np.asarray(cfa, dtype=np.intp)
-    colours = int(pattern.max()) + 1
-    levels = np.broadcast_to(np.asarray(black, dtype=np.float64), (colours,))
-    if not np.all(levels < white):
-        raise DecodeError(f"the white level {white:g} is not above the black level {levels.max():g}")
-    _check_values(mosaic, white)
+    levels, known = levels_of(pattern, black=black, white=white, balance=balance)
+    check_frame(mosaic, white, dark=dark)
     scale = 1.0 / (white - levels)
-    if balance is None:
-        gains = estimate_balance(mosaic, black=black, cfa=pattern, workers=workers)
-    else:
-        gains = np.asarray(balance, dtype=np.float64)
-        if gains.shape != (colours,) or not np.all(np.isfinite(gains) & (gains > 0)):
-            raise DecodeError(f"the white balance needs {colours} positive gains, one per colour, and is {balance}")
+    gains = estimate_balance(mosaic, black=black, cfa=pattern, workers=workers) if known is None else known
     plane = np.empty(mosaic.shape, dtype=np.float32)
     period = pattern.shape[0]
     factors, offsets = [], []
@@ -99,14 +88,41 @@ def estimate_balance(
             along[row] += part.sum(axis=0, dtype=np.uint32 if whole is np.uint64 else whole)
 
     each(add, range(a), workers)
-    sums = np.zeros(colours)
+    means = np.empty((a, b))
     for (row, column), colour in np.ndenumerate(pattern):
         count = len(range(row, mosaic.shape[0], a)) * len(range(column, mosaic.shape[1], b))
-        sums[colour] += along[row, column::b].sum() / count - levels[colour]
-    means = sums / np.maximum(counts, 1)
-    reference = means[int(np.argmax(counts))]
-    lit = means > 1e-3 * max(reference, 1e-12)
-    return np.where(lit, reference / np.where(lit, means, 1.0), 1.0)
+        means[row, column] = along[row, column::b].sum() / count - levels[colour]
+    return colour_gains(pattern, means)
+
+
+def colour_gains(pattern: NDArray[np.intp], means: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gains per colour index that give all colours the mean of the commonest one, from the means (a, b) of the
+    pattern's places. 1.0 for a colour without light."""
+    counts = np.bincount(pattern.ravel())
+    colours = np.bincount(pattern.ravel(), weights=means.ravel()) / np.maximum(counts, 1)
+    reference = colours[int(np.argmax(counts))]
+    lit = colours > 1e-3 * max(reference, 1e-12)
+    return np.where(lit, reference / np.where(lit, colours, 1.0), 1.0)
+
+
+def levels_of(
+    pattern: NDArray[np.intp],
+    *,
+    black: float | Sequence[float],
+    white: float,
+    balance: Sequence[float] | NDArray[np.float64] | None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Black levels and gains per colour index; None where none are given. Raises DecodeError for impossible ones."""
+    colours = int(pattern.max()) + 1
+    levels = np.broadcast_to(np.asarray(black, dtype=np.float64), (colours,))
+    if not np.all(levels < white):
+        raise DecodeError(f"the white level {white:g} is not above the black level {levels.max():g}")
+    if balance is None:
+        return levels, None
+    gains = np.asarray(balance, dtype=np.float64)
+    if gains.shape != (colours,) or not np.all(np.isfinite(gains) & (gains > 0)):
+        raise DecodeError(f"the white balance needs {colours} positive gains, one per colour, and is {balance}")
+    return levels, gains
 
 
 def even_colours(
@@ -259,12 +275,26 @@ def check_shape(mosaic: NDArray[Any]) -> None:
         raise DecodeError(f"the frame is {_size(mosaic)}: more than {LARGEST_PIXELS // 10**6} megapixels, cut it first")
 
 
+def check_frame(
+    mosaic: NDArray[Any], white: float, *, dark: NDArray[Any] | None = None, flat: Plane | None = None
+) -> None:
+    """Raises DecodeError for a frame that holds no picture, or a dark or white frame of another size."""
+    check_shape(mosaic)
+    if dark is not None and dark.shape != mosaic.shape:
+        raise DecodeError(f"the dark frame is {_size(dark)}, the frame {_size(mosaic)}: take a dark frame of its size")
+    if flat is not None and flat.shape != mosaic.shape:
+        raise DecodeError(
+            f"the white frame is {_size(flat)}, the frame {_size(mosaic)}: take a white frame of its size"
+        )
+    _check_values(mosaic, white)
+
+
 def _check_values(mosaic: NDArray[Any], white: float) -> None:
     if mosaic.dtype.kind not in "uif":
         raise DecodeError(f"the frame holds {mosaic.dtype} values: give integers or floats")
     if mosaic.dtype.kind == "f" and not np.isfinite(mosaic).all():
         raise DecodeError("the frame holds NaN or infinite values")
-    some = mosaic[:: max(1, mosaic.shape[0] // 256), :: max(1, mosaic.shape[1] // 256)]
+    some = mosaic[:: mosaic.shape[0] // 256 | 1, :: mosaic.shape[1] // 256 | 1]  # odd steps: all colours are among them
     if some.min() == some.max() and mosaic.min() == mosaic.max():
         raise DecodeError(f"the frame is constant: every pixel is {mosaic.flat[0]}")
     if np.mean(some >= 0.995 * white) > 0.5:

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from dappled.decode.bands import Bands, lay_out
 from dappled.decode.carriers import Carrier, Lattice
 from dappled.decode.errors import DecodeError
 from dappled.decode.spectrum import Complex, Spectrum
-from dappled.decode.threads import each
 
 Window = Literal["box", "cell"]
 
@@ -62,6 +62,24 @@ def default_size(lattice: Lattice, padded: tuple[int, int], window: Window = "bo
     return _fast_down(min(best[0], padded[0])), _fast_down(min(best[1], padded[1]))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SlicePlan:
+    """Where the slices of these carriers lie in spectra of one shape; made by `plan_slices`, applied to many frames."""
+
+    carriers: tuple[Carrier, ...]
+    bands: Bands
+    padded: tuple[int, int]
+    share: float
+
+    def apply(self, spectrum: Spectrum, *, workers: int = 1) -> Slices:
+        """The slices of a spectrum."""
+        values = np.empty((len(self.carriers), *self.bands.samples), dtype=np.complex64)
+        self.bands.cut(spectrum, values, workers=workers)
+        (high, wide), (height, width) = self.padded, self.bands.size
+        grid = np.array([[high / height, 0.0, 0.0], [0.0, wide / width, 0.0]])
+        return Slices(values, self.carriers, grid, self.share)
+
+
 def extract(
     spectrum: Spectrum,
     carriers: Sequence[Carrier],
@@ -77,58 +95,41 @@ def extract(
     `size` is (height, width) of the band in bins; by default `default_size` of `lattice`, which is otherwise only
     needed for the window "cell". `wrap` lets a band go on cyclically past the edge of the spectrum (sampled lenslet
     arrays); else what lies beyond Nyquist is 0. Scaled so that the slice of (0, 0) has the plane's local mean; phases
-    are those at pixel (0, 0), the fraction of a bin compensated exactly. The slices end where the frame ends.
+    are those at pixel (0, 0), the fraction of a bin compensated exactly. The slices end where the frame ends. The
+    same numbers as `equations.slice_at`, for all carriers at once.
     """
+    plan = plan_slices(spectrum.shape, spectrum.padded, carriers, size, lattice=lattice, window=window, wrap=wrap)
+    return plan.apply(spectrum, workers=workers)
+
+
+def plan_slices(
+    shape: tuple[int, int],
+    padded: tuple[int, int],
+    carriers: Sequence[Carrier],
+    size: tuple[int, int] | None = None,
+    *,
+    lattice: Lattice | None = None,
+    window: Window = "box",
+    wrap: bool = False,
+) -> SlicePlan:
+    """`extract` for all frames of `shape`, transformed over `padded`."""
     if not carriers:
         raise DecodeError("no carriers to cut slices at")
     if size is None or window == "cell":
         if lattice is None:
             raise DecodeError("slices need a size, or a lattice to take it from")
-        size = size or default_size(lattice, spectrum.padded, window)
+        size = size or default_size(lattice, padded, window)
     height, width = size
-    if not (2 <= height <= spectrum.padded[0] and 2 <= width <= spectrum.padded[1]):
-        raise DecodeError(f"a slice of {height}×{width} bins doesn't fit a spectrum of {spectrum.padded}")
-    scale = np.float32(1 / (spectrum.padded[0] * spectrum.padded[1]))
-    share = height * width / (spectrum.padded[0] * spectrum.padded[1])
+    if not (2 <= height <= padded[0] and 2 <= width <= padded[1]):
+        raise DecodeError(f"a slice of {height}×{width} bins doesn't fit a spectrum of {padded}")
+    share = height * width / (padded[0] * padded[1])
     cell = None
     if window == "cell" and lattice is not None:
-        cell = _cell_weights(lattice, spectrum.padded, size)
+        cell = _cell_weights(lattice, padded, size)
         share *= float(np.mean(cell**2))
-    rows = _samples(spectrum.shape[0], spectrum.padded[0], height)
-    columns = _samples(spectrum.shape[1], spectrum.padded[1], width)
-    values = np.empty((len(carriers), rows, columns), dtype=np.complex64)
-
-    def cut(k: int) -> None:
-        carrier = carriers[k]
-        row, column = spectrum.bins(carrier.fy, carrier.fx)
-        whole = round(row), round(column)
-        block = np.empty((height, width), dtype=np.complex64)
-        spectrum.block_into(block, whole[0] - height // 2, whole[1] - width // 2, wrap=wrap)
-        if cell is not None:
-            block *= cell
-        band = np.empty((height, width), dtype=np.complex64)
-        _unshift(band, block, scale)
-        image = fft.ifft2(band, norm="forward", overwrite_x=True)
-        turn_y = np.exp(-2j * np.pi * (row - whole[0]) * np.arange(rows) / height).astype(np.complex64)
-        turn_x = np.exp(-2j * np.pi * (column - whole[1]) * np.arange(columns) / width).astype(np.complex64)
-        np.multiply(image[:rows, :columns], turn_y[:, None], out=values[k])
-        values[k] *= turn_x
-        if carrier.ky == 0 and carrier.kx == 0:
-            values[k] += np.float32(spectrum.mean)
-
-    each(cut, range(len(carriers)), workers)
-    grid = np.array([[spectrum.padded[0] / height, 0.0, 0.0], [0.0, spectrum.padded[1] / width, 0.0]])
-    return Slices(values, tuple(carriers), grid, share)
-
-
-def _unshift(out: Complex, block: Complex, scale: np.float32) -> None:
-    """ifftshift times `scale`, without a temporary: the block's middle bin goes to (0, 0)."""
-    y, x = block.shape[0] // 2, block.shape[1] // 2
-    down, right = block.shape[0] - y, block.shape[1] - x
-    np.multiply(block[y:, x:], scale, out=out[:down, :right])
-    np.multiply(block[:y, x:], scale, out=out[down:, :right])
-    np.multiply(block[y:, :x], scale, out=out[:down, right:])
-    np.multiply(block[:y, :x], scale, out=out[down:, right:])
+    samples = _samples(shape[0], padded[0], height), _samples(shape[1], padded[1], width)
+    bands = lay_out(padded, carriers, size, samples, wrap=wrap, cell=cell)
+    return SlicePlan(tuple(carriers), bands, padded, share)
 
 
 def _samples(side: int, padded: int, size: int) -> int:

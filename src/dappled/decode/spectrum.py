@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +11,11 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.threads import each, spans
+from dappled.decode.threads import each
 
 Complex = NDArray[np.complex64]
-_ROWS = 96  # transformed at a time: fixed, so that the same rows share a run for any number of workers
-_TILE = 34  # bins on a side, one of its edge for the window
+TILE = 32  # columns that lie together in memory: a tile of them stays in the cache while it is transformed
+_QUIET = 34  # bins on a side of a part whose noise is measured, one of its edge for the window
 
 
 def padded_shape(shape: tuple[int, int]) -> tuple[int, int]:
@@ -22,43 +23,85 @@ def padded_shape(shape: tuple[int, int]) -> tuple[int, int]:
     return _next_even(shape[0], real=False), _next_even(shape[1], real=True)  # rows are transformed first
 
 
+@dataclass(frozen=True, slots=True)
+class Run:
+    """`count` bins of one axis that stand together: from `at` in a block, from `source` on in the spectrum."""
+
+    at: int
+    count: int
+    source: int
+
+
+def row_runs(first: int, count: int, side: int, *, wrap: bool = True) -> list[Run]:
+    """Rows first…first+count−1 (signed) of a spectrum of `side` rows in DFT order, cyclic.
+
+    Without `wrap` those up to the Nyquist frequency only.
+    """
+    at, end = 0, count
+    if not wrap:
+        at, end = max(0, -(side // 2) - first), min(count, side // 2 + 1 - first)
+    found = []
+    while at < end:
+        source = (first + at) % side
+        length = min(end - at, side - source)
+        found.append(Run(at, length, source))
+        at += length
+    return found
+
+
+def column_runs(first: int, count: int, side: int, *, wrap: bool = True) -> tuple[list[Run], list[Run]]:
+    """Columns first…first+count−1 (signed) in the half of a spectrum of `side` columns: as they are, and mirrored.
+
+    A mirrored run stands left of DC: its bins are the conjugates of `source`… backwards, at the negative row.
+    """
+    at, end = 0, count
+    if not wrap:
+        at, end = max(0, -(side // 2) - first), min(count, side // 2 + 1 - first)
+    plain, mirrored = [], []
+    while at < end:
+        frequency = (first + at + side // 2) % side - side // 2  # −side/2 … side/2 − 1
+        length = min(end - at, (0 if frequency < 0 else side // 2) - frequency)
+        if frequency >= 0:
+            plain.append(Run(at, length, frequency))
+        else:
+            mirrored.append(Run(at, length, -(frequency + length - 1)))
+        at += length
+    return plain, mirrored
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Spectrum:
-    """Half of the DFT of a real plane that was padded at its lower and right edge with its mean.
+    """Half of the DFT of a real plane that was padded at its lower and right edge with `level`, about its mean.
 
-    `half` complex64 (Hp, C), C ≤ Wp/2 + 1: rows in DFT order, columns from DC upwards. The mean was taken off before
-    the transform and stands in `mean`, so bin (0, 0) is 0. `shape` is the plane's, `padded` (Hp, Wp) the transform's.
+    `tiles` complex64 (n, Hp, TILE): rows in DFT order, columns from DC upwards, TILE of them in a tile; the first
+    `columns` ≤ Wp/2 + 1 of them are the spectrum's. The level was taken off before the transform, so bin (0, 0) only
+    holds what the mean has beside it. `shape` is the plane's, `padded` (Hp, Wp) the transform's.
     """
 
-    half: Complex
+    tiles: Complex
+    columns: int
     shape: tuple[int, int]
     padded: tuple[int, int]
-    mean: float
+    level: float
 
     @classmethod
     def of(cls, plane: NDArray[np.float32], *, workers: int = 1, largest_fx: float = 0.5) -> Spectrum:
         """The spectrum of a float32 (H, W) plane, up to `largest_fx` cycles/pixel along columns."""
+        from dappled.decode.transform import Transform  # noqa: PLC0415  # it makes spectra, and so imports this module
+
         if plane.ndim != 2:
             raise DecodeError(f"a plane has two axes, this array has {plane.ndim}")
-        padded = padded_shape((plane.shape[0], plane.shape[1]))
-        columns = min(padded[1] // 2 + 1, int(np.ceil(largest_fx * padded[1])) + 2)
-        runs = spans(plane.shape[0], _ROWS)
-        sums = np.empty(len(runs))
+        return Transform((plane.shape[0], plane.shape[1])).apply(plane, workers=workers, largest_fx=largest_fx)
 
-        def add(run: int) -> None:
-            sums[run] = plane[runs[run]].sum(axis=1, dtype=np.float32).sum(dtype=np.float64)
+    @property
+    def mean(self) -> float:
+        """The plane's mean."""
+        return self.level + float(self.tiles[0, 0, 0].real) / (self.shape[0] * self.shape[1])
 
-        each(add, range(len(runs)), workers)
-        mean = float(sums.sum() / plane.size)
-        half = np.empty((padded[0], columns), dtype=np.complex64)
-        half[plane.shape[0] :] = 0
-
-        def along(rows: slice) -> None:
-            half[rows] = fft.rfft(plane[rows] - np.float32(mean), n=padded[1], axis=1)[:, :columns]
-
-        each(along, runs, workers)
-        half = fft.fft(half, axis=0, overwrite_x=True, workers=workers)
-        return cls(half, (plane.shape[0], plane.shape[1]), padded, mean)
+    @property
+    def half(self) -> Complex:
+        """complex64 (Hp, columns), laid out anew: rows in DFT order, columns from DC upwards."""
+        return self.block(0, 0, self.padded[0], self.columns)
 
     def bins(self, fy: float, fx: float) -> tuple[float, float]:
         """Cycles/pixel as fractional bins of the padded transform, signed."""
@@ -70,71 +113,70 @@ class Spectrum:
         Bins left of DC are conjugates of those right of it. Beyond the Nyquist frequency the spectrum goes on
         cyclically (`wrap`) or is 0. Raises DecodeError for columns that were not computed.
         """
-        out = np.empty((height, width), dtype=np.complex64)
-        self.block_into(out, row, column, wrap=wrap)
+        out = np.zeros((height, width), dtype=np.complex64)
+        plain, mirrored = column_runs(column, width, self.padded[1], wrap=wrap)
+        self.require([*plain, *mirrored])
+        for run in plain:
+            for down in row_runs(row, height, self.padded[0], wrap=wrap):
+                target = out[down.at : down.at + down.count, run.at : run.at + run.count]
+                self._take(target, down.source, run.source)
+        for run in mirrored:
+            backwards = out[::-1, run.at : run.at + run.count][:, ::-1]
+            for down in row_runs(-row - height + 1, height, self.padded[0], wrap=wrap):
+                target = backwards[down.at : down.at + down.count]
+                self._take(target, down.source, run.source)
+                np.conjugate(target, out=target)
         return out
 
-    def block_into(self, out: Complex, row: int, column: int, *, wrap: bool = True) -> None:
-        """`block` into an array that is at hand."""
-        high, wide = self.padded
-        height, width = out.shape
-        rows = np.arange(row, row + height)
-        start = column
-        while start < column + width:
-            # One run of columns on one side of DC, in the cyclic spectrum.
-            place = (start + wide // 2) % wide - wide // 2  # −Wp/2 … Wp/2 − 1
-            stop = min(column + width, start + (0 if place < 0 else wide // 2) - place)
-            target = out[:, start - column : stop - column]
-            count = stop - start
-            if place >= 0:
-                self._copy(target, rows % high, place, count, conjugate=False)
-            else:
-                self._copy(target, -rows % high, -place, count, conjugate=True)
-            start = stop
-        if not wrap:
-            columns = np.arange(column, column + width)
-            out[np.abs(rows) > high // 2, :] = 0
-            out[:, np.abs(columns) > wide // 2] = 0
+    def require(self, across: Sequence[Run]) -> None:
+        """Raises DecodeError where one of these runs of columns was not computed."""
+        last = max((run.source + run.count for run in across), default=0)
+        if last > self.columns:
+            raise DecodeError(f"column {last - 1} of the spectrum was not computed (it has {self.columns})")
 
-    def _copy(self, target: Complex, rows: NDArray[np.intp], first: int, count: int, *, conjugate: bool) -> None:
-        last = first + count if not conjugate else first + 1
-        if last > self.half.shape[1]:
-            raise DecodeError(f"column {last - 1} of the spectrum was not computed (it has {self.half.shape[1]})")
-        columns = slice(first, first + count) if not conjugate else slice(first, first - count, -1)
-        step = 1 if not conjugate else -1
-        breaks = np.flatnonzero(np.diff(rows) != step) + 1
-        for part in np.split(np.arange(rows.size), breaks):
-            top, bottom = int(rows[part[0]]), int(rows[part[-1]])
-            taken = slice(top, bottom + 1) if not conjugate else slice(top, bottom - 1 if bottom else None, -1)
-            source = self.half[taken, columns]
-            if conjugate:
-                np.conjugate(source, out=target[part[0] : part[-1] + 1])
-            else:
-                target[part[0] : part[-1] + 1] = source
+    def _take(self, target: Complex, row: int, column: int) -> None:
+        """Bins as they lie in the tiles, from (row, column) on: a tile's end, whole tiles, a tile's beginning."""
+        height, width = target.shape
+        lines = slice(row, row + height)
+        head = min(width, -column % TILE)
+        if head:
+            begin = column % TILE
+            target[:, :head] = self.tiles[column // TILE, lines, begin : begin + head]
+        whole, tail = divmod(width - head, TILE)
+        tile = -(-column // TILE)
+        if whole:
+            between = self.tiles[tile : tile + whole, lines].transpose(1, 0, 2)
+            target[:, head : head + whole * TILE].reshape(height, whole, TILE)[...] = between
+        if tail:
+            target[:, width - tail :] = self.tiles[tile + whole, lines, :tail]
 
-    def noise_rms(self) -> float:
+    def noise_rms(self, workers: int = 1) -> float:
         """The plane's white noise (one standard deviation a pixel), from the quietest parts of the spectrum.
 
         The median power in each of some hundred tiles (under a Hann window: edges of the frame don't leak), then the
         tenth percentile of those: bands, carriers and colour replicas only cover some. An upper bound where every
         tile holds signal.
         """
-        tiles = []
-        for rows in np.array_split(np.arange(self.half.shape[0]), 16):
-            for columns in np.array_split(np.arange(self.half.shape[1]), 8):
-                part = hann(self.half[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1][:_TILE, :_TILE])
-                if part.size:
-                    tiles.append(float(np.median(part.real**2 + part.imag**2)))
-        power = float(np.quantile(tiles, 0.1)) / math.log(2)  # the median of an exponential is ln 2 of its mean
+        edges = [np.array_split(np.arange(side), parts) for side, parts in ((self.padded[0], 16), (self.columns, 8))]
+        high, wide = (min(_QUIET, *(part.size for part in parts)) for parts in edges)
+        corners = [(int(rows[0]), int(columns[0])) for rows in edges[0] for columns in edges[1]]
+        middle = np.empty(len(corners))
+
+        def look(index: int) -> None:
+            quiet = hann(self.block(*corners[index], high, wide))
+            middle[index] = np.median(quiet.real**2 + quiet.imag**2)
+
+        each(look, range(len(corners)), workers)
+        power = float(np.quantile(middle, 0.1)) / math.log(2)  # the median of an exponential is ln 2 of its mean
         power *= (8 / 3) ** 2  # the window's mean square is 3/8 an axis
         return float(np.sqrt(power / (self.shape[0] * self.shape[1])))
 
 
 def hann(block: Complex) -> Complex:
-    """A block of bins as if a Hann window over the padded lengths lay on the plane; one bin less at each edge."""
+    """Bins (…, h, w) as if a Hann window over the padded lengths lay on the plane; one less at each edge."""
     half, quarter = np.float32(0.5), np.float32(0.25)
-    rows = half * block[1:-1] - quarter * (block[:-2] + block[2:])
-    return np.asarray(half * rows[:, 1:-1] - quarter * (rows[:, :-2] + rows[:, 2:]), dtype=np.complex64)
+    rows = half * block[..., 1:-1, :] - quarter * (block[..., :-2, :] + block[..., 2:, :])
+    return np.asarray(half * rows[..., 1:-1] - quarter * (rows[..., :-2] + rows[..., 2:]), dtype=np.complex64)
 
 
 def _next_even(n: int, *, real: bool) -> int:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 Part = TypeVar("Part")
@@ -11,14 +11,39 @@ Part = TypeVar("Part")
 
 def each(work: Callable[[Part], None], parts: Iterable[Part], workers: int) -> None:
     """`work` on every part, which must not depend on `workers`. The first error is raised."""
-    parts = list(parts)
-    if workers <= 1 or len(parts) < 2:
-        for part in parts:
+    share(lambda: work, parts, workers)
+
+
+def share(start: Callable[[], Callable[[Part], None]], parts: Iterable[Part], workers: int) -> None:
+    """As `each`; every thread calls `start` once for a `work` of its own, so that `work` may hold scratch memory."""
+    waiting = list(parts)
+    if workers <= 1 or len(waiting) < 2:
+        work = start()
+        for part in waiting:
             work(part)
         return
-    with ThreadPoolExecutor(min(workers, len(parts))) as pool:
-        for _ in pool.map(work, parts):
-            pass
+    left, lock, errors = iter(waiting), threading.Lock(), list[BaseException]()
+
+    def run() -> None:
+        try:
+            work = start()
+            while not errors:
+                with lock:
+                    part = next(left, None)
+                if part is None:
+                    return
+                work(part)
+        except BaseException as error:  # noqa: BLE001  # raised again in the caller's thread
+            errors.append(error)
+
+    threads = [threading.Thread(target=run, daemon=True) for _ in range(min(workers, len(waiting)) - 1)]
+    for thread in threads:
+        thread.start()
+    run()
+    for thread in threads:
+        thread.join()
+    if errors:
+        raise errors[0]
 
 
 def spans(size: int, step: int) -> list[slice]:

@@ -20,6 +20,7 @@ from dappled.decode import plane as planes
 from dappled.decode.calibration import Calibration
 from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
 from dappled.decode.errors import DecodeError
+from dappled.decode.exposure import Developer, Exposure, developer
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
 from dappled.decode.plane import Plane
@@ -84,6 +85,7 @@ class Darkroom:
         self._dark: NDArray[Any] | None = None
         self._gains: dict[tuple[int, int], Plane] = {}
         self._balance: NDArray[np.float64] | None = None
+        self._developers: dict[Any, Developer] = {}
 
     def check(self) -> None:
         """Raises DappledError when the recipe names something that isn't there or isn't right."""
@@ -114,7 +116,7 @@ class Darkroom:
             raw = self.read(path)
         with _named(path):
             with _timed(ms, "plane"):
-                plane, chroma = self._plane(raw, colour=self.recipe.colour and views)
+                plane, chroma = self._expose(raw, colour=self.recipe.colour and views)
             decoder = self.decoder(plane.shape, raw.camera_model or "", colours=raw.cfa is not None)
             focal_length_mm = focal_length_mm or raw.focal_length_mm
             f_number = f_number or raw.f_number
@@ -131,40 +133,42 @@ class Darkroom:
 
     def plane(self, raw: RawFile) -> Plane:
         """The linear plane of a frame: black, white, dark frame; for masks also colours evened out, and white frame."""
-        return self._plane(raw, colour=False)[0]
+        return self._expose(raw, colour=False)[0].plane(self.recipe.workers)
 
     def read(self, path: Path | str) -> RawFile:
         """A frame's file, with what the recipe says about it. Raises DappledError."""
         return said(rawfile.read(Path(path)), self.recipe)
 
-    def _plane(self, raw: RawFile, *, colour: bool) -> tuple[Plane, NDArray[np.float32] | None]:
-        """The plane, and local colours (3, rows, columns) as shares of it where they are asked for."""
+    def _expose(self, raw: RawFile, *, colour: bool) -> tuple[Exposure, NDArray[np.float32] | None]:
+        """The plane to be, and local colours (3, rows, columns) as shares of it where they are asked for."""
         raw = said(raw, self.recipe)
         lenslets = self.recipe.mask == profiles.LENSLET
-        workers = self.recipe.workers
         cfa, black = _one_index_a_colour(raw)
-        made = planes.to_plane(
-            raw.mosaic,
-            black=black,
-            white=raw.white,
-            cfa=cfa,
-            balance=None if cfa is None or not lenslets else self._white_balance(),
-            dark=self._dark_frame(),
-            workers=workers,
-        )
+        balance = None if cfa is None or not lenslets else self._white_balance()
+        dark = self._dark_frame()
+        workers = self.recipe.workers
+        reference: list[int] = []
         chroma = None
         if cfa is not None:
             names = raw.colour_names
             # Behind lenslets the grey view is the mean of the colours; a masked frame has most of its detail in green.
             reference = [names.index("G")] if "G" in names and not lenslets else sorted({int(c) for c in cfa.flat})
             if colour and all(name in names for name in "RGB"):
-                chroma = planes.local_colours(made, cfa, [names.index(name) for name in "RGB"], reference)
-            planes.even_colours(made, cfa, reference, workers=workers)
+                even = planes.to_plane(
+                    raw.mosaic, black=black, white=raw.white, cfa=cfa, balance=balance, dark=dark, workers=workers
+                )
+                chroma = planes.local_colours(even, cfa, [names.index(name) for name in "RGB"], reference)
         elif colour:
             raise DecodeError("the frame has no colour pattern: decode it without --colour, or name it with --cfa")
-        if self.recipe.white and not lenslets:
-            made = planes.divide(made, self._gain((made.shape[0], made.shape[1])))
-        return made, chroma
+        planes.check_shape(raw.mosaic)
+        shape = raw.mosaic.shape[0], raw.mosaic.shape[1]
+        key = shape, None if cfa is None else (cfa.shape, cfa.tobytes()), black, raw.white
+        if key not in self._developers:
+            self._developers[key] = developer(
+                shape, black=black, white=raw.white, cfa=cfa, balance=balance, reference=reference
+            )
+        flat = self._gain(shape) if self.recipe.white and not lenslets else None
+        return self._developers[key].expose(raw.mosaic, dark=dark, flat=flat, workers=workers), chroma
 
     def _white_balance(self) -> NDArray[np.float64] | None:
         """The gains that make the white frame grey; None without one."""
