@@ -29,6 +29,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "flight": ("flight", "recorded flights: list, show, check, report, offload"),
     "geotag": ("geotag", "positions and attitudes for other programs: XMP sidecars, geo.txt, CSV, GeoJSON"),
     "georeference": ("georeference", "a flight as maps: KMZ overlay, GeoTIFF, footprints, terrain"),
+    "batch": ("batch", "whole flights frame by frame, on all cores or a Dask cluster"),
     "config": ("config", "check or show settings"),
     "profiles": ("config", "shipped camera and mask profiles"),
 }

@@ -12,13 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from dappled.drivers.darkroom import Darkroom, Recipe
+from dappled.drivers.darkroom import Darkroom, Development, Recipe
 from dappled.errors import DappledError
 from dappled.flight import durable
+from dappled.flight.records import Frame, Tag
 from dappled.products import footprints, maps, photographs, refine
 from dappled.products.basemap import BaseMap
 from dappled.products.earth import Geoid, Projection, utm
-from dappled.products.ground import Flat, Ground
+from dappled.products.eye import EyeError
+from dappled.products.ground import Flat, Ground, Raster
 from dappled.products.ground import load as load_ground
 from dappled.products.maps import MapError
 from dappled.products.photographs import Mounting, Photograph, Station
@@ -84,7 +86,7 @@ def survey(flight: Path, recipe: Recipe, options: Options, progress: Progress, s
     first = stations[0].camera
     projection = Projection(options.crs or utm(first.latitude_deg, first.longitude_deg))
     projection.at(first.latitude_deg, first.longitude_deg)
-    level = _level(stations, options)
+    level = level_of(stations, options)
     scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-maps-")))
     darkroom = Darkroom(recipe)
     darkroom.check()
@@ -92,28 +94,54 @@ def survey(flight: Path, recipe: Recipe, options: Options, progress: Progress, s
     for number, station in enumerate(stations):
         progress("decode", number, len(stations))
         try:
-            one = take(flight, station, darkroom, projection, options)
-            one.eye.check_horizon(station.frame.name)
-            maps.footprint(one.eye, Flat(level))
+            made = develop(darkroom, flight, station.frame, station.tag, options)
+            one = place(station, made, darkroom, projection, options)
         except DappledError as error:
             left.append((station.frame.name, str(error)))
             continue
         taken.append(_shelved(one, scratch))
     progress("decode", len(stations), len(stations))
-    if not taken:
-        raise DappledError(f"no frame of {flight} can be put on a map: {left[0][1]}")
-    ground = _ground(taken, projection, level, options)
-    kept: list[Photograph] = []
-    for one in taken:
-        try:
-            maps.footprint(one.eye, ground)
-            kept.append(one)
-        except MapError as error:
-            left.append((one.name, f"frame {one.name}: {error}"))
+    return on_ground(flight.name, taken, left, projection=projection, level_m=level, options=options)
+
+
+def on_ground(
+    flight: str,
+    taken: Sequence[Photograph],
+    left: Sequence[tuple[str, str]],
+    *,
+    projection: Projection,
+    level_m: float,
+    options: Options,
+) -> Survey:
+    """The survey of placed photographs; those that leave the ground or look above the horizon are left out and named.
+
+    `level_m` is the flat ground's height, also where one looks for terrain. Raises DappledError where none is left, or
+    the terrain can't be used.
+    """
+    kept, out = [], list(left)
+
+    def sieve(photos: Sequence[Photograph], ground: Ground) -> list[Photograph]:
+        held = []
+        for one in photos:
+            try:
+                one.eye.check_horizon(f"frame {one.name}")
+                maps.footprint(one.eye, ground)
+                held.append(one)
+            except EyeError as error:
+                out.append((one.name, str(error)))
+            except MapError as error:
+                out.append((one.name, f"frame {one.name}: {error}"))
+        return held
+
+    ground: Ground = Flat(level_m)
+    kept = sieve(taken, ground)
+    if kept and options.terrain is not None:
+        ground = _terrain(options.terrain, kept, projection, level_m, options.terrain_geoid)
+        kept = sieve(kept, ground)
     if not kept:
-        raise DappledError(f"no frame of {flight} can be put on a map: {left[-1][1]}")
+        raise DappledError(f"no frame of {flight} can be put on a map: {out[-1][1] if out else 'it has none'}")
     gsd_m = options.gsd_m or _two_digits(min(one.eye.gsd_m(_below(one, ground)) for one in kept))
-    return Survey(flight.name, tuple(kept), projection, ground, gsd_m, options.focus_m, tuple(left))
+    return Survey(flight, tuple(kept), projection, ground, gsd_m, options.focus_m, tuple(out))
 
 
 def refined(
@@ -150,14 +178,19 @@ def refined(
     return replace(made, photographs=tuple(photos), facts=facts, notes=(*made.notes, *kept))
 
 
-def take(flight: Path, station: Station, darkroom: Darkroom, projection: Projection, options: Options) -> Photograph:
-    """One frame, decoded and placed. Raises DappledError."""
-    made = darkroom.develop(
-        flight / station.frame.name,
-        focal_length_mm=options.focal_length_mm or station.tag.focal_length_mm,
-        f_number=options.f_number or station.tag.f_number,
-        views=True,
+def develop(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, options: Options) -> Development:
+    """One frame of a flight, decoded. Raises DappledError."""
+    return darkroom.develop(
+        flight / frame.name,
+        focal_length_mm=options.focal_length_mm or (tag.focal_length_mm if tag else None),
+        f_number=options.f_number or (tag.f_number if tag else None),
     )
+
+
+def place(
+    station: Station, made: Development, darkroom: Darkroom, projection: Projection, options: Options
+) -> Photograph:
+    """A decoded frame as a photograph on the map. Raises DappledError."""
     field, gains = made.light_field, photographs.true_colours(made.raw)
     if gains is not None and field.views.ndim == 5:
         field = replace(field, views=field.views * gains.astype(np.float32))
@@ -175,7 +208,7 @@ def _shelved(one: Photograph, scratch: Path) -> Photograph:
     return replace(kept, views=np.load(scratch / f"{one.name}-views.npy", mmap_mode="r"))
 
 
-def _level(stations: Sequence[Station], options: Options) -> float:
+def level_of(stations: Sequence[Station], options: Options) -> float:
     """The flat ground's height above sea level."""
     if options.ground_m is not None:
         return options.ground_m
@@ -187,15 +220,15 @@ def _level(stations: Sequence[Station], options: Options) -> float:
     return float(np.median(homes)) if homes else min(one.camera.altitude_msl_m for one in stations) - 1.0
 
 
-def _ground(taken: Sequence[Photograph], projection: Projection, level: float, options: Options) -> Ground:
-    if options.terrain is None:
-        return Flat(level)
-    met = np.concatenate([maps.footprint(one.eye, Flat(level))[:, :2] for one in taken])
+def _terrain(
+    path: Path, taken: Sequence[Photograph], projection: Projection, level_m: float, geoid: Geoid | None
+) -> Raster:
+    met = np.concatenate([maps.footprint(one.eye, Flat(level_m))[:, :2] for one in taken])
     centres = np.array([one.eye.centre[:2] for one in taken])
     low, high = np.concatenate([met, centres]).min(axis=0), np.concatenate([met, centres]).max(axis=0)
     margin = 0.25 * float(np.max(high - low)) + 5.0  # hills lie elsewhere than flat ground
     bounds = (low[0] - margin, low[1] - margin, high[0] + margin, high[1] + margin)
-    return load_ground(options.terrain, projection, bounds, geoid=options.terrain_geoid)
+    return load_ground(path, projection, bounds, geoid=geoid)
 
 
 def _below(one: Photograph, ground: Ground) -> float:

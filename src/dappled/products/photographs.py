@@ -98,8 +98,7 @@ def stations(flight: Path, mounting: Mounting) -> tuple[list[Station], list[tupl
 
     Raises FlightError.
     """
-    with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
-        frames, tags = ledger.frames(), ledger.tags()
+    frames, tags = recorded(flight)
     placed: list[Station] = []
     left: list[tuple[str, str]] = []
     for frame in frames:
@@ -108,6 +107,12 @@ def stations(flight: Path, mounting: Mounting) -> tuple[list[Station], list[tupl
         except PhotographError as error:
             left.append((frame.name, str(error)))
     return placed, left
+
+
+def recorded(flight: Path) -> tuple[list[Frame], dict[int, Tag]]:
+    """A flight's safe frames and their tags. Raises FlightError."""
+    with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
+        return ledger.frames(), ledger.tags()
 
 
 def station(frame: Frame, tag: Tag | None, mounting: Mounting) -> Station:

@@ -1,0 +1,70 @@
+"""`dappled batch`: whole flights, frame by frame, on all cores or a cluster."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from pathlib import Path
+
+from tqdm import tqdm
+
+from dappled.cli import common, georeference
+from dappled.errors import DappledError
+from dappled.flight import layout
+from dappled.products import batch, workers
+from dappled.products.batch import KINDS, Job
+from dappled.products.manifest import Manifest
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "examples:\n"
+        "  dappled batch ~/flights/20261121T* -o products\n"
+        "  dappled batch FLIGHT --as npz cog -o products --scheduler tcp://10.0.0.5:8786\n"
+        "Goes on where it was stopped. A bad frame is noted and does not stop the others."
+    )
+    parser.add_argument("flights", nargs="+", type=Path, metavar="FLIGHT", help="flight folders")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for what is made")
+    parser.add_argument("--as", dest="kinds", nargs="+", choices=tuple(KINDS), default=["npz"],
+                        help="of each frame: light field (npz, zarr, h5) or map (cog, kmz); default: npz")  # fmt: skip
+    parser.add_argument("--workers", type=common.whole, default=os.cpu_count() or 1, metavar="N",
+                        help="processes (default: one a core)")  # fmt: skip
+    parser.add_argument("--scheduler", metavar="URL", help="a Dask scheduler, as tcp://10.0.0.5:8786, instead")
+    georeference.add_placing(parser)
+    parser.add_argument("--json", action="store_true", help="a line of JSON for each frame")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    jobs: list[Job] = []
+    for flight in arguments.flights:
+        folder = layout.open_folder(flight)
+        facts = layout.read_facts(folder)
+        recipe = georeference.recipe(folder.path, facts, arguments)
+        jobs += batch.plan(
+            folder.path, recipe, georeference.options(facts, arguments), arguments.kinds, arguments.output
+        )
+    bad = 0
+    with Manifest(arguments.output) as manifest:
+        todo = [job for job in jobs if not manifest.holds(job.key)]
+        if arguments.scheduler:
+            answers = workers.on_cluster(todo, batch.make, arguments.scheduler)
+        else:
+            answers = workers.in_processes(todo, batch.make, min(arguments.workers, max(1, len(todo))))
+        bar = tqdm(total=len(jobs), initial=len(jobs) - len(todo), unit="frame", disable=not sys.stderr.isatty())
+        with bar:
+            for done in answers:
+                manifest.add(done)
+                bar.update()
+                if done.error is not None:
+                    bad += 1
+                    tqdm.write(f"dappled batch: {done.error}", file=sys.stderr)
+                if arguments.json:
+                    said = {"flight": done.flight, "frame": done.frame, "error": done.error, "seconds": done.seconds}
+                    print(json.dumps({**said, "files": [one.name for one in done.outputs]}))
+    if not jobs:
+        raise DappledError("these flights hold no frames")
+    if not arguments.json:
+        print(f"{len(todo) - bad} frames made, {len(jobs) - len(todo)} were there already, {bad} could not be made")
+    return 1 if bad else 0
