@@ -16,6 +16,7 @@ from dappled.drivers.camera import CameraError
 from dappled.drivers.mavlink import mavlink
 
 OLD_IMAGES = 256
+_WALKS = 16
 _ZOOM_STEP, _ZOOM_RANGE, _ZOOM_FOCAL_LENGTH, _ZOOM_WIDTH = 0, 2, 3, 4
 
 
@@ -32,6 +33,7 @@ class CameraCommands:
     ) -> None:
         self._shutter, self._clock, self._telling, self._knobs = shutter, clock, telling, knobs
         self._intervals = intervals
+        self._walks: dict[str, int] = {}  # who asks without an index: the next image for it
         self.wanted_images: deque[tuple[int, int]] = deque(maxlen=OLD_IMAGES)
 
     def answer(self, command: Command) -> Answer:
@@ -83,9 +85,16 @@ class CameraCommands:
         return self._old_image(command, 1)
 
     def _old_image(self, command: Command, place: int) -> Answer:
-        """How a past shot ended; without an index (NaN) the last one."""
+        """How a past shot ended. MAVSDK, which lists photographs from before it came, leaves the index out (NaN) each
+        time: it is told one after the other, from the first."""
         count = self._shutter.statistics().next_index
-        index = command.whole(place, count - 1)
+        if math.isfinite(command.parameters[place - 1]):
+            index = command.whole(place)
+        else:
+            index = self._walks.pop(command.source, 0) % max(count, 1)
+            self._walks[command.source] = index + 1
+            if len(self._walks) > _WALKS:
+                self._walks.pop(next(iter(self._walks)))
         if not 0 <= index < count:
             return Answer(DENIED, words=f"no image {index}: there are {count}")
         self.wanted_images.append((index, command.link))

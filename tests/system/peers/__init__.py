@@ -1,0 +1,1 @@
+"""Programs that nobody here wrote, driven by small scripts in processes of their own."""
