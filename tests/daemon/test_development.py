@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from dappled.daemon.development import DevelopmentError, WorkerDeveloper
+from dappled.drivers.budget import RestartBudget
 from dappled.drivers.darkroom import Recipe
 from dappled.mocks.masked_camera import reference_camera
 from tests.daemon.fakes import eventually
@@ -77,6 +78,23 @@ def test_a_worker_that_hangs_is_given_up_and_replaced(frame: str) -> None:
     with pytest.raises(DevelopmentError, match="given up"):
         developer.develop(frame, None, None)
     developer._timeout_s = 20.0
+    assert developer.develop(frame, None, None).sha256
+    developer.close()
+
+
+def test_a_worker_that_keeps_dying_is_not_started_without_end(frame: str) -> None:
+    now_ns = [0]
+    budget = RestartBudget(limit=2, window_s=60.0)
+    developer = WorkerDeveloper(RECIPE, budget=budget, clock_ns=lambda: now_ns[0])
+    for _ in range(2):
+        developer.warm_up()
+        os.kill(pid(developer), signal.SIGKILL)
+        assert developer._process is not None
+        developer._process.wait(5)
+    now_ns[0] = 20 * 10**9
+    with pytest.raises(DevelopmentError, match="keeps dying: it starts again in 40 s"):
+        developer.develop(frame, None, None)
+    now_ns[0] = 61 * 10**9
     assert developer.develop(frame, None, None).sha256
     developer.close()
 

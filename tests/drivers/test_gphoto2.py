@@ -15,9 +15,10 @@ from typing import Any
 
 import pytest
 
+from dappled.drivers.budget import RestartBudget
 from dappled.drivers.camera import Arrival, CameraError, Companion, Fired, ShotFailed, StateChanged
 from dappled.drivers.camera_channel import Channel
-from dappled.drivers.gphoto2 import GPhoto2Camera, RestartBudget, Spawn, open_camera, spawn_process
+from dappled.drivers.gphoto2 import GPhoto2Camera, Spawn, open_camera, spawn_process
 from dappled.drivers.gphoto2_before import Before
 from dappled.drivers.gphoto2_settings import GPhoto2Settings, parse_settings
 from dappled.mocks.body import Body, BodyOptions, pattern

@@ -11,10 +11,12 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
+from dappled.drivers.budget import RestartBudget
 from dappled.drivers.camera_channel import Channel, ChannelError, Message
 from dappled.drivers.darkroom import Recipe
 from dappled.errors import DappledError
@@ -76,11 +78,21 @@ class Developer(Protocol):
 class WorkerDeveloper:
     """Decodes in a worker process, one frame at a time; a worker that dies or hangs is replaced.
 
-    `timeout_s` bounds one frame. Threads may share it: they take turns.
+    `timeout_s` bounds one frame. Threads may share it: they take turns. A worker that keeps dying is started six times
+    a minute at most; frames in between are not decoded, and say why.
     """
 
-    def __init__(self, recipe: Recipe, *, timeout_s: float = 60.0, preview_px: int = 1024) -> None:
+    def __init__(
+        self,
+        recipe: Recipe,
+        *,
+        timeout_s: float = 60.0,
+        preview_px: int = 1024,
+        budget: RestartBudget | None = None,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         self._recipe, self._timeout_s, self._preview_px = recipe, timeout_s, preview_px
+        self._budget, self._clock_ns = budget or RestartBudget(limit=6, window_s=60.0), clock_ns
         self._turn = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._channel: Channel | None = None
@@ -136,6 +148,11 @@ class WorkerDeveloper:
         return answer
 
     def _begin(self) -> Channel:
+        if wait_ns := self._budget.wait_ns(self._clock_ns()):
+            raise DevelopmentError(
+                f"the decoder keeps dying: it starts again in {wait_ns / 1e9:.0f} s; frames stay in the record"
+            )
+        self._budget.spend(self._clock_ns())
         self._channel, there = Channel.pair()
         with there:
             self._process = subprocess.Popen(

@@ -14,12 +14,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 from dappled.drivers.attribution import Claim
+from dappled.drivers.budget import RestartBudget
 from dappled.drivers.camera import (
     Arrival,
     CameraError,
@@ -48,27 +48,6 @@ Spawn = Callable[[GPhoto2Settings, Before], tuple["subprocess.Popen[bytes]", Cha
 def open_camera(settings: Mapping[str, Any]) -> GPhoto2Camera:
     """The driver for these settings (see `GPhoto2Settings`); `start` it. Raises CameraError for a wrong setting."""
     return GPhoto2Camera(parse_settings(settings))
-
-
-class RestartBudget:
-    """At most `limit` starts in any `window_s`. Not thread-safe: one owner."""
-
-    def __init__(self, limit: int, window_s: float) -> None:
-        self._limit = limit
-        self._window_ns = round(window_s * 1e9)
-        self._spent_ns: deque[int] = deque()
-
-    def wait_ns(self, now_ns: int) -> int:
-        """How long until the next start is allowed; 0: now."""
-        while self._spent_ns and now_ns - self._spent_ns[0] >= self._window_ns:
-            self._spent_ns.popleft()
-        if len(self._spent_ns) < self._limit:
-            return 0
-        return self._spent_ns[0] + self._window_ns - now_ns
-
-    def spend(self, now_ns: int) -> None:
-        """A start was made."""
-        self._spent_ns.append(now_ns)
 
 
 def spawn_process(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
