@@ -13,16 +13,21 @@ from typing import Any
 from dappled.config.schema import ConfigError, Source, build, read_toml, setting
 from dappled.decode.carriers import LAWS, Sensor
 from dappled.decode.masks import Mask
+from dappled.decode.stagger import spread_sensor
 
 LENSLET = "lenslet"  # not a profile: the lattice is found in the frame itself
 
 
 @dataclass(frozen=True, slots=True)
 class RawShape:
-    """One raw shape that a camera is known to deliver, and where its samples stand on the chip."""
+    """One raw shape that a camera is known to deliver, and where its samples stand on the chip.
+
+    `staggered`: every second row, from the second on, sits half a column to the right.
+    """
 
     name: str
     sensor: Sensor
+    staggered: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,15 +62,22 @@ class CameraProfile:
         return nearest
 
     def sensor(self, shape: tuple[int, int]) -> Sensor:
-        """The sensor geometry of frames of this shape. Raises ConfigError for a shape the profile doesn't know."""
+        """The sensor geometry of frames of this shape, or of spread planes. Raises ConfigError for unknown shapes."""
         for known in self.raw:
             if known.sensor.shape == shape:
                 return known.sensor
+        for known in self.raw:
+            if known.staggered and spread_sensor(known.sensor).shape == shape:
+                return spread_sensor(known.sensor)
         sizes = ", ".join(f"{h} × {w}" for h, w in (known.sensor.shape for known in self.raw))
         raise ConfigError(
             f"camera profile {self.name} knows frames of {sizes} px, this one has {shape[0]} × {shape[1]}; "
             "choose another camera.profile, or add the shape to a profile of your own"
         )
+
+    def staggered(self, shape: tuple[int, ...]) -> bool:
+        """Whether mosaics of this shape are staggered, and are to be spread before they are decoded."""
+        return any(known.staggered and known.sensor.shape == shape for known in self.raw)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +108,8 @@ class _RawTable:
     row_mm: tuple[float, float] = setting((0.0, 0.0), "one row down, as (y, x)", unit="mm", low=-1, high=1)
     column_mm: tuple[float, float] = setting((0.0, 0.0), "one column right, as (y, x)", unit="mm", low=-1, high=1)
     name: str = setting("", "which shape this is")
+    staggered: bool = setting(False, "every second row sits half a column to the right")
+    picture: str = setting("", "name of the shape above on whose DFT the fd law counts bins, where not on this one's")
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,12 +139,17 @@ def camera(name: str) -> CameraProfile:
     table = build(_CameraTable, tables, source, "")
     if not table.raw:
         raise ConfigError(f"{source.name} has no [[raw]] table: name at least one raw shape with row_mm and column_mm")
-    shapes = []
+    shapes: list[RawShape] = []
     for entry in table.raw:
         raw = build(_RawTable, entry, source, "raw")
         if not any(raw.row_mm) or not any(raw.column_mm) or not all(raw.shape):
             raise ConfigError(f"{source.name}: [[raw]] {raw.name!r} needs shape, row_mm and column_mm")
-        shapes.append(RawShape(raw.name, Sensor(raw.shape, raw.row_mm, raw.column_mm)))
+        picture = next((known.sensor for known in shapes if known.name == raw.picture), None)
+        if raw.picture and picture is None:
+            raise ConfigError(
+                f"{source.name}: [[raw]] {raw.name!r} names the picture {raw.picture!r}, none above it is"
+            )
+        shapes.append(RawShape(raw.name, Sensor(raw.shape, raw.row_mm, raw.column_mm, picture), raw.staggered))
     lenses = []
     for entry in table.lens:
         lens = build(_LensTable, entry, source, "lens")

@@ -25,7 +25,7 @@ from dappled.decode.slices import default_size, extract
 from dappled.decode.spectrum import Spectrum
 from dappled.decode.views import Aperture, angular_frequencies, kappa, transfer
 
-_SEARCH = 0.08  # of a carrier's frequency: 4.5° of rotation, or 8 % of scale
+_SEARCH = 0.12  # of a carrier's frequency: 2° of rotation and, under the fd law, 10 % of the mask's distance
 _PLAUSIBLE = 0.35  # relative: a fitted mask distance further from the stated one is not believed
 
 
@@ -105,7 +105,7 @@ class Calibration:
                 "pattern": self.mask.pattern,
                 "harmonics": self.mask.harmonics,
             },
-            "sensor": {"row_mm": list(self.sensor.row_mm), "column_mm": list(self.sensor.column_mm)},
+            "sensor": _sensor_values(self.sensor),
             "fits": [
                 {
                     "focal_length_mm": f.focal_length_mm,
@@ -132,7 +132,7 @@ class Calibration:
         try:
             shape = _pair(values["shape"])
             mask = Mask(**values["mask"])
-            sensor = Sensor((int(shape[0]), int(shape[1])), **{k: _pair(v) for k, v in values["sensor"].items()})
+            sensor = _sensor_of({"shape": shape, **values["sensor"]})
             fits = tuple(
                 LatticeFit(
                     **{
@@ -403,6 +403,19 @@ def _mean(fits: list[LatticeFit]) -> LatticeFit:
         phase_residual_rad=float(np.sqrt(np.mean([f.phase_residual_rad**2 for f in fits]))),
         found=min(f.found for f in fits),
     )
+
+
+def _sensor_values(sensor: Sensor) -> dict[str, Any]:
+    values: dict[str, Any] = {"row_mm": list(sensor.row_mm), "column_mm": list(sensor.column_mm)}
+    if sensor.picture is not None:
+        values["picture"] = {"shape": list(sensor.picture.shape), **_sensor_values(sensor.picture)}
+    return values
+
+
+def _sensor_of(values: Mapping[str, Any]) -> Sensor:
+    height, width = _pair(values["shape"])
+    picture = _sensor_of(values["picture"]) if "picture" in values else None
+    return Sensor((int(height), int(width)), _pair(values["row_mm"]), _pair(values["column_mm"]), picture)
 
 
 def _pair(values: Sequence[float]) -> tuple[float, float]:

@@ -67,13 +67,14 @@ class Lattice:
 class Sensor:
     """A raw shape and what one step of row and of column is in millimetres on the chip.
 
-    `row_mm` and `column_mm` are (y, x) vectors: (pitch, 0) and (0, pitch) on an ordinary chip, diagonal ones on a
-    native Super CCD lattice.
+    `row_mm` and `column_mm` are (y, x) vectors: (pitch, 0) and (0, pitch) on an ordinary chip. `picture` is the shape
+    on whose DFT the `fd` law counts bins, where that isn't this one but another sampling of the same chip.
     """
 
     shape: tuple[int, int]
     row_mm: Vector
     column_mm: Vector
+    picture: Sensor | None = None
 
     def cycles_per_pixel(self, fy_per_mm: float, fx_per_mm: float) -> Vector:
         """A spatial frequency on the chip (cycles/mm, axes y and x) as cycles/pixel along rows and columns."""
@@ -97,9 +98,15 @@ def fd(mask: Mask, sensor: Sensor, mask_distance_mm: float, focal_length_mm: flo
     As printed it reads 1/mm as mm: an unstated constant of 1 mm² makes the units right. Bins count on the frame's DFT,
     so cycles/pixel are f_mask · (d / f) · 1 mm² / side.
     """
-    height_mm, width_mm = sensor.size_mm
+    picture = sensor.picture or sensor
+    height_mm, width_mm = picture.size_mm
     step = mask.frequency_per_mm * mask_distance_mm / focal_length_mm  # 1/mm, read as mm
-    return Lattice((step / height_mm, 0.0), (0.0, step / width_mm))
+    if sensor.picture is None:
+        return Lattice((step / height_mm, 0.0), (0.0, step / width_mm))
+    down, across = math.hypot(*picture.row_mm), math.hypot(*picture.column_mm)
+    return Lattice(
+        sensor.cycles_per_pixel(step / height_mm / down, 0.0), sensor.cycles_per_pixel(0.0, step / width_mm / across)
+    )
 
 
 def geometric(mask: Mask, sensor: Sensor, mask_distance_mm: float, focal_length_mm: float) -> Lattice:
