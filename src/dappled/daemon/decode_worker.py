@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import os
@@ -10,6 +11,7 @@ import socket
 import sys
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -115,6 +117,8 @@ def main() -> None:
     """Serve the socket whose descriptor is the only argument."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C is the parent's to act on
     os.nice(NICENESS)
+    with contextlib.suppress(OSError):  # short of memory, the kernel shall end this process and not the recorder
+        Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
     serve(socket.socket(fileno=int(sys.argv[1])), Worker())
 
 
