@@ -17,11 +17,11 @@ from dappled.daemon import inputs
 from dappled.drivers.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import layout
-from dappled.products import drawings, earth, georeference
+from dappled.products import difference, drawings, earth, georeference, terrain
 from dappled.products.georeference import Options, Progress, Survey
 from dappled.products.photographs import Mounting
 
-KINDS = ("kmz", "cog", "footprints")
+KINDS = ("kmz", "cog", "footprints", "terrain", "difference")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -37,6 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="what to make (default: kmz cog footprints)")  # fmt: skip
     parser.add_argument("--each", action="store_true", help="a kmz or cog of each frame too, in frames/")
     parser.add_argument("--quad", action="store_true", help="each frame's kmz as a LatLonQuad: the view itself")
+    parser.add_argument("--against", type=Path, metavar="FLIGHT", help="for difference: the other, later flight")
     add_placing(parser)
     better = parser.add_argument_group("refinement")
     better.add_argument("--refine", nargs="+", default=[], metavar="WITH",
@@ -84,13 +85,25 @@ def add_placing(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     folder = layout.open_folder(arguments.flight)
     output = arguments.output or folder.path / "maps"
-    facts = layout.read_facts(folder)
+    if ("difference" in arguments.kinds) != (arguments.against is not None):
+        raise DappledError("--as difference and --against FLIGHT go together")
     with ExitStack() as stack:
         progress = stack.enter_context(Bar())
-        made = georeference.survey(folder.path, recipe(folder.path, facts, arguments), options(facts, arguments),
-                                   progress, stack)  # fmt: skip
-        made = _refined(made, arguments, progress)
+        made = _survey(folder.path, arguments, progress, stack)
         files = _draw(made, output, arguments)
+        terrain_of = None
+        if "terrain" in arguments.kinds:
+            terrain_of = terrain.of(made, progress)
+            files.append(terrain.write_raster(made, terrain_of, output / "terrain.tif"))
+            files.append(terrain.write_points(made, terrain_of, output / "terrain.las"))
+        if arguments.against is not None:
+            arguments.crs = made.projection.name
+            other = _survey(layout.open_folder(arguments.against).path, arguments, progress, stack)
+            changed = difference.of_pictures(made, other)
+            files.append(difference.write(made, other, changed, output / "difference.tif", "share of brightness"))
+            if terrain_of is not None:
+                raised = difference.of_heights(terrain_of, terrain.of(other, progress))
+                files.append(difference.write(made, other, raised, output / "height-difference.tif", "m"))
     report = georeference.write_report(made, output, files)
     if arguments.json:
         print(report.read_text(), end="")
@@ -101,6 +114,13 @@ def run(arguments: argparse.Namespace) -> int:
     for why in (*(why for _, why in made.left), *made.notes):
         print(why, file=sys.stderr)
     return 0
+
+
+def _survey(flight: Path, arguments: argparse.Namespace, progress: Progress, stack: ExitStack) -> Survey:
+    """A flight decoded, placed, and refined as the arguments say."""
+    facts = layout.read_facts(layout.open_folder(flight))
+    made = georeference.survey(flight, recipe(flight, facts, arguments), options(facts, arguments), progress, stack)
+    return _refined(made, arguments, progress)
 
 
 def _refined(made: Survey, arguments: argparse.Namespace, progress: Progress) -> Survey:
