@@ -7,7 +7,6 @@ originals have changed.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from dataclasses import replace
 from importlib import metadata, resources
 from pathlib import Path
@@ -17,12 +16,12 @@ from dappled.config import profiles
 from dappled.config.settings import Settings
 from dappled.daemon.street import Names
 from dappled.drivers.darkroom import Darkroom, Recipe, camera_name
+from dappled.drivers.kept_recipe import FILES, FOLDER, of_flight
 from dappled.errors import DappledError
 from dappled.flight import durable
 
-FOLDER = "inputs"
+__all__ = ["FOLDER", "keep", "names", "of_flight", "recipe", "versions"]
 _LIBRARIES = ("numpy", "scipy", "rawpy", "pyzmq", "pymavlink", "gphoto2", "pillow", "tifffile")
-_FILES = ("calibration", "white", "dark")
 
 
 def recipe(settings: Settings) -> tuple[Names, Recipe | None]:
@@ -52,35 +51,18 @@ def recipe(settings: Settings) -> tuple[Names, Recipe | None]:
     return names, made
 
 
-def keep(made: Recipe, flight: Path) -> Recipe:
-    """The same recipe with its files and profiles copied into the flight. Raises DappledError when the disk refuses."""
-    folder = flight / FOLDER
+def keep(made: Recipe, flight: Path, run: str = "") -> Recipe:
+    """The same recipe with its files and profiles copied into the flight, those of a later run into a folder of its
+    name. Raises DappledError when the disk refuses."""
+    folder = flight / FOLDER / run
     try:
         durable.make_folder(folder)
-        kept: dict[str, Any] = {
-            name: _copy(getattr(made, name), folder, name) for name in _FILES if getattr(made, name)
-        }
+        kept: dict[str, Any] = {name: _copy(getattr(made, name), folder, name) for name in FILES if getattr(made, name)}
         kept["camera"] = _copy_profile(made.camera, folder, "cameras")
         kept["mask"] = _copy_profile(made.mask, folder, "masks")
     except OSError as error:
         raise DappledError(f"the decoder's inputs can't be copied to {folder}: {error.strerror}") from None
     return replace(made, **kept)
-
-
-def of_flight(flight: Path, facts: Mapping[str, Any], overrides: Mapping[str, Any]) -> Recipe | None:
-    """The recipe that a recorded flight was decoded by, its files from the flight's own copies; overrides on top."""
-    settings = facts.get("settings", {})
-    decode, folder = settings.get("decode", {}), flight / FOLDER
-    files: dict[str, Any] = {name: _kept(decode.get(name, ""), folder, name) for name in _FILES}
-    made = Recipe(
-        camera=_kept_profile(settings.get("camera", {}).get("profile", "auto"), folder, "cameras"),
-        mask=_kept_profile(settings.get("mask", {}).get("profile", ""), folder, "masks"),
-        law=decode.get("law", ""),
-        workers=decode.get("workers", 1),
-        **files,
-    )
-    made = replace(made, **{name: value for name, value in overrides.items() if value is not None})
-    return made if made.mask else None
 
 
 def names(made: Recipe | None) -> Names:
@@ -119,12 +101,3 @@ def _copy_profile(profile: str, folder: Path, kind: str) -> str:
     source = Path(profile) if profile.endswith(".toml") else shipped
     durable.write_file(target, source.read_bytes())
     return str(target)
-
-
-def _kept(named: str, folder: Path, name: str) -> str:
-    return str(folder / f"{name}{Path(named).suffix}") if named else ""
-
-
-def _kept_profile(profile: str, folder: Path, kind: str) -> str:
-    copy = folder / kind / f"{Path(profile).stem}.toml"
-    return str(copy) if copy.is_file() else profile
