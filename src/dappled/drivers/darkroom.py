@@ -24,6 +24,8 @@ from dappled.decode.exposure import Developer, Exposure, developer
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
 from dappled.decode.plane import Plane
+from dappled.decode.stagger import spread
+from dappled.decode.transform import Source
 from dappled.drivers import rawfile
 from dappled.drivers.rawfile import RawFile
 from dappled.errors import DappledError
@@ -86,6 +88,7 @@ class Darkroom:
         self._gains: dict[tuple[int, int], Plane] = {}
         self._balance: NDArray[np.float64] | None = None
         self._developers: dict[Any, Developer] = {}
+        self._staggered: dict[tuple[tuple[int, int], str], bool] = {}
 
     def check(self) -> None:
         """Raises DappledError when the recipe names something that isn't there or isn't right."""
@@ -116,7 +119,8 @@ class Darkroom:
             raw = self.read(path)
         with _named(path):
             with _timed(ms, "plane"):
-                plane, chroma = self._expose(raw, colour=self.recipe.colour and views)
+                exposure, chroma = self._expose(raw, colour=self.recipe.colour and views)
+                plane = self._where_taken(exposure, raw)
             decoder = self.decoder(plane.shape, raw.camera_model or "", colours=raw.cfa is not None)
             focal_length_mm = focal_length_mm or raw.focal_length_mm
             f_number = f_number or raw.f_number
@@ -133,7 +137,18 @@ class Darkroom:
 
     def plane(self, raw: RawFile) -> Plane:
         """The linear plane of a frame: black, white, dark frame; for masks also colours evened out, and white frame."""
-        return self._expose(raw, colour=False)[0].plane(self.recipe.workers)
+        exposure = self._expose(raw, colour=False)[0]
+        source = self._where_taken(exposure, raw)
+        return source.plane(self.recipe.workers) if isinstance(source, Exposure) else source
+
+    def _where_taken(self, exposure: Exposure, raw: RawFile) -> Source:
+        """The plane with each sample where it stands on the chip: a staggered one spread out."""
+        if self.recipe.mask == profiles.LENSLET:
+            return exposure
+        key = exposure.shape, raw.camera_model or ""
+        if key not in self._staggered:
+            self._staggered[key] = self.camera(key[1]).staggered(key[0])
+        return spread(exposure.plane(self.recipe.workers)) if self._staggered[key] else exposure
 
     def read(self, path: Path | str) -> RawFile:
         """A frame's file, with what the recipe says about it. Raises DappledError."""
