@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from dappled.daemon import replay
 from dappled.daemon.replay import Progress, RecordedTelemetry, ReplayError
 from dappled.daemon.street import Names, Story, Street, Watchers
 from dappled.daemon.tagger import BodyLatency
-from dappled.drivers.camera import Identity
+from dappled.drivers.camera import Arrival, Event, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.replay import ReplayCamera
 from dappled.flight.errors import FlightError
 from dappled.flight.records import Cause, Shot
@@ -51,7 +52,7 @@ def again(flight: Path, pace: replay.Pace | None = None) -> list[str]:
     )
     street.start()
     try:
-        replay.play(recording, street, progress, pace=pace, timeout_s=20)
+        replay.play(recording, street, progress, time=replay.clock(recording), pace=pace, timeout_s=20)
     finally:
         street.stop(5)
     assert len(ended) == len(recording.shots)
@@ -75,6 +76,42 @@ def test_a_missing_frame_is_told_and_ends(tmp_path: Path) -> None:
     flight = record(tmp_path)
     (flight / "frames" / "000002.dng").unlink()
     assert any("000002.dng can't be read" in text for text in again(flight))
+
+
+def test_what_was_told_of_a_shot_in_flight_is_no_difference(tmp_path: Path) -> None:
+    """A driver that never says when it fired, and a file that may be another shot's: both go into the tag."""
+
+    def untold(shot: int) -> list[Event | Exception]:
+        (_, arrival) = good(shot)
+        assert isinstance(arrival, Arrival)
+        return [dataclasses.replace(arrival, facts={"doubt": "it came late"})]
+
+    with rig(tmp_path, untold) as one:
+        one.wish(0)
+        one.ended(0)
+        told = one.flight.ledger.tag(0)
+        assert told is not None
+        assert told.time_source == "wish + body latency; in doubt: it came late"
+        assert {event.kind for event in one.flight.ledger.events()} >= {"untimed", "doubt"}
+    assert again(one.flight.folder.path) == []
+
+
+def test_the_street_hears_the_recordings_clock(tmp_path: Path) -> None:
+    recording = replay.of_flight(record(tmp_path))
+    clock = replay.clock(recording)
+    first, last = recording.shots[0], recording.shots[-1]
+    assert (clock.utc_ns(), clock.monotonic_ns()) == (first.wished_utc_ns, first.wished_monotonic_ns)
+    camera = ReplayCamera(recording.files, Identity("dappled", "recording", "", ""), clock.monotonic_ns)
+    camera.start()
+    ready = camera.next_event(1)
+    assert isinstance(ready, StateChanged)
+    assert ready.monotonic_ns == first.wished_monotonic_ns
+    clock.advance_to(last.wished_utc_ns)
+    camera.fire(1)  # it failed
+    fired, failed = camera.next_event(1), camera.next_event(1)
+    assert isinstance(fired, Fired)
+    assert isinstance(failed, ShotFailed)
+    assert failed.monotonic_ns == last.wished_monotonic_ns
 
 
 def test_pace() -> None:
@@ -123,5 +160,6 @@ def test_a_shot_that_never_ends_is_given_up(tmp_path: Path) -> None:
 
         def fire(self, index: int) -> None: ...
 
+    deaf = Progress(threading.Semaphore(0))
     with pytest.raises(ReplayError, match="did not come to an end"):
-        replay.play(recording, Deaf(), Progress(threading.Semaphore(0)), pace=None, timeout_s=0.01)  # type: ignore[arg-type]  # a street that does nothing
+        replay.play(recording, Deaf(), deaf, time=replay.clock(recording), pace=None, timeout_s=0.01)  # type: ignore[arg-type]  # a street that does nothing

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from dappled.daemon import tagger
 from dappled.daemon.tagger import BodyLatency, Settings
 from dappled.flight.records import Frame
@@ -21,3 +23,15 @@ def test_what_a_file_does_not_say_stays_unknown() -> None:
     made = tagger.tag(frame, tagger.mid_exposure(0, LATENCY, None), Settings(), camera="c", mask="m", pose=no_pose())
     assert (made.index, made.frame_sha256, made.camera, made.mask) == (3, "ab", "c", "m")
     assert (made.focal_length_mm, made.f_number, made.exposure_s, made.iso) == (None,) * 4
+
+
+def test_a_wish_is_a_poor_witness_of_the_exposure() -> None:
+    """Nobody saw the trigger call: it came between the wish and the file."""
+    found = tagger.by_wish(0, 3_070_000_000, LATENCY, 0.02)
+    assert found.utc_ns == 70_000_000
+    assert found.source == "wish + body latency"
+    assert found.sigma_ns == pytest.approx(2.99e9 / 3**0.5, rel=1e-3)
+    assert found.called_utc_ns == 0
+    early = tagger.by_wish(0, 10_000_000, LATENCY, None)
+    assert early.sigma_ns == 15_000_000  # a stamp before the exposure bounds nothing
+    assert tagger.by_wish(0, None, LATENCY, None).sigma_ns > 500_000_000

@@ -14,6 +14,7 @@ import rawpy
 
 from dappled.daemon import wire
 from dappled.flight import check, summary
+from dappled.flight.ledger import LedgerReader
 from tests.system.conftest import FRAMES, Flown, dappled, flip
 
 
@@ -114,6 +115,26 @@ def test_verify_needs_a_flight(tmp_path: Path) -> None:
     done = dappled("replay", str(tmp_path), "--verify")
     assert done.returncode == 1
     assert "no recorded flight" in done.stderr
+
+
+def test_a_new_recipe_writes_beside_the_old_results(copied: Path) -> None:
+    """Without a calibration, as if it had been lost: its own run, which verifies, and the flight's own still does."""
+    (shipped,) = (copied / "inputs" / "masks").glob("*.toml")
+    done = dappled("replay", str(copied), "--mask", str(shipped), "--camera", "reference-36mm", "--run", "again")
+    assert done.returncode == 0, done.stderr
+    assert "as run again" in done.stderr
+    with LedgerReader.open(copied / "flight.sqlite") as ledger:
+        assert ledger.runs() == {"live": FRAMES, "again": FRAMES}
+    for words in (["--run", "again"], []):
+        verified = dappled("replay", str(copied), "--verify", *words)
+        assert verified.returncode == 0, verified.stdout + verified.stderr
+    assert "again: 3 frames decoded again" in dappled("flight", "show", str(copied)).stdout
+    with sqlite3.connect(copied / "flight.sqlite") as ledger_file:
+        ledger_file.execute("DELETE FROM results WHERE idx = 1 AND run = 'again'")
+    ledger_file.close()
+    spoilt = dappled("replay", str(copied), "--verify", "--run", "again")
+    assert spoilt.returncode == 1
+    assert "frame 1: the record holds no hash of its slices" in spoilt.stderr
 
 
 def test_flight_verbs_read_it(flown: Flown) -> None:

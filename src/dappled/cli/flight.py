@@ -17,6 +17,7 @@ from tqdm import tqdm
 from dappled.config import settings
 from dappled.flight import check, index, offload, summary
 from dappled.flight.errors import FlightError
+from dappled.flight.ledger import LIVE
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -107,6 +108,9 @@ def _show(flight: Path, as_json: bool) -> int:
         if line.result:
             words.append(f"{line.result.carriers_found}/{line.result.carriers_predicted} carriers")
         print("  ".join(words))
+    for run, count in found.runs.items():
+        if run != LIVE:
+            print(f"   run  {run}: {count} frames decoded again")
     for stray in found.strays:
         print(f" stray  {stray.name}  {stray.reason}")
     return 0

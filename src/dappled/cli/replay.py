@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from datetime import UTC, datetime
@@ -15,23 +16,28 @@ import dappled
 from dappled.cli import story
 from dappled.cli.common import seconds
 from dappled.config import settings as configuration
-from dappled.daemon import curve, inputs, replay
+from dappled.daemon import curve, inputs, replay, runs
 from dappled.daemon.answers import Answers
 from dappled.daemon.books import ReplayBook
 from dappled.daemon.development import WorkerDeveloper
 from dappled.daemon.publisher import Publisher
 from dappled.daemon.replay import Progress, RecordedTelemetry, ReplayError
+from dappled.daemon.runs import Run, RunBook
 from dappled.daemon.street import Names, Story, Street, Watchers
 from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency
 from dappled.drivers.camera import Identity
 from dappled.drivers.darkroom import Recipe
 from dappled.drivers.replay import ReplayCamera
 from dappled.flight import check, layout
+from dappled.flight.ledger import LIVE
+
+_GIVEN = ("camera", "mask", "white", "dark", "calibration")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n  dappled replay flights/20261121T101503Z-0a1b2c3d --verify\n"
+        "  dappled replay flights/20261121T101503Z-0a1b2c3d --calibration new.toml --run new\n"
         "  dappled replay frames/ --mask lenslet --white white.png --telemetry flight.tlog --publish"
     )
     parser.add_argument("flight", type=Path, help="flight folder, or a folder of frames")
@@ -45,6 +51,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--step", action="store_true", help="wait for Enter before each frame")
     parser.add_argument("--publish", action=argparse.BooleanOptionalAction, default=False, help="send over ZeroMQ")
     parser.add_argument("--verify", action="store_true", help="compare every hash; exit 1 on any difference")
+    parser.add_argument(
+        "--run",
+        dest="run_name",
+        metavar="NAME",
+        help="name for results by another recipe, in the ledger (default: the time); with --verify: which to verify",
+    )
     parser.add_argument("--camera", metavar="P", help="camera profile or TOML file")
     parser.add_argument("--mask", metavar="P", help="mask profile or TOML file, or lenslet")
     parser.add_argument("--telemetry", type=Path, metavar="FILE", help=".tlog beside a folder of frames")
@@ -65,55 +77,36 @@ def run(arguments: argparse.Namespace) -> int:
     is_flight = (arguments.flight / layout.FlightFolder(arguments.flight).ledger.name).is_file()
     if arguments.verify and not is_flight:
         raise ReplayError(f"{arguments.flight} is no recorded flight: there are no hashes to verify")
+    if arguments.run_name and not (arguments.verify or _changed(arguments)):
+        raise ReplayError("--run names results by another recipe: give --calibration, --mask, --camera … or --verify")
     problems = list(check.check(arguments.flight).problems) if arguments.verify else []
     facts = layout.read_facts(layout.open_folder(arguments.flight)) if is_flight else {}
     recipe = _recipe(arguments, facts, settings)
     recording = _recording(arguments, is_flight)
     names, latency, recorded = _as_recorded(arguments, facts, recipe)
-    telemetry = RecordedTelemetry(
-        recording.telemetry,
-        recording.horizons,
-        wait_s=recorded.pose.wait_ms / 1e3,
-        component_id=recorded.mavlink.component_id,
-        attitude_sigma_rad=math.radians(recorded.pose.attitude_sigma_deg),
-    )
-    book = replay.book(recording)
-    progress = Progress.begin()
-
-    def finished(one: Story) -> None:
-        print(story.as_json(one) if arguments.json else story.line(one), flush=True)
-        progress.note(one)
-
     with ExitStack() as stack:
+        keep = None
+        if is_flight and recipe and _changed(arguments) and not arguments.verify:
+            name = arguments.run_name or datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+            results = stack.enter_context(RunBook(arguments.flight, Run(name, recipe, names), time.time_ns))
+            recipe, keep = results.run.recipe, results.decoded
+            print(f"results stand beside the old ones as run {name}", file=sys.stderr)
+        book = replay.book(recording, keep)
         developer = WorkerDeveloper(recipe) if recipe else None
         if developer:
             stack.callback(developer.close)
             developer.warm_up()
-        publisher = _publisher(settings, book, developer, stack) if arguments.publish else None
-        if publisher:
-            publisher.publish("start", _start(settings, names))
-        identity = Identity("dappled", "recording", "", str(arguments.flight))
-        camera = ReplayCamera(recording.files, identity)
-        street = Street(
-            camera=camera,
+        bad = _play(
+            arguments,
+            settings,
+            recording,
             book=book,
-            poses=telemetry.pose,
             developer=developer,
-            publisher=publisher,
-            latency=latency,
-            names=names,
-            watchers=Watchers(finished=finished),
-            decode_queue=1000,
+            flown=(names, latency, recorded),
+            stack=stack,
         )
-        street.start()
-        stack.callback(street.stop, 5.0)
-        replay.play(recording, street, progress, pace=_pace(arguments))
-        if publisher:
-            counts = {"wished": len(recording.shots), "safe": progress.frames}
-            publisher.publish("end", {"utc_ns": recording.shots[-1].wished_utc_ns, "shots": counts})
-            publisher.stop()  # answers last questions: before the decoder goes
     if not arguments.verify:
-        return 1 if progress.bad else 0
+        return 1 if bad else 0
     problems += book.verdict(decoded=recipe is not None)
     for text in problems:
         print(f"different: {text}", file=sys.stderr)
@@ -122,9 +115,66 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if problems else 0
 
 
+def _play(
+    arguments: argparse.Namespace,
+    settings: configuration.Settings,
+    recording: replay.Recording,
+    *,
+    book: ReplayBook,
+    developer: WorkerDeveloper | None,
+    flown: tuple[Names, BodyLatency, configuration.Settings],
+    stack: ExitStack,
+) -> int:
+    """The recording down the street; how many frames came to a bad end."""
+    names, latency, recorded = flown
+    clock, progress = replay.clock(recording), Progress.begin()
+    telemetry = RecordedTelemetry(
+        recording.telemetry,
+        recording.horizons,
+        wait_s=recorded.pose.wait_ms / 1e3,
+        component_id=recorded.mavlink.component_id,
+        attitude_sigma_rad=math.radians(recorded.pose.attitude_sigma_deg),
+    )
+
+    def finished(one: Story) -> None:
+        print(story.as_json(one) if arguments.json else story.line(one), flush=True)
+        progress.note(one)
+
+    publisher = _publisher(settings, book, developer, stack) if arguments.publish else None
+    if publisher:
+        publisher.publish("start", _start(settings, names, clock.utc_ns()))
+    identity = Identity("dappled", "recording", "", str(arguments.flight))
+    street = Street(
+        camera=ReplayCamera(recording.files, identity, clock.monotonic_ns),
+        book=book,
+        poses=telemetry.pose,
+        developer=developer,
+        publisher=publisher,
+        latency=latency,
+        names=names,
+        watchers=Watchers(finished=finished),
+        decode_queue=1000,
+    )
+    street.start()
+    stack.callback(street.stop, 5.0)
+    replay.play(recording, street, progress, time=clock, pace=_pace(arguments))
+    if publisher:
+        counts = {"wished": len(recording.shots), "safe": progress.frames}
+        publisher.publish("end", {"utc_ns": clock.utc_ns(), "shots": counts})
+        publisher.stop()  # answers last questions: before the decoder goes
+    return progress.bad
+
+
+def _changed(arguments: argparse.Namespace) -> bool:
+    """Whether a recipe other than the flight's own is asked for."""
+    return any(getattr(arguments, name) for name in _GIVEN)
+
+
 def _recipe(arguments: argparse.Namespace, facts: Mapping[str, Any], settings: configuration.Settings) -> Recipe | None:
-    given = {name: getattr(arguments, name) for name in ("camera", "mask", "white", "dark", "calibration")}
+    given = {name: getattr(arguments, name) for name in _GIVEN}
     if facts:
+        if arguments.verify and arguments.run_name:
+            return runs.of_flight(arguments.flight, arguments.run_name).recipe
         if not facts.get("decode_in_flight") and not given["mask"]:
             return None
         return inputs.of_flight(arguments.flight, facts, given)
@@ -136,7 +186,7 @@ def _recipe(arguments: argparse.Namespace, facts: Mapping[str, Any], settings: c
 
 def _recording(arguments: argparse.Namespace, is_flight: bool) -> replay.Recording:
     if is_flight:
-        return replay.of_flight(arguments.flight)
+        return replay.of_flight(arguments.flight, (arguments.verify and arguments.run_name) or LIVE)
     if not arguments.flight.is_dir():
         raise ReplayError(f"{arguments.flight} is neither a flight nor a folder of frames")
     return replay.of_folder(
@@ -182,9 +232,9 @@ def _publisher(
     return publisher
 
 
-def _start(settings: configuration.Settings, names: Names) -> dict[str, Any]:
+def _start(settings: configuration.Settings, names: Names, utc_ns: int) -> dict[str, Any]:
     return {
-        "utc_ns": int(datetime.now(UTC).timestamp() * 1e9),
+        "utc_ns": utc_ns,
         "software": f"dappled {dappled.__version__}",
         "camera": names.camera,
         "mask": names.mask,

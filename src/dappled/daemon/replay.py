@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
-import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from time import sleep
 
 from dappled.daemon.books import Expected, ReplayBook
+from dappled.daemon.clock import RecordedClock
 from dappled.daemon.street import Story, Street
 from dappled.daemon.tagger import Exposure
 from dappled.daemon.telemetry import Telemetry, first_position_utc_ns
@@ -16,8 +18,8 @@ from dappled.drivers.mavlink_framing import Decoder, Message
 from dappled.drivers.replay import Recorded
 from dappled.errors import DappledError
 from dappled.flight import durable, layout, telemetry_log
-from dappled.flight.entries import ShotRow
-from dappled.flight.ledger import LedgerReader
+from dappled.flight.entries import Result, ShotRow
+from dappled.flight.ledger import LIVE, LedgerReader
 from dappled.flight.records import Cause, Frame, Pose, Shot
 
 FRAME_SUFFIXES = (".raf", ".cr2", ".dng", ".tif", ".tiff", ".png", ".npy", ".nef", ".arw", ".jpg", ".jpeg")
@@ -40,15 +42,19 @@ class Recording:
     horizons: dict[int, int]
 
 
-def of_flight(folder: Path) -> Recording:
-    """A recorded flight. Raises FlightError when it is none."""
+def of_flight(folder: Path, run: str = LIVE) -> Recording:
+    """A recorded flight, with the slices of one run. Raises FlightError when it is none."""
     flight = layout.open_folder(folder)
     with LedgerReader.open(flight.ledger) as ledger:
         rows = ledger.shots()
         frames = {frame.index: frame for frame in ledger.frames()}
         poses = ledger.poses()
         digests = {table: ledger.digests(table) for table in ("poses", "tags")}
-        results = ledger.results()
+        results = ledger.results(run)
+        events = [event for event in ledger.events() if event.index is not None]
+    told: dict[int | None, dict[str, str]] = defaultdict(dict)
+    for event in events:
+        told[event.index][event.kind] = event.text
     expected, files = [], []
     for row in rows:
         index = row.shot.index
@@ -61,9 +67,10 @@ def of_flight(folder: Path) -> Recording:
                 _recorded(digests["poses"], index),
                 _recorded(digests["tags"], index),
                 None if result is None else result.slices_sha256,
+                frozenset(told[index]),
             )
         )
-        files.append(_file(folder, row, frame))
+        files.append(_file(folder, row, frame, told[index].get("doubt")))
     if not frames:
         raise ReplayError(f"{folder} holds no frames: there is nothing to replay")
     telemetry = flight.telemetry if flight.telemetry.is_file() else None
@@ -154,7 +161,7 @@ class Progress:
 Pace = Callable[[Shot, Shot | None], None]  # waits between the shot before (None for the first) and this one
 
 
-def as_recorded(rate: float, sleep: Callable[[float], None] = time.sleep) -> Pace:
+def as_recorded(rate: float, sleep: Callable[[float], None] = sleep) -> Pace:
     """The intervals of the flight, `rate` times as fast."""
 
     def wait(shot: Shot, before: Shot | None) -> None:
@@ -164,19 +171,28 @@ def as_recorded(rate: float, sleep: Callable[[float], None] = time.sleep) -> Pac
     return wait
 
 
+def clock(recording: Recording) -> RecordedClock:
+    """The recording's clock, at its first wish."""
+    first = recording.shots[0]
+    return RecordedClock(first.wished_utc_ns, first.wished_utc_ns - first.wished_monotonic_ns)
+
+
 def play(
     recording: Recording,
     street: Street,
     progress: Progress,
     *,
+    time: RecordedClock,
     pace: Pace | None,
     timeout_s: float = 120.0,
 ) -> None:
-    """Play every shot. Without a pace each waits for the one before, so that nothing is ever dropped."""
+    """Play every shot, at its recorded time. Without a pace each waits for the one before, so that nothing is ever
+    dropped."""
     before: Shot | None = None
     for shot in recording.shots:
         if pace:
             pace(shot, before)
+        time.advance_to(shot.wished_utc_ns)
         street.expect(shot)
         street.fire(shot.index)
         if pace is None and not progress.finished.acquire(timeout=timeout_s):
@@ -188,18 +204,19 @@ def play(
                 raise ReplayError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
 
 
-def book(recording: Recording) -> ReplayBook:
-    """The book that compares this recording with what comes down the street."""
-    return ReplayBook(recording.root, recording.expected)
+def book(recording: Recording, keep: Callable[[Result], object] | None = None) -> ReplayBook:
+    """The book that compares this recording with what comes down the street, but for results that `keep` takes."""
+    return ReplayBook(recording.root, recording.expected, keep)
 
 
-def _file(folder: Path, row: ShotRow, frame: Frame | None) -> Recorded:
+def _file(folder: Path, row: ShotRow, frame: Frame | None, doubt: str | None) -> Recorded:
     called, returned = row.fired_called_monotonic_ns, row.fired_returned_monotonic_ns
     fired = None if called is None or returned is None else (called, returned)
     if frame is None:
         return Recorded(row.shot.index, None, "", fired, reason=row.reason or "no frame was recorded")
     arrived_ns = frame.arrived_utc_ns - row.shot.wished_utc_ns + row.shot.wished_monotonic_ns
-    return Recorded(row.shot.index, folder / frame.name, frame.camera_name, fired, arrived_ns)
+    facts = {} if doubt is None else {"doubt": doubt}
+    return Recorded(row.shot.index, folder / frame.name, frame.camera_name, fired, arrived_ns, facts=facts)
 
 
 def _recorded(digests: dict[int, tuple[str, str]], index: int) -> str | None:

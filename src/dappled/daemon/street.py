@@ -428,7 +428,8 @@ class Street:
             self._note("untimed", "the driver never said when it fired: the camera's clock is used", story.shot.index)
             return by_camera
         self._note("untimed", "the driver never said when it fired: the wish's time is used", story.shot.index)
-        return tagger.mid_exposure(story.shot.wished_utc_ns, self._latency, settings.exposure_s)
+        arrived_utc_ns = story.frame.arrived_utc_ns if story.frame else None
+        return tagger.by_wish(story.shot.wished_utc_ns, arrived_utc_ns, self._latency, settings.exposure_s)
 
     # decode and publish
 

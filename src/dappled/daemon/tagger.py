@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 from dappled.flight.records import Frame, Pose, Tag
 
 LATENCY_SOURCE = "trigger call + body latency"
+WISH_SOURCE = "wish + body latency"
+_UNSEEN_NS = 10**9  # how late a trigger call may be, where not even the file's arrival bounds it
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +58,17 @@ def mid_exposure(fired_utc_ns: int, latency: BodyLatency, exposure_s: float | No
         half_ns,
         fired_utc_ns,
     )
+
+
+def by_wish(wished_utc_ns: int, arrived_utc_ns: int | None, latency: BodyLatency, exposure_s: float | None) -> Exposure:
+    """The wish's time plus the body's latency, where nobody saw the trigger call.
+
+    The call may have come at any time up to the file's arrival: that goes into sigma, as an even chance from 0 on.
+    """
+    exposure = mid_exposure(wished_utc_ns, latency, exposure_s)
+    late_ns = _UNSEEN_NS if arrived_utc_ns is None else max(0, arrived_utc_ns - exposure.utc_ns - exposure.half_ns)
+    sigma_ns = round(math.hypot(exposure.sigma_ns, late_ns / math.sqrt(3)))
+    return replace(exposure, sigma_ns=sigma_ns, source=WISH_SOURCE)
 
 
 def tag(frame: Frame, exposure: Exposure, settings: Settings, *, camera: str, mask: str, pose: Pose) -> Tag:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import queue
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from dappled.drivers.camera import (
@@ -28,7 +28,8 @@ from dappled.drivers.camera import (
 class Recorded:
     """One recorded shot: its file and the camera's name for it, or the reason why there is none.
 
-    The fired times bracket the recorded trigger call; None where it was never seen, as is the file's arrival.
+    The fired times bracket the recorded trigger call; None where it was never seen, as is the file's arrival. `facts`
+    are those that came with the file (see `Arrival`).
     """
 
     shot: int
@@ -37,23 +38,35 @@ class Recorded:
     fired_monotonic_ns: tuple[int, int] | None
     arrived_monotonic_ns: int | None = None
     reason: str = ""
+    facts: Mapping[str, object] = field(default_factory=dict)
 
 
 class ReplayCamera:
     """A Camera (see `drivers.camera`) that plays recorded shots. Files are only ever opened for reading."""
 
-    def __init__(self, shots: Iterable[Recorded], identity: Identity) -> None:
+    def __init__(
+        self,
+        shots: Iterable[Recorded],
+        identity: Identity,
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """`monotonic_ns` stamps what the recording has no stamp for: the recording's own clock, in a replay."""
         self._shots = {recorded.shot: recorded for recorded in shots}
-        self._identity = identity
+        self._identity, self._now_ns = identity, monotonic_ns
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._playing = False
 
     def start(self) -> None:
         """See Camera."""
-        self._events.put(StateChanged("ready", "", time.monotonic_ns(), self._identity))
+        self._playing = True
+        self._events.put(StateChanged("ready", "", self._now_ns(), self._identity))
 
     def fire(self, shot: int) -> None:
         """See Camera: the recorded events of this shot follow at once."""
-        now_ns = time.monotonic_ns()
+        now_ns = self._now_ns()
+        if not self._playing:
+            self._events.put(ShotFailed(shot, "the recording is not playing", now_ns))
+            return
         recorded = self._shots.get(shot)
         if recorded is None:
             self._events.put(ShotFailed(shot, f"shot {shot} is not in the recording", now_ns))
@@ -69,12 +82,13 @@ class ReplayCamera:
             self._events.put(ShotFailed(shot, f"{recorded.path} can't be read: {error.strerror}", now_ns))
             return
         arrived_ns = recorded.arrived_monotonic_ns or now_ns
-        self._events.put(Arrival(shot, recorded.camera_name, Blob(fd, os.fstat(fd).st_size), arrived_ns))
+        blob = Blob(fd, os.fstat(fd).st_size)
+        self._events.put(Arrival(shot, recorded.camera_name, blob, arrived_ns, recorded.facts))
 
     def next_event(self, timeout_s: float) -> Event | None:
         """See Camera."""
         try:
-            return self._events.get(timeout=timeout_s)
+            return self._events.get(timeout=timeout_s) if timeout_s > 0 else self._events.get_nowait()
         except queue.Empty:
             return None
 
@@ -96,3 +110,4 @@ class ReplayCamera:
 
     def stop(self) -> None:
         """See Camera."""
+        self._playing = False

@@ -22,6 +22,7 @@ from dappled.flight.states import advance
 
 _Record = TypeVar("_Record")
 
+LIVE = "live"
 APPLICATION_ID = 0x4450504C  # "DPPL"
 SCHEMA_VERSION = 1
 
@@ -163,6 +164,10 @@ class LedgerReader:
     def result(self, index: int, run: str = "live") -> Result | None:
         rows = self._rows("SELECT record FROM results WHERE idx = ? AND run = ?", index, run)
         return self._load(_result, rows[0][0]) if rows else None
+
+    def runs(self) -> dict[str, int]:
+        """How many results each run has; "live" is the flight itself."""
+        return dict(self._rows("SELECT run, count(*) FROM results GROUP BY run ORDER BY min(rowid)"))
 
     def digests(self, table: str) -> dict[int, tuple[str, str]]:
         """(sha256 as noted, record text) by index, of "poses" or "tags"."""

@@ -56,7 +56,7 @@ class Line:
 @dataclass(frozen=True, slots=True)
 class Flight:
     """A flight, whole: settings, facts, a line for every shot, strays and events. `utc_correction_ns` is to be added to
-    every `utc_ns`; None where nobody ever knew UTC."""
+    every `utc_ns`; None where nobody ever knew UTC. `runs` counts the results of each."""
 
     name: str
     settings: Mapping[str, Any]
@@ -65,6 +65,7 @@ class Flight:
     strays: tuple[Stray, ...]
     events: tuple[Event, ...]
     utc_correction_ns: int | None
+    runs: Mapping[str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +123,7 @@ def show(path: Path) -> Flight:
             strays=tuple(ledger.strays()),
             events=tuple(ledger.events()),
             utc_correction_ns=ledger.utc_correction_ns(),
+            runs=ledger.runs(),
         )
 
 
