@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
+import struct
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pytest
+import rawpy
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from dappled.cli import main
+from dappled.drivers import exif
 from dappled.errors import DappledError
 from dappled.flight import recording
 from dappled.flight.check import check
-from dappled.flight.records import Pose
+from dappled.flight.records import Gnss, Pose
 from dappled.mocks.path import from_euler
-from dappled.products import camera_pose, geotags, sidecars
+from dappled.products import camera_pose, exif_gps, geotags, sidecars
 from dappled.products.camera_pose import FORWARD, NADIR, Angles
+from dappled.products.earth import Geoid
+from dappled.products.exif_gps import ExifError
+from dappled.products.geotags import Mounting
 from tests.flight.makers import deliver, pose, tag, wish
 
 START_NS = 1_795_256_103_000_000_000
@@ -115,6 +124,162 @@ def test_the_other_convention_and_another_folder(flight: Path, tmp_path: Path) -
     assert not list((flight / "frames").glob("*.xmp"))
 
 
+KNOWN = Gnss(6, 22, 0.6, 1.1, 0.014, 0.021, 0.05, 12.0)
+
+
+def rtk(**changed: Any) -> Pose:
+    return replace(pose(), position_sigma_m=0.02, vertical_sigma_m=0.03, gnss=KNOWN, **changed)
+
+
+def one_frame(root: Path, frame: bytes, name: str, where: Pose, *, utc_known: bool = True) -> Path:
+    begun = recording.begin(root / "flights", lambda: START_NS, utc_known=utc_known)
+    wish(begun, 0)
+    begun.ledger.add_tag(replace(tag(deliver(begun, 0, frame, name)), pose=where, utc_ns=START_NS + 123_456_789))
+    if not utc_known:
+        begun.learn_utc(86_400 * 10**9, 1, "test")
+    begun.close()
+    return begun.folder.path
+
+
+def test_accuracies_and_the_receivers_word_are_in_every_form(tmp_path: Path) -> None:
+    flight = one_frame(tmp_path, b"raw", "IMG.CR2", rtk())
+    geotags.write(flight, Mounting(geoid=Geoid(offset_m=-33.5)))
+    said = attributes(flight / "frames" / "000000.cr2.xmp")
+    assert said["{http://www.dji.com/drone-dji/1.0/}RtkFlag"] == "50"
+    assert said["{http://www.dji.com/drone-dji/1.0/}RtkStdHgt"] == "0.0300"
+    assert said["{http://pix4d.com/camera/1.0/}GPSZAccuracy"] == "0.030"
+    assert said["{http://ns.adobe.com/exif/1.0/}GPSSatellites"] == "22"
+    assert said["{urn:dappled:sidecar:1}EllipsoidalHeightM"] == "181.600"
+    (line,) = (flight / "geotags" / "geo.txt").read_text().splitlines()[1:]
+    assert line.split()[3] == "215.100"
+    assert line.split()[-2:] == ["0.020", "0.030"]
+    (row,) = (flight / "geotags" / "pix4d.csv").read_text().splitlines()
+    assert row.endswith(",0.020,0.030")
+    (point,) = json.loads((flight / "geotags" / "track.geojson").read_text())["features"]
+    assert point["geometry"]["coordinates"][2] == pytest.approx(181.6)
+    assert point["properties"]["gnss"]["fix_type"] == 6
+
+
+def test_times_are_put_right_where_utc_was_learnt(tmp_path: Path) -> None:
+    flight = one_frame(tmp_path, b"raw", "IMG.CR2", rtk(), utc_known=False)
+    geotags.write(flight)
+    said = attributes(flight / "frames" / "000000.cr2.xmp")
+    assert said["{http://ns.adobe.com/exif/1.0/}GPSTimeStamp"] == "2026-11-22T10:15:03.123456Z"
+
+
+# --- EXIF in copies
+
+
+def tiff(order: Literal["little", "big"] = "little", model: str = "Model") -> bytes:
+    """The least TIFF: one row of eight pixels, with a model."""
+    exif = Image.Exif()
+    exif[0x0110] = model
+    exif.endian = "<" if order == "little" else ">"
+    data = io.BytesIO()
+    Image.new("L", (8, 1), 77).save(data, "TIFF", exif=exif)
+    return data.getvalue()
+
+
+def jpeg(*, exif: bool) -> bytes:
+    data, told = io.BytesIO(), Image.Exif()
+    told[0x0110] = "Model"
+    Image.new("L", (8, 8), 77).save(data, "JPEG", **({"exif": told} if exif else {}))
+    return data.getvalue()
+
+
+def raf() -> bytes:
+    preview = jpeg(exif=True)
+    header = bytearray(160)
+    header[:15] = b"FUJIFILMCCD-RAW"
+    struct.pack_into(">II", header, 84, 160, len(preview))
+    return bytes(header) + preview + b"sensor data"
+
+
+def gps(data: bytes) -> dict[int, Any]:
+    """The GPS directory, as Pillow reads it."""
+    if data.startswith(b"FUJIFILM"):
+        offset, length = struct.unpack_from(">II", data, 84)
+        data = data[offset : offset + length]
+    with Image.open(io.BytesIO(data)) as image:
+        told = image.getexif()
+        assert told.get(0x0110, "Model") == "Model"
+        return dict(told.get_ifd(0x8825))
+
+
+def degrees(parts: tuple[Any, Any, Any]) -> float:
+    return float(parts[0]) + float(parts[1]) / 60 + float(parts[2]) / 3600
+
+
+FILES = {
+    "IMG.TIF": tiff(),
+    "IMG.DNG": tiff("big"),
+    "IMG.JPG": jpeg(exif=True),
+    "BARE.JPG": jpeg(exif=False),
+    "DSCF0001.RAF": raf(),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_copy_has_its_place_in_exif_and_the_original_none(tmp_path: Path, name: str) -> None:
+    flight = one_frame(tmp_path, FILES[name], name, rtk(latitude_rad=-0.7266))
+    ((frame, copy),) = geotags.copies(flight, tmp_path / "copies")
+    assert isinstance(copy, Path)
+    assert (flight / frame).read_bytes() == FILES[name]
+    found = gps(copy.read_bytes())
+    assert (found[1], found[3], found[5], found[0x12]) == ("S", "W", b"\0", "WGS-84")
+    assert degrees(found[2]) == pytest.approx(math.degrees(0.7266), abs=1e-9)
+    assert degrees(found[4]) == pytest.approx(math.degrees(1.5977), abs=1e-9)
+    assert float(found[6]) == pytest.approx(215.1)
+    assert [float(part) for part in found[7]] == [10, 15, 3.123456]
+    assert (found[0x1D], found[8]) == ("2026:11:21", "22")
+    assert (float(found[0x0B]), float(found[0x1F])) == (0.6, 0.02)
+    again = exif_gps.tagged(copy.read_bytes(), exif_gps.Place(10.0, 20.0, -5.0))
+    assert degrees(gps(again)[2]) == 10.0
+    assert gps(again)[5] == b"\1"
+    assert 7 not in gps(again)
+
+
+@pytest.mark.parametrize("file", ["synthetic_450D.CR2", "synthetic_S5200.RAF"])
+def test_copies_of_raws_open_as_before(shared_data: Path, file: str) -> None:
+    original = (shared_data / "raw" / file).read_bytes()
+    copy = exif_gps.tagged(original, exif_gps.Place(41.6, -91.5, 215.0, START_NS))
+    with rawpy.imread(io.BytesIO(original)) as before, rawpy.imread(io.BytesIO(copy)) as after:
+        assert np.array_equal(before.raw_image, after.raw_image)
+    assert exif.read(io.BytesIO(copy)) == exif.read(io.BytesIO(original))
+    if file.endswith("CR2"):
+        told = Image.Exif()
+        told.load_from_fp(io.BytesIO(copy))
+        assert degrees(told.get_ifd(0x8825)[2]) == pytest.approx(41.6, abs=1e-9)
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_refused_in_a_sentence_or_tagged(data: bytes) -> None:
+    for start in (b"", b"II*\0\x08\0\0\0", b"MM\0*", b"\xff\xd8\xff\xe1", b"FUJIFILMCCD-RAW"):
+        try:
+            made = exif_gps.tagged(start + data, exif_gps.Place(1.0, 2.0, 3.0))
+            assert len(made) > len(data)
+        except ExifError:
+            continue
+
+
+def test_the_command_makes_copies_and_says_what_it_could_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flight = one_frame(tmp_path, b"no image at all", "IMG.CR2", rtk())
+    assert main(["geotag", str(flight), "--copies", str(tmp_path / "copies"), "--geoid", "12.5", "--json"]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["copies"] == []
+    assert json.loads(said.out)["geoid"] == "constant 12.5 m"
+    assert "no copy of frames/000000.cr2: it is no TIFF-like raw" in said.err
+    assert main(["geotag", str(flight), "--copies", str(flight / "frames")]) == 1
+    assert "into the flight itself" in capsys.readouterr().err
+    assert main(["geotag", str(flight), "--geoid", str(tmp_path / "none.gtx")]) == 1
+    assert "there is no geoid grid" in capsys.readouterr().err
+
+
+# --- the camera's pose
+
+
 def at(roll: float, pitch: float, yaw: float, *, latitude_deg: float = 41.6) -> Pose:
     attitude = from_euler(math.radians(roll), math.radians(pitch), math.radians(yaw))
     return replace(pose(), attitude=attitude, latitude_rad=math.radians(latitude_deg))
@@ -142,6 +307,19 @@ def test_conventions_of_other_programs() -> None:
     assert close(tilted.vehicle, 200, -5, 3)
 
 
+def test_a_camera_on_the_gimbal_looks_where_the_gimbal_looks() -> None:
+    head = from_euler(0.0, math.radians(-60), math.radians(200))
+    flown = replace(at(10, 5, 120), gimbal_attitude=head, gimbal_source="GIMBAL_DEVICE_ATTITUDE_STATUS")
+    there = camera_pose.of(flown, camera_mount=FORWARD, on_gimbal=True)
+    assert there is not None
+    assert close(there.dji, 200, -60, 0)
+    assert close(there.vehicle, 120, 5, 10)
+    without = camera_pose.of(at(10, 5, 120), camera_mount=FORWARD, on_gimbal=True)
+    assert without is not None
+    assert without.dji is None
+    assert without.vehicle is not None
+
+
 @pytest.mark.parametrize("latitude_deg", [-77.0, 0.0, 41.6])
 @pytest.mark.parametrize("lever", [(0.3, 0.0, 0.0), (0.1, -0.2, 0.5)])
 def test_the_lever_arm_turns_with_the_vehicle(latitude_deg: float, lever: tuple[float, float, float]) -> None:
@@ -160,13 +338,13 @@ def test_the_lever_arm_turns_with_the_vehicle(latitude_deg: float, lever: tuple[
     assert bare.altitude_msl_m - moved.altitude_msl_m == pytest.approx(ned[2], abs=1e-6)
 
 
-@given(st.floats(-89, 89), st.floats(-180, 180), st.floats(-400, 9000))
+@given(st.floats(-89, 89), st.floats(-179.9, 180), st.floats(-400, 9000))
 def test_ecef_and_back(latitude_deg: float, longitude_deg: float, height_m: float) -> None:
     latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
     found = camera_pose.from_ecef(camera_pose.to_ecef(latitude, longitude, height_m))
-    assert found[0] == pytest.approx(latitude, abs=1e-14)
-    assert math.remainder(found[1] - longitude, 2 * math.pi) == pytest.approx(0, abs=1e-14)
-    assert found[2] == pytest.approx(height_m, abs=1e-7)
+    assert found[0] == pytest.approx(latitude, abs=1e-12)
+    assert math.remainder(found[1] - longitude, 2 * math.pi) == pytest.approx(0, abs=1e-12)
+    assert found[2] == pytest.approx(height_m, abs=1e-6)
 
 
 def test_ecef_of_a_known_place() -> None:

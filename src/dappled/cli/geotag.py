@@ -5,11 +5,16 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from dappled.flight import layout
-from dappled.products import camera_pose, geotags
+from dappled.products import camera_pose, earth, geotags
+from dappled.products.earth import EarthError, Geoid
+from dappled.products.geotags import Mounting
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -31,22 +36,33 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--mount", nargs=9, type=float, metavar="M",
         help="camera axes (right, down, forward) to body, row by row (default: the flight's pose.mount, or nadir)",
     )  # fmt: skip
+    parser.add_argument(
+        "--on-gimbal", action=argparse.BooleanOptionalAction, default=None,
+        help="the camera hangs on the gimbal (default: the flight's pose.on_gimbal)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--geoid", metavar="FILE|M",
+        help="grid, or metres, of mean sea level above the ellipsoid (default: PROJ's EGM grid, if it is there)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--copies", type=Path, metavar="DIR", help="also copies of the frames, with their place in EXIF"
+    )
     parser.add_argument("--json", action="store_true", help="as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     facts = layout.read_facts(layout.open_folder(arguments.flight))
-    recorded: dict[str, Any] = facts.get("settings", {}).get("pose", {})
-    lever = arguments.lever_arm or recorded.get("lever_arm_m") or (0.0, 0.0, 0.0)
-    values = arguments.mount or recorded.get("mount")
+    mounting = _mounting(arguments, facts.get("settings", {}).get("pose", {}))
     written = geotags.write(
         arguments.flight,
-        lever_m=(float(lever[0]), float(lever[1]), float(lever[2])),
-        mount=camera_pose.NADIR if values is None else camera_pose.mount(tuple(values)),
+        mounting,
         output=arguments.output,
         replace_extension=arguments.lightroom,
         force=arguments.force,
     )
+    found = dict(_copies(arguments.flight, arguments.copies, mounting)) if arguments.copies else {}
+    copied = [str(path) for path in found.values() if isinstance(path, Path)]
+    without_copy = {name: reason for name, reason in found.items() if isinstance(reason, str)}
     if arguments.json:
         print(
             json.dumps(
@@ -55,14 +71,48 @@ def run(arguments: argparse.Namespace) -> int:
                     "placed": written.placed,
                     "without_position": written.without_position,
                     "without_tag": written.without_tag,
+                    "copies": copied,
+                    "without_copy": without_copy,
+                    "geoid": mounting.geoid.name if mounting.geoid else None,
                 },
                 indent=2,
             )
         )
     else:
-        print(f"{written.placed} frames placed, {len(written.files)} files written")
+        words = f"{written.placed} frames placed, {len(written.files)} files written"
+        print(words + (f", {len(copied)} copies with EXIF" if arguments.copies else ""))
     for name in written.without_position:
         print(f"no position is known for {name}", file=sys.stderr)
     for name in written.without_tag:
         print(f"{name} was never tagged", file=sys.stderr)
+    for name, reason in without_copy.items():
+        if name not in (*written.without_position, *written.without_tag):
+            print(f"no copy of {name}: {reason}", file=sys.stderr)
     return 0
+
+
+def _copies(flight: Path, folder: Path, mounting: Mounting) -> Iterable[tuple[str, Path | str]]:
+    made = geotags.copies(flight, folder, mounting)
+    return tqdm(made, unit="frame", disable=None, delay=1.0, leave=False)
+
+
+def _mounting(arguments: argparse.Namespace, recorded: dict[str, Any]) -> Mounting:
+    lever = arguments.lever_arm or recorded.get("lever_arm_m") or (0.0, 0.0, 0.0)
+    values = arguments.mount or recorded.get("mount")
+    on_gimbal = recorded.get("on_gimbal", False) if arguments.on_gimbal is None else arguments.on_gimbal
+    return Mounting(
+        (float(lever[0]), float(lever[1]), float(lever[2])),
+        camera_pose.NADIR if values is None else camera_pose.mount(tuple(values)),
+        on_gimbal,
+        _geoid(arguments.geoid),
+    )
+
+
+def _geoid(given: str | None) -> Geoid | None:
+    try:
+        return earth.geoid(given)
+    except EarthError as error:
+        if given is not None:
+            raise
+        print(f"heights stay above mean sea level: {error}", file=sys.stderr)
+        return None

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+import pyproj
 from numpy.typing import NDArray
 
 from dappled.errors import DappledError
@@ -19,8 +21,7 @@ Matrix = NDArray[np.float64]
 
 NADIR: Matrix = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # looks down, image top forward
 FORWARD: Matrix = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # looks forward, image top up
-_A_M, _F = 6378137.0, 1 / 298.257223563
-_E2 = _F * (2 - _F)
+_GEODETIC, _GEOCENTRIC = "EPSG:4979", "EPSG:4978"  # both on WGS 84, heights above the ellipsoid
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +39,7 @@ class CameraPose:
 
     `pix4d`: all zero looks down with the image's top to the north, pitch 90 looks to the horizon. `dji`: pitch 0 looks
     to the horizon, −90 down. `vehicle`: the aircraft's own. `lever_applied` False: the position is the antenna's.
+    `height_ellipsoid_m` is known where the geoid is.
     """
 
     latitude_deg: float
@@ -48,6 +50,7 @@ class CameraPose:
     dji: Angles | None
     vehicle: Angles | None
     lever_applied: bool
+    height_ellipsoid_m: float | None = None
 
 
 def mount(values: tuple[float, ...]) -> Matrix:
@@ -62,37 +65,45 @@ def mount(values: tuple[float, ...]) -> Matrix:
     raise DappledError(f"the mount {list(values)} is no rotation: give nine numbers, row by row, camera axes to body")
 
 
-def of(pose: Pose, lever_m: Vector3 = (0.0, 0.0, 0.0), camera_mount: Matrix = NADIR) -> CameraPose | None:
+def of(
+    pose: Pose,
+    lever_m: Vector3 = (0.0, 0.0, 0.0),
+    camera_mount: Matrix = NADIR,
+    *,
+    on_gimbal: bool = False,
+    undulation_m: float | None = None,
+) -> CameraPose | None:
     """The camera's pose; None where the vehicle's position is not known.
 
     `lever_m` goes from the antenna (the autopilot's position) to the perspective centre, in body axes, metres.
+    `on_gimbal`: the camera hangs on the gimbal, whose recorded attitude counts, and the mount turns camera axes into
+    those of its head. `undulation_m` is how high mean sea level stands above the ellipsoid there.
     """
     if pose.latitude_rad is None or pose.longitude_rad is None or pose.altitude_msl_m is None:
         return None
     latitude, longitude, altitude = pose.latitude_rad, pose.longitude_rad, pose.altitude_msl_m
-    height = pose.height_above_home_m
-    if pose.attitude is None:
-        return CameraPose(
-            math.degrees(latitude), math.degrees(longitude), altitude, height, None, None, None, not any(lever_m)
-        )
-    body = matrix_of(pose.attitude)
-    ned = body @ np.array(lever_m)
-    if any(lever_m):
+    height, applied = pose.height_above_home_m, not any(lever_m)
+    if pose.attitude is not None and any(lever_m):
         # Eq 1, corrected: X_camera = X_antenna + R(ned → ecef) · R(body → ned) · lever. Only the lever is turned.
-        # (Mean sea level stands for the ellipsoid here: at 50 m between them that is 1e-5 of the lever.)
-        place = to_ecef(latitude, longitude, altitude) + ned_to_ecef(latitude, longitude) @ ned
-        latitude, longitude, altitude = from_ecef(place)
+        # (Without the geoid mean sea level stands for the ellipsoid: at 50 m between them that is 1e-5 of the lever.)
+        ned = matrix_of(pose.attitude) @ np.array(lever_m)
+        base = undulation_m or 0.0
+        place = to_ecef(latitude, longitude, altitude + base) + ned_to_ecef(latitude, longitude) @ ned
+        latitude, longitude, above = from_ecef(place)
+        altitude, applied = above - base, True
         height = None if height is None else height - float(ned[2])
-    camera = body @ camera_mount
+    head = pose.gimbal_attitude if on_gimbal else pose.attitude
+    camera = None if head is None else matrix_of(head) @ camera_mount
     return CameraPose(
         math.degrees(latitude),
         math.degrees(longitude),
         altitude,
         height,
-        angles(camera @ NADIR.T),
-        angles(camera @ FORWARD.T),
-        angles(body),
-        True,
+        None if camera is None else angles(camera @ NADIR.T),
+        None if camera is None else angles(camera @ FORWARD.T),
+        None if pose.attitude is None else angles(matrix_of(pose.attitude)),
+        applied,
+        None if undulation_m is None else altitude + undulation_m,
     )
 
 
@@ -121,30 +132,20 @@ def angles(rotation: Matrix) -> Angles:
 
 
 def to_ecef(latitude_rad: float, longitude_rad: float, height_m: float) -> Matrix:
-    """Earth-centred, Earth-fixed metres on WGS 84."""
-    n = _A_M / math.sqrt(1 - _E2 * math.sin(latitude_rad) ** 2)
-    across = (n + height_m) * math.cos(latitude_rad)
-    return np.array(
-        [
-            across * math.cos(longitude_rad),
-            across * math.sin(longitude_rad),
-            (n * (1 - _E2) + height_m) * math.sin(latitude_rad),
-        ]
-    )
+    """Earth-centred, Earth-fixed metres, from WGS 84 with the height above the ellipsoid."""
+    return np.array(_earth().transform(longitude_rad, latitude_rad, height_m, radians=True), dtype=np.float64)
 
 
 def from_ecef(place: Matrix) -> tuple[float, float, float]:
-    """(latitude, longitude in radians, height in metres) on WGS 84, by iteration to below a nanometre near the
-    ground."""
+    """(latitude, longitude in radians, height above the ellipsoid in metres) on WGS 84."""
     x, y, z = (float(part) for part in place)
-    across = math.hypot(x, y)
-    latitude = math.atan2(z, across * (1 - _E2))
-    for _ in range(6):
-        n = _A_M / math.sqrt(1 - _E2 * math.sin(latitude) ** 2)
-        latitude = math.atan2(z + _E2 * n * math.sin(latitude), across)
-    n = _A_M / math.sqrt(1 - _E2 * math.sin(latitude) ** 2)
-    height = across * math.cos(latitude) + z * math.sin(latitude) - _A_M**2 / n
-    return latitude, math.atan2(y, x), height
+    longitude, latitude, height = _earth().transform(x, y, z, radians=True, direction="INVERSE")
+    return latitude, longitude, height
+
+
+@cache
+def _earth() -> pyproj.Transformer:
+    return pyproj.Transformer.from_crs(_GEODETIC, _GEOCENTRIC, always_xy=True, allow_ballpark=False)
 
 
 def ned_to_ecef(latitude_rad: float, longitude_rad: float) -> Matrix:

@@ -21,6 +21,8 @@ _SPACES = {
     "dappled": "urn:dappled:sidecar:1",
 }
 
+_RTK_FLAGS = {3: "16", 4: "16", 5: "34", 6: "50"}  # DJI's words for a single, differential, float and fixed solution
+
 
 class SidecarError(DappledError):
     """A sidecar can't be written; one sentence."""
@@ -31,9 +33,9 @@ def path_of(frame: Path, *, replace_extension: bool = False) -> Path:
     return frame.with_suffix(".xmp") if replace_extension else frame.with_name(frame.name + ".xmp")
 
 
-def text(tag: Tag, camera: CameraPose | None) -> str:
-    """The sidecar of a frame. What is unknown is not in it."""
-    words = {**_of_tag(tag), **(_of_place(tag, camera) if camera else {})}
+def text(tag: Tag, camera: CameraPose | None, utc_ns: int | None) -> str:
+    """The sidecar of a frame, `utc_ns` being its mid-exposure put right. What is unknown is not in it."""
+    words = {**_of_tag(tag, utc_ns), **(_of_place(tag, camera) if camera else {})}
     spaces = "\n".join(f"    xmlns:{name}={quoteattr(uri)}" for name, uri in _SPACES.items())
     values = "\n".join(f"    {name}={quoteattr(value)}" for name, value in words.items() if value is not None)
     return (
@@ -59,21 +61,23 @@ def write(path: Path, content: str, *, force: bool = False) -> None:
         raise disk_error("write the sidecar", path, error) from error
 
 
-def _of_tag(tag: Tag) -> dict[str, str | None]:
+def _of_tag(tag: Tag, utc_ns: int | None) -> dict[str, str | None]:
     pose = tag.pose
-    taken = datetime.fromtimestamp(tag.utc_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S")
-    stamp = f"{taken}.{tag.utc_ns % 10**9 // 1000:06d}Z"
     return {
         "xmp:CreatorTool": _MARK,
-        "exif:GPSTimeStamp": stamp,
+        "exif:GPSTimeStamp": None if utc_ns is None else _stamp(utc_ns),
         "dappled:ImageIndex": str(tag.index),
         "dappled:FrameSha256": tag.frame_sha256,
-        "dappled:MidExposureUtcNs": str(tag.utc_ns),
+        "dappled:MidExposureUtcNs": None if utc_ns is None else str(utc_ns),
         "dappled:MidExposureSigmaNs": str(tag.utc_sigma_ns),
         "dappled:TimeSource": tag.time_source,
         "dappled:PoseSource": pose.source,
         "dappled:VehicleAttitudeWxyz": None if pose.attitude is None else " ".join(f"{q:.9f}" for q in pose.attitude),
+        "dappled:GimbalAttitudeWxyz": None
+        if pose.gimbal_attitude is None
+        else " ".join(f"{q:.9f}" for q in pose.gimbal_attitude),
         "dappled:PositionSigmaM": _number(pose.position_sigma_m, 3),
+        "dappled:VerticalSigmaM": _number(pose.vertical_sigma_m, 3),
         "dappled:AttitudeSigmaRad": _number(pose.attitude_sigma_rad, 6),
         "dappled:Camera": tag.camera,
         "dappled:Mask": tag.mask or None,
@@ -81,7 +85,7 @@ def _of_tag(tag: Tag) -> dict[str, str | None]:
 
 
 def _of_place(tag: Tag, camera: CameraPose) -> dict[str, str | None]:
-    sigma = tag.pose.position_sigma_m
+    sigma, gnss = tag.pose.position_sigma_m, tag.pose.gnss
     axis_sigma = None if sigma is None else sigma / 2**0.5
     words: dict[str, str | None] = {
         "exif:GPSVersionID": "2.3.0.0",
@@ -90,7 +94,11 @@ def _of_place(tag: Tag, camera: CameraPose) -> dict[str, str | None]:
         "exif:GPSLongitude": _minutes(camera.longitude_deg, "EW"),
         "exif:GPSAltitude": f"{round(abs(camera.altitude_msl_m) * 1000)}/1000",
         "exif:GPSAltitudeRef": "1" if camera.altitude_msl_m < 0 else "0",
+        "exif:GPSHPositioningError": None if sigma is None else f"{round(sigma * 1000)}/1000",
+        "exif:GPSDOP": None if gnss is None or gnss.hdop is None else f"{round(gnss.hdop * 100)}/100",
+        "exif:GPSSatellites": None if gnss is None or gnss.satellites is None else str(gnss.satellites),
         "Camera:GPSXYAccuracy": _number(sigma, 3),
+        "Camera:GPSZAccuracy": _number(tag.pose.vertical_sigma_m, 3),
         "drone-dji:AbsoluteAltitude": f"{camera.altitude_msl_m:+.3f}",
         "drone-dji:RelativeAltitude": None
         if camera.height_above_home_m is None
@@ -99,6 +107,9 @@ def _of_place(tag: Tag, camera: CameraPose) -> dict[str, str | None]:
         "drone-dji:GpsLongitude": f"{camera.longitude_deg:.9f}",
         "drone-dji:RtkStdLat": _number(axis_sigma, 4),
         "drone-dji:RtkStdLon": _number(axis_sigma, 4),
+        "drone-dji:RtkStdHgt": _number(tag.pose.vertical_sigma_m, 4),
+        "drone-dji:RtkFlag": None if gnss is None else _RTK_FLAGS.get(gnss.fix_type),
+        "dappled:EllipsoidalHeightM": _number(camera.height_ellipsoid_m, 3),
         "dappled:LeverArmApplied": str(camera.lever_applied),
     }
     if camera.pix4d and camera.dji and camera.vehicle:
@@ -114,6 +125,11 @@ def _of_place(tag: Tag, camera: CameraPose) -> dict[str, str | None]:
             "drone-dji:FlightRollDegree": f"{camera.vehicle.roll_deg:+.4f}",
         }
     return words
+
+
+def _stamp(utc_ns: int) -> str:
+    taken = datetime.fromtimestamp(utc_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S")
+    return f"{taken}.{utc_ns % 10**9 // 1000:06d}Z"
 
 
 def _minutes(degrees: float, signs: str) -> str:
