@@ -51,7 +51,10 @@ def _show(tables: dict[str, dict[str, object]]) -> None:
             shown = table
         unit = f" [{rule.unit}]" if rule.unit else ""
         choices = f" ({', '.join(c or chr(34) * 2 for c in rule.choices)})" if rule.choices else ""
-        line = tomli_w.dumps({key: tables[table][key]}, multiline_strings=False).strip().replace("\n", " ")
+        if key in tables[table]:
+            line = tomli_w.dumps({key: tables[table][key]}, multiline_strings=False).strip().replace("\n", " ")
+        else:
+            line = f"# {key} is not set"
         print(f"{line:42} # {rule.text}{unit}{choices}")
 
 

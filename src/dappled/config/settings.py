@@ -12,18 +12,25 @@ from typing import Any
 
 from dappled.config.schema import ConfigError, Rule, Source, build, read_toml, setting
 
-
 SOCKET_MODES = ("0600", "0660", "0666")
 
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    driver: str = setting("gphoto2", "Driver by name: gphoto2, or one that another package registers")
+    driver: str = setting(
+        "gphoto2", "Driver by name: gphoto2, fujifilm, folder, simulated, or one that another package registers"
+    )
     profile: str = setting("auto", "Camera profile by name or TOML file; auto goes by the model in the frame")
     serial: str = setting("", "Only the body with this serial number; empty takes the first found")
     port: str = setting("", "libgphoto2 port, such as usb: or ptpip:127.0.0.1:15740:15740; empty takes the first found")
     capture_target: str = setting("card", "Where the body keeps the file before it is fetched", choices=("card", "ram"))
     delete_after_download: bool = setting(False, "Delete from the card what is safe on disk; the card is a second copy")
+    shutter: str = setting(
+        "",
+        "Shutter line of fujifilm and folder: gpio:CHIP:LINE, servo:OUTPUT:PRESSED:RELEASED, relay:NUMBER, autopilot",
+    )
+    pickup: str = setting("", "Where fujifilm and folder find files: later, storage, a libgphoto2 port, or a folder")
+    options: dict | None = setting(None, "What the driver alone knows")  # type: ignore[type-arg]  # noqa: RUF009  the field's default is None; the driver checks what is in it
     latency_ms: float = setting(60.0, "From the trigger call to the start of the exposure", unit="ms", low=0, high=5000)
     latency_sigma_ms: float = setting(30.0, "How well that is known, 1 σ", unit="ms", low=0, high=5000)
     max_pending: int = setting(2, "Shots under way at once; a wish above that is refused", low=1, high=1000)
@@ -214,7 +221,7 @@ def of_tables(tables: Mapping[str, Any], name: str) -> Settings:
 def to_tables(settings: Settings) -> dict[str, Any]:
     """Settings as plain TOML values."""
     return {
-        name: {key: list(value) if isinstance(value, tuple) else value for key, value in table.items()}
+        name: {k: list(value) if isinstance(value, tuple) else value for k, value in table.items() if value is not None}
         for name, table in dataclasses.asdict(settings).items()
     }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.metadata import entry_points
+from typing import Any
 
 from dappled.config.schema import ConfigError
 from dappled.config.settings import CameraSettings
@@ -18,16 +19,25 @@ def open_camera(settings: CameraSettings) -> Camera:
     entry = found.get(settings.driver)
     if entry is None:
         raise ConfigError(f"no camera driver is called {settings.driver!r}; installed: {', '.join(sorted(found))}")
-    options = {
-        "port": settings.port or None,
-        "serial": settings.serial or None,
-        "capture_target": settings.capture_target,
-        "delete_after_download": settings.delete_after_download,
-        "timeouts": {"file_s": settings.file_timeout_s},
-    }
+    options = _options(settings)
     try:
         make = entry.load()
     except (ImportError, AttributeError) as error:
         raise CameraError(f"the camera driver {settings.driver!r} can't be loaded ({error}); install it anew") from None
     camera: Camera = make(options)
     return camera
+
+
+def _options(settings: CameraSettings) -> dict[str, Any]:
+    """What a driver is handed: the file's time-out, and every other setting that was set. It refuses what it doesn't
+    know, so that nobody believes in a setting that does nothing."""
+    common = {
+        "port": settings.port,
+        "serial": settings.serial,
+        "capture_target": "" if settings.capture_target == "card" else settings.capture_target,
+        "delete_after_download": settings.delete_after_download,
+        "shutter": settings.shutter,
+        "pickup": settings.pickup,
+    }
+    given = {name: value for name, value in common.items() if value}
+    return {"timeouts": {"file_s": settings.file_timeout_s}, **given, **(settings.options or {})}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from dappled.daemon import camera_messages
@@ -181,6 +181,16 @@ class Component:
         return self._copies.is_copy(packet, self._clock.monotonic_ns())
 
     # what goes out
+
+    def order(self, number: int, parameters: Sequence[float]) -> str | None:
+        """Give our autopilot a command (MAV_CMD, parameters from the first); a sentence where it can't be given."""
+        autopilot = self._identity.autopilot()
+        if autopilot is None:
+            return "no autopilot was heard on the MAVLink links"
+        system, link = autopilot
+        seven = (*parameters, *(0.0,) * (7 - len(parameters)))
+        sent = self._links.send(mavlink.MAVLink_command_long_message(system, 1, number, 0, *seven), link)
+        return None if sent else "its link takes no more messages"
 
     def announce(self, captured: Captured) -> None:
         """A shot ended, its frame safe or lost: tell everybody, once."""

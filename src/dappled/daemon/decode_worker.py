@@ -1,4 +1,4 @@
-"""The decode process: `python -m dappled.daemon.decode_worker FD`. Ends when its parent does."""
+"""The decode process: `python -m dappled.daemon.decode_worker FD PARENT`. Ends when its parent does."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from dappled.daemon.development import NICENESS, serve
 from dappled.decode.pictures import slice_mosaic
 from dappled.drivers.camera import Blob
 from dappled.drivers.camera_channel import Message
+from dappled.drivers.child import end_with_parent
 from dappled.drivers.darkroom import Darkroom, Development, Recipe
 from dappled.errors import sentence
 
@@ -114,12 +115,14 @@ def _naming(path: str | None, error: Exception) -> str:
 
 
 def main() -> None:
-    """Serve the socket whose descriptor is the only argument."""
+    """Arguments: the socket's descriptor, the parent's process id."""
+    fd, parent = (int(word) for word in sys.argv[1:])
+    end_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C is the parent's to act on
     os.nice(NICENESS)
     with contextlib.suppress(OSError):  # short of memory, the kernel shall end this process and not the recorder
         Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
-    serve(socket.socket(fileno=int(sys.argv[1])), Worker())
+    serve(socket.socket(fileno=fd), Worker())
 
 
 if __name__ == "__main__":

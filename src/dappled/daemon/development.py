@@ -156,7 +156,7 @@ class WorkerDeveloper:
         self._channel, there = Channel.pair()
         with there:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "dappled.daemon.decode_worker", str(there.fileno())],
+                [sys.executable, "-m", "dappled.daemon.decode_worker", str(there.fileno()), str(os.getpid())],
                 pass_fds=[there.fileno()],
                 stdin=subprocess.DEVNULL,
             )

@@ -7,7 +7,7 @@ import math
 import shutil
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -38,6 +38,7 @@ from dappled.daemon.utc import UtcLearner
 from dappled.drivers.camera import Camera, Identity, SettingsChanged, StateChanged
 from dappled.drivers.darkroom import Recipe
 from dappled.drivers.mavlink import Packet, mavlink
+from dappled.drivers.shutter_line import UsesAutopilot
 from dappled.errors import DappledError, report
 from dappled.flight import layout
 from dappled.flight import recording as flights
@@ -88,6 +89,8 @@ class Service:
         with ExitStack() as stack:
             names, recipe = inputs.recipe(self.settings)
             camera = open_camera(self.settings.camera)
+            if isinstance(camera, UsesAutopilot):
+                camera.use_autopilot(self._order)
             door = console_process.open_door(self.settings, stack)
             self._publisher = Publisher(
                 self.settings.publish.slices,
@@ -377,6 +380,9 @@ class Service:
         while not self._telemetry.settled(exposure) and self._clock.utc_ns() < give_up_ns:
             self._stopping.wait(0.005) if not self._stopping.is_set() else self._clock.wait(threading.Event(), 0.005)
         return self._telemetry.locate(exposure)
+
+    def _order(self, number: int, parameters: Sequence[float]) -> str | None:
+        return "the daemon is still starting" if self._component is None else self._component.order(number, parameters)
 
     # what the ground station hears
 

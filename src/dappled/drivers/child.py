@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import select
 import signal
 import sys
+import threading
 
 _PR_SET_PDEATHSIG = 1
 NICENESS = -10
@@ -20,6 +22,25 @@ def die_with_parent(parent: int) -> None:
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         sys.exit(0)  # it ended before we asked
+
+
+def end_with_parent(parent: int) -> None:
+    """End this process when the one that started it has ended, whichever of its threads did the starting.
+
+    (`die_with_parent` goes by the thread, and a thread may end long before its process.)
+    """
+    try:
+        watched = os.pidfd_open(parent)
+    except OSError:
+        sys.exit(0)  # it ended before we asked
+    threading.Thread(target=_exit_after, args=[watched], name="parent", daemon=True).start()
+
+
+def _exit_after(pidfd: int) -> None:
+    poll = select.poll()
+    poll.register(pidfd, select.POLLIN)
+    poll.poll()
+    os._exit(1)  # nobody is left to be told anything
 
 
 def raise_priority(niceness: int = NICENESS) -> None:

@@ -341,6 +341,14 @@ class GPhoto2Session:
                 raise LostError(_sentence(error, f"tell of {file.name}")) from error
             return None
 
+    def about(self, file: CameraFile) -> tuple[int, int | None]:
+        """(size in bytes, when it was made by the body's clock) of a file on the card. Raises SessionError."""
+        try:
+            info = self._camera.file_get_info(file.folder, file.name).file
+        except gp.GPhoto2Error as error:
+            raise _translated(error, f"tell of {file.name}") from error
+        return info.size, _time(info)
+
     def delete(self, file: CameraFile) -> None:
         """Delete a file on the card."""
         try:

@@ -164,7 +164,7 @@ def _doubts(
     for j, one in enumerate(files):
         if j in settled:
             continue
-        candidates = [str(shots[i].index) for i in np.nonzero(possible[:, j])[0]]
+        candidates = [str(shots[int(i)].index) for i in np.nonzero(possible[:, j])[0]]
         if candidates:
             which = " or ".join(candidates[:4]) + (" …" if len(candidates) > 4 else "")
             sentences.append(f"{one.name} may be of shot {which}: order, count and time leave that open")

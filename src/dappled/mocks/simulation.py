@@ -80,6 +80,9 @@ class Simulation:
                 port=body.port,
                 profile=CAMERA,
                 serial="",
+                shutter="",
+                pickup="",
+                options=None,
                 delete_after_download=True,  # its card is in memory
                 latency_ms=LATENCY_MS,
                 latency_sigma_ms=LATENCY_SIGMA_MS,

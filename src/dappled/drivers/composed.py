@@ -1,0 +1,355 @@
+"""A camera made of a shutter line and a place where its files are picked up: neither knows of the other.
+
+Files that come while their shots are waited for are told apart by order and by the camera's own time (`attribution`).
+Where files only come later, each shot is deferred at once, and matched (`matching`) when the place is there.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from dappled.drivers import matching
+from dappled.drivers.attribution import BodyClock, Claim, attribute
+from dappled.drivers.camera import (
+    Arrival,
+    CameraError,
+    Companion,
+    Deferred,
+    Event,
+    Fired,
+    Identity,
+    Setting,
+    SettingName,
+    ShotFailed,
+    StateChanged,
+    check_change,
+)
+from dappled.drivers.pickup import Found, Group, Source, groups
+from dappled.drivers.shutter_line import Order, ShutterLine, UsesAutopilot, pressing
+
+_LATE = 64
+_WAITING = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How a composed camera behaves. `follows`: None where files come in flight, within `file_s`; else the sentence how
+    they will come later. `hold_s`: how long the shutter is pressed. `poll_s`: between looks at the source. `retry_s`:
+    between attempts to open the line. `pair_s`: how long a JPEG waits for the raw file beside it."""
+
+    file_s: float = 30.0
+    follows: str | None = None
+    hold_s: float = 0.2
+    poll_s: float = 0.2
+    retry_s: float = 1.0
+    pair_s: float = 1.0
+
+
+class ComposedCamera:
+    """The driver (`drivers.camera.Camera`). `source` None: nothing is picked up in flight."""
+
+    def __init__(
+        self,
+        identity: Identity,
+        line: ShutterLine,
+        source: Source | None,
+        plan: Plan,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._identity, self._line, self._plan, self._clock_ns = identity, line, plan, clock_ns
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._orders: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        self._open: dict[int, None] = {}  # shots that have not ended
+        self._started = self._stopping = False
+        self._ready = threading.Event()
+        self._arrived = threading.Event()  # a shot was fired: look for its file
+        self._pickup = None if source is None else _Pickup(source, plan, self._deliver, self._give_up, clock_ns)
+        self._fire_thread = threading.Thread(target=self._fire_all, name="shutter line", daemon=True)
+        self._pick_thread = threading.Thread(target=self._pick_up, name="pickup", daemon=True)
+
+    def use_autopilot(self, order: Order) -> None:
+        """See UsesAutopilot: for lines that go there."""
+        if isinstance(self._line, UsesAutopilot):
+            self._line.use_autopilot(order)
+
+    def start(self) -> None:
+        """See Camera."""
+        self._started = True
+        self._events.put(StateChanged("starting", "", self._clock_ns()))
+        self._fire_thread.start()
+        if self._pickup is not None:
+            self._pick_thread.start()
+
+    def fire(self, shot: int) -> None:
+        """See Camera: the line is pressed by a thread of its own."""
+        with self._lock:
+            if shot in self._open:
+                raise CameraError(f"shot {shot} was fired before and has not ended")
+            ready = self._ready.is_set() and not self._stopping and len(self._open) < _WAITING
+            if ready:
+                self._open[shot] = None
+        if ready:
+            self._orders.put(shot)
+        else:
+            reason = "the camera was stopped" if self._stopping else "the shutter line is not open"
+            self._events.put(ShotFailed(shot, reason, self._clock_ns()))
+
+    def next_event(self, timeout_s: float) -> Event | None:
+        """See Camera."""
+        try:
+            return self._events.get(timeout=timeout_s) if timeout_s > 0 else self._events.get_nowait()
+        except queue.Empty:
+            return None
+
+    def release(self, arrival: Arrival | Companion) -> None:
+        """See Camera: what is picked up stays where it is; sources are never written to."""
+
+    @property
+    def identity(self) -> Identity | None:
+        """See Camera: known once the line is open."""
+        return self._identity if self._ready.is_set() else None
+
+    def settings(self) -> tuple[Setting, ...]:
+        """See Camera: nothing can be read over a wire."""
+        return ()
+
+    def change(self, name: SettingName, value: str) -> None:
+        """See Camera."""
+        check_change((), name, value)
+
+    def stop(self) -> None:
+        """See Camera."""
+        with self._lock:
+            self._stopping = True
+        self._orders.put(-1)
+        self._arrived.set()
+        for thread in (self._fire_thread, self._pick_thread):
+            if thread.is_alive():
+                thread.join(0.8)
+        with self._lock:
+            left, self._open = list(self._open), {}
+        for shot in left:
+            self._events.put(ShotFailed(shot, "the camera was stopped", self._clock_ns()))
+
+    # the shutter
+
+    def _fire_all(self) -> None:
+        if not self._open_line():
+            return
+        while not self._stopping:
+            shot = self._orders.get()
+            if not self._stopping:
+                self._fire_one(shot)
+        self._line.close()
+
+    def _open_line(self) -> bool:
+        said = ""
+        while not self._stopping:
+            try:
+                self._line.open()
+            except CameraError as error:
+                if str(error) != said:
+                    said = str(error)
+                    self._events.put(StateChanged("faulted", said, self._clock_ns()))
+                self._wait(self._plan.retry_s)
+            else:
+                self._ready.set()
+                self._events.put(StateChanged("ready", "", self._clock_ns(), self._identity))
+                return True
+        return False
+
+    def _fire_one(self, shot: int) -> None:
+        self._events.put(StateChanged("busy", "", self._clock_ns(), self._identity))
+        try:
+            called_ns, returned_ns = pressing(self._line, self._clock_ns)
+        except CameraError as error:
+            self._end(shot, ShotFailed(shot, str(error), self._clock_ns()))
+        else:
+            self._events.put(Fired(shot, called_ns, returned_ns))
+            if self._pickup is not None:
+                self._pickup.expect(Claim(shot, called_ns))
+                self._arrived.set()
+            if self._plan.follows is not None:
+                self._end(shot, Deferred(shot, self._plan.follows, self._clock_ns()))
+            self._let_go()
+        self._events.put(StateChanged("ready", "", self._clock_ns(), self._identity))
+
+    def _let_go(self) -> None:
+        self._wait(self._plan.hold_s)
+        try:
+            self._line.let_go()
+        except CameraError as error:
+            self._events.put(StateChanged("faulted", f"the shutter stays pressed: {error}", self._clock_ns()))
+
+    def _wait(self, seconds: float) -> None:
+        """Wait, but not when stopping: the end of the orders is a -1."""
+        until = time.monotonic() + seconds
+        while not self._stopping and (left := until - time.monotonic()) > 0:
+            time.sleep(min(left, 0.05))
+
+    def _end(self, shot: int, event: ShotFailed | Deferred | Arrival) -> bool:
+        """Tell a shot's end; False where it had ended before."""
+        with self._lock:
+            was = shot in self._open
+            self._open.pop(shot, None)
+        if was or isinstance(event, Arrival):
+            self._events.put(event)
+        return was
+
+    # the files
+
+    def _pick_up(self) -> None:
+        assert self._pickup is not None
+        while not self._stopping:
+            self._pickup.look()
+            self._arrived.wait(self._plan.poll_s)
+            self._arrived.clear()
+            self._wait(self._plan.poll_s / 4)
+        self._pickup.close()
+
+    def _deliver(self, arrival: Arrival | Companion) -> None:
+        if isinstance(arrival, Arrival) and arrival.shot is not None:
+            self._end(arrival.shot, arrival)
+        else:
+            self._events.put(arrival)
+
+    def _give_up(self, shot: int) -> None:
+        reason = f"no file came within {self._plan.file_s:g} s of the release"
+        self._end(shot, ShotFailed(shot, reason, self._clock_ns()))
+
+
+class _Pickup:
+    """Watches a source. What lay there before the first shot is older than the flight. One thread looks."""
+
+    def __init__(
+        self,
+        source: Source,
+        plan: Plan,
+        deliver: Callable[[Arrival | Companion], None],
+        give_up: Callable[[int], None],
+        clock_ns: Callable[[], int],
+    ) -> None:
+        self._source, self._plan = source, plan
+        self._tell, self._give_up_shot, self._clock_ns = deliver, give_up, clock_ns
+        self._lock = threading.Lock()
+        self._claims: list[Claim] = []
+        self._late: list[Claim] = []
+        self._clock = BodyClock()
+        self._done: set[str] | None = None
+        self._before: dict[str, int] = {}
+        self._first_seen: dict[str, int] = {}
+        self._stems: dict[str, int] = {}  # delivered frames by stem: for companions that come after
+
+    def expect(self, claim: Claim) -> None:
+        """A shot was fired; its file may come."""
+        with self._lock:
+            self._claims.append(claim)
+
+    def look(self) -> None:
+        """Deliver what is new and whole; give up what was waited for too long."""
+        try:
+            found = self._source.list()
+        except CameraError:
+            found = []
+        else:
+            if self._done is None and not self._claims:
+                self._done = {one.name for one in found}
+            self._take(found)
+        self._before = {one.name: one.size for one in found}
+        self._bound()
+
+    def close(self) -> None:
+        """Let go of the source."""
+        self._source.close()
+
+    def _take(self, found: list[Found]) -> None:
+        done = self._done = self._done or set()
+        fresh = [one for one in found if one.name not in done]
+        whole = [one for one in fresh if one.size > 0 and self._before.get(one.name) == one.size]
+        if self._plan.follows is None:
+            for group in groups(whole):
+                if self._complete(group):
+                    self._hand_over(group)
+        elif whole and len(whole) == len(fresh):  # nothing is still being written: now order and count mean something
+            self._match(groups(whole))
+
+    def _complete(self, group: Group) -> bool:
+        """Whether no raw file is to be expected beside it any more."""
+        now_ns = self._clock_ns()
+        first_ns = self._first_seen.setdefault(group.main.stem, now_ns)
+        waited = now_ns - first_ns >= self._plan.pair_s * 1e9
+        return group.main.raw or group.main.stem in self._stems or waited
+
+    def _hand_over(self, group: Group) -> None:
+        """A file that comes in flight: whose is it?"""
+        main = group.main
+        if main.stem in self._stems:
+            self._accompany(self._stems[main.stem], (main, *group.companions))
+            return
+        try:
+            taken_s = self._source.taken_s(main)
+        except CameraError:
+            return  # the next look may find it again
+        with self._lock:
+            current = self._claims[0] if self._claims else None
+        shown = None if taken_s is None else int(taken_s)
+        verdict = attribute(self._late, current, shown, self._clock)
+        if current is not None and verdict.shot == current.shot and shown is not None and not self._late:
+            self._clock = self._clock.learnt(current, shown)
+        facts = {"doubt": verdict.doubt} if verdict.doubt else {}
+        if self._bring(verdict.shot, group, facts):
+            self._late = [] if verdict.doubt else [one for one in self._late if one.shot != verdict.shot]
+
+    def _match(self, fresh: list[Group]) -> None:
+        """A card that appeared, with all that was taken since: only pairs that are sure are taken now."""
+        with self._lock:
+            claims = list(self._claims)
+        try:
+            dated = [matching.DatedFile(group.main.name, self._source.taken_s(group.main)) for group in fresh]
+        except CameraError:
+            return  # the card is gone again
+        shots = [matching.FiredShot(claim.shot, claim.fired_ns / 1e9) for claim in claims]
+        by_name = {group.main.name: group for group in fresh}
+        for shot, name in matching.match(shots, dated, plausible_s=float("inf")).pairs:
+            self._bring(shot, by_name[name], {})
+
+    def _bring(self, shot: int | None, group: Group, facts: dict[str, str]) -> bool:
+        try:
+            blob = self._source.open(group.main)
+        except CameraError:
+            return False  # the next look may find it again
+        assert self._done is not None
+        self._done.add(group.main.name)
+        with self._lock:
+            self._claims = [claim for claim in self._claims if claim.shot != shot]
+        self._tell(Arrival(shot, group.main.base, blob, self._clock_ns(), {"name": group.main.name, **facts}))
+        if shot is not None:
+            self._stems[group.main.stem] = shot
+            self._accompany(shot, group.companions)
+        return True
+
+    def _accompany(self, shot: int, files: tuple[Found, ...]) -> None:
+        assert self._done is not None
+        for one in files:
+            try:
+                blob = self._source.open(one)
+            except CameraError:
+                continue
+            self._done.add(one.name)
+            self._tell(Companion(shot, one.base, blob, self._clock_ns(), {"name": one.name}))
+
+    def _bound(self) -> None:
+        if self._plan.follows is not None:
+            return
+        limit_ns = self._clock_ns() - round(self._plan.file_s * 1e9)
+        with self._lock:
+            overdue = [claim for claim in self._claims if claim.fired_ns < limit_ns]
+            self._claims = [claim for claim in self._claims if claim.fired_ns >= limit_ns]
+        for claim in overdue:
+            self._late = [*self._late, claim][-_LATE:]
+            self._give_up_shot(claim.shot)

@@ -1,0 +1,160 @@
+"""Files of a camera in PTP mode, through libgphoto2 in a process of its own that only lists and fetches.
+
+A body that sleeps or is pulled out costs this process and no other; the next call starts another one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from dappled.drivers.camera import Blob, CameraError
+from dappled.drivers.camera_channel import Channel, ChannelError, Message
+from dappled.drivers.pickup import SUFFIXES, Found
+
+_ANSWER_S = 60.0
+_START_S = 0.2
+
+
+@dataclass(slots=True)
+class _Child:
+    process: subprocess.Popen[bytes]
+    channel: Channel
+
+
+class PtpSource:
+    """See `pickup.Source`. One thread calls it."""
+
+    def __init__(self, port: str) -> None:
+        self._port = port
+        self._child: _Child | None = None
+        self._taken_s: dict[str, int | None] = {}
+
+    def list(self) -> list[Found]:
+        """See Source. Each call opens the camera anew: libgphoto2 remembers what it listed."""
+        (fd,) = self._ask({"do": "list"}).fds
+        with os.fdopen(fd, "rb") as file:
+            file.seek(0)
+            rows = json.load(file)
+        self._taken_s = {name: taken_s for name, _, taken_s in rows}
+        return [Found(name, size) for name, size, _ in rows]
+
+    def taken_s(self, found: Found) -> float | None:
+        """See Source: the body's own note of when the file was made."""
+        return self._taken_s.get(found.name)
+
+    def open(self, found: Found) -> Blob:
+        """See Source."""
+        answer = self._ask({"do": "fetch", "name": found.name})
+        return Blob(answer.fds[0], answer.body["size"])
+
+    def close(self) -> None:
+        """See Source."""
+        child, self._child = self._child, None
+        if child is None:
+            return
+        child.channel.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.process.wait(_START_S)
+        child.process.kill()
+        child.process.wait()
+
+    def _ask(self, question: Mapping[str, Any]) -> Message:
+        child = self._child = self._child or _begin(self._port)
+        try:
+            child.channel.send(question, timeout_s=5.0)
+            answer = child.channel.receive(_ANSWER_S)
+        except ChannelError as error:
+            self.close()
+            raise CameraError(f"the camera at {self._port} was lost ({error}): connect it again") from None
+        if answer is None:
+            self.close()
+            raise CameraError(f"the camera at {self._port} did not answer for {_ANSWER_S:g} s: switch it off and on")
+        if "error" in answer.body:
+            raise CameraError(str(answer.body["error"]))
+        return answer
+
+
+def _begin(port: str) -> _Child:
+    channel, other = Channel.pair()
+    with other:
+        command = [sys.executable, "-m", "dappled.drivers.ptp_source", str(other.fileno()), str(os.getpid()), port]
+        environment = {**os.environ, "HOME": "/nonexistent"}  # libgphoto2 keeps settings there
+        process = subprocess.Popen(
+            command, pass_fds=(other.fileno(),), stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment
+        )
+    return _Child(process, channel)
+
+
+# --- the process ----------------------------------------------------------------------------------------------------
+
+
+class _Files:
+    """The files of the camera at a port. libgphoto2 is imported here, in the child, and nowhere else."""
+
+    def __init__(self, port: str) -> None:
+        from dappled.drivers import gphoto2_session  # noqa: PLC0415  # reason above
+        from dappled.drivers.gphoto2_settings import GPhoto2Settings  # noqa: PLC0415  # goes with it
+
+        self._library = gphoto2_session
+        self._settings = GPhoto2Settings(port=None if port == "usb:" else port)
+        self._session: gphoto2_session.GPhoto2Session | None = None
+
+    def answer(self, question: Mapping[str, Any]) -> Blob | str:
+        """What was asked for, or a sentence why it can't be had."""
+        try:
+            return self._list() if question["do"] == "list" else self._fetch(question["name"])
+        except self._library.SessionError as error:
+            return str(error)
+
+    def _list(self) -> Blob:
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+        session = self._session = self._library.open_session(self._settings)
+        rows = [
+            (f"{file.folder}/{file.name}", *session.about(file))
+            for file in sorted(session.files(), key=lambda file: (file.folder, file.name))
+            if file.name.lower().endswith(SUFFIXES)
+        ]
+        return Blob.of(json.dumps(rows).encode(), "listing")
+
+    def _fetch(self, path: str) -> Blob | str:
+        if self._session is None:
+            return "the camera was not listed yet"
+        folder, _, name = path.rpartition("/")
+        return self._session.fetch(self._library.CameraFile(folder, name)).blob
+
+
+def _serve(channel: Channel, files: _Files) -> None:
+    while True:
+        question = channel.receive(3600)
+        if question is None:
+            continue
+        answer = files.answer(question.body)
+        if isinstance(answer, str):
+            channel.send({"error": answer}, timeout_s=5.0)
+            continue
+        channel.send({"size": answer.size}, (answer.fd,), timeout_s=5.0)
+        answer.close()
+
+
+def main() -> None:
+    """Arguments: the socket's descriptor, the parent's process id, the port."""
+    from dappled.drivers.child import die_with_parent  # noqa: PLC0415  # the parent doesn't need it
+
+    fd, parent, port = sys.argv[1:]
+    die_with_parent(int(parent))
+    with contextlib.suppress(ChannelError):  # the parent is gone, or has closed
+        _serve(Channel(socket.socket(fileno=int(fd))), _Files(port))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,305 @@
+"""Drivers that are a shutter line and a pickup, against a body with a contact and a card, and folders."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from dappled.drivers import exif, folder, fujifilm
+from dappled.drivers.camera import Arrival, CameraError, Companion, Deferred, Fired, Identity, ShotFailed, StateChanged
+from dappled.drivers.composed import ComposedCamera, Plan
+from dappled.drivers.pickup import FolderSource, StorageSource
+from dappled.drivers.replay import Recorded, ReplayCamera
+from dappled.drivers.shutter_line import GpioLine, OutsideLine
+from dappled.mocks import simulated
+from dappled.mocks.body import pattern
+from dappled.mocks.eos450d import thumbnail
+from dappled.mocks.finepix import FinePix, picture
+from tests.drivers.contract import CameraContract, Rig, content, of_shots, until, until_shot_ends, until_state
+
+WHO = Identity("FUJIFILM", "FinePix S5200", "", "gpio")
+FAST = Plan(file_s=5.0, hold_s=0.01, poll_s=0.02, retry_s=0.02)
+T0 = 1_700_000_000.0
+
+
+@pytest.fixture
+def body(tmp_path: Path) -> FinePix:
+    return FinePix(tmp_path, write_s=0.0, wall_s=lambda: T0)
+
+
+def line(body: FinePix) -> GpioLine:
+    return GpioLine("/dev/gpiochip0", 17, request=body.request)
+
+
+class TestContractOfAWireAndAFolder(CameraContract):
+    """The fujifilm driver whose card is a folder that can be reached in flight."""
+
+    @pytest.fixture
+    def rig(self, body: FinePix) -> Iterator[Rig]:
+        camera = ComposedCamera(WHO, line(body), FolderSource(body.card), FAST)
+        yield Rig(camera, lambda number: picture(number, 6.3, T0), loose=True)
+        camera.stop()
+
+
+class TestContractOfAWireAndMassStorage(CameraContract):
+    """The fujifilm driver: each shot is deferred, and its file follows from the mounted card."""
+
+    @pytest.fixture
+    def rig(self, body: FinePix) -> Iterator[Rig]:
+        body.plug()
+        plan = Plan(follows="it follows", hold_s=0.01, poll_s=0.02)
+        camera = ComposedCamera(WHO, line(body), StorageSource(body.mounts, body.places), plan)
+        yield Rig(camera, lambda number: picture(number, 6.3, T0), loose=True, follows=True)
+        camera.stop()
+
+
+class _OtherProgram:
+    """Fires and fills a folder, whenever the line is pressed."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._made = folder, 0
+
+    def open(self) -> None: ...
+    def let_go(self) -> None: ...
+    def close(self) -> None: ...
+
+    def press(self) -> None:
+        self._made += 1
+        part = self._folder / ".part"
+        part.write_bytes(pattern(self._made, 100_000))
+        part.rename(self._folder / f"shot_{self._made:03d}.dng")
+
+
+class TestContractOfTheFolder(CameraContract):
+    @pytest.fixture
+    def rig(self, tmp_path: Path) -> Iterator[Rig]:
+        camera = ComposedCamera(WHO, _OtherProgram(tmp_path), FolderSource(tmp_path), FAST)
+        yield Rig(camera, lambda number: pattern(number, 100_000), loose=True)
+        camera.stop()
+
+
+class TestContractOfTheSimulatedCamera(CameraContract):
+    @pytest.fixture
+    def rig(self) -> Iterator[Rig]:
+        camera = simulated.open_camera({"picture": "pattern:100000:dng"})
+        yield Rig(camera, lambda number: pattern(number, 100_000), loose=True)
+        camera.stop()
+
+
+class TestContractOfReplay(CameraContract):
+    @pytest.fixture
+    def rig(self, tmp_path: Path) -> Iterator[Rig]:
+        shots = []
+        for number, shot in enumerate((7, 3, 4, 5, 1, 0, 2, 9), 1):
+            path = tmp_path / f"{shot:06d}.dng"
+            place = {7: 1, 3: 1, 4: 2, 5: 3, 1: 1}.get(shot, number)
+            path.write_bytes(pattern(place, 50_000))
+            shots.append(Recorded(shot, path, f"IMG_{number:04d}.DNG", (10, 20), 30))
+        camera = ReplayCamera(shots, Identity("dappled", "recording", "", ""))
+        yield Rig(camera, lambda number: pattern(number, 50_000), recorded=True)
+        camera.stop()
+
+
+def test_raw_and_jpeg_in_a_folder_are_one_frame(tmp_path: Path) -> None:
+    camera = ComposedCamera(WHO, OutsideLine(), FolderSource(tmp_path), FAST)
+    camera.start()
+    try:
+        until_state(camera, "ready")
+        camera.fire(1)
+        until(camera, lambda event: isinstance(event, Fired))
+        (tmp_path / "A_0001.JPG").write_bytes(thumbnail(1))
+        (tmp_path / "A_0001.CR2").write_bytes(pattern(1, 5000))
+        events = until(camera, lambda event: isinstance(event, Companion))
+        arrival, companion = [event for event in events if isinstance(event, Arrival | Companion)]
+        assert (arrival.shot, arrival.name, companion.shot, companion.name) == (1, "A_0001.CR2", 1, "A_0001.JPG")
+        assert (content(arrival), content(companion)) == (pattern(1, 5000), thumbnail(1))
+    finally:
+        camera.stop()
+
+
+def test_a_file_that_is_still_written_is_waited_for(tmp_path: Path) -> None:
+    camera = ComposedCamera(WHO, OutsideLine(), FolderSource(tmp_path), FAST)
+    camera.start()
+    try:
+        until_state(camera, "ready")
+        camera.fire(1)
+        stop = threading.Event()
+
+        def write() -> None:
+            with (tmp_path / "slow.dng").open("wb") as file:
+                for _ in range(60):
+                    file.write(bytes(1000))
+                    file.flush()
+                    stop.wait(0.005)
+
+        writer = threading.Thread(target=write)
+        writer.start()
+        arrival = until_shot_ends(camera, 1)[-1]
+        writer.join()
+        assert isinstance(arrival, Arrival)
+        assert len(content(arrival)) == 60_000
+    finally:
+        camera.stop()
+
+
+def test_what_lay_there_before_is_left_alone_and_what_nobody_wished_for_has_no_shot(tmp_path: Path) -> None:
+    (tmp_path / "old.dng").write_bytes(b"old")
+    camera = ComposedCamera(WHO, OutsideLine(), FolderSource(tmp_path), FAST)
+    camera.start()
+    try:
+        until_state(camera, "ready")
+        time.sleep(0.1)  # a look at the folder; what it does not see is a stray below, and no test fails
+        (tmp_path / "new.dng").write_bytes(b"new")
+        arrival = until(camera, lambda event: isinstance(event, Arrival))[-1]
+        assert isinstance(arrival, Arrival)
+        assert (arrival.shot, content(arrival)) == (None, b"new")
+    finally:
+        camera.stop()
+
+
+def test_no_file_fails_the_shot_and_a_late_one_is_told_by_the_camera_s_clock(tmp_path: Path) -> None:
+    plan = Plan(file_s=0.5, hold_s=0.01, poll_s=0.02)
+    now_s = 1000.0
+    body = FinePix(tmp_path, write_s=0.0, wall_s=lambda: T0 + now_s, clock_offset_s=3600.0)
+    camera = ComposedCamera(WHO, OutsideLine(), FolderSource(body.card), plan, lambda: round(now_s * 1e9))
+    camera.start()
+    try:
+        until_state(camera, "ready")
+        camera.fire(1)
+        body.contact(True)
+        _closed(until_shot_ends(camera, 1))
+        now_s += 10
+        camera.fire(2)
+        until(camera, lambda event: isinstance(event, Fired) and event.shot == 2)
+        taken_s = now_s
+        now_s += 20
+        failed = until_shot_ends(camera, 2)[-1]
+        assert isinstance(failed, ShotFailed)
+        camera.fire(3)
+        until(camera, lambda event: isinstance(event, Fired) and event.shot == 3)
+        (body.card / "DCIM" / "late.RAF").write_bytes(picture(2, 6.3, T0 + taken_s + 3600))
+        late = until(camera, lambda event: isinstance(event, Arrival))[-1]
+        assert isinstance(late, Arrival)
+        assert (late.shot, "doubt" in late.facts) == (2, False)
+        late.blob.close()
+        body.contact(True)
+        _closed(until_shot_ends(camera, 3))
+    finally:
+        camera.stop()
+
+
+def test_a_card_that_appears_after_many_shots_brings_them_all_in_order(tmp_path: Path) -> None:
+    now_s = 1000.0
+    body = FinePix(tmp_path, write_s=0.0, wall_s=lambda: T0 + now_s, clock_offset_s=-3600.0)
+    plan = Plan(follows="it follows", hold_s=0.001, poll_s=0.02)
+    source = StorageSource(body.mounts, body.places)
+    camera = ComposedCamera(WHO, line(body), source, plan, lambda: round(now_s * 1e9))
+    camera.start()
+    try:
+        until_state(camera, "ready")
+        for shot, step_s in enumerate((3, 5, 4, 9, 3, 6)):
+            now_s += step_s
+            camera.fire(shot)
+            events = until(camera, lambda event: isinstance(event, Deferred))
+            assert of_shots(events) == [(Fired, shot), (Deferred, shot)]
+            until_state(camera, "ready")
+        missing = body.card / "DCIM" / "100_FUJI" / "DSCF0003.RAF"
+        assert body.made == 6
+        deadline = time.monotonic() + 20
+        while len(list(missing.parent.glob("*.RAF"))) < 6:
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        missing.unlink()
+        body.plug()
+        found: dict[int | None, str] = {}
+        while len(found) < 5:
+            arrival = until(camera, lambda event: isinstance(event, Arrival))[-1]
+            assert isinstance(arrival, Arrival)
+            found[arrival.shot] = arrival.name
+            arrival.blob.close()
+        assert found == {shot: f"DSCF{shot + 1:04d}.RAF" for shot in (0, 1, 3, 4, 5)}
+    finally:
+        camera.stop()
+
+
+def test_a_line_that_another_program_holds_is_named_and_taken_when_it_is_free(body: FinePix) -> None:
+    body.hold_line(True)
+    camera = ComposedCamera(WHO, line(body), None, Plan(follows="later", hold_s=0.01, retry_s=0.02))
+    camera.start()
+    try:
+        faulted = until_state(camera, "faulted")
+        assert "/dev/gpiochip0" in faulted.reason
+        camera.fire(1)
+        assert of_shots(until_shot_ends(camera, 1)) == [(ShotFailed, 1)]
+        body.hold_line(False)
+        until_state(camera, "ready")
+        camera.fire(2)
+        assert of_shots(until(camera, lambda event: isinstance(event, Deferred))) == [(Fired, 2), (Deferred, 2)]
+    finally:
+        camera.stop()
+    assert body.made == 1
+
+
+def _closed(events: Sequence[object]) -> None:
+    for event in events:
+        if isinstance(event, Arrival):
+            event.blob.close()
+
+
+# --- settings
+
+
+def test_a_fujifilm_without_a_shutter_line_says_which_there_are() -> None:
+    with pytest.raises(CameraError, match="gpio:CHIP:LINE"):
+        fujifilm.open_camera({})
+
+
+@pytest.mark.parametrize(
+    ("pickup", "words"), [("later", "flight pickup"), ("storage", "storage"), ("usb:", "usb:"), ("", "flight pickup")]
+)
+def test_a_fujifilm_says_how_its_files_will_come(pickup: str, words: str) -> None:
+    camera = fujifilm.open_camera({"shutter": "outside", "pickup": pickup, "hold_ms": 1})
+    camera.start()
+    try:
+        until_state(camera, "ready")
+        camera.fire(1)
+        told = until(camera, lambda event: isinstance(event, Deferred))[-1]
+        assert isinstance(told, Deferred)
+        assert words in told.reason
+    finally:
+        camera.stop()
+
+
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [({}, "camera.pickup"), ({"pickup": "/no/such"}, "/no/such"), ({"pickup": "/tmp", "iso": 1}, "iso"),
+     ({"pickup": "/tmp", "timeouts": {"file_s": 0}}, "file_s"), ({"pickup": "/tmp", "hold_ms": "x"}, "hold_ms"),
+     ({"pickup": 5}, "pickup")],
+)  # fmt: skip
+def test_wrong_settings_of_a_folder_are_named(settings: dict[str, object], word: str) -> None:
+    with pytest.raises(CameraError, match=word):
+        folder.open_camera(settings)
+
+
+def test_a_wrong_simulation_is_named() -> None:
+    with pytest.raises(CameraError, match="colour"):
+        simulated.open_camera({"colour": True})
+    camera = simulated.open_camera({"picture": "nothing"})
+    camera.start()
+    faulted = until(camera, lambda event: isinstance(event, StateChanged) and event.state == "faulted")[-1]
+    assert isinstance(faulted, StateChanged)
+    assert "nothing" in faulted.reason
+    camera.stop()
+
+
+def test_the_mock_s_raf_tells_its_exposure(tmp_path: Path) -> None:
+    path = tmp_path / "one.RAF"
+    path.write_bytes(picture(1, 12.5, T0))
+    with path.open("rb") as file:
+        found = exif.read(file)
+    assert (found.make, found.model, found.focal_length_mm) == ("FUJIFILM", "FinePix S5200", 12.5)
+    assert found.taken == time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(T0))
