@@ -1,0 +1,118 @@
+"""Readers in other languages, taken from docs/wire.md alone, on a live simulated stream."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.system.conftest import dappled
+
+ROOT = Path(__file__).parents[2]
+FRAMES = 3
+READERS = {
+    "python": ("python", "python/reader.py"),
+    "cpp": ("cpp", "cpp/reader.cpp"),
+    "cargo": ("toml", "rust/Cargo.toml"),
+    "rust": ("rust", "rust/src/main.rs"),
+    "octave": ("octave", "octave/reader.m"),
+}
+
+
+def block(language: str) -> str:
+    """The first block of this language in docs/wire.md that is a whole file."""
+    document = (ROOT / "docs" / "wire.md").read_text(encoding="utf-8")
+    found: list[str] = re.findall(rf"```{language}\n(.*?)```", document, re.DOTALL)
+    return found[0]
+
+
+@pytest.mark.parametrize("name", sorted(READERS))
+def test_the_document_holds_the_examples_word_for_word(name: str) -> None:
+    language, path = READERS[name]
+    text = (ROOT / "examples" / "readers" / path).read_text(encoding="utf-8")
+    if language == "toml":
+        assert text in (ROOT / "docs" / "wire.md").read_text(encoding="utf-8")
+    else:
+        assert block(language) == text
+
+
+def python(folder: Path) -> list[str]:
+    (folder / "reader.py").write_text(block("python"), encoding="utf-8")
+    return [sys.executable, str(folder / "reader.py")]
+
+
+def cpp(folder: Path) -> list[str]:
+    compiler = shutil.which("g++")
+    if compiler is None or not Path("/usr/include/zmq.h").exists():
+        pytest.skip("no g++ with libzmq: apt install g++ libzmq3-dev nlohmann-json3-dev")
+    (folder / "reader.cpp").write_text(block("cpp"), encoding="utf-8")
+    subprocess.run(
+        [compiler, "-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "reader.cpp", "-o", "reader", "-lzmq"],
+        cwd=folder,
+        check=True,
+        timeout=100,
+    )
+    return [str(folder / "reader")]
+
+
+def rust(folder: Path) -> list[str]:
+    cargo = shutil.which("cargo")
+    if cargo is None:
+        pytest.skip("no Rust: see rustup.rs")
+    (folder / "src").mkdir()
+    (folder / "src" / "main.rs").write_text(block("rust"), encoding="utf-8")
+    for name in ("Cargo.toml", "Cargo.lock"):
+        shutil.copy(ROOT / "examples" / "readers" / "rust" / name, folder)
+    fetched = subprocess.run(
+        [cargo, "fetch", "--locked"], cwd=folder, check=False, timeout=100, capture_output=True, text=True
+    )
+    if fetched.returncode and "failed to" in fetched.stderr and "download" in fetched.stderr:
+        pytest.skip(f"the crates can't be fetched here: {fetched.stderr.strip().splitlines()[-1]}")
+    assert fetched.returncode == 0, fetched.stderr
+    # The crate builds libzmq from source, once a machine.
+    target = ROOT / "build" / "reader-rust"
+    subprocess.run(
+        [cargo, "build", "--locked", "--offline", "-q", "--target-dir", str(target)],
+        cwd=folder,
+        check=True,
+        timeout=400,
+    )
+    return [str(target / "debug" / "reader")]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("made", [python, cpp, rust])
+def test_a_reader_reads_a_live_stream(made: object, tmp_path: Path, sockets: Path) -> None:
+    """Each line names the frame, the shape and the mean of the first slice, as `dappled watch` keeps them."""
+    folder = tmp_path / "reader"
+    folder.mkdir()
+    assert callable(made)
+    command = made(folder)
+    endpoint = f"ipc://{sockets}/{made.__name__}"
+    (tmp_path / "dappled.toml").write_text(f'[record]\ndirectory = "flights"\n[publish]\nslices = "{endpoint}"\n')
+    watch = [sys.executable, "-m", "dappled", "watch", endpoint, "--save", "received", "--count", str(FRAMES),
+             "--timeout", "60"]  # fmt: skip
+    reader = subprocess.Popen([*command, endpoint], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    keeper = subprocess.Popen(watch, cwd=tmp_path, stdout=subprocess.DEVNULL)
+    try:
+        flown = dappled("run", "--simulate", "--frames", str(FRAMES), "--config", "dappled.toml", cwd=tmp_path)
+        said, complaints = reader.communicate(timeout=60)
+        assert keeper.wait(60) == 0
+    finally:
+        reader.kill()
+        keeper.kill()
+    assert flown.returncode == 0, flown.stderr
+    assert reader.returncode == 0, complaints
+    read = re.findall(r"^frame (\d+) slices (\d+)x(\d+)x(\d+) mean (-?[\d.]+)$", said, re.MULTILINE)
+    kept = {int(path.stem): np.load(path) for path in (tmp_path / "received").glob("*.npy")}
+    assert [int(line[0]) for line in read] == sorted(kept)
+    for line in read:
+        slices = kept[int(line[0])]
+        assert tuple(map(int, line[1:4])) == slices.shape
+        assert float(line[4]) == pytest.approx(float(slices[0].real.mean(dtype=float)), abs=2e-6)
