@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tomli_w
 
-from dappled.cli import common
+from dappled.cli import calibrate_lens, common
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
 from dappled.decode.calibration import Calibration, CalibrationFrame, calibrate
@@ -19,11 +19,19 @@ from dappled.drivers.darkroom import Darkroom, DarkroomError
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "example: dappled calibrate white-f22.dng --camera canon-eos-450d --mask mask-2 -o calibration.toml"
     common.frames(parser, "+")
-    common.add_recipe(parser)
+    common.add_recipe(parser, mask_needed=False)
+    calibrate_lens.add(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="calibration to write (.toml)")
 
 
 def run(arguments: argparse.Namespace) -> int:
+    if arguments.lens:
+        arguments.mask = arguments.mask or ""
+        return calibrate_lens.run(
+            common.recipe(arguments), arguments.frames, arguments.board, arguments.output, arguments.focal_length
+        )
+    if not arguments.mask:
+        raise ConfigError("which mask? Name its profile or TOML file with --mask")
     if arguments.mask == profiles.LENSLET:
         raise ConfigError("a lenslet array needs no calibration: give its white frame with --white when decoding")
     found = from_frames(

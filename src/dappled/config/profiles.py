@@ -133,6 +133,11 @@ class _MaskTable:
     description: str = setting("", "one line")
 
 
+def tables(name: str, kind: str) -> dict[str, Any]:
+    """A profile as its file has it; kind is "cameras" or "masks"."""
+    return _read(name, kind)[0]
+
+
 def camera(name: str) -> CameraProfile:
     """A camera profile by shipped name or TOML file."""
     tables, source = _read(name, "cameras")

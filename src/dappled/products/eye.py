@@ -115,17 +115,27 @@ class Eye:
 
 def intrinsics(sensor: Sensor, lens: Lens, grid: Floats) -> Floats:
     """(3, 3) from (x, y, 1) at distance 1 to a view's pixel: lens, chip, and the view's `grid` (2, 3) on the sensor."""
-    rows, columns = sensor.shape
-    chip = np.array([[sensor.column_mm[1], sensor.row_mm[1]], [sensor.column_mm[0], sensor.row_mm[0]]])  # (c, r) → mm
-    flip = grid[::-1, [1, 0, 2]]  # (x, y, 1) of the view → (column, row)
-    to_mm = chip @ flip[:, :2]
-    offset = chip @ (flip[:, 2] - [(columns - 1) / 2, (rows - 1) / 2])
+    to_mm, offset = _to_chip(sensor, grid)
     back = np.linalg.inv(to_mm)
     principal = np.array([lens.principal_point_mm[1], lens.principal_point_mm[0]])
     matrix = np.eye(3)
     matrix[:2, :2] = back * lens.v_mm
     matrix[:2, 2] = back @ (principal - offset)
     return matrix
+
+
+def on_chip_mm(pixels: Floats, sensor: Sensor, grid: Floats) -> Floats:
+    """(n, 2) millimetres (x, y) from the chip's middle, of a view's pixels (n, 2)."""
+    to_mm, offset = _to_chip(sensor, grid)
+    return np.asarray(pixels @ to_mm.T + offset)
+
+
+def _to_chip(sensor: Sensor, grid: Floats) -> tuple[Floats, Floats]:
+    """(2, 2) and (2,): from a view's (x, y) to mm (x, y) from the chip's middle."""
+    rows, columns = sensor.shape
+    chip = np.array([[sensor.column_mm[1], sensor.row_mm[1]], [sensor.column_mm[0], sensor.row_mm[0]]])  # (c, r) → mm
+    flip = grid[::-1, [1, 0, 2]]  # (x, y, 1) of the view → (column, row)
+    return chip @ flip[:, :2], chip @ (flip[:, 2] - [(columns - 1) / 2, (rows - 1) / 2])
 
 
 def look(

@@ -1,0 +1,105 @@
+"""`dappled calibrate --lens`: distance, principal point and distortion of the lens, kept in a camera profile."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from dappled.config import profiles
+from dappled.drivers.darkroom import Darkroom, DarkroomError, Recipe
+from dappled.errors import DappledError
+from dappled.products import chessboard
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """--lens and what goes with it."""
+    group = parser.add_argument_group("lens, for maps")
+    group.add_argument("--lens", action="store_true", help="frames show a chessboard: calibrate the lens instead, and\n"
+                       "write a copy of the camera's profile with it (-o FILE.toml)")  # fmt: skip
+    group.add_argument("--board", default="9x6", metavar="CxR", help="its inner corners (default: 9x6)")
+
+
+def run(recipe: Recipe, frames: list[Path], board: str, output: Path, focal_length_mm: float | None) -> int:
+    """Calibrate from frames, decoded where a mask is named. A frame without the board is named and left out."""
+    if output.suffix != ".toml":
+        raise DarkroomError(f"{output}: a camera profile ends in .toml")
+    size = _board(board)
+    darkroom = Darkroom(recipe)
+    seen: list[NDArray[np.float64]] = []
+    grids: list[NDArray[np.float64]] = []
+    model, shape = "", (0, 0)
+    length = focal_length_mm
+    for path in tqdm(frames, unit="frame", disable=not sys.stderr.isatty()):
+        image, grid, raw_shape, raw_model, raw_length = _picture(darkroom, path, focal_length_mm)
+        if shape not in ((0, 0), raw_shape):
+            raise DarkroomError(f"{path} is {raw_shape} px, the others {shape}: calibrate frames of one size")
+        if length is not None and raw_length is not None and abs(raw_length / length - 1) > 0.01:
+            raise DarkroomError(
+                f"{path} was taken at {raw_length:g} mm, the others at {length:g}: one length at a time"
+            )
+        shape, model, length = raw_shape, raw_model, length or raw_length
+        found = chessboard.corners(image, size)
+        if found is None:
+            print(f"no whole board in {path}", file=sys.stderr)
+            continue
+        seen.append(found)
+        grids.append(grid)
+    if length is None:
+        raise DarkroomError("the frames don't say their focal length: give --focal-length")
+    profile = darkroom.camera(model)
+    fit = chessboard.fit(seen, grids, board=size, sensor=profile.sensor(shape), focal_length_mm=length)
+    _write(recipe.camera if recipe.camera != "auto" else profile.name, fit.lens, output)
+    y, x = fit.lens.principal_point_mm
+    print(f"{fit.boards} boards, residual {fit.residual_um:.2f} µm on the chip")
+    print(f"v = {fit.lens.v_mm:.3f} ± {fit.v_sigma_mm:.3f} mm at {length:g} mm, principal point {y:+.3f}, {x:+.3f} mm")
+    print("k1, k2, p1, p2, k3 = " + ", ".join(f"{number:.5g}" for number in fit.lens.distortion))
+    print(f"written to {output}")
+    return 0
+
+
+def _picture(
+    darkroom: Darkroom, path: Path, focal_length_mm: float | None
+) -> tuple[NDArray[np.float32], NDArray[np.float64], tuple[int, int], str, float | None]:
+    """What is looked at: behind a mask the decoded mean, else the frame itself."""
+    if darkroom.recipe.mask:
+        made = darkroom.develop(path, focal_length_mm=focal_length_mm, views=False)
+        rows, columns = made.light_field.attributes["shape"]
+        image = np.ascontiguousarray(made.light_field.slices[0].real)
+        length = focal_length_mm or made.raw.focal_length_mm
+        return image, made.light_field.grid, (int(rows), int(columns)), made.raw.camera_model or "", length
+    raw = darkroom.read(path)
+    with darkroom.naming(path):
+        plane = darkroom.plane(raw)
+    grid = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    length = focal_length_mm or raw.focal_length_mm
+    return np.asarray(plane), grid, (plane.shape[0], plane.shape[1]), raw.camera_model or "", length
+
+
+def _write(camera: str, lens: profiles.Lens, output: Path) -> None:
+    tables = profiles.tables(camera, "cameras")
+    others = [one for one in tables.get("lens", []) if abs(one["focal_length_mm"] / lens.focal_length_mm - 1) > 0.01]
+    mine = {
+        "focal_length_mm": lens.focal_length_mm,
+        "v_mm": lens.v_mm,
+        "principal_point_mm": list(lens.principal_point_mm),
+        "distortion": list(lens.distortion),
+    }
+    tables["lens"] = sorted([*others, mine], key=lambda one: float(one["focal_length_mm"]))
+    output.write_text(tomli_w.dumps(tables), encoding="utf-8")
+
+
+def _board(text: str) -> tuple[int, int]:
+    columns, _, rows = text.lower().partition("x")
+    try:
+        size = int(columns), int(rows)
+    except ValueError:
+        size = 0, 0
+    if min(size) < 3:
+        raise DappledError(f"--board {text}: give its inner corners as 9x6, three at least on each side")
+    return size
