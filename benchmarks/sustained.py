@@ -1,0 +1,231 @@
+"""Frames faster than they can be decoded, for minutes: is each one recorded, and does memory stay flat?
+
+python benchmarks/sustained.py [--json] [--directory DIR] [--seconds 300] [--rate 4] [--megabytes 11] [--decode-s 2]
+
+The street of a live flight (shutter, journal, recorder, ledger, tagger, decode queue) in front of a camera that brings
+a new file for every shot. Decoding is too slow on purpose. Afterwards the whole flight is read back and compared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import mmap
+import os
+import queue
+import shutil
+import statistics
+import tempfile
+import threading
+import time
+from collections import deque
+from pathlib import Path
+
+from dappled.daemon.books import LiveBook
+from dappled.daemon.clock import SystemClock
+from dappled.daemon.development import Developed
+from dappled.daemon.shutter import Shutter, Wish
+from dappled.daemon.street import Names, Story, Street, Watchers
+from dappled.daemon.tagger import BodyLatency, Exposure
+from dappled.daemon.telemetry_pose import nothing
+from dappled.drivers.camera import (
+    Arrival,
+    Blob,
+    Companion,
+    Event,
+    Fired,
+    Identity,
+    Setting,
+    SettingName,
+    StateChanged,
+    check_change,
+)
+from dappled.flight import check, recording, summary
+from dappled.flight.records import Pose, Shot
+
+QUEUE = 4
+
+
+class SteadyCamera:
+    """Brings a file of `size` bytes for each shot, different each time."""
+
+    def __init__(self, size: int) -> None:
+        self._picture = bytearray(os.urandom(size))
+        self._shots: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self.identity = Identity("benchmark", "steady", "", "")
+        self._events: deque[Event] = deque([StateChanged("ready", "", time.monotonic_ns(), self.identity)])
+
+    def start(self) -> None: ...
+
+    def fire(self, shot: int) -> None:
+        self._shots.put(shot)
+
+    def next_event(self, timeout_s: float) -> Event | None:
+        if not self._events:
+            try:
+                shot = self._shots.get(timeout=timeout_s)
+            except queue.Empty:
+                return None
+            now_ns = time.monotonic_ns()
+            self._picture[:8] = shot.to_bytes(8, "big")
+            blob = Blob.of(memoryview(self._picture))
+            self._events += [Fired(shot, now_ns, now_ns), Arrival(shot, f"IMG_{shot:04d}.CR2", blob, now_ns)]
+        return self._events.popleft()
+
+    def release(self, arrival: Arrival | Companion) -> None: ...
+
+    def settings(self) -> tuple[Setting, ...]:
+        return ()
+
+    def change(self, name: SettingName, value: str) -> None:
+        check_change((), name, value)
+
+    def stop(self) -> None: ...
+
+
+class SlowDeveloper:
+    """Takes its time over every frame; gives as much as 13 slices of a small frame."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+
+    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> Developed:
+        time.sleep(self._seconds)
+        body = mmap.mmap(-1, 1 << 20)
+        unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+        return Developed(body, "0" * 64, [], [[0.0] * 4], "predicted", 1, 1, "geometric", unit, b"", (0, 0))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--directory", type=Path, default=None, help="a folder on the disk to measure")
+    parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--rate", type=float, default=4.0, help="frames a second")
+    parser.add_argument("--megabytes", type=float, default=11.0)
+    parser.add_argument("--decode-s", type=float, default=2.0)
+    wanted = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=wanted.directory) as folder:
+        size = round(wanted.megabytes * 1e6)
+        figures = measure(Path(folder), wanted.seconds, wanted.rate, size, decode_s=wanted.decode_s)
+    if wanted.json:
+        print(json.dumps(figures))
+    else:
+        for name, value in figures.items():
+            print(f"{name:32} {value:12.3f}")
+
+
+def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: float) -> dict[str, float]:
+    """Counts, milliseconds and megabytes, as the names say. `lost` counts shots without an intact frame, and frames
+    neither decoded nor noted as not decoded. Memory: the growth from the second quarter to the last."""
+    clock, wishes_ms = SystemClock(), []
+    flight = recording.begin(root, clock.utc_ns, {})
+    book, record_ms, over = LiveBook(flight, clock), [], threading.Semaphore(0)
+
+    def finished(story: Story) -> None:
+        record_ms.append(story.ms.get("record", 0.0))
+        over.release()
+
+    def pose(index: int, exposure: Exposure) -> tuple[Exposure, Pose]:
+        return exposure, nothing(exposure.utc_ns, 0)
+
+    def settled(index: int, ok: bool) -> None:
+        shutters[0].settled(index, ok)
+
+    shutters: list[Shutter] = []
+    street = Street(
+        camera=SteadyCamera(size),
+        book=book,
+        poses=pose,
+        developer=SlowDeveloper(decode_s),
+        publisher=None,
+        latency=BodyLatency(60.0, 15.0, "benchmark"),
+        names=Names("benchmark", "mask", "geometric"),
+        watchers=Watchers(settled=settled, finished=finished),
+        decode_queue=QUEUE,
+    )
+
+    def note(shot: Shot) -> None:
+        flight.journal.note(shot)
+        book.wished(shot)
+        street.expect(shot)
+
+    shutters.append(Shutter(next_index=0, note=note, fire=street.fire, clock=clock, capacity=1000))
+    memory = Memory()
+    street.start()
+    count = round(seconds * rate)
+    start = time.monotonic()
+    for number in range(count):
+        time.sleep(max(0.0, start + number / rate - time.monotonic()))
+        began = time.perf_counter()
+        shutters[0].wish(Wish("benchmark", "console", number))
+        wishes_ms.append((time.perf_counter() - began) * 1e3)
+        memory.look()
+    behind_s = time.monotonic() - start - (count - 1) / rate
+    for _ in range(count):
+        over.acquire(timeout=60 + decode_s * (QUEUE + 2))
+    street.stop(10.0)
+    flight.close()
+    return {
+        **_account(flight.folder.path, count),
+        **_times(wishes_ms, record_ms),
+        "behind_s": behind_s,
+        **memory.growth(),
+    }
+
+
+class Memory:
+    """Resident memory of this process, and what all memfds hold."""
+
+    def __init__(self) -> None:
+        self._seen: list[tuple[float, float]] = []
+
+    def look(self) -> None:
+        resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+        held = sum(path.stat().st_size for path in Path("/proc/self/fd").iterdir() if _is_memfd(path)) / 1e6
+        self._seen.append((resident, held))
+
+    def growth(self) -> dict[str, float]:
+        quarter = max(1, len(self._seen) // 4)
+        early, late = self._seen[quarter : 2 * quarter], self._seen[-quarter:]
+        rows = {}
+        for place, name in enumerate(("resident", "memfd")):
+            rows[f"{name}_mb"] = statistics.median(one[place] for one in late)
+            rows[f"{name}_growth_mb"] = rows[f"{name}_mb"] - statistics.median(one[place] for one in early)
+        return rows
+
+
+def _is_memfd(path: Path) -> bool:
+    try:
+        return os.readlink(path).startswith("/memfd:")
+    except OSError:  # closed in the meantime
+        return False
+
+
+def _account(flight: Path, count: int) -> dict[str, float]:
+    balance, found = summary.report(flight), check.check(flight)
+    skipped = sum(event.kind == "not decoded" for event in summary.show(flight).events)
+    missing = count - balance.safe + max(0, balance.frames - balance.decoded - skipped)
+    shutil.rmtree(flight / "frames")
+    return {
+        "shots": count,
+        "frames": balance.frames,
+        "decoded": balance.decoded,
+        "left_undecoded": skipped,
+        "lost": missing + len(found.problems),
+        "gigabytes": balance.size / 1e9,
+    }
+
+
+def _times(wishes_ms: list[float], record_ms: list[float]) -> dict[str, float]:
+    def share(values: list[float], part: float) -> float:
+        return sorted(values)[min(len(values) - 1, int(part * len(values)))]
+
+    rows: dict[str, float] = {}
+    for name, values in (("wish", wishes_ms), ("record", record_ms)):
+        rows |= {f"{name}_median_ms": share(values, 0.5), f"{name}_p99_ms": share(values, 0.99)}
+    return rows
+
+
+if __name__ == "__main__":
+    main()
