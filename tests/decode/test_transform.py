@@ -20,7 +20,9 @@ def test_developing_while_transforming_is_developing_first(largest_fx: float) ->
     for source in (exposure, plane):
         spectrum = transform.apply(source, largest_fx=largest_fx)
         whole = np.fft.rfft2(padded_plane(plane, spectrum.level))[:, : spectrum.columns]
-        assert np.abs(spectrum.half - whole).max() < 1e-5 * np.abs(whole).max()
+        off = np.abs(spectrum.half - whole)
+        off[0, 0] = 0  # the mean: below
+        assert off.max() < 1e-5 * np.abs(whole).max()
         assert spectrum.columns == min(whole.shape[1], int(np.ceil(largest_fx * spectrum.padded[1])) + 2)
         assert spectrum.mean == pytest.approx(float(plane.mean(dtype=np.float64)), rel=1e-5)
 

@@ -1,15 +1,13 @@
 """Many slices at once: where each band lies in a spectrum, worked out once, then transformed back and turned.
 
-The same numbers as `equations.slice_at`. The inverse transform goes over columns, straight from the spectrum's tiles,
-and then over rows, a few at a time, so that they stay in the cache. Bringing the band to baseband, the fraction of a
-bin and the scale are one factor along each axis.
+The same numbers as `equations.slice_at`. Bringing the band to baseband, the fraction of a bin and the scale are one
+factor along each axis.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +15,7 @@ from scipy import fft
 
 from dappled.decode.carriers import Carrier
 from dappled.decode.spectrum import TILE, Complex, Run, Spectrum, column_runs, row_runs
-from dappled.decode.threads import each, share, spans
-
-_AT_ONCE = 52_000  # bins of a band that are transformed at a time: they stay in the cache
+from dappled.decode.threads import share
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +37,8 @@ class Band:
     """One slice's place: its columns in pieces (`across` as they stand in the spectrum, `beyond` those past Nyquist),
     its rows in runs, those of plain pieces and those of mirrored ones.
 
-    `turn_down` (rows, n), the same in each column, and `turn_across` (columns,) are e^{−2πi place n/size}, the place
-    counted from the band's first bin.
+    `turn_down` (rows,) and `turn_across` (columns,) are e^{−2πi place n/size}, the place counted from the band's first
+    bin; the second with the scale.
     """
 
     pieces: tuple[Piece, ...]
@@ -71,38 +67,17 @@ class Bands:
         """All slices into `out` complex64 (K, rows, columns). Raises DecodeError for columns that aren't there."""
         for band in self.bands:
             spectrum.require(band.across)
-        # Whole slices to every worker, and what does not divide by their number in parts, all of them at each.
-        alone = len(self.bands) // max(1, workers) * max(1, workers)
 
         def start() -> Callable[[int], None]:
-            block = self._block()
+            block = np.empty(self.size, dtype=np.complex64)
 
-            def whole(k: int) -> None:
+            def slice_at(k: int) -> None:
                 self._gather(spectrum, k, block)
-                for columns in self._groups():
-                    self._down(k, block, columns)
-                for lines in self._lines():
-                    self._along(spectrum, k, block, out, lines)
+                self._transform(spectrum, k, block, out[k])
 
-            return whole
+            return slice_at
 
-        if alone:
-            share(start, range(alone), workers)
-        for k in range(alone, len(self.bands)):
-            block = self._block()
-            self._gather(spectrum, k, block)
-            each(partial(self._down, k, block), self._groups(), workers)
-            each(partial(self._along, spectrum, k, block, out), self._lines(), workers)
-
-    def _block(self) -> Complex:
-        """Memory for one band."""
-        return np.empty(self.size, dtype=np.complex64)
-
-    def _groups(self) -> list[slice]:
-        return spans(self.size[1], max(1, _AT_ONCE // self.size[0]))
-
-    def _lines(self) -> list[slice]:
-        return spans(self.samples[0], max(1, _AT_ONCE // self.size[1]))
+        share(start, range(len(self.bands)), workers)
 
     def _gather(self, spectrum: Spectrum, k: int, block: Complex) -> None:
         """The band's bins (h, w)."""
@@ -125,21 +100,16 @@ class Bands:
         if self.cell is not None:
             block *= self.cell
 
-    def _down(self, k: int, block: Complex, columns: slice) -> None:
-        """Columns transformed back along rows, and turned."""
-        rows = self.samples[0]
-        made = fft.ifft(block[:, columns], axis=0, norm="forward", overwrite_x=True)
-        turn = self.bands[k].turn_down[:, : columns.stop - columns.start]
-        np.multiply(made[:rows], turn, out=block[:rows, columns])
-
-    def _along(self, spectrum: Spectrum, k: int, block: Complex, out: Complex, lines: slice) -> None:
-        """Rows transformed back along columns and turned, to their place in the slice."""
+    def _transform(self, spectrum: Spectrum, k: int, block: Complex, out: Complex) -> None:
+        """The band transformed back and turned; one axis after the other, so that a turn finds it in the cache."""
         band = self.bands[k]
-        made = fft.ifft(block[lines], axis=1, norm="forward", overwrite_x=True)
-        target = out[k, lines]
-        np.multiply(made[:, : self.samples[1]], band.turn_across, out=target)
+        rows, columns = self.samples
+        made = fft.ifft(block, axis=0, norm="forward", overwrite_x=True)[:rows]
+        made *= band.turn_down[:, None]
+        made = fft.ifft(made, axis=1, norm="forward", overwrite_x=True)
+        np.multiply(made[:, :columns], band.turn_across, out=out)
         if band.is_mean:
-            target += np.float32(spectrum.level)
+            out += np.float32(spectrum.level)
 
 
 def lay_out(
@@ -174,7 +144,7 @@ def _band(
             tuple(row_runs(top, size[0], padded[0], wrap=wrap)),
             tuple(row_runs(bottom, size[0], padded[0], wrap=wrap)),
         ),
-        turn_down=_repeated(_turn(row - top, samples[0], size[0]), min(size[1], max(1, _AT_ONCE // size[0]))),
+        turn_down=_turn(row - top, samples[0], size[0]).astype(np.complex64),
         turn_across=(scale * _turn(column - left, samples[1], size[1])).astype(np.complex64),
         is_mean=carrier.ky == 0 and carrier.kx == 0,
     )
@@ -195,11 +165,6 @@ def _turn(place: float, count: int, size: int) -> NDArray[np.complex128]:
     """e^{−2πi place n/size} for n < count: what a sinusoid at a fractional bin is brought to 0 by."""
     turned: NDArray[np.complex128] = np.exp(-2j * np.pi * place * np.arange(count) / size)
     return turned
-
-
-def _repeated(turn: NDArray[np.complex128], count: int) -> Complex:
-    """(n, count): in full, as NumPy is slower with one factor a row."""
-    return np.repeat(turn.astype(np.complex64)[:, None], count, axis=1)
 
 
 def _pieces(across: Sequence[Run], *, mirrored: bool) -> list[Piece]:

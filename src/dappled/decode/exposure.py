@@ -7,19 +7,22 @@ float32's rounding. The plane itself is never laid out when an exposure goes str
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.plane import Plane, between, check_frame, colour_gains, levels_of
+from dappled.decode.plane import Plane, check_frame, colour_gains, levels_of
 from dappled.decode.threads import each, share, spans
 
-_ROWS = 32  # at a time: a run of them stays in the cache
-_SAMPLED = 24  # so many patterns' rows tell the mean
-_STEP = 29  # of rows and columns of a laid plane that tell its mean
+_ROWS = 96  # at a time: fewer cost more for Python than the cache gives
+_PRODUCT = 250_000  # multiplications in a matrix product: more would wake BLAS' own threads, beside ours
+_STEP = 29  # every so many rows and columns tell the mean: odd, so that all colours are among them
+
+
+Between: TypeAlias = tuple[NDArray[np.intp], NDArray[np.float32]]
 
 
 class RowSource(Protocol):
@@ -101,22 +104,25 @@ class Exposure:
         """Develop these rows into `out` float32 (n, W)."""
         made, period = self.developer, self.period
         for row in range(period):
-            lines = slice(rows.start + row, rows.stop, period)
+            these = slice(rows.start + row, rows.stop, period)
             target = out[row::period]
             if not len(target):
                 break
-            np.copyto(target, self.mosaic[lines], casting="unsafe")
+            np.copyto(target, self.mosaic[these], casting="unsafe")
             if self.dark is None:
                 target -= made.black[row]
             else:
-                np.subtract(target, self.dark[lines], out=target, casting="unsafe")
+                np.subtract(target, self.dark[these], out=target, casting="unsafe")
             if self.factors.shape[1] == 1:
                 target *= self.factors[row, 0]
             else:
-                weights = made.down[row][rows.start // period :][: len(target)]
-                near = np.flatnonzero(weights.any(axis=0))  # the few cells that these rows lie between
-                cells = slice(int(near[0]), int(near[-1]) + 1)
-                target *= weights[:, cells] @ self.factors[row, cells]
+                first = rows.start // period
+                below, share_next = (of_all[first : first + len(target)] for of_all in made.down[row])
+                for same in np.split(np.arange(len(target)), np.flatnonzero(np.diff(below)) + 1):
+                    cell, lines = int(below[same[0]]), slice(int(same[0]), int(same[-1]) + 1)
+                    shares = np.array([1 - share_next[lines], share_next[lines]], dtype=np.float32).T
+                    for across in spans(self.shape[1], _PRODUCT // (2 * len(same))):
+                        target[lines, across] *= shares @ self.factors[row, cell : cell + 2, across]
         if self.flat is not None:
             out *= self.flat[rows]
 
@@ -133,8 +139,8 @@ class Developer:
 
     `pattern` (a, b) colour indices; `black` one float32 (W,) a row of it; `levels` and `scale` = 1/(white − level) per
     colour index; `balance` per colour index or None; `reference` the colours whose local mean all are brought to; none:
-    no evening. A cell is `steps` patterns. For each row of the pattern `down` holds the cells' weights for its lines, for
-    each column `across` the cell before each pixel and the share of the next.
+    no evening. A cell is `steps` patterns. `down` for each row of the pattern, `across` for each column, hold the cell
+    before each line or pixel and the share of the next.
     """
 
     shape: tuple[int, int]
@@ -146,8 +152,8 @@ class Developer:
     reference: tuple[int, ...]
     steps: tuple[int, int]
     black: tuple[NDArray[np.float32], ...]
-    down: tuple[NDArray[np.float32], ...]
-    across: tuple[tuple[NDArray[np.intp], NDArray[np.float32]], ...]
+    down: tuple[Between, ...]
+    across: tuple[Between, ...]
 
     @property
     def cells(self) -> tuple[int, int]:
@@ -173,21 +179,19 @@ class Developer:
         colours = np.unique(self.pattern)
         if len(colours) == 1 or (not self.reference and self.balance is not None):
             gains = np.ones(len(self.levels)) if self.balance is None else self.balance
-            factors = self._uniform(gains)
+            factors, level = self._uniform(gains), self._level(mosaic, dark, gains)
         else:
             sums = self._sums(mosaic, workers)
             if dark is not None:
                 sums -= self._sums(dark, workers)
             places = self._means(sums, zero=dark is not None)
             gains = colour_gains(self.pattern, places) if self.balance is None else self.balance
-            factors = self._uniform(gains)
+            factors, level = self._uniform(gains), self._level(mosaic, dark, gains)
             if self.reference and min(self.cells) > 0:
-                factors = self._even(sums, gains, zero=dark is not None, workers=workers)
-        exposure = Exposure(self, mosaic, factors, 0.0, dark, flat)
-        some = _sample(exposure)
-        if float(np.mean(some > 1e-3)) < 0.01:
-            raise DecodeError("the frame is black: nothing in it is above a thousandth of sensor white")
-        return replace(exposure, level=float(some.mean(dtype=np.float64)))
+                factors, level = self._even(sums, gains, zero=dark is not None, workers=workers)
+        if flat is not None:
+            level *= float(flat[::_STEP, ::_STEP].mean(dtype=np.float64))
+        return Exposure(self, mosaic, factors, level, dark, flat)
 
     def _uniform(self, gains: NDArray[np.float64]) -> NDArray[np.float32]:
         """Factors (a, 1, W) of one gain a colour."""
@@ -231,8 +235,8 @@ class Developer:
 
     def _even(
         self, sums: NDArray[np.float32], gains: NDArray[np.float64], *, zero: bool, workers: int
-    ) -> NDArray[np.float32]:
-        """Factors (a, cells, W) that bring every colour's local mean to the reference colours'."""
+    ) -> tuple[NDArray[np.float32], float]:
+        """Factors (a, cells, W) that bring every colour's local mean to the reference colours', and the mean of all."""
         a, b = self.pattern.shape
         rows, columns = self.cells
         step = self.steps[1]
@@ -261,10 +265,26 @@ class Developer:
             gain = (gain * (self.scale[colour] * gains[colour])).astype(np.float32)
             below, share_above = self.across[column]
             slope = np.diff(gain, axis=1, append=gain[:, -1:])
-            factors[row, :, column::b] = gain[:, below] + share_above * slope[:, below]
+            line = np.take(slope, below, axis=1)
+            line *= share_above
+            line += np.take(gain, below, axis=1)
+            factors[row, :, column::b] = line
 
         each(spread, np.ndindex(a, b), workers)
-        return factors
+        return factors, float(wanted.mean())
+
+    def _level(self, mosaic: NDArray[Any], dark: NDArray[Any] | None, gains: NDArray[np.float64]) -> float:
+        """About the plane's mean, from a sample. Raises DecodeError where that is black."""
+        down, across = (_STEP if side > 16 * _STEP else 1 for side in self.shape)
+        some = mosaic[::down, ::across].astype(np.float64)
+        rows, columns = (np.arange(count) * step for count, step in zip(some.shape, (down, across), strict=True))
+        a, b = self.pattern.shape
+        colour = self.pattern[np.ix_(rows % a, columns % b)]
+        some -= self.levels[colour] if dark is None else dark[::down, ::across]
+        some *= (gains * self.scale)[colour]
+        if float(np.mean(some > 1e-3)) < 0.01:
+            raise DecodeError("the frame is black: nothing in it is above a thousandth of sensor white")
+        return float(some.mean())
 
 
 def developer(
@@ -290,32 +310,17 @@ def developer(
     known = tuple(colour for colour in reference if colour in pattern)
     if len(np.unique(pattern)) == 1 or min(cells) == 0:
         known = ()
-    down: tuple[NDArray[np.float32], ...] = ()
-    across: tuple[tuple[NDArray[np.intp], NDArray[np.float32]], ...] = ()
+    down: tuple[Between, ...] = ()
+    across: tuple[Between, ...] = ()
     if known:
-        down = tuple(_weights(len(range(row, shape[0], a)), cells[0], steps[0]) for row in range(a))
+        down = tuple(_between(len(range(row, shape[0], a)), cells[0], steps[0]) for row in range(a))
         across = tuple(_between(len(range(column, shape[1], b)), cells[1], steps[1]) for column in range(b))
     blacks = tuple(levels[np.resize(pattern[row], shape[1])].astype(np.float32) for row in range(a))
     return Developer(shape, pattern, levels, 1.0 / (white - levels), white, gains, known, steps, blacks, down, across)
 
 
-def _sample(exposure: Exposure) -> NDArray[np.float32]:
-    """Some whole patterns' rows all over the frame, developed."""
-    period, (height, width) = exposure.period, exposure.shape
-    patterns = height // period
-    starts = np.unique(np.linspace(0, patterns - 1, min(patterns, _SAMPLED)).astype(int)) * period
-    rows = np.empty((len(starts), period, width), dtype=np.float32)
-    for out, start in zip(rows, starts, strict=True):
-        exposure.rows_into(out, slice(int(start), int(start) + period))
-    return rows
-
-
-def _weights(size: int, cells: int, step: int) -> NDArray[np.float32]:
-    return between((np.arange(size) + 0.5) / step, cells)
-
-
-def _between(size: int, cells: int, step: int) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """What `_weights` says, sparsely: the cell before each place, and the share of the next one."""
+def _between(size: int, cells: int, step: int) -> Between:
+    """The cell before each place (its middle), and the share of the next one; constant beyond the outer ones."""
     places = np.clip((np.arange(size) + 0.5) / step - 0.5, 0, cells - 1)
-    below = np.floor(places).astype(np.intp)
+    below = np.minimum(np.floor(places), max(cells - 2, 0)).astype(np.intp)
     return below, (places - below).astype(np.float32)

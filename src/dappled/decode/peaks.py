@@ -76,10 +76,10 @@ def _measure_one(spectrum: Spectrum, fy: float, fx: float, radius: float, promin
     raw = spectrum.block(top - 1, left - 1, 2 * around + 3, 2 * around + 3)
     windowed = hann(raw)
     magnitude = np.abs(windowed)
-    floor = float(np.median(magnitude))
-    y, x = np.mgrid[top : top + 2 * around + 1, left : left + 2 * around + 1]
-    allowed = np.hypot(y - row, x - column) <= max(radius, 0.75)
-    allowed &= np.hypot(y, x) > 3  # the frame's mean is no carrier
+    floor = float(np.partition(magnitude, magnitude.size // 2, axis=None)[magnitude.size // 2])  # the median
+    y, x = np.ogrid[top : top + 2 * around + 1, left : left + 2 * around + 1]
+    allowed = (y - row) ** 2 + (x - column) ** 2 <= max(radius, 0.75) ** 2
+    allowed &= y * y + x * x > 9  # the frame's mean is no carrier
     allowed[[0, -1], :] = False
     allowed[:, [0, -1]] = False
     i, j = divmod(int(np.argmax(np.where(allowed, magnitude, -1.0))), magnitude.shape[1])

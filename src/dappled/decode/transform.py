@@ -14,6 +14,8 @@ from dappled.decode.plane import Plane
 from dappled.decode.spectrum import TILE, Complex, Spectrum, padded_shape
 from dappled.decode.threads import each, share, spans
 
+_TILES = 4  # transformed at a time
+
 Source: TypeAlias = "Plane | Exposure"
 
 
@@ -51,16 +53,15 @@ class Transform:
 
         share(start, spans(self.shape[0], step), workers)
 
-        def down(index: int) -> None:
-            tile = tiles[index]
-            tile[self.shape[0] :] = 0
-            if index == 0:
-                tile[self.shape[0] :, 0] = level * self.padded[1]  # the transform of a row of nothing but the level
-            made = fft.fft(tile, axis=0, overwrite_x=True)
-            if not np.may_share_memory(made, tile):
-                tile[...] = made
+        tiles[:, self.shape[0] :] = 0
+        tiles[0, self.shape[0] :, 0] = level * self.padded[1]  # the transform of a row of nothing but the level
 
-        each(down, range(len(tiles)), workers)
+        def down(these: slice) -> None:
+            made = fft.fft(tiles[these], axis=1, overwrite_x=True)
+            if not np.may_share_memory(made, tiles):
+                tiles[these] = made
+
+        each(down, spans(len(tiles), _TILES), workers)
         tiles[0, 0, 0] -= level * self.padded[0] * self.padded[1]
         return Spectrum(tiles, columns, self.shape, self.padded, level)
 
