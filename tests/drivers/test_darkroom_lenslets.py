@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 from scipy import ndimage
 
 from dappled.decode.calibration import at_corner
@@ -15,6 +16,7 @@ from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
 from dappled.decode.views import from_lenslet_slices
 from dappled.drivers.darkroom import Darkroom, DarkroomError, Recipe
+from dappled.mocks.lytro import container, metadata
 
 LFTOOLBOX_DB = (41.9, 42.4, 42.8, 42.9, 43.2, 41.8, 39.4)
 PITCH_PX = 5  # of the truth
@@ -67,3 +69,16 @@ def test_a_colour_pattern_that_is_none_is_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "frame.npy", np.random.default_rng(0).random((64, 64)).astype(np.float32))
     with pytest.raises(DarkroomError, match="as in BGGR"):
         Darkroom(Recipe("auto", "lenslet", cfa="RGGX")).develop(tmp_path / "frame.npy")
+
+
+def test_a_lytro_container_gives_the_same_light_field_as_its_pixels_in_a_png(shared_data: Path, tmp_path: Path) -> None:
+    folder = shared_data / "lenslet/lytro_like"
+    for name in ("raw", "white"):
+        values = np.asarray(Image.open(folder / f"{name}.png")).astype(np.uint16)
+        told = metadata((values.shape[0], values.shape[1]), pattern="bggr")
+        (tmp_path / f"{name}.lfp").write_bytes(container(values, told))
+    plain = Darkroom(_recipe(folder)).develop(folder / "raw.png", views=False).light_field
+    packed = Darkroom(Recipe("auto", "lenslet", white=str(tmp_path / "white.lfp"), workers=2))
+    found = packed.develop(tmp_path / "raw.lfp", views=False).light_field
+    assert found.attributes["camera"] == "F01"
+    assert found.slices.tobytes() == plain.slices.tobytes()

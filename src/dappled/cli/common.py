@@ -61,4 +61,4 @@ def recipe(arguments: argparse.Namespace) -> Recipe:
 
 def frames(parser: argparse.ArgumentParser, count: str) -> None:
     """The frames, as positional arguments."""
-    parser.add_argument("frames", nargs=count, type=Path, metavar="FRAME", help="RAF, CR2, DNG, TIFF, PNG or NPY")
+    parser.add_argument("frames", nargs=count, type=Path, metavar="FRAME", help="RAF, CR2, DNG, LFP, TIFF, PNG or NPY")

@@ -1,16 +1,18 @@
 """A frame's file as numbers: the sensor's values as they were stored, and what they mean.
 
-What the bytes are decides, not the name: camera raws (RAF, CR2, DNG …) through LibRaw, TIFF, PNG, JPEG and NPY by
-their own readers. Values are not made linear, scaled or balanced here. A colour image has no mosaic; its values become
-(R + 2G + B)/4, the mean of a Bayer cell.
+What the bytes are decides, not the name: camera raws (RAF, CR2, DNG …) through LibRaw, Lytro's containers, TIFF, PNG,
+JPEG and NPY by their own readers. (Lytro's bare .raw files hold nothing but pixels: there the name and the size decide,
+or metadata that lies beside them.) Values are not made linear, scaled or balanced here. A colour image has no mosaic;
+its values become (R + 2G + B)/4, the mean of a Bayer cell.
 """
 
 from __future__ import annotations
 
 import io
+import json
 import mmap
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -23,7 +25,7 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from dappled.drivers import exif
+from dappled.drivers import exif, lytro
 from dappled.drivers.exif import Exposure, positive
 from dappled.errors import DappledError
 
@@ -79,7 +81,8 @@ def read(source: Source, name: str | None = None) -> RawFile:
             return _picture(file)
         if start.startswith(_TIFF_STARTS) and _is_plain_tiff(file, label):
             return _tiff(file)
-        return _raw(file)
+        frame = _lytro(source, label, file)
+        return _raw(file) if frame is None else _of_lytro(frame)
 
 
 def read_metadata(source: Source, name: str | None = None) -> Exposure:
@@ -97,12 +100,56 @@ def read_metadata(source: Source, name: str | None = None) -> Exposure:
             return exif.read(file)
         if start.startswith(_TIFF_STARTS) and _is_plain_tiff(file, label):
             return exif.read(file)
-        told = exif.read(file)
+        frame = _lytro(source, label, file, pixels=False)
+        told = exif.read(file) if frame is None else _exposure_of_lytro(frame)
         if told.make is not None:
             return told
         file.seek(0)
         with rawpy.imread(file) as raw:
             return _exposure(file, raw)
+
+
+def _lytro(source: Source, label: str, file: BinaryIO, *, pixels: bool = True) -> lytro.Lytro | None:
+    """A Lytro camera's frame, without `pixels` only what it says; None for other files."""
+    start = file.read(len(lytro.START))
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    if start == lytro.START:
+        return (lytro.read_container if pixels else lytro.read_container_metadata)(file.read())
+    told = _beside(source) or lytro.BARE.get(size) if label.lower().endswith(".raw") else None
+    if told is None:
+        return None
+    return lytro.read_bare(file.read(), told) if pixels else lytro.read_bare_metadata(told)
+
+
+def _beside(source: Source) -> Mapping[str, Any] | None:
+    """The JSON beside a bare .raw file, of the same name and .json or .txt; None without."""
+    if not isinstance(source, Path | str):
+        return None
+    for suffix in (".json", ".JSON", ".txt", ".TXT"):
+        path = Path(source).with_suffix(suffix)
+        if path.is_file():
+            told = json.loads(path.read_bytes())
+            return told if isinstance(told, dict) else None
+    return None
+
+
+def _of_lytro(frame: lytro.Lytro) -> RawFile:
+    return _with(
+        _exposure_of_lytro(frame),
+        frame.mosaic,
+        black=frame.black[0] if len(set(frame.black)) == 1 else frame.black,
+        white=frame.white,
+        cfa=frame.cfa,
+        colour_names=frame.colour_names,
+        balance=frame.balance,
+    )
+
+
+def _exposure_of_lytro(frame: lytro.Lytro) -> Exposure:
+    return Exposure(
+        frame.make, frame.model, frame.focal_length_mm, frame.f_number, frame.exposure_s, frame.iso, frame.taken_utc
+    )
 
 
 def _raw(file: BinaryIO) -> RawFile:
@@ -276,7 +323,7 @@ def _sentences(label: str) -> Iterator[None]:
         yield
     except (rawpy.LibRawFileUnsupportedError, UnidentifiedImageError) as error:
         raise RawFileError(
-            f"{label} is not a frame that can be read (camera raw, DNG, TIFF, PNG, JPEG or NPY), or is cut short"
+            f"{label} is not a frame that can be read (camera raw, DNG, Lytro, TIFF, PNG, JPEG or NPY), or is cut short"
         ) from error
     except Image.DecompressionBombError as error:
         raise RawFileError(f"{label} claims to be larger than any frame: {error}") from error
