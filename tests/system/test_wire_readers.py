@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -88,13 +89,12 @@ def rust(folder: Path) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("made", [python, cpp, rust])
-def test_a_reader_reads_a_live_stream(made: object, tmp_path: Path, sockets: Path) -> None:
+def test_a_reader_reads_a_live_stream(made: Callable[[Path], list[str]], tmp_path: Path, sockets: Path) -> None:
     """Each line names the frame, the shape and the mean of the first slice, as `dappled watch` keeps them."""
     folder = tmp_path / "reader"
     folder.mkdir()
-    assert callable(made)
     command = made(folder)
-    endpoint = f"ipc://{sockets}/{made.__name__}"
+    endpoint = f"ipc://{sockets}/reader-{getattr(made, '__name__', '')}"
     (tmp_path / "dappled.toml").write_text(f'[record]\ndirectory = "flights"\n[publish]\nslices = "{endpoint}"\n')
     watch = [sys.executable, "-m", "dappled", "watch", endpoint, "--save", "received", "--count", str(FRAMES),
              "--timeout", "60"]  # fmt: skip

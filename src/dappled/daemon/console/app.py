@@ -41,7 +41,7 @@ _PICTURES = (
     "depth.png",
     "map.png",
 )
-_SHIFT_PX = 8.0
+_DISPARITY_PX = 8.0
 _MAP_PX, _KML_PX = 320, 1024
 
 
@@ -247,7 +247,7 @@ def _picture(parts: Parts) -> Endpoint:
         message = await parts.feed.slices(frame)
         studio = parts.studio
         if name == "refocus.jpg":
-            return _file(await _make(parts, studio.refocused, message, _shift(request)), name)
+            return _file(await _make(parts, studio.refocused, message, _disparity(request)), name)
         makers: dict[str, Callable[..., Any]] = {
             "thumb.jpg": lambda one: pictures.jpeg(studio.thumb(one)),
             "mean.jpg": studio.mean,
@@ -268,14 +268,14 @@ async def _make(parts: Parts, function: Callable[..., Any], *arguments: Any) -> 
     return await asyncio.get_running_loop().run_in_executor(parts.workers, function, *arguments)
 
 
-def _shift(request: Request) -> float:
+def _disparity(request: Request) -> float:
     try:
-        shift = float(request.query_params.get("shift", "0"))
+        disparity = float(request.query_params.get("disparity", "0"))
     except ValueError:
-        shift = float("nan")
-    if not abs(shift) <= _SHIFT_PX:  # NaN too
-        raise StudioError(f"shift is a number of pixels from {-_SHIFT_PX:g} to {_SHIFT_PX:g}")
-    return shift
+        disparity = float("nan")
+    if not abs(disparity) <= _DISPARITY_PX:  # NaN too
+        raise StudioError(f"disparity is a number of pixels from {-_DISPARITY_PX:g} to {_DISPARITY_PX:g}")
+    return disparity
 
 
 async def _rectified(parts: Parts, frame: int, longest_side: int, *, sharp: bool = False) -> Rectified | None:

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import fft
 
+from dappled.decode.refocus import shift_and_add
+from dappled.decode.viewstack import ViewStack
+
 Grey = NDArray[np.uint8]
 Colour = NDArray[np.uint8]
 MOSAIC_PX = 2560  # of a views' mosaic; every WebGL2 takes 2048, phones of the last ten years 4096
@@ -21,12 +24,15 @@ _UNKNOWN = 205
 
 
 @dataclass(frozen=True, slots=True)
-class ViewSet:
-    """Views float32 (V, U, h, w), linear, and their aperture points (V, U, 2) in shares of the aperture."""
+class Mosaic:
+    """All views side by side, sRGB bytes on one scale. `tile` is the (height, width) of one, reduced by the whole
+    number `scale`; a disparity of `scale` moves a view by its step (of `row_steps`, `column_steps`) in tile pixels."""
 
-    views: NDArray[np.float32]
-    offsets: NDArray[np.float64]
-    source: str
+    picture: Grey
+    tile: tuple[int, int]
+    scale: int
+    row_steps: NDArray[np.float64]
+    column_steps: NDArray[np.float64]
 
 
 def small(image: NDArray[np.floating], longest_side: int) -> NDArray[np.float32]:
@@ -90,39 +96,28 @@ def spectrum(slices: NDArray[np.complex64], carriers: Sequence[Sequence[float]],
     return grey
 
 
-def views_mosaic(made: ViewSet) -> tuple[Grey, tuple[int, int]]:
-    """All views side by side, one common scale, sRGB; and the (height, width) of one, which is even out to 8 px, so
-    that a JPEG's blocks never hold two views."""
-    v, u, height, width = made.views.shape
+def views_mosaic(stack: ViewStack) -> Mosaic:
+    """The mosaic of grey views. Tiles are cut to whole 8 px, so that a JPEG's blocks never hold two views."""
+    v, u, height, width = stack.views.shape
     step = max(1, -(-max(v * height, u * width) // MOSAIC_PX))
     height, width = height // step // 8 * 8, width // step // 8 * 8
     out = np.empty((v * height, u * width), dtype=np.uint8)
-    white = level(made.views[v // 2, u // 2])
+    white = level(stack.middle())
     for row in range(v):
         for column in range(u):
-            view = made.views[row, column][: height * step, : width * step]
+            view = stack.views[row, column][: height * step, : width * step]
             mean = view.reshape(height, step, width, step).mean(axis=(1, 3))
             out[row * height : (row + 1) * height, column * width : (column + 1) * width] = encoded(mean / white)
-    return out, (height, width)
+    return Mosaic(out, (height, width), step, stack.row_steps, stack.column_steps)
 
 
-def refocused(mosaic: Grey, tile: tuple[int, int], offsets: NDArray[np.float64], shift_px: float) -> Grey:
-    """The views of a mosaic, each moved by `shift_px` × its aperture offset × views an axis, and averaged (Eq 28).
-
-    `shift_px` is the disparity, in tile pixels between neighbouring views, that comes into focus. Bilinear, in linear
-    light; what lies beyond a view's edge counts for nothing. The page's shader does the same.
-    """
-    v, u = offsets.shape[:2]
-    linear = decoded(mosaic)
-    total, weight = np.zeros(tile, dtype=np.float32), np.zeros(tile, dtype=np.float32)
-    for row in range(v):
-        for column in range(u):
-            view = linear[row * tile[0] : (row + 1) * tile[0], column * tile[1] : (column + 1) * tile[1]]
-            dy, dx = shift_px * v * offsets[row, column, 0], shift_px * u * offsets[row, column, 1]
-            moved, there = _moved(view, float(dy), float(dx))
-            total += moved
-            weight += there
-    return encoded(total / np.maximum(weight, 1e-6))
+def refocused(mosaic: Mosaic, disparity: float) -> Grey:
+    """The mosaic's views focused on a disparity (Eq 28 and 29), in linear light; the page's shader does the same."""
+    height, width = mosaic.tile
+    v, u = len(mosaic.row_steps), len(mosaic.column_steps)
+    views = decoded(mosaic.picture).reshape(v, height, u, width).swapaxes(1, 2)
+    stack = ViewStack(np.ascontiguousarray(views), mosaic.row_steps, mosaic.column_steps)
+    return encoded(np.nan_to_num(shift_and_add(stack, disparity / mosaic.scale)))
 
 
 def depth_colours(disparity: NDArray[np.float32], sigma: NDArray[np.float32] | None) -> Colour:
@@ -177,18 +172,3 @@ def _lay(out: NDArray[np.float32], tile: NDArray[np.floating], top: int, left: i
     if y < bottom and x < right:
         part = out[y:bottom, x:right]
         np.maximum(part, tile[y - top : bottom - top, x - left : right - left], out=part)
-
-
-def _moved(view: NDArray[np.float32], dy: float, dx: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """out(y, x) = view(y + dy, x + dx), and 1 where that lies between the view's outermost samples."""
-    for axis, shift in ((0, dy), (1, dx)):
-        n = view.shape[axis]
-        at = np.clip(np.arange(n) + shift, 0, n - 1)
-        low = np.minimum(at.astype(int), max(n - 2, 0))
-        part = (at - low).astype(np.float32)
-        part = part[:, None] if axis == 0 else part[None, :]
-        view = np.take(view, low, axis) * (1 - part) + np.take(view, np.minimum(low + 1, n - 1), axis) * part
-    rows = np.arange(view.shape[0]) + dy
-    columns = np.arange(view.shape[1]) + dx
-    inside = ((rows >= 0) & (rows <= view.shape[0] - 1))[:, None] & ((columns >= 0) & (columns <= view.shape[1] - 1))
-    return view, inside.astype(np.float32)

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from dappled.config import profiles
 from dappled.daemon.console import footprint, pictures
 from dappled.daemon.console.footprint import Rectified
-from dappled.daemon.console.pictures import ViewSet
+from dappled.daemon.console.pictures import Mosaic
 from dappled.daemon.wire import Message
+from dappled.decode import viewstack
 from dappled.decode.carriers import Carrier, Lattice
 from dappled.decode.decoder import MaskDecoder
+from dappled.decode.lightfield import LightField
 from dappled.decode.pictures import slice_mosaic
 from dappled.decode.slices import Slices
 from dappled.drivers.darkroom import Darkroom, Recipe
@@ -77,32 +79,25 @@ class Studio:
         return pictures.shown(_stack(message)[0].real)
 
     def views(self, message: Message) -> tuple[dict[str, Any], bytes]:
-        """The views' mosaic as a JPEG, and its layout: how many, how large, their aperture offsets, where the phases
+        """The views' mosaic as a JPEG, and its layout: how many, how large, where they stand, and where the phases
         came from. Raises StudioError where this frame has none."""
 
         def make() -> tuple[dict[str, Any], bytes]:
-            made = self._views(message)
-            mosaic, tile = pictures.views_mosaic(made)
+            made, source = self._mosaic(message)
             layout = {
-                "views": list(made.offsets.shape[:2]),
-                "tile": list(tile),
-                "offsets": np.round(made.offsets, 6).tolist(),
-                "source": made.source,
+                "tile": list(made.tile),
+                "scale": made.scale,
+                "row_steps": np.round(made.row_steps, 6).tolist(),
+                "column_steps": np.round(made.column_steps, 6).tolist(),
+                "source": source,
             }
-            return layout, pictures.jpeg(mosaic, 92)
+            return layout, pictures.jpeg(made.picture, 92)
 
         return self._once(message, "views", make)
 
-    def refocused(self, message: Message, shift_px: float) -> bytes:
-        """The frame focused where neighbouring views differ by `shift_px` of their mosaic's pixels, JPEG. For browsers
-        without WebGL."""
-
-        def mosaic() -> tuple[NDArray[np.uint8], tuple[int, int], NDArray[np.float64]]:
-            made = self._views(message)
-            return *pictures.views_mosaic(made), made.offsets
-
-        picture, tile, offsets = self._once(message, "mosaic", mosaic)
-        return pictures.jpeg(pictures.refocused(picture, tile, offsets, shift_px))
+    def refocused(self, message: Message, disparity: float) -> bytes:
+        """The frame focused on a disparity, in pixels of a view from view to view, JPEG. For browsers without WebGL."""
+        return pictures.jpeg(pictures.refocused(self._mosaic(message)[0], disparity))
 
     def depth(self, message: Message) -> bytes:
         """A `depth` message in colours, PNG."""
@@ -135,7 +130,14 @@ class Studio:
         known = [raw.sensor.size_mm for raw in camera.raw if shape is None or list(raw.sensor.shape) == list(shape)]
         return known[0] if known else None
 
-    def _views(self, message: Message) -> ViewSet:
+    def _mosaic(self, message: Message) -> tuple[Mosaic, str]:
+        def make() -> tuple[Mosaic, str]:
+            field = self._light_field(message)
+            return pictures.views_mosaic(viewstack.of(field)), str(field.attributes["views_from"])
+
+        return self._once(message, "mosaic", make)
+
+    def _light_field(self, message: Message) -> LightField:
         header = message.header
         if self._darkroom is None:
             raise StudioError("no mask is named: frames are not decoded")
@@ -154,7 +156,7 @@ class Studio:
             grid,
             float(1 / (grid[0, 0] * grid[1, 1])),
         )
-        made = decoder.views(
+        views, offsets, views_from, _ = decoder.views(
             slices,
             Lattice(tuple(vectors[0].tolist()), tuple(vectors[1].tolist())),
             header["carriers_from"],
@@ -162,11 +164,12 @@ class Studio:
             f_number=header["f_number"],
             noise_rms=header["noise_rms"] or 0.0,
         )
-        if not made[0].size:
+        if not views.size:
             raise StudioError(
                 "this frame has no views: without a calibration they need carriers that show in it, and its f-number"
             )
-        return ViewSet(made[0], made[1], made[2])
+        carriers = np.array(header["carriers"])
+        return LightField(slices.values, carriers, views, offsets, grid, {"views_from": views_from})
 
     def _once(self, message: Message, kind: str, make: Callable[[], Made]) -> Made:
         key = (message.header["flight"], message.header["frame"], kind)
@@ -192,5 +195,8 @@ def _mean(message: Message, longest_side: int) -> NDArray[np.float32]:
 
 def _size(made: Any) -> int:
     parts = made if isinstance(made, tuple) else (made,)
-    return sum(part.nbytes if isinstance(part, np.ndarray) else len(part) if isinstance(part, bytes) else 200
-               for part in parts)  # fmt: skip
+    sizes = (
+        part.picture.nbytes if isinstance(part, Mosaic) else len(part) if isinstance(part, bytes) else 200
+        for part in parts
+    )
+    return sum(sizes)

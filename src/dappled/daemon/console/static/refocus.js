@@ -1,6 +1,6 @@
 // The views of one frame as a texture, moved and averaged on the graphics card. The same sum is made in NumPy by
 // dappled.daemon.console.pictures.refocused; a test compares the two.
-const MOST_VIEWS = 169;
+const MOST_VIEWS = 32;   // an axis
 const VERTEX = `#version 300 es
 void main() {
   vec2 corner = vec2(float((gl_VertexID << 1) & 2), float(gl_VertexID & 2));
@@ -11,15 +11,16 @@ precision highp float;
 uniform sampler2D mosaic;
 uniform vec2 tile;              // width, height of a view
 uniform ivec2 views;            // columns, rows of views
-uniform vec2 offsets[${MOST_VIEWS}];  // (u, v) of each, in shares of the aperture
-uniform float shift;            // pixels between neighbouring views
+uniform float rowSteps[${MOST_VIEWS}];     // how far a view moves for a disparity of 1
+uniform float columnSteps[${MOST_VIEWS}];
+uniform float disparity;        // in pixels of a tile, from view to view
 out vec4 colour;
 void main() {
   vec2 p = vec2(gl_FragCoord.x, tile.y - gl_FragCoord.y);
   vec2 whole = tile * vec2(views);
   float sum = 0.0, weight = 0.0;
   for (int v = 0; v < views.y; v++) for (int u = 0; u < views.x; u++) {
-    vec2 q = p + shift * vec2(views) * offsets[v * views.x + u];
+    vec2 q = p + disparity * vec2(columnSteps[u], rowSteps[v]);
     if (all(greaterThanEqual(q, vec2(0.499))) && all(lessThanEqual(q, tile - 0.499))) {
       sum += texture(mosaic, (vec2(u, v) * tile + clamp(q, vec2(0.5), tile - 0.5)) / whole).r;
       weight += 1.0;
@@ -48,27 +49,28 @@ export class Refocus {
   }
 
   fits(layout) {
-    const [rows, columns] = layout.views, [height, width] = layout.tile;
+    const rows = layout.row_steps.length, columns = layout.column_steps.length, [height, width] = layout.tile;
     const most = this.gl.getParameter(this.gl.MAX_TEXTURE_SIZE);
-    return rows * columns <= MOST_VIEWS && rows * height <= most && columns * width <= most;
+    return Math.max(rows, columns) <= MOST_VIEWS && rows * height <= most && columns * width <= most;
   }
 
   show(layout, bitmap) {
-    const gl = this.gl, [rows, columns] = layout.views, [height, width] = layout.tile;
+    const gl = this.gl, [height, width] = layout.tile;
     gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.SRGB8_ALPHA8, gl.RGBA, gl.UNSIGNED_BYTE, bitmap);
     this.canvas.width = width;
     this.canvas.height = height;
     gl.viewport(0, 0, width, height);
     gl.uniform2f(this.at("tile"), width, height);
-    gl.uniform2i(this.at("views"), columns, rows);
-    gl.uniform2fv(this.at("offsets"), new Float32Array(layout.offsets.flat().flatMap(([v, u]) => [u, v])));
+    gl.uniform2i(this.at("views"), layout.column_steps.length, layout.row_steps.length);
+    gl.uniform1fv(this.at("rowSteps"), layout.row_steps);
+    gl.uniform1fv(this.at("columnSteps"), layout.column_steps);
     this.layout = layout;
   }
 
-  draw(shift) {
+  draw(disparity) {
     if (!this.layout) return;
-    this.gl.uniform1f(this.at("shift"), shift);
+    this.gl.uniform1f(this.at("disparity"), disparity / this.layout.scale);
     this.gl.drawArrays(this.gl.TRIANGLES, 0, 3);
   }
 }
@@ -86,32 +88,32 @@ function link(gl) {
   return program;
 }
 
-// The shift at which all views agree best around a point (x, y in pixels of a view): the least variance over views.
+// The disparity at which all views agree best around a point (x, y in pixels of a tile): the least variance over views.
 export function sharpest(layout, bitmap, x, y, reach = 3) {
-  const [rows, columns] = layout.views, [height, width] = layout.tile, radius = 9;
+  const { row_steps: down, column_steps: across, tile: [height, width] } = layout, radius = 9;
   const paper = new OffscreenCanvas(bitmap.width, bitmap.height);
   const pen = paper.getContext("2d", { willReadFrequently: true });
   pen.drawImage(bitmap, 0, 0);
-  const pixels = pen.getImageData(0, 0, bitmap.width, bitmap.height).data;
+  const pixels = pen.getImageData(0, 0, bitmap.width, bitmap.height).data, line = bitmap.width * 4;
   const value = (row, column, py, px) => {
     const cy = Math.min(Math.max(py, 0), height - 1.001), cx = Math.min(Math.max(px, 0), width - 1.001);
     const y0 = Math.floor(cy), x0 = Math.floor(cx), fy = cy - y0, fx = cx - x0;
-    const at = ((row * height + y0) * bitmap.width + column * width + x0) * 4, down = bitmap.width * 4;
-    return (pixels[at] * (1 - fx) + pixels[at + 4] * fx) * (1 - fy) + (pixels[at + down] * (1 - fx) + pixels[at + down + 4] * fx) * fy;
+    const at = (row * height + y0) * line + (column * width + x0) * 4;
+    return (pixels[at] * (1 - fx) + pixels[at + 4] * fx) * (1 - fy) + (pixels[at + line] * (1 - fx) + pixels[at + line + 4] * fx) * fy;
   };
   let best = 0, least = Infinity;
-  for (let shift = -reach; shift <= reach + 1e-9; shift += 0.1) {
+  for (let disparity = -reach; disparity <= reach + 1e-9; disparity += 0.1) {
+    const moved = disparity / layout.scale;
     let total = 0;
     for (let dy = -radius; dy <= radius; dy += 3) for (let dx = -radius; dx <= radius; dx += 3) {
       let sum = 0, squares = 0;
-      for (let v = 0; v < rows; v++) for (let u = 0; u < columns; u++) {
-        const [ov, ou] = layout.offsets[v][u];
-        const one = value(v, u, y + dy + shift * rows * ov, x + dx + shift * columns * ou);
+      for (let v = 0; v < down.length; v++) for (let u = 0; u < across.length; u++) {
+        const one = value(v, u, y + dy + moved * down[v], x + dx + moved * across[u]);
         sum += one; squares += one * one;
       }
-      total += squares - sum * sum / (rows * columns);
+      total += squares - sum * sum / (down.length * across.length);
     }
-    if (total < least) { least = total; best = shift; }
+    if (total < least) { least = total; best = disparity; }
   }
   return best;
 }

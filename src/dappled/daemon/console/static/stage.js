@@ -20,7 +20,7 @@ export class Stage {
     }
     for (const name of TABS) $(`tab-${name}`).addEventListener("click", () => this.choose(name));
     document.querySelector(".tabs").addEventListener("keydown", (event) => this.arrow(event));
-    $("shift").addEventListener("input", () => this.draw());
+    $("disparity").addEventListener("input", () => this.draw());
     $("autofocus").addEventListener("click", () => this.focusAt(0.5, 0.5));
     for (const id of ["gl", "picture"]) $(id).addEventListener("click", (event) => {
       const box = event.currentTarget.getBoundingClientRect();
@@ -114,10 +114,10 @@ export class Stage {
       this.refocus.show(layout, bitmap);
       show($("picture"), false);
       show($("gl"), true);
-      $("caption").textContent = `${layout.views[0]} × ${layout.views[1]} views of ${layout.tile[1]} × ${layout.tile[0]} px, phases from the ${layout.source}. Tap where it should be sharp.`;
+      $("caption").textContent = `${layout.row_steps.length} × ${layout.column_steps.length} views of ${layout.tile[1]} × ${layout.tile[0]} px, phases from the ${layout.source}. Tap where it should be sharp.`;
     } else {
       show($("gl"), false);
-      $("caption").textContent = `${layout.views[0]} × ${layout.views[1]} views, phases from the ${layout.source}. This browser has no WebGL2: the vehicle makes the picture.`;
+      $("caption").textContent = `${layout.row_steps.length} × ${layout.column_steps.length} views, phases from the ${layout.source}. This browser has no WebGL2: the vehicle makes the picture.`;
     }
     this.size();
     this.draw();
@@ -140,23 +140,24 @@ export class Stage {
   }
 
   draw() {
-    const shift = Number($("shift").value);
-    $("shift-text").textContent = `${shift > 0 ? "+" : ""}${fixed(shift, 2)} px`;
+    const disparity = Number($("disparity").value);
+    const alpha = disparity > -1 ? `, α ${fixed(1 / (1 + disparity), 2)}` : "";
+    $("disparity-text").textContent = `${disparity > 0 ? "+" : ""}${fixed(disparity, 2)} px${alpha}`;
     if (this.tab !== "refocus" || !this.layout) return;
-    if (this.bitmap && this.refocus) this.refocus.draw(shift);
-    else this.ask(shift);
+    if (this.bitmap && this.refocus) this.refocus.draw(disparity);
+    else this.ask(disparity);
   }
 
   // Without WebGL: one picture at a time, the newest wish next.
-  async ask(shift) {
-    this.wanted = shift;
+  async ask(disparity) {
+    this.wanted = disparity;
     if (this.asking) return;
     this.asking = true;
     try {
       while (this.wanted !== null && this.tab === "refocus" && this.layout) {
         const next = this.wanted;
         this.wanted = null;
-        await this.loadPicture(`/api/frames/${this.frame.tag.frame}/refocus.jpg?shift=${next}`, "refocus", this.turn);
+        await this.loadPicture(`/api/frames/${this.frame.tag.frame}/refocus.jpg?disparity=${next}`, "refocus", this.turn);
         $("caption").textContent = `Views from the ${this.layout?.source}. This browser has no WebGL2: the vehicle makes the picture.`;
       }
     } catch (error) {
@@ -169,7 +170,7 @@ export class Stage {
   focusAt(x, y) {
     if (this.tab !== "refocus" || !this.layout || !this.bitmap) return;
     const [height, width] = this.layout.tile;
-    $("shift").value = sharpest(this.layout, this.bitmap, x * width, y * height);
+    $("disparity").value = sharpest(this.layout, this.bitmap, x * width, y * height);
     this.draw();
   }
 
@@ -211,12 +212,13 @@ export class Stage {
     paper.setAttribute("viewBox", `0 0 ${wide} 1000`);
     const at = (fy, fx) => [(0.5 + fx) * wide, (0.5 + fy) * 1000];
     const predicted = facts.predicted?.length ? facts.predicted : facts.carriers.map((row) => ({ at: row, seen: null }));
-    for (const [, , fy, fx] of facts.carriers) for (const sign of [1, -1]) {
+    const halves = (ky, kx) => (ky || kx ? [1, -1] : [1]);   // the mean is its own mirror
+    for (const [ky, kx, fy, fx] of facts.carriers) for (const sign of halves(ky, kx)) {
       const [x, y] = at(sign * fy, sign * fx);
       paper.append(svg("rect", { x: x - size[1] / 2, y: y - size[0] / 2, width: size[1], height: size[0], fill: "none", stroke: "#ff6a5e", "stroke-width": 1.2, opacity: 0.75 }));
     }
     let seen = 0;
-    for (const one of predicted) for (const sign of [1, -1]) {
+    for (const one of predicted) for (const sign of halves(...one.at)) {
       const [ky, kx, fy, fx] = one.at, [x, y] = at(sign * fy, sign * fx);
       const cross = svg("path", { d: `M${x - 11} ${y}h22M${x} ${y - 11}v22`, stroke: "#ffe14d", "stroke-width": 2, fill: "none" });
       cross.append(svg("title", {}, `order ${signed(sign * ky)}, ${signed(sign * kx)}`));

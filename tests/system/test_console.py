@@ -1,0 +1,283 @@
+"""The console in a real browser, in front of a whole simulated daemon: what a person on the field does and sees."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from dappled.daemon.console import pictures
+from dappled.daemon.console.pictures import Mosaic
+
+CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
+SCREENSHOTS = Path(__file__).parents[2] / "build" / "screenshots"
+TOKEN = "only-for-this-test-0123456789"  # noqa: S105  # it opens nothing
+DEADLINE_MS = 45_000
+LAPTOP, PHONE = {"width": 1440, "height": 900}, {"width": 390, "height": 844}
+GPU = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+
+@dataclass
+class Daemon:
+    """A simulated daemon with a console."""
+
+    url: str
+    process: subprocess.Popen[str]
+    said: list[str] = field(default_factory=list)
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory, sockets: Path) -> Iterator[Daemon]:
+    """`dappled run --simulate` with a console that asks for a token, on a port that the system chose."""
+    folder = tmp_path_factory.mktemp("console")
+    (folder / "token").write_text(TOKEN)
+    (folder / "token").chmod(0o600)
+    (folder / "dappled.toml").write_text(
+        f'[record]\ndirectory = "flights"\n[publish]\nslices = "ipc://{sockets}/console"\n'
+        '[console]\nbind = "127.0.0.1:0"\ntoken = "token"\n'
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dappled", "run", "--simulate", "--seed", "3", "--config", "dappled.toml"],
+        cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
+    )  # fmt: skip
+    assert process.stderr is not None
+    said: list[str] = []
+    for line in process.stderr:
+        said.append(line)
+        if line.startswith("console "):
+            break
+    if process.poll() is not None:
+        process.stderr.close()
+        pytest.fail("".join(said))
+    reader = threading.Thread(target=said.extend, args=[process.stderr])
+    reader.start()
+    yield Daemon(said[-1].split()[1], process, said)
+    process.send_signal(signal.SIGTERM)
+    try:
+        assert process.wait(20) == 0, "".join(said)
+    finally:
+        process.kill()
+        reader.join(5)
+        process.stderr.close()
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    """Debian's Chromium without a window; skips where there is none."""
+    if shutil.which(CHROMIUM) is None:
+        pytest.skip(f"no browser at {CHROMIUM}: apt install chromium, or set CHROMIUM")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *GPU])
+        yield browser
+        browser.close()
+
+
+@dataclass
+class Watched:
+    """A page, and what it did that it should not."""
+
+    page: Page
+    wrong: list[str]
+
+
+def opened(browser: Browser, daemon: Daemon, viewport: dict[str, Any], *, log_in: bool = True, **more: Any) -> Watched:
+    """The console in a browser profile of its own, until it has judged go or no-go."""
+    context = browser.new_context(viewport=viewport, **more)  # type: ignore[arg-type]  # a plain dict is its type
+    page = context.new_page()
+    wrong: list[str] = []
+    page.on("console", lambda m: wrong.append(f"{m.type}: {m.text}") if m.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: wrong.append(f"page error: {error}"))
+    page.on("request", lambda r: None if r.url.startswith((daemon.url, "blob:", "data:")) else wrong.append(r.url))
+    page.set_default_timeout(DEADLINE_MS)
+    if log_in:
+        page.goto(f"{daemon.url}#token={TOKEN}")
+        page.wait_for_selector('#verdict[data-state="go"], #verdict[data-state="caution"]')
+    else:
+        page.goto(daemon.url)
+    return Watched(page, wrong)
+
+
+def until(page: Page, condition: str) -> None:
+    """Wait for a JavaScript condition. (Playwright's own way needs eval, which the page's rules forbid.)"""
+    deadline = time.monotonic() + DEADLINE_MS / 1e3
+    while not page.evaluate(condition):
+        assert time.monotonic() < deadline, f"never: {condition}"
+        page.wait_for_timeout(30)
+
+
+def shoot(page: Page) -> int:
+    """Press the button as a keyboard would; the frame's number once its views are drawn."""
+    page.focus("#shoot")
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('#told').textContent.startsWith('shot ')")
+    index = int(page.inner_text("#told").split()[1])
+    page.wait_for_selector(f'#strip [data-frame="{index}"][aria-selected="true"] img')
+    until(page, f"document.querySelector('#which').textContent === 'frame {index}'")
+    until(page, "!document.querySelector('#gl').hidden || !document.querySelector('#picture').hidden")
+    return index
+
+
+def drawn(page: Page, disparity: float) -> NDArray[np.float64]:
+    """What the graphics card drew after the slider was moved there."""
+    coded = page.evaluate(
+        """(value) => {
+            const slider = document.querySelector('#disparity');
+            slider.value = value;
+            slider.dispatchEvent(new Event('input'));
+            return document.querySelector('#gl').toDataURL('image/png');
+        }""",
+        disparity,
+    )
+    return grey(base64.b64decode(coded.partition(",")[2]))
+
+
+def grey(data: bytes) -> NDArray[np.float64]:
+    with Image.open(io.BytesIO(data)) as picture:
+        return np.asarray(picture.convert("L"), dtype=np.float64)
+
+
+def client(daemon: Daemon) -> httpx.Client:
+    """Another client with the token."""
+    return httpx.Client(base_url=daemon.url, headers={"authorization": f"Bearer {TOKEN}"}, timeout=30)
+
+
+def mosaic(daemon: Daemon, frame: int) -> Mosaic:
+    """The same views as the browser's, had by another client."""
+    with client(daemon) as one:
+        layout = one.get(f"/api/frames/{frame}/views.json").raise_for_status().json()
+        data = one.get(f"/api/frames/{frame}/views.jpg").raise_for_status().content
+    return Mosaic(
+        grey(data).astype(np.uint8),
+        (layout["tile"][0], layout["tile"][1]),
+        layout["scale"],
+        np.array(layout["row_steps"]),
+        np.array(layout["column_steps"]),
+    )
+
+
+def test_a_person_shoots_looks_and_focuses(chromium: Browser, daemon: Daemon) -> None:
+    watched = opened(chromium, daemon, LAPTOP)
+    page = watched.page
+    assert page.inner_text("#verdict-word") == "Go"
+    assert {"Camera", "Disk", "Autopilot", "Position", "Clock", "Decoding", "Service"} == set(
+        page.locator("#checks b").all_inner_texts()
+    )
+    frame = shoot(page)
+    page.wait_for_selector("#gl:not([hidden])")
+    views = mosaic(daemon, frame)
+    inner = np.s_[12:-12, 12:-12]  # beyond the edges fewer views are averaged, and the two interpolate differently
+    for disparity in (-1.0, 0.0, 0.5, 2.0):
+        ours = pictures.refocused(views, disparity).astype(np.float64)
+        theirs = drawn(page, disparity)
+        assert theirs.shape == ours.shape
+        assert np.abs(ours - theirs)[inner].mean() < 1.0, f"disparity {disparity}"
+    assert np.abs(drawn(page, 2.0) - drawn(page, -1.0))[inner].mean() > 3.0  # the slider moves the focus
+
+    page.click("#autofocus")
+    assert "α" in page.inner_text("#disparity-text")
+    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+    page.screenshot(path=SCREENSHOTS / "laptop-refocus.png")
+    for tab in ("views", "slices", "spectrum"):
+        page.click(f"#tab-{tab}")
+        page.wait_for_selector(f'#picture[data-kind="{tab}"]:not([hidden])')
+        page.screenshot(path=SCREENSHOTS / f"laptop-{tab}.png")
+    assert page.locator("#overlay path").count() == 25  # 24 carriers and the mean, each predicted
+    assert page.locator("#overlay circle").count() >= 12
+    assert page.locator("#log li").count() >= 2
+    assert "safe" in page.inner_text("#log")
+    assert page.inner_text("#facts").count("unknown") == 0
+    page.keyboard.press("ArrowLeft")  # the tabs are one stop for the keyboard, and arrows go through them
+    page.wait_for_selector('#tab-slices[aria-selected="true"]')
+    assert watched.wrong == []
+
+
+def test_an_interval_runs_and_stops(chromium: Browser, daemon: Daemon) -> None:
+    watched = opened(chromium, daemon, LAPTOP)
+    page = watched.page
+    before = int(page.locator("#counters dd").first.inner_text())
+    page.fill("#interval-s", "0.5")
+    page.fill("#interval-count", "0")
+    page.click("#interval-go")
+    until(page, "document.querySelector('#interval-go').textContent === 'Stop'")
+    until(page, f"Number(document.querySelector('#counters dd').textContent) >= {before + 2}")
+    page.click("#interval-go")
+    until(page, "document.querySelector('#told').textContent === 'the interval is stopped'")
+    until(page, "document.querySelector('#interval-go').textContent === 'Start'")
+    assert watched.wrong == []
+
+
+def test_a_phone_shows_go_or_no_go_first_and_fits(chromium: Browser, daemon: Daemon) -> None:
+    watched = opened(chromium, daemon, PHONE, device_scale_factor=2, is_mobile=True, has_touch=True)
+    page = watched.page
+    shoot(page)
+    page.wait_for_selector("#gl:not([hidden])")
+    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+    page.screenshot(path=SCREENSHOTS / "phone.png")
+    page.screenshot(path=SCREENSHOTS / "phone-whole.png", full_page=True)
+    assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+    verdict, button = page.locator("#verdict").bounding_box(), page.locator("#shoot").bounding_box()
+    assert verdict is not None
+    assert button is not None
+    assert verdict["y"] < 150
+    assert button["y"] + button["height"] <= PHONE["height"]  # under the thumb without scrolling
+    assert button["height"] >= 48
+    assert watched.wrong == []
+
+
+def test_without_webgl_the_vehicle_makes_the_picture(daemon: Daemon, chromium: Browser) -> None:
+    without = "HTMLCanvasElement.prototype.getContext = (of => function (kind, ...more) {"
+    without += (
+        "return kind === 'webgl2' ? null : of.call(this, kind, ...more); })(HTMLCanvasElement.prototype.getContext)"
+    )
+    context = chromium.new_context(viewport=LAPTOP)  # type: ignore[arg-type]  # a plain dict is its type
+    context.add_init_script(without)
+    page = context.new_page()
+    page.set_default_timeout(DEADLINE_MS)
+    page.goto(f"{daemon.url}#token={TOKEN}")
+    page.wait_for_selector('#verdict[data-state="go"], #verdict[data-state="caution"]')
+    frame = shoot(page)
+    page.wait_for_selector('#picture[data-kind="refocus"]:not([hidden])')
+    assert "no WebGL2" in page.inner_text("#caption")
+    before = page.evaluate("document.querySelector('#picture').src")
+    page.locator("#disparity").fill("2")
+    until(page, f"document.querySelector('#picture').src !== '{before}'")
+    views = mosaic(daemon, frame)
+    ours = pictures.refocused(views, 2.0).astype(np.float64)
+    with client(daemon) as one:
+        made = grey(one.get(f"/api/frames/{frame}/refocus.jpg?disparity=2").raise_for_status().content)
+    assert np.abs(made - ours).mean() < 4.0  # both through a JPEG of their own
+    page.screenshot(path=SCREENSHOTS / "laptop-without-webgl.png")
+
+
+def test_the_token_is_asked_for(chromium: Browser, daemon: Daemon) -> None:
+    watched = opened(chromium, daemon, LAPTOP, log_in=False)
+    page = watched.page
+    page.wait_for_selector("#login[open]")
+    page.fill("#token", "a guess")
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('#login-text').textContent === 'this is not the token'")
+    page.screenshot(path=SCREENSHOTS / "laptop-token.png")
+    page.fill("#token", TOKEN)
+    page.keyboard.press("Enter")
+    page.wait_for_selector('#verdict[data-state="go"], #verdict[data-state="caution"]')
+    assert TOKEN not in page.url
+    assert all("40" in text for text in watched.wrong)  # the browser's own notes of 401 and 403
