@@ -6,8 +6,8 @@ link had delivered by then. Errors are horizontal distances and whole turns, aga
 
 python benchmarks/pose.py [--json] [--frames 400] [--seed 1] [--log FLIGHT.tlog]
 
-With --log: that real flight instead. Each position and attitude is left out in turn (every --stride-th) and predicted
-from its neighbours.
+With --log: that real flight instead. Each position and attitude is left out in turn (or every --stride-th) and
+predicted from its neighbours.
 """
 
 from __future__ import annotations
@@ -17,19 +17,22 @@ import json
 import math
 import random
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path as File
+from typing import TypeVar
 
+from dappled.daemon import telemetry_pose
 from dappled.daemon.camera_clock import CameraClock, exposure_from_camera
 from dappled.daemon.interpolation import metres_per_radian, turn_rad
 from dappled.daemon.tagger import BodyLatency, Exposure, mid_exposure
-from dappled.daemon.telemetry import Telemetry, first_position_utc_ns
+from dappled.daemon.telemetry import ATTITUDE_GAP_NS, POSITION_GAP_NS, Telemetry
+from dappled.daemon.telemetry_samples import AttitudeSample, PositionSample, attitude, position
 from dappled.drivers.mavlink import Decoder, Message, mavlink
 from dappled.flight import telemetry_log
 from dappled.flight.records import Pose
 from dappled.mocks.autopilot import BootTime, telemetry_message
-from dappled.mocks.path import Path, from_euler
+from dappled.mocks.path import Path
 
 START_NS = 1_790_000_000 * 10**9
 SPEED_M_S = 15.0
@@ -42,6 +45,7 @@ BODY = BodyLatency(60.0, 10.0, "trigger call + body latency")
 CONTACT_SIGMA_S = 0.001  # the worst that counts as a hot shoe
 CAMERA_CLOCK_S = -3600.37  # the body's clock against UTC: another zone, and some seconds' part
 WARM_UP_S, EVERY_S = 40.0, 1.37
+S = TypeVar("S", PositionSample, AttitudeSample)
 RATES_HZ = {
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10.0,
     mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
@@ -64,7 +68,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=400)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--log", type=File)
-    parser.add_argument("--stride", type=int, default=29)
+    parser.add_argument("--stride", type=int, default=1)
     arguments = parser.parse_args()
     figures = (
         leave_one_out(arguments.log, arguments.stride) if arguments.log else measure(arguments.frames, arguments.seed)
@@ -103,45 +107,67 @@ def measure(frames: int, seed: int) -> dict[str, dict[str, float]]:
     return {name: _figures(path, rows) for name, rows in found.items()}
 
 
-def leave_one_out(log: File, stride: int) -> dict[str, dict[str, float]]:
-    """Horizontal distances (m) and turns (degrees) between recorded samples and what their neighbours say of them."""
-    decode = Decoder()
-    packets = []
-    for number, stamp_us, raw in telemetry_log.read(log):
-        if (message := decode(raw)) is not None:
-            packets.append((number, stamp_us, message))
-    first = first_position_utc_ns(packets) or 0
-    found: dict[str, list[float]] = {"position_m": [], "attitude_deg": []}
-    refused = 0
-    kinds = {"GLOBAL_POSITION_INT", "ATTITUDE"}
-    chosen = [i for i, p in enumerate(packets) if p[2].get_type() in kinds and p[1] * 1000 > first + 60 * 10**9]
-    for place in chosen[::stride]:
-        left_out = packets[place][2]
-        telemetry = Telemetry()
-        for packet in (*packets[max(0, place - 1500) : place], *packets[place + 1 : place + 400]):
-            telemetry.feed(*packet)
-        clock = telemetry.boot_clock()
-        pose = clock and telemetry.pose_at(clock.utc_ns(left_out.time_boot_ms * 10**6 + 500_000), 0)
-        if not pose or pose.source != "interpolated" or pose.latitude_rad is None or pose.longitude_rad is None:
-            refused += 1
-        elif left_out.get_type() == "ATTITUDE" and pose.attitude is not None:
-            truth = from_euler(left_out.roll, left_out.pitch, left_out.yaw)
-            found["attitude_deg"].append(math.degrees(turn_rad(pose.attitude, truth)))
-        elif left_out.get_type() == "GLOBAL_POSITION_INT":
-            north_m, east_m = metres_per_radian(pose.latitude_rad, 0.0)
-            north = (pose.latitude_rad - math.radians(left_out.lat / 1e7)) * north_m
-            east = (pose.longitude_rad - math.radians(left_out.lon / 1e7)) * east_m
-            found["position_m"].append(math.hypot(north, east))
-    rows = {
-        name: {
-            "samples": len(values),
-            "median": statistics.median(values),
-            "rms": _rms(values),
-            "p95": sorted(values)[int(0.95 * len(values))],
-        }
-        for name, values in found.items()
+def leave_one_out(log: File, stride: int = 1) -> dict[str, dict[str, float]]:
+    """How far each recorded position (metres, horizontal) and attitude (degrees) is from what its two neighbours say of
+    it, and how far they say that they may be off. Refused: the neighbours are too far apart to be bridged."""
+    positions, attitudes = _samples(log)
+    return {
+        "position_m": _left_out(positions, POSITION_GAP_NS, _position_miss, 0.03, stride),
+        "attitude_deg": _left_out(attitudes, ATTITUDE_GAP_NS, _attitude_miss, 0.02, stride),
     }
-    return {**rows, "refused": {"samples": refused}}
+
+
+def _left_out(
+    samples: Sequence[S], gap_ns: int, miss: Callable[[S, S, S], tuple[float, float]], rounding: float, stride: int
+) -> dict[str, float]:
+    """`rounding` is what the messages themselves round to."""
+    refused, found = 0, []
+    for before, left_out, after in list(zip(samples, samples[1:], samples[2:], strict=False))[::stride]:
+        if 0 < after.boot_ns - before.boot_ns <= gap_ns:
+            found.append(miss(before, left_out, after))
+        else:
+            refused += 1
+    misses = sorted(one for one, _ in found)
+    doubts = [doubt for _, doubt in found]
+    return {
+        "samples": len(found),
+        "refused": refused,
+        "median": statistics.median(misses),
+        "rms": _rms(misses),
+        "p95": misses[int(0.95 * len(misses))],
+        "doubt_rms": _rms(doubts),
+        "doubt_over_error": _rms(doubts) / _rms(misses),
+        "within_2_doubts": sum(one <= 2 * doubt + rounding for one, doubt in found) / len(found),
+    }
+
+
+def _samples(log: File) -> tuple[list[PositionSample], list[AttitudeSample]]:
+    """All positions and attitudes of the autopilot, once each."""
+    decode = Decoder()
+    positions: list[PositionSample] = []
+    attitudes: list[AttitudeSample] = []
+    for number, stamp_us, raw in telemetry_log.read(log):
+        message = decode(raw)
+        if message is None or message.get_srcComponent() != 1:
+            continue
+        if message.get_type() == "GLOBAL_POSITION_INT" and (place := position(number, stamp_us * 1000, message)):
+            positions.append(place)
+        elif message.get_type() == "ATTITUDE" and (turned := attitude(number, stamp_us * 1000, message)):
+            attitudes.append(turned)
+    return positions, attitudes
+
+
+def _position_miss(before: PositionSample, left_out: PositionSample, after: PositionSample) -> tuple[float, float]:
+    found, doubt_m, _ = telemetry_pose.position((before, after), left_out.boot_ns)
+    north_m, east_m = metres_per_radian(left_out.latitude_rad, left_out.altitude_msl_m)
+    north = (found.latitude_rad - left_out.latitude_rad) * north_m
+    east = (found.longitude_rad - left_out.longitude_rad) * east_m
+    return math.hypot(north, east), doubt_m
+
+
+def _attitude_miss(before: AttitudeSample, left_out: AttitudeSample, after: AttitudeSample) -> tuple[float, float]:
+    found, doubt_rad = telemetry_pose.attitude((before, after), left_out.boot_ns)
+    return math.degrees(turn_rad(found, left_out.attitude)), math.degrees(doubt_rad)
 
 
 def _take(called_s: float, rng: random.Random) -> Taken:
@@ -222,6 +248,7 @@ def _figures(path: Path, rows: Sequence[tuple[Taken, Exposure, Pose]]) -> dict[s
         "frames": len(metres),
         "time_rms_ms": _rms(late_ms),
         "time_sigma_ms": _rms(sigma_ms),
+        "time_sigma_over_error": _rms(sigma_ms) / _rms(late_ms),
         "position_rms_m": _rms(metres),
         "position_sigma_m": _rms(sigma_m),
         "position_sigma_over_error": _rms(sigma_m) / _rms(metres),

@@ -135,13 +135,30 @@ def benchmark() -> ModuleType:
 
 
 @pytest.mark.slow
-def test_a_flight_is_placed_as_well_as_promised_and_says_so() -> None:
-    figures: dict[str, Any] = benchmark().measure(400, 2)
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_flight_is_placed_as_well_as_promised_and_says_so(seed: int) -> None:
+    """The body's latency has σ = 10 ms: 15 cm and 0.30° at this speed and turn, and a fifteenth by chance."""
+    figures: dict[str, Any] = benchmark().measure(300, seed)
     assert figures["hot_shoe"]["position_rms_m"] <= 0.03
     assert figures["hot_shoe"]["attitude_rms_deg"] <= 0.05
-    assert figures["body_latency"]["position_rms_m"] <= 0.17
-    assert figures["body_latency"]["attitude_rms_deg"] <= 0.34
+    assert figures["body_latency"]["position_rms_m"] <= 0.16
+    assert figures["body_latency"]["attitude_rms_deg"] <= 0.32
     for row in figures.values():
-        assert row["frames"] >= 397
-        assert 0.8 <= row["position_sigma_over_error"] <= 1.2
-        assert 0.8 <= row["attitude_sigma_over_error"] <= 1.2
+        assert row["frames"] >= 297
+        for what in ("time", "position", "attitude"):
+            assert 0.8 <= row[f"{what}_sigma_over_error"] <= 1.2, what
+
+
+def test_each_sample_of_a_real_flight_is_predicted_by_its_neighbours(shared_data: Path) -> None:
+    """A copter, one sample in half a second: with one left out a second is bridged, and the doubt is as large as the
+    error."""
+    rows: dict[str, Any] = benchmark().leave_one_out(shared_data / "telemetry" / "dronekit-flight.tlog")
+    assert rows["position_m"]["samples"] > 2600
+    assert rows["attitude_deg"]["samples"] > 2800
+    assert rows["position_m"]["median"] < 0.05
+    assert rows["position_m"]["rms"] < 0.2
+    assert rows["attitude_deg"]["median"] < 0.05
+    for row in rows.values():
+        assert 0.8 <= row["doubt_over_error"] <= 1.2
+        assert row["within_2_doubts"] > 0.9
+        assert row["refused"] < 20

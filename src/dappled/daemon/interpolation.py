@@ -43,13 +43,12 @@ def normalised(*parts: float) -> Quaternion:
     return w / length, x / length, y / length, z / length
 
 
-def hermite_doubt(moved: Vector3, start: Vector3, end: Vector3, span_s: float, share: float) -> float:
-    """Metres (1 σ) by which `hermite` may miss at `share` of a way `moved`, with the velocities at its ends.
+def hermite_doubt(moved: float, slopes: tuple[float, float], span_s: float, share: float) -> float:
+    """How far (1 σ) `hermite` may miss at `share` of a way `moved`, with these slopes at its ends.
 
-    A way that disagrees with its velocities' mean was not wholly told by them: half of the difference, in the middle.
+    A way that disagrees with its slopes' mean was not wholly told by them: half of the difference, in the middle.
     """
-    missing = math.hypot(*(moved[i] - 0.5 * (start[i] + end[i]) * span_s for i in range(3)))
-    return 0.5 * missing * (4 * share * (1 - share)) ** 2
+    return 0.5 * abs(moved - 0.5 * (slopes[0] + slopes[1]) * span_s) * (4 * share * (1 - share)) ** 2
 
 
 def slerp_doubt(

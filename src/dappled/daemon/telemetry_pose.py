@@ -62,7 +62,7 @@ def pose(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) -> Pose:
     )
     if not at.positions:
         return made
-    found, doubt_m = position(at.positions, at.boot_ns)
+    found, across_doubt_m, upright_doubt_m = position(at.positions, at.boot_ns)
     age_s = min(abs(sample.boot_ns - at.boot_ns) for sample in at.positions) / 1e9
     blur_s = sigma_s if len(at.positions) == 2 else math.hypot(sigma_s, age_s)
     north, east, down = found.velocity_ned_m_s
@@ -76,8 +76,10 @@ def pose(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) -> Pose:
         altitude_msl_m=found.altitude_msl_m,
         height_above_home_m=found.height_above_home_m,
         velocity_ned_m_s=found.velocity_ned_m_s,
-        position_sigma_m=None if across_m is None else math.hypot(across_m, math.hypot(north, east) * blur_s, doubt_m),
-        vertical_sigma_m=None if upright_m is None else math.hypot(upright_m, down * blur_s, doubt_m),
+        position_sigma_m=None
+        if across_m is None
+        else math.hypot(across_m, math.hypot(north, east) * blur_s, across_doubt_m),
+        vertical_sigma_m=None if upright_m is None else math.hypot(upright_m, down * blur_s, upright_doubt_m),
         age_ms=age_s * 1e3,
     )
 
@@ -87,11 +89,12 @@ def nothing(utc_ns: int, packets: int) -> Pose:
     return Pose("none", utc_ns, None, None, None, None, None, None, None, None, None, None, packets)
 
 
-def position(samples: Sequence[PositionSample], boot_ns: int) -> tuple[PositionSample, float]:
-    """The sample that would stand at `boot_ns`, from one or two; and how many metres (1 σ) two leave it in doubt."""
+def position(samples: Sequence[PositionSample], boot_ns: int) -> tuple[PositionSample, float, float]:
+    """The sample that would stand at `boot_ns`, from one or two; and how many metres (1 σ) two leave it in doubt,
+    horizontally and vertically."""
     a = samples[0]
     if len(samples) == 1:
-        return a, 0.0
+        return a, 0.0, 0.0
     b = samples[1]
     span_s = (b.boot_ns - a.boot_ns) / 1e9
     share = (boot_ns - a.boot_ns) / (b.boot_ns - a.boot_ns)
@@ -115,7 +118,8 @@ def position(samples: Sequence[PositionSample], boot_ns: int) -> tuple[PositionS
         a.height_above_home_m + hermite((0.0, height), (-va[2], -vb[2]), span_s, share),
         (vn, ve, vd),
     )
-    return found, hermite_doubt(to_b, va, vb, span_s, share)
+    doubts = [hermite_doubt(to_b[i], (va[i], vb[i]), span_s, share) for i in range(3)]
+    return found, math.hypot(doubts[0], doubts[1]), doubts[2]
 
 
 def attitude(samples: Sequence[AttitudeSample], boot_ns: int) -> tuple[Quaternion, float]:
