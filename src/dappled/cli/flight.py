@@ -1,4 +1,4 @@
-"""`dappled flight list|show|check|report|offload`: recorded flights."""
+"""`dappled flight list|show|check|report|offload|pickup`: recorded flights."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from dappled.cli import flight_pickup
 from dappled.config import settings
 from dappled.flight import check, index, offload, summary
 from dappled.flight.errors import FlightError
@@ -36,6 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     away.add_argument("destination", type=Path, metavar="DEST", help="folder that will hold the flight's folder")
     away.add_argument("flight", nargs="?", type=Path, help="flight folder (default: the last one)")
     away.add_argument("--prune", action="store_true", help="afterwards remove the frames here; the ledger stays")
+    flight_pickup.configure(actions.add_parser("pickup", help=flight_pickup.HELP))
     for one in actions.choices.values():
         one.add_argument("--json", action="store_true", help="as JSON")
 
@@ -44,6 +46,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.action == "list":
         return _list(arguments.folder or _flights(), arguments.json)
     flight = arguments.flight or last_flight()
+    if arguments.action == "pickup":
+        return flight_pickup.run(flight, arguments)
     if arguments.action == "offload":
         return _offload(flight, arguments.destination, arguments.prune, arguments.json)
     return {"show": _show, "check": _check, "report": _report}[arguments.action](flight, arguments.json)

@@ -18,8 +18,8 @@ from dappled.drivers.matching import seconds
 
 RAW_SUFFIXES = (".raf", ".cr2", ".dng", ".nef", ".arw", ".crw", ".tif", ".tiff", ".npy", ".png")
 SUFFIXES = (*RAW_SUFFIXES, ".jpg", ".jpeg")
-_MOUNTS = Path("/proc/self/mounts")
-_PLACES = ("/media/", "/run/media/", "/mnt")
+MOUNTS = Path("/proc/self/mounts")
+PLACES = ("/media/", "/run/media/", "/mnt")
 _MANY = 100_000
 
 
@@ -136,9 +136,9 @@ class FolderSource:
 class StorageSource(FolderSource):
     """The DCIM folder of a removable disk, wherever it is mounted, as soon as it is."""
 
-    def __init__(self, mounts: Path = _MOUNTS, places: tuple[str, ...] = _PLACES) -> None:
+    def __init__(self, mounts: Path | None = None, places: tuple[str, ...] | None = None) -> None:
         super().__init__(Path("/nonexistent"))
-        self._mounts, self._places = mounts, places
+        self._mounts, self._places = mounts or MOUNTS, places or PLACES
 
     def list(self) -> list[Found]:
         """See Source."""

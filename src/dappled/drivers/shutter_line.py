@@ -69,7 +69,7 @@ def request_output(chip: str, line: int, active_low: bool) -> Output:
 class GpioLine:
     """A line of a GPIO chip, by libgpiod: active while the shutter is pressed."""
 
-    def __init__(self, chip: str, line: int, *, active_low: bool = False, request: Request = request_output) -> None:
+    def __init__(self, chip: str, line: int, *, active_low: bool = False, request: Request | None = None) -> None:
         self._chip, self._line, self._active_low, self._request = chip, line, active_low, request
         self._output: Output | None = None
 
@@ -77,7 +77,7 @@ class GpioLine:
         """See ShutterLine."""
         if self._output is None:
             try:
-                self._output = self._request(self._chip, self._line, self._active_low)
+                self._output = (self._request or request_output)(self._chip, self._line, self._active_low)
             except (OSError, ValueError) as error:
                 raise CameraError(
                     f"the shutter line {self._line} of {self._chip} can't be had ({error}): "
