@@ -43,7 +43,7 @@ class Body:
 class Rig:
     """A component whose links are a list."""
 
-    def __init__(self, *, feedback_is_shot: bool = False) -> None:
+    def __init__(self, *, feedback_is_shot: bool = False, capacity: int = 8) -> None:
         self.body = Body()
         self.decode = "on"
         own = OwnKnob("LF_DECODE", "Decode in flight", lambda: self.decode, ("on", "off"), self._decode)
@@ -62,6 +62,7 @@ class Rig:
             fire=self.fired.append,
             clock=self.clock,
             obstacle=lambda: self.obstacle,
+            capacity=capacity,
             on_change=lambda: self.component.state_changed(),  # noqa: PLW0108 (the component is made after the shutter)
         )
         self.component = Component(

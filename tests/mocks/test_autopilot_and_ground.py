@@ -3,106 +3,23 @@
 from __future__ import annotations
 
 import math
-import queue
-import threading
 import time
 from collections.abc import Iterator
 
 import pytest
 
 from dappled.daemon.boot_clock import BootClock
-from dappled.daemon.clock import SystemClock
-from dappled.daemon.component import CameraFacts, Captured, Component
 from dappled.daemon.ground_client import GroundClient, GroundError
 from dappled.daemon.interpolation import turn_rad
-from dappled.daemon.knobs import Knobs
-from dappled.daemon.shutter import Shutter
-from dappled.daemon.telemetry import Telemetry
-from dappled.drivers.camera import Setting, SettingName
-from dappled.drivers.mavlink import MavlinkLinks, Packet
 from dappled.mocks.autopilot import Autopilot, BootTime
 from dappled.mocks.ground import GroundStation
 from dappled.mocks.path import Path
-
-
-class Camera:
-    """A camera that has each frame 20 ms after the wish; index 2 fails."""
-
-    def __init__(self) -> None:
-        self.clock = SystemClock()
-        self.telemetry = Telemetry()
-        self.count = 0
-        self.done: dict[int, Captured] = {}
-        self.fired: queue.Queue[int | None] = queue.Queue()
-        self.links = MavlinkLinks(
-            ["udpin:127.0.0.1:0"],
-            system_id=1,
-            component_id=100,
-            tap=self._tap,
-            on_packet=self._on_packet,
-            clock=self.clock,
-        )
-        self.shutter = Shutter(next_index=0, note=lambda _: None, fire=self.fired.put, clock=self.clock)
-        self.component = Component(
-            self.links,
-            self.shutter,
-            self.clock,
-            Knobs(self),
-            facts=lambda: CameraFacts("dappled", "test", (0, 1, 0)),
-            storage=lambda: None,
-            lookup=self.done.get,
-        )
-        self._worker = threading.Thread(target=self._work)
-
-    def settings(self) -> tuple[Setting, ...]:
-        return ()
-
-    def change(self, name: SettingName, value: str) -> None:
-        raise AssertionError
-
-    @property
-    def url(self) -> str:
-        return f"udpout:127.0.0.1:{self.links.port(0)}"
-
-    def _tap(self, stamp_us: int, raw: bytes) -> int:
-        self.count += 1
-        return self.count - 1
-
-    def _on_packet(self, packet: Packet) -> None:
-        assert packet.number is not None
-        self.telemetry.feed(packet.number, packet.stamp_us, packet.message)
-        self.component.on_packet(packet)
-
-    def _work(self) -> None:
-        while True:
-            try:
-                index = self.fired.get(timeout=0.02)
-            except queue.Empty:
-                self.component.tick()
-                continue
-            if index is None:
-                return
-            threading.Event().wait(0.02)
-            captured = Captured(index, ok=index != 2, utc_ns=self.clock.utc_ns())
-            self.done[index] = captured
-            self.shutter.settled(index, captured.ok)
-            self.component.announce(captured)
-
-    def __enter__(self) -> Camera:
-        self.links.start()
-        self._worker.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.shutter.stop()
-        self.links.stop()
-        self.fired.put(None)
-        self._worker.join(5)
+from tests.daemon.mavlink_rig import Camera
 
 
 @pytest.fixture
 def camera() -> Iterator[Camera]:
-    with Camera() as camera:
+    with Camera(fails=[2], settled=False) as camera:
         yield camera
 
 

@@ -5,8 +5,8 @@
    messages that are acknowledged (their sender repeats when it misses the answer) or that carry a sequence.
 2. One trigger, several messages. PX4 says CAMERA_TRIGGER, IMAGE_START_CAPTURE and DO_DIGICAM_CONTROL for one
    trigger, and a vehicle on two links says each of them twice. Within 0.3 s of a shot's first message, a message of
-   the same source belongs to that shot if the shot has none of this kind from this link yet; the oldest such shot
-   takes it.
+   the same source belongs to that shot if the shot has none of this kind from this link yet, and none of this kind
+   with another sequence; the oldest such shot takes it.
 
 So a second press with the same sequence (most ground stations: always 0) inside 1.2 s is lost; and triggers from one
 source less than 0.3 s apart may be joined if some of their messages were lost on the way.
@@ -47,7 +47,7 @@ class _Remembered:
     sequence: int | None
     first_ns: int
     last_ns: int
-    parts: set[tuple[str, int | None]]
+    parts: dict[tuple[str, int | None], int | None]  # (kind, link): sequence; shared by all names of a shot
 
 
 class Recent:
@@ -62,7 +62,7 @@ class Recent:
         found = self._retry(wish, now_ns) or self._part(wish, now_ns)
         if found is None:
             return None
-        found.parts.add((wish.kind, wish.link))
+        found.parts[wish.kind, wish.link] = wish.sequence
         if (wish.kind, wish.sequence) == (found.kind, found.sequence):
             found.last_ns = max(found.last_ns, now_ns)
         else:  # a part that may itself be retried: remembered under its own name
@@ -73,8 +73,8 @@ class Recent:
 
     def add(self, wish: Wish, now_ns: int, index: int) -> None:
         """A new wish became shot `index`."""
-        part = (wish.kind, wish.link)
-        self._wishes.append(_Remembered(index, wish.source, wish.kind, wish.sequence, now_ns, now_ns, {part}))
+        parts = {(wish.kind, wish.link): wish.sequence}
+        self._wishes.append(_Remembered(index, wish.source, wish.kind, wish.sequence, now_ns, now_ns, parts))
 
     def _retry(self, wish: Wish, now_ns: int) -> _Remembered | None:
         if not wish.acknowledged and wish.sequence is None:
@@ -90,8 +90,11 @@ class Recent:
         return None
 
     def _part(self, wish: Wish, now_ns: int) -> _Remembered | None:
-        part = (wish.kind, wish.link)
         for known in self._wishes:
-            if known.source == wish.source and now_ns - known.first_ns <= TRIGGER_NS and part not in known.parts:
+            if known.source != wish.source or now_ns - known.first_ns > TRIGGER_NS:
+                continue
+            if (wish.kind, wish.link) in known.parts:
+                continue
+            if all(sequence == wish.sequence for (kind, _), sequence in known.parts.items() if kind == wish.kind):
                 return known
         return None
