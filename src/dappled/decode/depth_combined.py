@@ -50,6 +50,9 @@ def depth(evidence: Evidence, search: Search) -> DepthMap:
         likelihood += cost
     smooth = semiglobal.smoothed(-likelihood, small=_SMALL, large=_LARGE, workers=search.workers)
     start = smooth.argmin(axis=0)
+    if not evidence.white:
+        likelihood, _ = windowed(likelihood, _NARROW)
+        samples *= box(_NARROW) ** 2
     disparity, curvature = peaked(likelihood, disparities, start)
     best = np.take_along_axis(likelihood, start[None], axis=0)[0]
     sure = confidence(likelihood, best, samples)

@@ -17,6 +17,7 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import LightField
 
 Image = NDArray[np.float32]
+CAMERAS = "cameras"  # an attribute of light fields: true where each view is a camera's, further right with larger u
 _REGULAR = 1e-3  # of a view: the places of views that stand on a grid of rows and columns
 
 
@@ -70,8 +71,9 @@ class ViewStack:
 def of(field: LightField, views: NDArray[np.float32] | None = None) -> ViewStack:
     """The views of a light field, or others on the same places.
 
-    Behind a mask a larger aperture coordinate sees nearer things at larger ones; under a lenslet, which turns the
-    aperture's picture round, at smaller ones. Raises DecodeError where there are no views, or not on rows and columns.
+    Behind a mask a larger aperture coordinate sees nearer things at larger ones. A lenslet turns the aperture's picture
+    round: at smaller ones; and so does a camera further to the right. Raises DecodeError where there are no views, or
+    not on rows and columns.
     """
     values = field.views if views is None else views
     if 0 in values.shape:
@@ -82,14 +84,15 @@ def of(field: LightField, views: NDArray[np.float32] | None = None) -> ViewStack
     count = max(values.shape[:2])
     if max(on_rows) > _REGULAR / count:
         raise DecodeError("the light field's views don't stand on rows and columns of the aperture")
-    sign = -1.0 if field.attributes.get("lenslet_pitch_px") else 1.0
+    cameras = bool(field.attributes.get(CAMERAS))
+    sign = -1.0 if cameras or field.attributes.get("lenslet_pitch_px") else 1.0
     row_px, column_px = float(np.hypot(*field.grid[:, 0])), float(np.hypot(*field.grid[:, 1]))
     # One step is 1/count of the aperture; a row of a view may be taller than a column is wide.
     return ViewStack(
         values,
         sign * count * down * column_px / row_px,
         sign * count * across,
-        sensor_px_per_disparity=count * column_px,
+        sensor_px_per_disparity=None if cameras else count * column_px,
     )
 
 

@@ -1,0 +1,3 @@
+from dappled.products.opened import open as open
+
+__version__: str

@@ -1,0 +1,281 @@
+"""The face for programs: `dappled.open(path)` gives a light field, a frame or a flight.
+
+with_views = dappled.open("frame.zarr")              # or a folder of n × n pictures
+sharp = with_views.refocus(alpha=0.8)                 # float32 (h, w) or (h, w, 3)
+depth = with_views.depth(method="combined")           # .disparity, .sigma, .confidence
+frame = dappled.open("frame.cr2", mask="mask-2", calibration="calibration.toml")
+for frame in dappled.open("~/flights/20261121T101503Z-0a1b2c3d"): frame.views
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.config import profiles
+from dappled.decode import depth as depths
+from dappled.decode import evidence as evidences
+from dappled.decode import refocus as refocusing
+from dappled.decode import viewstack
+from dappled.decode.depthmap import DepthMap
+from dappled.decode.errors import DecodeError
+from dappled.decode.evidence import Evidence
+from dappled.decode.lightfield import LightField
+from dappled.decode.ranging import DistanceMap, Ranging
+from dappled.decode.refocus import FocalPlane
+from dappled.decode.stereo_pair import StereoPair, eyes
+from dappled.decode.viewstack import ViewStack
+from dappled.drivers import kept_recipe
+from dappled.drivers.darkroom import Darkroom, Recipe
+from dappled.errors import DappledError
+from dappled.flight import layout, summary
+from dappled.flight.records import Tag
+from dappled.products import lightfiles, viewfolders
+
+RANGING = "ranging"  # the attribute of a light field that leads to metres
+_LIGHT_FIELDS = (".zarr", ".npz", ".h5")
+
+
+class OpenError(DappledError):
+    """Something that can't be opened; one sentence."""
+
+
+@dataclass(frozen=True)
+class OpenedLightField:
+    """A decoded light field and what can be made of it. `field` is the plain value, `path` where it came from.
+
+    `focus_m` is where the lens was focused (inf: infinity), for metres where no calibration says it.
+    """
+
+    field: LightField
+    path: Path | None = None
+    focus_m: float | None = None
+    workers: int = 2
+
+    @property
+    def views(self) -> NDArray[np.float32]:
+        """float32 (V, U, h, w) or (V, U, h, w, 3), linear, 1.0 = sensor white."""
+        return self.field.views
+
+    @property
+    def slices(self) -> NDArray[np.complex64]:
+        """complex64 (K, h, w), DC first; (0, h, w) where the light field came as views."""
+        return self.field.slices
+
+    @property
+    def attributes(self) -> Mapping[str, Any]:
+        """Frame shape, camera, mask, law, focal length, f-number …"""
+        return self.field.attributes
+
+    @cached_property
+    def stack(self) -> ViewStack:
+        """The views with their places. Raises DecodeError where there are none."""
+        return viewstack.of(self.field)
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        """What depth is estimated from. Raises DecodeError where there are no views, or only one."""
+        return evidences.of_light_field(self.field)
+
+    @cached_property
+    def ranging(self) -> Ranging | None:
+        """From disparity to metres: by a calibration with targets, or by `focus_m`; None: only relative depth."""
+        kept = self.attributes.get(RANGING)
+        if kept:
+            return Ranging.from_dict(kept).at(self.attributes.get("f_number"))
+        if self.focus_m is None:
+            return None
+        return lens_ranging(self.field, self.focus_m)
+
+    def disparity_of(
+        self, *, alpha: float | None = None, disparity: float | None = None, distance_m: float | None = None
+    ) -> float:
+        """The disparity that one of the three names; 0 for none. Raises DappledError for more than one, and for metres
+        without a calibration."""
+        given = [value for value in (alpha, disparity, distance_m) if value is not None]
+        if len(given) > 1:
+            raise OpenError("give one of alpha, disparity and distance, not several")
+        if alpha is not None:
+            return refocusing.disparity_of_alpha(alpha)
+        if distance_m is not None:
+            return self.metres().disparity(distance_m, self.stack)
+        return 0.0 if disparity is None else disparity
+
+    def metres(self) -> Ranging:
+        """`ranging`, or OpenError with what to do."""
+        if self.ranging is None:
+            raise OpenError(
+                f"{self.path or 'the light field'} has no distances: calibrate with targets "
+                "(dappled calibrate --target METRES), or say where the lens was focused (--focus METRES, or inf)"
+            )
+        return self.ranging
+
+    def refocus(
+        self,
+        *,
+        alpha: float | None = None,
+        disparity: float | None = None,
+        distance_m: float | None = None,
+        aperture: float | None = None,
+        tilt: tuple[float, float] = (0.0, 0.0),
+    ) -> NDArray[np.float32]:
+        """The picture focused at one α (Eq 29), disparity or distance; none of them: as it was taken.
+
+        `aperture` is the diameter of a round synthetic aperture as a share of the whole; `tilt` the change of
+        disparity over the picture's height and width. float32 (h, w) or (h, w, 3), NaN where no view sees.
+        """
+        at = self.disparity_of(alpha=alpha, disparity=disparity, distance_m=distance_m)
+        if any(tilt):
+            return refocusing.tilted(self.stack, FocalPlane(at, *tilt), workers=self.workers)
+        weights = None if aperture is None else refocusing.disc(self.stack, aperture)
+        return refocusing.shift_and_add(self.stack, at, weights=weights, workers=self.workers)
+
+    def depth(
+        self, method: str = "combined", *, between: tuple[float, float] | None = None, window: int = depths.WINDOW
+    ) -> DepthMap:
+        """Disparities with standard errors and confidence, NaN where unknown; `method` one of `depth.METHODS`."""
+        return depths.estimate(self.evidence, method, between=between, window=window, workers=self.workers)
+
+    def distances(self, depth: DepthMap) -> DistanceMap:
+        """A depth map in metres with standard errors. Raises OpenError where no calibration leads to metres."""
+        return self.metres().distances(depth, self.stack)
+
+    def eyes(self, *, separation: float = 0.6, disparity: float = 0.0) -> StereoPair:
+        """A virtual stereo pair that converges on a disparity."""
+        return eyes(self.stack, separation=separation, disparity=disparity, workers=self.workers)
+
+    def save(self, path: Path | str, *, overwrite: bool = False) -> None:
+        """Write it as .zarr, .npz or .h5."""
+        lightfiles.save(Path(path), self.field, overwrite=overwrite)
+
+
+@dataclass(frozen=True)
+class OpenedFrame:
+    """A raw frame: `light_field` decodes it, once. `tag` says when and where it was taken, where a flight knows."""
+
+    path: Path
+    darkroom: Darkroom
+    tag: Tag | None = None
+    index: int | None = None
+
+    @cached_property
+    def light_field(self) -> OpenedLightField:
+        """The decoded frame. Raises DappledError."""
+        length, stop = (None, None) if self.tag is None else (self.tag.focal_length_mm, self.tag.f_number)
+        made = self.darkroom.develop(self.path, focal_length_mm=length, f_number=stop)
+        return OpenedLightField(made.light_field, self.path)
+
+    @property
+    def views(self) -> NDArray[np.float32]:
+        """The light field's views."""
+        return self.light_field.views
+
+    def refocus(self, **at: Any) -> NDArray[np.float32]:
+        """As `OpenedLightField.refocus`."""
+        return self.light_field.refocus(**at)
+
+    def depth(self, method: str = "combined", **options: Any) -> DepthMap:
+        """As `OpenedLightField.depth`."""
+        return self.light_field.depth(method, **options)
+
+
+@dataclass(frozen=True)
+class OpenedFlight:
+    """A recorded flight: a sequence of its safe frames, decoded by its own recipe when they are looked at."""
+
+    path: Path
+    record: summary.Flight
+    darkroom: Darkroom | None
+
+    def __len__(self) -> int:
+        return sum(line.frame is not None for line in self.record.lines)
+
+    def __iter__(self) -> Iterator[OpenedFrame]:
+        return (self._frame(line) for line in self.record.lines if line.frame is not None)
+
+    def __getitem__(self, index: int) -> OpenedFrame:
+        """The frame of an image index. Raises KeyError."""
+        for line in self.record.lines:
+            if line.frame is not None and line.frame.index == index:
+                return self._frame(line)
+        raise KeyError(index)
+
+    def _frame(self, line: summary.Line) -> OpenedFrame:
+        if self.darkroom is None:
+            raise OpenError(f"{self.path} was recorded without a mask: name one, as in dappled.open(path, mask=…)")
+        assert line.frame is not None
+        return OpenedFrame(self.path / line.frame.name, self.darkroom, line.tag, line.frame.index)
+
+
+Opened = OpenedLightField | OpenedFrame | OpenedFlight
+
+
+def open(path: str | Path, *, focus_m: float | None = None, **recipe: Any) -> Opened:
+    """What a path holds: a light field (.zarr, .npz, .h5, or a folder of n × n pictures), a flight, or a raw frame.
+
+    `focus_m` is where a light field's lens was focused. `recipe` says how frames are decoded: `camera`, `mask`, `law`,
+    `calibration`, `white`, `dark`, `colour` … as `Recipe`; a flight has its own, on top of which these are laid.
+    Raises DappledError.
+    """
+    found = Path(path).expanduser()
+    if not found.exists():
+        raise OpenError(f"there is no {found}; check the path")
+    if found.suffix in _LIGHT_FIELDS:
+        return OpenedLightField(lightfiles.load(found), found, focus_m)
+    if not found.is_dir():
+        return OpenedFrame(found, Darkroom(_recipe(Recipe("auto", "", workers=2), recipe, found)))
+    if layout.FlightFolder(found).ledger.exists():
+        record = summary.show(found)
+        own = kept_recipe.of_flight(found, record.settings, recipe)
+        return OpenedFlight(found, record, None if own is None else Darkroom(own))
+    return OpenedLightField(viewfolders.read(found), found, focus_m)
+
+
+def light_field(path: str | Path, *, focus_m: float | None = None) -> OpenedLightField:
+    """`open`, for a light field only. Raises DappledError."""
+    here = Path(path).expanduser()
+    raw = here.is_file() and here.suffix not in _LIGHT_FIELDS
+    found = None if raw else open(here, focus_m=focus_m)
+    if not isinstance(found, OpenedLightField):
+        raise OpenError(f"{path} is no light field: decode it first (dappled decode), or name a .zarr, .npz or .h5")
+    return found
+
+
+def lens_ranging(field: LightField, focus_m: float) -> Ranging | None:
+    """Eq 5 by what a light field says of its camera: focal length, f-number and the profile's pixels; None where it
+    doesn't."""
+    said = field.attributes
+    length, stop, camera = said.get("focal_length_mm"), said.get("f_number"), said.get("camera")
+    if not (length and stop and camera and said.get("shape")) or said.get("lenslet_pitch_px"):
+        return None
+    try:
+        rows, columns = said["shape"]
+        sensor = profiles.camera(str(camera)).sensor((int(rows), int(columns)))
+    except DappledError:
+        return None  # a camera that no profile knows: relative depth only
+    return Ranging.of_lens(float(length), float(stop), math.hypot(*sensor.column_mm), focus_m)
+
+
+def with_ranging(field: LightField, ranging: Ranging) -> LightField:
+    """The light field with its way to metres among its attributes."""
+    return replace(field, attributes={**field.attributes, RANGING: ranging.to_dict()})
+
+
+def _recipe(plain: Recipe, given: Mapping[str, Any], path: Path) -> Recipe:
+    try:
+        made = replace(plain, **given)
+    except TypeError as error:
+        raise OpenError(f"{path} can't be opened so: {error}") from None
+    if not made.mask:
+        raise OpenError(f"{path} is a raw frame: say how to decode it, as in dappled.open(path, mask='mask-2')")
+    return made
+
+
+__all__ = ["DecodeError", "Opened", "OpenedFlight", "OpenedFrame", "OpenedLightField", "light_field", "open"]

@@ -1,0 +1,112 @@
+"""Pictures for the eye: tone, mosaics with captions, and false colours with a scale."""
+
+from __future__ import annotations
+
+import math
+import secrets
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from dappled.errors import DappledError
+
+Bytes = NDArray[np.uint8]
+_GAP = 6  # px between the pictures of a mosaic
+_PAPER = 255
+# Viridis (S. van der Walt and N. Smith), every ninth part.
+_VIRIDIS = np.array(
+    [
+        (68, 1, 84), (72, 40, 120), (62, 74, 137), (49, 104, 142), (38, 130, 142),
+        (31, 158, 137), (53, 183, 121), (109, 205, 89), (180, 222, 44), (253, 231, 37),
+    ],
+    dtype=np.float64,
+)  # fmt: skip
+_UNKNOWN = (150, 150, 150)
+
+
+class PrintError(DappledError):
+    """A picture can't be written; one sentence."""
+
+
+def white_of(pictures: Sequence[NDArray[np.floating]]) -> float:
+    """The brightness that becomes white in all of them: what all but the brightest 0.5 % are below."""
+    values = np.concatenate([np.ravel(p)[:: max(1, p.size // 200_000)] for p in pictures])
+    values = values[np.isfinite(values)]
+    return max(float(np.quantile(values, 0.995)), 1e-9) if values.size else 1.0
+
+
+def toned(picture: NDArray[np.floating], white: float) -> Bytes:
+    """uint8 of a linear picture with the sRGB curve; NaN is black."""
+    linear = np.clip(np.nan_to_num(picture) / white, 0, 1)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    made: Bytes = np.rint(255 * encoded).astype(np.uint8)
+    return made
+
+
+def coloured(values: NDArray[np.floating], low: float, high: float) -> Bytes:
+    """uint8 (h, w, 3): viridis from `low` (dark) to `high` (bright), grey where unknown."""
+    share = np.clip((np.nan_to_num(values) - low) / max(high - low, 1e-12), 0, 1) * (len(_VIRIDIS) - 1)
+    at = np.arange(len(_VIRIDIS))
+    made = np.stack([np.interp(share, at, _VIRIDIS[:, c]) for c in range(3)], axis=-1)
+    made[~np.isfinite(values)] = _UNKNOWN
+    colours: Bytes = np.rint(made).astype(np.uint8)
+    return colours
+
+
+def with_scale(values: NDArray[np.floating], low: float, high: float, unit: str) -> Bytes:
+    """`coloured` with a scale below it that names both ends and says what grey means."""
+    picture = coloured(values, low, high)
+    width = picture.shape[1]
+    size = max(11, min(22, width // 28))
+    strip = Image.new("RGB", (width, 2 * size + 10), (_PAPER,) * 3)
+    bar = coloured(
+        np.broadcast_to(np.linspace(low, high, max(width - 2 * size, 2)), (size, max(width - 2 * size, 2))), low, high
+    )
+    strip.paste(Image.fromarray(bar), (size, 4))
+    draw, font = ImageDraw.Draw(strip), ImageFont.load_default(size - 2)
+    y = size + 6
+    draw.text((size, y), f"{low:.3g} {unit}", fill=0, font=font)
+    draw.text((width - size, y), f"{high:.3g} {unit}", fill=0, font=font, anchor="ra")
+    if not np.isfinite(values).all():
+        draw.text((width // 2, y), "grey: unknown", fill=(110, 110, 110), font=font, anchor="ma")
+    return np.concatenate([picture, np.asarray(strip)], axis=0)
+
+
+def mosaic(pictures: Sequence[Bytes], captions: Sequence[str] = (), columns: int | None = None) -> Bytes:
+    """Pictures of one size side by side in rows of `columns` (None: as square as may be), captions below."""
+    if not pictures:
+        raise PrintError("there is no picture to show")
+    coloured_ones = [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in pictures]
+    height, width = coloured_ones[0].shape[:2]
+    across = columns or math.ceil(math.sqrt(len(pictures)))
+    down = math.ceil(len(pictures) / across)
+    size = max(11, min(24, width // 16))
+    below = size + 8 if captions else 0
+    sheet = Image.new(
+        "RGB", (across * (width + _GAP) + _GAP, down * (height + below + _GAP) + _GAP), (_PAPER, _PAPER, _PAPER)
+    )
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size)
+    for number, picture in enumerate(coloured_ones):
+        left = _GAP + number % across * (width + _GAP)
+        top = _GAP + number // across * (height + below + _GAP)
+        sheet.paste(Image.fromarray(np.ascontiguousarray(picture)), (left, top))
+        if captions:
+            draw.text((left + width // 2, top + height + 3), captions[number], fill=0, font=font, anchor="ma")
+    return np.asarray(sheet)
+
+
+def save(path: Path, picture: Bytes | NDArray[np.uint16]) -> None:
+    """Write a PNG, JPEG or TIFF under its name, whole or not at all. Raises PrintError."""
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
+        raise PrintError(f"{path}: a picture is written as .png, .jpg or .tif; name it so")
+    part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
+    try:
+        Image.fromarray(np.ascontiguousarray(picture)).save(part)
+        part.replace(path)
+    except OSError as error:
+        raise PrintError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
+    finally:
+        part.unlink(missing_ok=True)

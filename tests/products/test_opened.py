@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import dappled
+from dappled.decode.errors import DecodeError
+from dappled.decode.ranging import Ranging
+from dappled.errors import DappledError
+from dappled.products import lightfiles, opened
+from dappled.products.opened import OpenedLightField, OpenError
+from tests.products.fields import DISPARITY, light_field
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    lightfiles.save(tmp_path / "a.npz", light_field())
+    return tmp_path / "a.npz"
+
+
+def test_a_light_field_is_opened_refocused_and_measured(path: Path) -> None:
+    found = dappled.open(path)
+    assert isinstance(found, OpenedLightField)
+    assert found.views.shape == (5, 5, 60, 80)
+    assert found.slices.shape == (3, 60, 80)
+    assert found.attributes["camera"] == "reference-36mm"
+    middle = found.views[2, 2]
+    inner = (slice(6, -6), slice(6, -6))
+    sharp, as_taken = found.refocus(disparity=DISPARITY), found.refocus()
+    assert np.abs(sharp - middle)[inner].max() < np.abs(as_taken - middle)[inner].max() / 3
+    np.testing.assert_allclose(found.refocus(alpha=1 / (1 + DISPARITY)), sharp, atol=1e-5)
+    np.testing.assert_allclose(found.refocus(disparity=DISPARITY, aperture=0.1), middle, atol=1e-6)
+    depth = found.depth()
+    assert np.nanmedian(depth.disparity) == pytest.approx(DISPARITY, abs=0.01)
+    assert found.eyes().left.shape == (60, 80)
+
+
+def test_metres_need_a_calibration_or_a_focus(path: Path) -> None:
+    found = opened.light_field(path)
+    assert found.ranging is None
+    with pytest.raises(OpenError, match="has no distances"):
+        found.refocus(distance_m=5.0)
+    focused = opened.light_field(path, focus_m=float("inf"))
+    assert focused.ranging is not None
+    # One view's step is a fifth of 6.757 mm, a pixel of a view 0.1 mm: Eq 5.
+    distance = 50.0 / 7.4 / 5 * 50e-3 / (DISPARITY * 0.1)
+    assert focused.disparity_of(distance_m=distance) == pytest.approx(DISPARITY, rel=1e-6)
+    made = focused.distances(focused.depth())
+    assert np.nanmedian(made.distance_m) == pytest.approx(distance, rel=0.03)
+    nearest = made.nearest_m()
+    assert nearest is not None
+    assert nearest == pytest.approx(distance, rel=0.1)
+
+
+def test_a_kept_ranging_follows_the_f_number() -> None:
+    lens = Ranging(40.0, -1.0, f_number=7.4)
+    found = OpenedLightField(opened.with_ranging(light_field(f_number=14.8), lens))
+    assert found.ranging is not None
+    assert found.ranging.gain_px_m == pytest.approx(20.0)
+
+
+@pytest.mark.parametrize("change", [{"camera": "nobody's"}, {"f_number": None}, {"lenslet_pitch_px": [10, 10]}])
+def test_a_camera_that_is_not_known_has_relative_depth_only(change: dict[str, Any]) -> None:
+    assert opened.lens_ranging(light_field(**change), float("inf")) is None
+
+
+@pytest.mark.parametrize("ending", ["png", "tif"])
+def test_a_folder_of_pictures_is_a_light_field(tmp_path: Path, ending: str) -> None:
+    field = light_field(n=3)
+    for v in range(3):
+        for u in range(3):  # cameras: further right, near things are further left
+            picture = np.rint(65535 * field.views[2 - v, 2 - u]).astype(np.uint16)
+            Image.fromarray(picture if ending == "tif" else (picture >> 8).astype(np.uint8)).save(
+                tmp_path / f"v{v}_{u}.{ending}"
+            )
+    found = dappled.open(tmp_path)
+    assert isinstance(found, OpenedLightField)
+    assert found.slices.shape[0] == 0
+    assert np.nanmedian(found.depth().disparity) == pytest.approx(DISPARITY, abs=0.02)
+    with pytest.raises(DappledError, match="has no distances"):
+        found.metres()
+
+
+def test_what_cannot_be_opened_is_told(tmp_path: Path, path: Path) -> None:
+    (tmp_path / "frame.cr2").write_bytes(b"raw")
+    (tmp_path / "empty").mkdir()
+    for act, words in (
+        (lambda: dappled.open(tmp_path / "gone"), "there is no"),
+        (lambda: dappled.open(tmp_path / "frame.cr2"), "say how to decode it"),
+        (lambda: dappled.open(tmp_path / "frame.cr2", mesh="mask-2"), "can't be opened so"),
+        (lambda: dappled.open(tmp_path / "empty"), "holds 0 pictures"),
+        (lambda: opened.light_field(path).refocus(alpha=1, disparity=2), "give one of"),
+    ):
+        with pytest.raises(OpenError if "pictures" not in words else DappledError, match=words):
+            act()
+    with pytest.raises(OpenError, match="is no light field"):
+        opened.light_field(_frame(tmp_path))
+    with pytest.raises(AttributeError, match="no attribute 'close'"):
+        dappled.close  # type: ignore[attr-defined]  # noqa: B018  it isn't there
+
+
+def _frame(folder: Path) -> Path:
+    """A file that is opened as a raw frame by a light field's door."""
+    (folder / "b.dng").write_bytes(b"raw")
+    return folder / "b.dng"
+
+
+def test_one_view_has_no_depth() -> None:
+    with pytest.raises(DecodeError, match="depth needs views from several places"):
+        OpenedLightField(light_field(n=1)).depth()
