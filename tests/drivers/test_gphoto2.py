@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -587,3 +588,24 @@ def test_a_body_that_comes_back_under_another_address_is_found() -> None:
             _ended(until_shot_ends(camera, 1))
         finally:
             camera.stop()
+
+
+def test_a_silent_body_on_usb_has_its_port_reset(body: Body) -> None:
+    resets: list[str] = []
+    settings = parse_settings({"port": body.port, "timeouts": {"answer_s": 1.5}})
+    camera = GPhoto2Camera(settings, reset=resets.append)
+    camera.start()
+    try:
+        until_state(camera, "ready")
+        assert camera.identity is not None
+        camera._identity = replace(camera.identity, port="usb:001,005")  # as if it were there
+        body.fault("silence")
+        camera.fire(1)
+        failed = until_shot_ends(camera, 1)[-1]
+        assert isinstance(failed, ShotFailed)
+        assert "port reset" in failed.reason
+        assert resets == ["usb:001,005"]
+        body.fault("clear")
+        until_state(camera, "ready")
+    finally:
+        camera.stop()

@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
+from dappled.drivers import usb_bus
 from dappled.drivers.attribution import Claim
 from dappled.drivers.budget import RestartBudget
 from dappled.drivers.camera import (
@@ -82,10 +83,12 @@ class GPhoto2Camera:
         spawn: Spawn = spawn_process,
         clock_ns: Callable[[], int] = time.monotonic_ns,
         budget: RestartBudget | None = None,
+        reset: Callable[[str], None] = usb_bus.reset,
     ) -> None:
         self._settings = settings
         self._spawn = spawn
         self._clock_ns = clock_ns
+        self._reset = reset
         self._budget = budget or RestartBudget(limit=5, window_s=60.0)
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._stopping = threading.Event()
@@ -210,12 +213,26 @@ class GPhoto2Camera:
                         self._pass_on(message_event(message))
                 elif now_ns - heard_ns > answer_s * 1e9:
                     process.kill()
-                    return f"the camera's process did not answer for {answer_s:g} s and was killed; it starts again"
+                    process.wait()
+                    done = self._reset_port()
+                    return (
+                        f"the camera's process did not answer for {answer_s:g} s and was killed{done}; it starts again"
+                    )
                 if now_ns - asked_ns > _PING_S * 1e9:
                     asked_ns = now_ns
                     channel.send({"do": "ping"})
         except ChannelError as error:
             return f"the camera's process ended unexpectedly ({error}); it starts again"
+
+    def _reset_port(self) -> str:
+        """A body that went silent on USB is reset, as if its cable had been pulled; what is to be said of it."""
+        if self._identity is None or not self._identity.port.startswith("usb:"):
+            return ""
+        try:
+            self._reset(self._identity.port)
+        except CameraError as error:
+            return f" ({error})"
+        return ", the camera's USB port reset"
 
     def _pass_on(self, event: Event) -> None:
         if isinstance(event, Fired):

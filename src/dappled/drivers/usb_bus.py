@@ -1,0 +1,135 @@
+"""Who is on the USB bus, by PyUSB: cameras in their modes, who may open them, who holds them, and how to reset one."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import usb.core
+import usb.util
+
+from dappled.drivers.camera import CameraError
+
+Mode = Literal["PTP", "mass storage", "other"]
+
+CANON, FUJIFILM = 0x04A9, 0x04CB
+MAKERS = {CANON: "Canon", FUJIFILM: "Fujifilm", 0x04B0: "Nikon", 0x054C: "Sony", 0x07B4: "Olympus", 0x04DA: "Panasonic"}
+_STILL_IMAGE, _MASS_STORAGE = 0x06, 0x08  # USB class codes; a still image device speaks PTP
+_NO_LIBUSB = "no libusb is on this machine: install libusb-1.0-0 (Debian, Ubuntu) or libusb1 (Fedora)"
+
+
+class UsbError(CameraError):
+    """The bus can't be looked at, or a device can't be reset; one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class UsbBody:
+    """A camera on the bus. `name` is what it calls itself, "" where this user may not ask it."""
+
+    bus: int
+    address: int
+    vendor: int
+    product: int
+    mode: Mode
+    name: str = ""
+
+    @property
+    def port(self) -> str:
+        """As libgphoto2 names it."""
+        return f"usb:{self.bus:03d},{self.address:03d}"
+
+    @property
+    def maker(self) -> str:
+        """By the vendor number."""
+        return MAKERS.get(self.vendor, f"vendor {self.vendor:04x}")
+
+    @property
+    def fires(self) -> bool:
+        """Whether USB can fire it: no Fujifilm of the thesis' time, and nothing that is a disk at the moment."""
+        return self.mode == "PTP" and self.vendor != FUJIFILM
+
+    def node(self, dev: Path = Path("/dev/bus/usb")) -> Path:
+        """Its device file."""
+        return dev / f"{self.bus:03d}" / f"{self.address:03d}"
+
+
+def bodies(backend: Any = None) -> list[UsbBody]:
+    """All cameras on the bus, in the order of their addresses. Raises UsbError without a libusb.
+
+    `backend` is PyUSB's; None: the libusb of this machine.
+    """
+    found = (_body(device) for device in _devices(backend))
+    return sorted((body for body in found if body is not None), key=lambda body: (body.bus, body.address))
+
+
+def changes(before: Iterable[UsbBody], after: Iterable[UsbBody]) -> tuple[list[UsbBody], list[UsbBody]]:
+    """Who came and who went between two looks. A body that was plugged in again has another address: it did both."""
+    was, now = set(before), set(after)
+    return sorted(now - was, key=lambda body: body.port), sorted(was - now, key=lambda body: body.port)
+
+
+def reset(port: str, backend: Any = None) -> None:
+    """Reset the device at a libgphoto2 port ("usb:001,005"), as if its cable had been pulled. Raises UsbError."""
+    match = re.fullmatch(r"usb:(\d+),(\d+)", port)
+    if match is None:
+        raise UsbError(f"{port!r} names no device on USB, as usb:001,005 does")
+    bus, address = int(match[1]), int(match[2])
+    for device in _devices(backend):
+        if (device.bus, device.address) == (bus, address):
+            try:
+                device.reset()
+            except (usb.core.USBError, NotImplementedError) as error:
+                raise UsbError(f"the device at {port} can't be reset ({error}): pull its cable") from None
+            finally:
+                usb.util.dispose_resources(device)
+            return
+    raise UsbError(f"no device is at {port} any more")
+
+
+def holders(node: Path, proc: Path = Path("/proc")) -> list[str]:
+    """Programs that have a device file open, as "name (process 123)", as far as this user may see them."""
+    found = []
+    for process in proc.iterdir():
+        if process.name.isdigit() and process.name != str(os.getpid()):
+            try:
+                open_files = {os.readlink(link) for link in (process / "fd").iterdir()}
+                if str(node) in open_files:
+                    found.append(f"{(process / 'comm').read_text().strip()} (process {process.name})")
+            except OSError:
+                continue  # another user's, or gone
+    return sorted(found)
+
+
+def _devices(backend: Any) -> Iterator[Any]:
+    try:
+        yield from usb.core.find(find_all=True, backend=backend)
+    except usb.core.NoBackendError:
+        raise UsbError(_NO_LIBUSB) from None
+    except usb.core.USBError as error:
+        raise UsbError(f"the USB bus can't be looked at ({error})") from None
+
+
+def _body(device: Any) -> UsbBody | None:
+    """The device as a camera; None for hubs, mice and disks of others."""
+    try:
+        classes = {interface.bInterfaceClass for configuration in device for interface in configuration}
+    except usb.core.USBError:
+        classes = set()
+    camera = _STILL_IMAGE in classes
+    if not camera and device.idVendor not in MAKERS:
+        return None
+    mode: Mode = "PTP" if camera else "mass storage" if _MASS_STORAGE in classes else "other"
+    return UsbBody(device.bus, device.address, device.idVendor, device.idProduct, mode, _name(device))
+
+
+def _name(device: Any) -> str:
+    try:
+        return str(device.product or "").strip()
+    except (usb.core.USBError, ValueError, NotImplementedError):
+        return ""  # not ours to ask, or it has none
+    finally:
+        usb.util.dispose_resources(device)
