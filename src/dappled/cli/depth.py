@@ -1,0 +1,157 @@
+"""`dappled depth`: disparities, and distances where a calibration allows, each with its uncertainty."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.cli import fields
+from dappled.decode import depth as depths
+from dappled.decode.depthmap import DepthMap
+from dappled.decode.ranging import DistanceMap
+from dappled.products import exports, photographs, pointcloud, prints
+from dappled.products.opened import OpenedLightField, OpenError
+from dappled.products.photographs import Mounting
+
+_POINTS = (".ply", ".las", ".laz")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "examples:\n  dappled depth frame.zarr -o depth.png\n"
+        "  dappled depth frame.zarr --focus inf -o depth.npz points.ply\n"
+        "  dappled depth frame.zarr --calibration c.toml --flight FLIGHT --frame 42 -o points.las\n"
+        "OUT: .png (false colours), .npz (all of it), .pfm (disparity), .ply, .las, .laz (points)."
+    )
+    fields.add_field(parser)
+    parser.add_argument("--method", choices=tuple(depths.METHODS), default="combined",
+                        help="combined (default), contrast, gradient or stereo")  # fmt: skip
+    fields.add_between(parser)
+    parser.add_argument("--window", type=int, default=depths.WINDOW, metavar="PX",
+                        help=f"side of what a pixel is judged by (default: {depths.WINDOW})")  # fmt: skip
+    parser.add_argument("--most-sigma", type=float, default=0.1, metavar="SHARE",
+                        help="withhold points with a σ above this share of their distance (default: 0.1)")  # fmt: skip
+    parser.add_argument("--flight", type=Path, metavar="FLIGHT", help="with --frame: points on the map, by its pose")
+    parser.add_argument("--frame", type=int, metavar="N", help="which frame of the flight this is")
+    parser.add_argument("--crs", default="", metavar="EPSG:N", help="projection of the points (default: the UTM zone)")
+    parser.add_argument("-o", "--output", nargs="+", type=Path, default=[], metavar="OUT", help="files to write")
+    parser.add_argument("--json", action="store_true", help="the summary as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    found = fields.opened_field(arguments)
+    between = None if arguments.between is None else (arguments.between[0], arguments.between[1])
+    made = found.depth(arguments.method, between=between, window=arguments.window)
+    distances = found.distances(made) if found.ranging is not None else None
+    told: dict[str, Any] = summary(found, made, distances)
+    for path in arguments.output:
+        told.setdefault("written", []).append(str(path))
+        told |= _write(path, found, made, distances, arguments)
+    print(json.dumps(told) if arguments.json else words(told))
+    return 0
+
+
+def summary(found: OpenedLightField, made: DepthMap, distances: DistanceMap | None) -> dict[str, Any]:
+    """What a depth map says in a few numbers; None where nothing is known."""
+    told: dict[str, Any] = {
+        "method": made.method,
+        "known": made.known_share(),
+        "disparity_px": _quartiles(made.disparity),
+        "sigma_px": _quartiles(made.sigma),
+        "distances_from": None if found.ranging is None else found.ranging.source,
+    }
+    if distances is not None:
+        told["distance_known"] = float(np.isfinite(distances.distance_m).mean())
+        told["distance_m"] = _quartiles(distances.distance_m)
+        told["distance_sigma_m"] = _quartiles(distances.sigma_m)
+        told["nearest_m"] = distances.nearest_m()
+    return told
+
+
+def words(told: dict[str, Any]) -> str:
+    """The summary as lines."""
+
+    def three(values: list[float] | None, unit: str) -> str:
+        return "unknown" if values is None else " / ".join(f"{v:.3g}" for v in values) + f" {unit}"
+
+    lines = [
+        f"{told['method']}: {told['known']:.0%} of the pixels known",
+        f"disparity (quartiles): {three(told['disparity_px'], 'px/view')}, σ {three(told['sigma_px'], 'px/view')}",
+    ]
+    if "distance_m" in told:
+        lines.append(
+            f"distance (quartiles): {three(told['distance_m'], 'm')}, σ {three(told['distance_sigma_m'], 'm')}, "
+            f"{told['distance_known']:.0%} known; by {told['distances_from']}"
+        )
+    else:
+        lines.append("relative depth only: metres need --focus, or a calibration with targets (--calibration)")
+    if "withheld" in told:
+        lines.append(f"{told['points']} points, {told['withheld']} withheld for their σ ({told['coordinates']})")
+    lines += [f"written: {path}" for path in told.get("written", [])]
+    return "\n".join(lines)
+
+
+def _write(
+    path: Path,
+    found: OpenedLightField,
+    made: DepthMap,
+    distances: DistanceMap | None,
+    arguments: argparse.Namespace,
+) -> dict[str, Any]:
+    kind = path.suffix.lower()
+    if kind == ".npz":
+        arrays: dict[str, NDArray[Any]] = {
+            "disparity": made.disparity, "sigma": made.sigma, "confidence": made.confidence,
+        }  # fmt: skip
+        if distances is not None:
+            arrays |= {"distance_m": distances.distance_m, "distance_sigma_m": distances.sigma_m}
+        np.savez_compressed(path, allow_pickle=False, **arrays)
+    elif kind == ".pfm":
+        exports.write_pfm(path, made.disparity)
+    elif kind in _POINTS:
+        return _points(path, found, distances, arguments)
+    elif distances is not None:
+        prints.save(path, _picture(distances.distance_m, "m"))
+    else:
+        prints.save(path, _picture(made.disparity, "px/view"))
+    return {}
+
+
+def _points(
+    path: Path, found: OpenedLightField, distances: DistanceMap | None, arguments: argparse.Namespace
+) -> dict[str, Any]:
+    if distances is None:
+        found.metres()  # says what is missing
+        raise OpenError("points need distances")
+    station = None
+    if arguments.flight is not None:
+        if arguments.frame is None:
+            raise OpenError("--flight needs --frame N: which of its frames this is")
+        frames, tags = photographs.recorded(arguments.flight)
+        chosen = next((f for f in frames if f.index == arguments.frame), None)
+        if chosen is None:
+            raise OpenError(f"{arguments.flight} has no frame {arguments.frame}")
+        station = photographs.station(chosen, tags.get(chosen.index), Mounting())
+    cloud = pointcloud.of(
+        found.field, found.refocus(), distances, most_sigma=arguments.most_sigma, station=station, crs=arguments.crs
+    )
+    pointcloud.write(path, cloud)
+    return {"points": len(cloud.points), "withheld": cloud.withheld, "coordinates": cloud.crs or "camera axes"}
+
+
+def _picture(values: NDArray[np.float32], unit: str) -> prints.Bytes:
+    known = values[np.isfinite(values)]
+    if known.size == 0:
+        raise OpenError("no pixel is known: there is nothing to draw (is the scene without texture?)")
+    low, high = (float(x) for x in np.quantile(known, [0.01, 0.99]))
+    return prints.with_scale(values, low, high, unit)
+
+
+def _quartiles(values: NDArray[np.float32]) -> list[float] | None:
+    known = values[np.isfinite(values)]
+    return None if known.size == 0 else [float(x) for x in np.quantile(known, [0.25, 0.5, 0.75])]

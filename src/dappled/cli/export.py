@@ -1,0 +1,59 @@
+"""`dappled export`: light fields in the forms that other tools read."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from dappled.cli import fields
+from dappled.products import exports, lightfiles, rerun_log
+from dappled.products.opened import OpenedLightField
+
+KINDS = {
+    "hci": "HCI benchmark folder: a PNG a view, parameters.cfg; with --depth also disp_estimate.pfm",
+    "eslf": "ESLF: one 16-bit PNG, a lenslet a pixel; its size beside it in a .txt",
+    "mat": "MATLAB v5 as LFToolbox has it: LF [t, s, v, u, c]",
+    "quilt": "quilt PNG for light-field displays; its name tells columns, rows and aspect",
+    "h5": "HDF5: slices, views and all", "npz": "NumPy", "zarr": "Zarr",
+    "rerun": "Rerun recording (.rrd): views, picture, depth",
+}  # fmt: skip
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    lines = "\n".join(f"  {name:6} {what}" for name, what in KINDS.items())
+    parser.epilog = f"forms:\n{lines}\nexample: dappled export frame.zarr --as hci -o hci/frame"
+    fields.add_field(parser)
+    parser.add_argument("--as", dest="kind", choices=tuple(KINDS), required=True, help="the form")
+    parser.add_argument("--depth", action="store_true", help="hci, rerun: with a depth map (combined)")
+    parser.add_argument("--lenslet", type=int, default=0, metavar="PX",
+                        help=f"eslf: side of a lenslet (LFToolbox: {exports.ESLF_LENSLET_PX})")  # fmt: skip
+    parser.add_argument("--disparity", type=float, default=0.0, metavar="D", help="quilt: what lies in the screen")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="file or folder to write")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    found = fields.opened_field(arguments)
+    print(write(found, arguments.kind, arguments.output, arguments))
+    return 0
+
+
+def write(found: OpenedLightField, kind: str, path: Path, arguments: argparse.Namespace) -> Path:
+    """The path that was written. Raises DappledError."""
+    match kind:
+        case "hci":
+            exports.hci(path, found.field, found.depth() if arguments.depth else None)
+        case "eslf":
+            exports.eslf(path, found.field, arguments.lenslet)
+        case "mat":
+            exports.mat(path, found.field)
+        case "quilt":
+            return exports.quilt(path, found.field, disparity=arguments.disparity)
+        case "rerun":
+            depth = found.depth() if arguments.depth else None
+            distances = found.distances(depth) if depth is not None and found.ranging is not None else None
+            rerun_log.write(path, found.field, found.refocus(), depth, distances)
+        case _:
+            if path.suffix != f".{kind}":
+                raise exports.ExportError(f"{path}: --as {kind} writes a .{kind} file; name it so")
+            lightfiles.save(path, found.field)
+    return path

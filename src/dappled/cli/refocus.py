@@ -1,0 +1,131 @@
+"""`dappled refocus`: pictures focused anew (Eq 28 and 29), focal stacks, all in focus, two eyes."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.cli import fields
+from dappled.decode.focal_stack import all_in_focus, focal_stack
+from dappled.decode.fourier_refocus import Spectrum4D, difference
+from dappled.decode.refocus import magnified
+from dappled.decode.stereo_pair import anaglyph, side_by_side
+from dappled.products import prints
+from dappled.products.opened import OpenedLightField, OpenError
+
+Picture = NDArray[np.float32]
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "examples:\n  dappled refocus frame.zarr --alpha 1 0.8 1.2 2 -o four.png        # Fig 39\n"
+        "  dappled refocus frame.zarr --distance 20 --focus inf -o at-20-m.png\n"
+        "  dappled refocus frame.zarr --stack 0 0.6 9 --all-in-focus -o sharp.png\n"
+        "Several planes become one picture with captions. .npy keeps the numbers: linear, 1.0 = sensor white."
+    )
+    fields.add_field(parser)
+    where = parser.add_argument_group("focus (one of them)").add_mutually_exclusive_group()
+    where.add_argument("--alpha", nargs="+", type=float, metavar="A",
+                       help="Eq 29's α: 1 as taken, below 1 nearer, above 1 farther")  # fmt: skip
+    where.add_argument("--disparity", nargs="+", type=float, metavar="D", help="px from view to view")
+    where.add_argument("--distance", nargs="+", type=fields.metres, metavar="M", help="metres; needs distances")
+    where.add_argument("--stack", nargs=3, type=float, metavar=("FROM", "TO", "N"), help="N disparities")
+    parser.add_argument("--magnify", action="store_true",
+                        help="with --alpha: Eq 29 to the letter, where the picture grows with α")  # fmt: skip
+    parser.add_argument("--aperture", type=float, metavar="D", help="round synthetic aperture, share of the whole")
+    parser.add_argument("--tilt", nargs=2, type=float, default=(0.0, 0.0), metavar=("H", "W"),
+                        help="tilted plane: change of disparity over the picture's height and width")  # fmt: skip
+    parser.add_argument(
+        "--all-in-focus", action="store_true", help="with --stack: each pixel from its sharpest picture"
+    )
+    parser.add_argument("--index", type=Path, metavar="FILE", help="with --all-in-focus: which picture, as a picture")
+    parser.add_argument("--eyes", choices=("anaglyph", "side-by-side", "crossed"), help="what two eyes would see")
+    parser.add_argument("--fourier", action="store_true",
+                        help="by a slice of the 4D spectrum (Ng), and how far shift and add is from it")  # fmt: skip
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=".png, .jpg, .tif or .npy")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    found = fields.opened_field(arguments)
+    planes = _planes(found, arguments)
+    if arguments.all_in_focus or arguments.index:
+        made, captions = [_sharp(found, arguments)], [""]
+    elif arguments.eyes:
+        made, captions = [_eyes(found, d, arguments.eyes) for _, d in planes], [c for c, _ in planes]
+    elif arguments.fourier:
+        made, captions = _fourier(found, planes), [c for c, _ in planes]
+    else:
+        made = [
+            found.refocus(disparity=d, aperture=arguments.aperture, tilt=(arguments.tilt[0], arguments.tilt[1]))
+            for _, d in planes
+        ]
+        captions = [c for c, _ in planes]
+        if arguments.magnify:
+            if not arguments.alpha:
+                raise OpenError("--magnify goes with --alpha: it is Eq 29's x/α")
+            made = [magnified(picture, alpha) for picture, alpha in zip(made, arguments.alpha, strict=True)]
+    _write(arguments.output, made, captions)
+    return 0
+
+
+def _planes(found: OpenedLightField, arguments: argparse.Namespace) -> list[tuple[str, float]]:
+    """(caption, disparity) of each plane that was asked for."""
+    if arguments.alpha:
+        return [(f"alpha = {a:g}", found.disparity_of(alpha=a)) for a in arguments.alpha]
+    if arguments.distance:
+        return [(f"{z:g} m", found.disparity_of(distance_m=z)) for z in arguments.distance]
+    if arguments.stack:
+        low, high, count = arguments.stack
+        if count < 1 or count != round(count):
+            raise OpenError(f"--stack: {count:g} is no number of pictures")
+        return [(f"{d:.3g} px/view", float(d)) for d in np.linspace(low, high, round(count))]
+    if arguments.disparity:
+        return [(f"{d:g} px/view", d) for d in arguments.disparity]
+    return [("as taken", 0.0)]
+
+
+def _sharp(found: OpenedLightField, arguments: argparse.Namespace) -> Picture:
+    if not arguments.stack:
+        raise OpenError("--all-in-focus needs --stack FROM TO N: the planes to choose from")
+    planes = np.array([d for _, d in _planes(found, arguments)])
+    made = all_in_focus(focal_stack(found.stack, planes, workers=found.workers))
+    known = made.index >= 0
+    print(f"{known.mean():.0%} of the pixels have a sharpest picture")
+    if arguments.index:
+        disparity = np.where(known, planes[made.index], np.nan)
+        prints.save(arguments.index, prints.with_scale(disparity, float(planes[0]), float(planes[-1]), "px/view"))
+    return made.picture
+
+
+def _eyes(found: OpenedLightField, disparity: float, form: str) -> Picture:
+    pair = found.eyes(disparity=disparity)
+    return anaglyph(pair) if form == "anaglyph" else side_by_side(pair, crossed=form == "crossed")
+
+
+def _fourier(found: OpenedLightField, planes: list[tuple[str, float]]) -> list[Picture]:
+    """The pictures by Fourier slices; prints how far shift and add is from each."""
+    stack = found.stack.grey()
+    most = max(abs(d) for _, d in planes)
+    spectrum = Spectrum4D.of(stack, most_disparity=most, workers=found.workers)
+    border = min(int(most * stack.reach) + 4, min(stack.views.shape[2:4]) // 4)
+    made = []
+    for caption, disparity in planes:
+        made.append(spectrum.refocused(disparity, workers=found.workers))
+        summed = OpenedLightField(found.field, workers=found.workers).refocus(disparity=disparity)
+        summed = summed.mean(axis=2) if summed.ndim == 3 else summed
+        off = difference(summed, made[-1], border)
+        print(f"{caption}: shift and add differs by {off.psnr_db:.1f} dB (largest {off.largest:.4f} of white)")
+    return made
+
+
+def _write(path: Path, pictures: list[Picture], captions: list[str]) -> None:
+    if path.suffix == ".npy":
+        np.save(path, pictures[0] if len(pictures) == 1 else np.stack(pictures))
+    else:
+        white = prints.white_of(pictures)
+        toned = [prints.toned(p, white) for p in pictures]
+        prints.save(path, toned[0] if len(toned) == 1 else prints.mosaic(toned, captions))
+    print(f"{', '.join(c for c in captions if c) or 'one picture'}: {path}")

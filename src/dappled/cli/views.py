@@ -1,0 +1,86 @@
+"""`dappled views`: what a light field holds, as one picture: its views, its slices (Figs 37 and 43), how far each view
+has moved (Fig 57)."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from dappled.cli import fields
+from dappled.decode.depth_stereo import shifts_from_middle
+from dappled.decode.evidence import of_light_field
+from dappled.decode.pictures import slice_mosaic
+from dappled.decode.viewstack import ViewStack
+from dappled.products import prints
+from dappled.products.opened import OpenedLightField, OpenError
+
+_LONGEST = 2400  # px
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "examples:\n  dappled views frame.zarr -o views.png\n  dappled views frame.zarr --of slices -o slices.png\n"
+        "  dappled views frame.zarr --of shifts -o shifts.png"
+    )
+    fields.add_field(parser, ranged=False)
+    parser.add_argument("--of", choices=("views", "slices", "shifts", "slice-shifts"), default="views",
+                        help="views (default), slices at their carriers, or shifts: how far each view has\n"
+                        "moved from the middle; slice-shifts: the same of slices, as the thesis tried")  # fmt: skip
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="picture to write")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    found = fields.opened_field(arguments)
+    made = {"views": _views, "slices": _slices, "shifts": _shifts, "slice-shifts": _slice_shifts}[arguments.of](found)
+    prints.save(arguments.output, _small(made))
+    count_v, count_u = found.views.shape[:2]
+    print(f"{count_v} × {count_u} views of {found.views.shape[3]} × {found.views.shape[2]} px; {arguments.output}")
+    return 0
+
+
+def _views(found: OpenedLightField) -> prints.Bytes:
+    stack = found.stack
+    white = prints.white_of([stack.views])
+    pictures = [prints.toned(view, white) for line in stack.views for view in line]
+    return prints.mosaic(pictures, columns=stack.views.shape[1])
+
+
+def _slices(found: OpenedLightField) -> prints.Bytes:
+    if len(found.slices) == 0:
+        raise OpenError(f"{found.path} came as views and has no slices")
+    return slice_mosaic(found.slices, found.field.carriers, longest_side=_LONGEST)
+
+
+def _shifts(found: OpenedLightField) -> prints.Bytes:
+    # The views of a noisy masked frame shrink parallax: what is measured here is measured on those without.
+    return _coloured(shifts_from_middle(of_light_field(found.field).stack))
+
+
+def _slice_shifts(found: OpenedLightField) -> prints.Bytes:
+    if len(found.slices) == 0:
+        raise OpenError(f"{found.path} came as views and has no slices")
+    stack = found.stack
+    orders = {(int(ky), int(kx)): k for k, (ky, kx) in enumerate(found.field.carriers[:, :2])}
+    reach = max(max(abs(ky), abs(kx)) for ky, kx in orders)
+    side = 2 * reach + 1
+    images = np.zeros((side, side, *found.slices.shape[1:]), dtype=np.float32)
+    for (ky, kx), k in orders.items():
+        magnitude = np.abs(found.slices[k])
+        magnitude /= max(float(np.quantile(magnitude, 0.995)), 1e-12)
+        images[reach + ky, reach + kx] = images[reach - ky, reach - kx] = magnitude
+    steps = np.arange(side, dtype=np.float64) - reach
+    return _coloured(shifts_from_middle(ViewStack(images, steps * stack.row_steps[-1] / reach, steps)))
+
+
+def _coloured(shifts: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> prints.Bytes:
+    low, high = (float(x) for x in np.quantile(shifts, [0.01, 0.99]))
+    pictures = [prints.coloured(shift, low, high) for line in shifts for shift in line]
+    print(f"dark {low:.2f} px, bright {high:.2f} px from the middle view")
+    return prints.mosaic(pictures, columns=shifts.shape[1])
+
+
+def _small(picture: prints.Bytes) -> prints.Bytes:
+    step = max(1, -(-max(picture.shape[:2]) // _LONGEST))
+    return picture[::step, ::step]

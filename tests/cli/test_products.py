@@ -1,0 +1,137 @@
+"""`dappled views`, `refocus`, `depth` and `export` as a person calls them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dappled.cli import main
+from dappled.products import lightfiles
+from tests.products.fields import DISPARITY, light_field
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("field") / "frame.npz"
+    lightfiles.save(path, light_field())
+    return str(path)
+
+
+def size(path: Path) -> tuple[int, int]:
+    with Image.open(path) as picture:
+        return picture.size
+
+
+@pytest.mark.parametrize("of", ["views", "slices", "shifts", "slice-shifts"])
+def test_views_as_one_picture(field: str, of: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if "shifts" in of:
+        pytest.importorskip("cv2", reason="shifts need OpenCV, an extra")
+    assert main(["views", field, "--of", of, "-o", str(tmp_path / "a.png")]) == 0
+    assert size(tmp_path / "a.png")[0] > 200
+    assert "5 × 5 views of 80 × 60 px" in capsys.readouterr().out
+
+
+def test_four_alphas_become_one_picture(field: str, tmp_path: Path) -> None:
+    words = ["refocus", field, "--alpha", "1", "0.8", "1.2", "2"]
+    assert main([*words, "-o", str(tmp_path / "a.png")]) == 0
+    assert size(tmp_path / "a.png")[0] > 2 * 80
+    assert main([*words, "--magnify", "-o", str(tmp_path / "a.npy")]) == 0
+    assert np.load(tmp_path / "a.npy").shape == (4, 60, 80)
+
+
+def test_metres_focus_where_the_board_is(field: str, tmp_path: Path) -> None:
+    metres = 50.0 / 7.4 / 5 * 50e-3 / (DISPARITY * 0.1)
+    for name, words in (
+        ("metres", ["--distance", str(metres), "--focus", "inf"]),
+        ("disparity", ["--disparity", str(DISPARITY)]),
+        ("tilt", ["--disparity", str(DISPARITY), "--tilt", "0.1", "0"]),
+        ("disc", ["--disparity", str(DISPARITY), "--aperture", "0.5"]),
+    ):
+        assert main(["refocus", field, *words, "-o", str(tmp_path / f"{name}.npy")]) == 0
+    a, b, c = (np.load(tmp_path / f"{name}.npy") for name in ("metres", "disparity", "tilt"))
+    np.testing.assert_allclose(a, b, atol=1e-5)
+    assert np.nanmax(np.abs(b - c)) > 1e-3
+
+
+def test_fourier_tells_how_far_the_sum_is(field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["refocus", field, "--alpha", "0.7", "1", "--fourier", "-o", str(tmp_path / "a.png")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [float(line.split("by ")[1].split(" dB")[0]) > 35 for line in lines[:2]] == [True, True]
+
+
+def test_stack_eyes_and_all_in_focus(field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stack = ["--stack", "0", "0.8", "5"]
+    assert main(["refocus", field, *stack, "-o", str(tmp_path / "s.png")]) == 0
+    index = str(tmp_path / "i.png")
+    assert main(["refocus", field, *stack, "--all-in-focus", "--index", index, "-o", str(tmp_path / "f.npy")]) == 0
+    assert np.load(tmp_path / "f.npy").shape == (60, 80)
+    for form, wide in (("anaglyph", 80), ("side-by-side", 160), ("crossed", 160)):
+        assert main(["refocus", field, "--eyes", form, "-o", str(tmp_path / f"{form}.png")]) == 0
+        assert size(tmp_path / f"{form}.png") == (wide, 60)
+    assert "have a sharpest picture" in capsys.readouterr().out
+
+
+def test_depth_in_pixels_and_in_metres(field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["depth", field, "-o", str(tmp_path / "d.png"), str(tmp_path / "d.pfm")]) == 0
+    assert "relative depth only" in capsys.readouterr().out
+    words = ["depth", field, "--focus", "inf", "--json", "--between", "0", "1", "-o"]
+    assert main([*words, *(str(tmp_path / f"m.{kind}") for kind in ("npz", "png", "ply"))]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["disparity_px"][1] == pytest.approx(DISPARITY, abs=0.01)
+    assert told["points"] > 1000
+    assert told["coordinates"] == "camera axes"
+    with np.load(tmp_path / "m.npz") as made:
+        assert set(made) == {"disparity", "sigma", "confidence", "distance_m", "distance_sigma_m"}
+        assert float(np.nanmedian(made["distance_m"])) == pytest.approx(told["distance_m"][1])
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [("hci", "hci"), ("eslf", "e.png"), ("mat", "m.mat"), ("quilt", "q.png"), ("npz", "n.npz"), ("h5", "h.h5")],
+)
+def test_every_form_is_written(field: str, kind: str, name: str, tmp_path: Path) -> None:
+    if kind == "h5":
+        pytest.importorskip("h5py", reason="HDF5 is an extra")
+    assert main(["export", field, "--as", kind, "-o", str(tmp_path / name)]) == 0
+    assert any(tmp_path.iterdir())
+
+
+def test_a_rerun_recording_is_written_and_can_be_read(field: str, tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="an extra")
+    path = tmp_path / "a.rrd"
+    assert main(["export", field, "--as", "rerun", "--depth", "--focus", "inf", "-o", str(path)]) == 0
+    assert path.read_bytes()[:4] in (b"RRF2", b"RRIO", b"RRF3")
+    assert path.stat().st_size > 60 * 80
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["refocus", "{}", "--alpha", "0", "-o", "{out}.png"], "is no image plane"),
+        (["refocus", "{}", "--distance", "5", "-o", "{out}.png"], "has no distances"),
+        (["refocus", "{}", "--magnify", "-o", "{out}.png"], "goes with --alpha"),
+        (["refocus", "{}", "--all-in-focus", "-o", "{out}.png"], "needs --stack"),
+        (["refocus", "{}", "--stack", "0", "1", "0.5", "-o", "{out}.png"], "no number of pictures"),
+        (["refocus", "{}", "-o", "{out}.gif"], "name it so"),
+        (["depth", "{}", "-o", "{out}.ply"], "has no distances"),
+        (["depth", "{}", "--focus", "inf", "--flight", "x", "-o", "{out}.ply"], "--frame N"),
+        (["depth", "{}", "--window", "4"], "a window of 4 px"),
+        (["export", "{}", "--as", "npz", "-o", "{out}.h5"], "writes a .npz file"),
+        (["depth", "{}", "--calibration", "{toml}"], "knows no distances"),
+        (["views", "{}.gone.npz", "-o", "{out}.png"], "there is no"),
+    ],
+)
+def test_wrong_calls_are_one_sentence(
+    field: str, words: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "c.toml").write_text("law = 'fd'\n")
+    filled = [w.replace("{}", field).format(out=tmp_path / "o", toml=tmp_path / "c.toml") for w in words]
+    assert main(filled) == 1
+    sentence = capsys.readouterr().err
+    assert told in sentence
+    assert sentence.count("\n") == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["c.toml"]
