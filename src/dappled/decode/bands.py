@@ -63,21 +63,29 @@ class Bands:
     samples: tuple[int, int]
     cell: NDArray[np.float32] | None
 
-    def cut(self, spectrum: Spectrum, out: Complex, *, workers: int = 1) -> None:
-        """All slices into `out` complex64 (K, rows, columns). Raises DecodeError for columns that aren't there."""
+    def cut(
+        self, spectrum: Spectrum, out: Complex, *, workers: int = 1, beside: Sequence[Callable[[], None]] = ()
+    ) -> None:
+        """All slices into `out` complex64 (K, rows, columns), and other work that fills the workers' waiting.
+
+        Raises DecodeError for columns that aren't there.
+        """
         for band in self.bands:
             spectrum.require(band.across)
 
-        def start() -> Callable[[int], None]:
+        def start() -> Callable[[int | Callable[[], None]], None]:
             block = np.empty(self.size, dtype=np.complex64)
 
-            def slice_at(k: int) -> None:
-                self._gather(spectrum, k, block)
-                self._transform(spectrum, k, block, out[k])
+            def work(part: int | Callable[[], None]) -> None:
+                if callable(part):
+                    part()
+                else:
+                    self._gather(spectrum, part, block)
+                    self._transform(spectrum, part, block, out[part])
 
-            return slice_at
+            return work
 
-        share(start, range(len(self.bands)), workers)
+        share(start, [*range(len(self.bands)), *beside], workers)
 
     def _gather(self, spectrum: Spectrum, k: int, block: Complex) -> None:
         """The band's bins (h, w)."""

@@ -21,6 +21,7 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.lattice import fit, residual_bins
 from dappled.decode.lightfield import LightField
 from dappled.decode.masks import Mask, Order
+from dappled.decode.noise import Noise
 from dappled.decode.peaks import Measured, measure
 from dappled.decode.plan import Plans
 from dappled.decode.slices import Slices, default_size, extract
@@ -143,12 +144,14 @@ class MaskDecoder:
                 f"all carriers but the mean fall off the sensor at {focal_length_mm} mm: wrong mask, law or length?"
             )
         with self.plans.lend(self.sensor.shape) as plan:
-            reach = self._reach(predicted, focal_length_mm)
+            reach = self.largest_fx(focal_length_mm)
             spectrum = plan.spectrum(plane, workers=self.workers, largest_fx=reach)
             lattice, measured, carriers_from = self.locate(spectrum, focal_length_mm, predicted)
             used = [c for c in lattice.carriers([(c.ky, c.kx) for c in predicted]) if c.on_sensor]
-            slices = plan.cut(spectrum, used, self.slice_size(lattice), workers=self.workers)
-            noise = spectrum.noise_rms(self.workers)
+            looking = Noise(spectrum)
+            size = self.slice_size(lattice)
+            slices = plan.cut(spectrum, used, size, workers=self.workers, beside=looking.work)
+            noise = looking.rms()
         if views:
             made, offsets, views_from, told = self.views(
                 slices, lattice, carriers_from, focal_length_mm=focal_length_mm, f_number=f_number, noise_rms=noise
@@ -168,11 +171,12 @@ class MaskDecoder:
 
     def transform(self, plane: Source, focal_length_mm: float) -> Spectrum:
         """The spectrum as far out as this focal length's slices and searches need it."""
-        largest = self._reach(self.predict(focal_length_mm), focal_length_mm)
+        largest = self.largest_fx(focal_length_mm)
         return Transform(self.sensor.shape).apply(plane, workers=self.workers, largest_fx=largest)
 
-    def _reach(self, predicted: Sequence[Carrier], focal_length_mm: float) -> float:
+    def largest_fx(self, focal_length_mm: float) -> float:
         """The largest frequency along columns that slices and searches ask for, in cycles/pixel."""
+        predicted = self.predict(focal_length_mm)
         reach = max(abs(c.fx) for c in predicted) * (1 + _ROTATION)
         width = self.slice_size(self.lattice_at(focal_length_mm))[1]
         wide = padded_shape(self.sensor.shape)[1]

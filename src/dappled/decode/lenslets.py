@@ -16,6 +16,7 @@ from dappled.decode.decoder import DecodeReport, light_field, no_views
 from dappled.decode.errors import DecodeError
 from dappled.decode.lattice import FoundLattice, find_lattice
 from dappled.decode.lightfield import LightField
+from dappled.decode.noise import noise_rms
 from dappled.decode.plan import Plan, Plans
 from dappled.decode.slices import Slices, default_size
 from dappled.decode.spectrum import Spectrum
@@ -87,7 +88,7 @@ class LensletDecoder:
             spectrum = plan.spectrum(plane, workers=self.workers)
             found = self.white.found if self.white is not None else find_lattice(spectrum)
             slices = _cut(plan, spectrum, found, self.workers)
-            noise_rms = spectrum.noise_rms(self.workers)
+            noise = noise_rms(spectrum, workers=self.workers)
         if self.white is not None:
             origin = at_corner(self.white.origin, found.lattice, self.shape)
         else:
@@ -108,7 +109,7 @@ class LensletDecoder:
             used=slices.carriers,
             carriers_from="calibrated" if self.white is not None else "found",
             views_from="none" if not views else "white" if self.white is not None else "frame",
-            noise_rms=noise_rms,
+            noise_rms=noise,
         )
         facts: dict[str, Any] = {
             "law": "found",

@@ -7,7 +7,7 @@ stays a value that several threads may use; the bytes that come out are the same
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -37,9 +37,10 @@ class Plan:
         size: tuple[int, int] | None = None,
         *,
         workers: int = 1,
+        beside: Sequence[Callable[[], None]] = (),
         **choices: Any,
     ) -> Slices:
-        """As `slices.extract`; the same carriers and choices are laid out only once."""
+        """As `slices.extract`; the same carriers and choices are laid out only once. Other work is done `beside`."""
         key = tuple(carriers), size, tuple(sorted(choices.items()))
         layout = self._layouts.pop(key, None)
         if layout is None:
@@ -47,7 +48,7 @@ class Plan:
             while len(self._layouts) >= _KEPT:
                 del self._layouts[next(iter(self._layouts))]
         self._layouts[key] = layout  # the latest stand last
-        return layout.apply(spectrum, workers=workers)
+        return layout.apply(spectrum, workers=workers, beside=beside)
 
 
 class Plans:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -71,10 +71,10 @@ class SlicePlan:
     padded: tuple[int, int]
     share: float
 
-    def apply(self, spectrum: Spectrum, *, workers: int = 1) -> Slices:
-        """The slices of a spectrum."""
+    def apply(self, spectrum: Spectrum, *, workers: int = 1, beside: Sequence[Callable[[], None]] = ()) -> Slices:
+        """The slices of a spectrum; other work is done `beside`."""
         values = np.empty((len(self.carriers), *self.bands.samples), dtype=np.complex64)
-        self.bands.cut(spectrum, values, workers=workers)
+        self.bands.cut(spectrum, values, workers=workers, beside=beside)
         (high, wide), (height, width) = self.padded, self.bands.size
         grid = np.array([[high / height, 0.0, 0.0], [0.0, wide / width, 0.0]])
         return Slices(values, self.carriers, grid, self.share)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,11 +10,9 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.threads import each, spans
 
 Complex = NDArray[np.complex64]
 TILE = 32  # columns that lie together in memory: a tile of them stays in the cache while it is transformed
-_QUIET = 34  # bins on a side of a part whose noise is measured, one of its edge for the window
 
 
 def padded_shape(shape: tuple[int, int]) -> tuple[int, int]:
@@ -149,28 +146,6 @@ class Spectrum:
             target[:, head : head + whole * TILE].reshape(height, whole, TILE)[...] = between
         if tail:
             target[:, width - tail :] = self.tiles[tile + whole, lines, :tail]
-
-    def noise_rms(self, workers: int = 1) -> float:
-        """The plane's white noise (one standard deviation a pixel), from the quietest parts of the spectrum.
-
-        The median power in each of some hundred tiles (under a Hann window: edges of the frame don't leak), then the
-        tenth percentile of those: bands, carriers and colour replicas only cover some. An upper bound where every
-        tile holds signal.
-        """
-        edges = [np.array_split(np.arange(side), parts) for side, parts in ((self.padded[0], 16), (self.columns, 8))]
-        high, wide = (min(_QUIET, *(part.size for part in parts)) for parts in edges)
-        corners = [(int(rows[0]), int(columns[0])) for rows in edges[0] for columns in edges[1]]
-        middle = np.empty(len(corners))
-
-        def look(some: slice) -> None:
-            quiet = hann(np.array([self.block(*corner, high, wide) for corner in corners[some]]))
-            power = (quiet.real**2 + quiet.imag**2).reshape(len(quiet), -1)
-            middle[some] = np.partition(power, power.shape[1] // 2, axis=1)[:, power.shape[1] // 2]
-
-        each(look, spans(len(corners), 16), workers)
-        power = float(np.quantile(middle, 0.1)) / math.log(2)  # the median of an exponential is ln 2 of its mean
-        power *= (8 / 3) ** 2  # the window's mean square is 3/8 an axis
-        return float(np.sqrt(power / (self.shape[0] * self.shape[1])))
 
 
 def hann(block: Complex) -> Complex:
