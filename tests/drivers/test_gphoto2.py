@@ -597,10 +597,11 @@ def test_a_silent_body_on_usb_has_its_port_reset(body: Body) -> None:
     camera.start()
     try:
         until_state(camera, "ready")
-        assert camera.identity is not None
-        camera._identity = replace(camera.identity, port="usb:001,005")  # as if it were there
         body.fault("silence")
         camera.fire(1)
+        until_state(camera, "busy")
+        assert camera.identity is not None
+        camera._identity = replace(camera.identity, port="usb:001,005")  # as if it were there
         failed = until_shot_ends(camera, 1)[-1]
         assert isinstance(failed, ShotFailed)
         assert "port reset" in failed.reason
