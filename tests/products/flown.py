@@ -12,6 +12,7 @@ import rasterio
 import tomli_w
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from dappled.config import profiles
 from dappled.daemon.interpolation import metres_per_radian
@@ -20,18 +21,22 @@ from dappled.decode.plane import to_plane
 from dappled.drivers import rawfile
 from dappled.drivers.darkroom import Recipe
 from dappled.flight import recording
-from dappled.flight.records import Pose, Tag
+from dappled.flight.records import Pose, Quaternion, Tag
 from dappled.mocks import terrain
 from dappled.mocks.flyover import Terrain
 from dappled.mocks.masked_camera import MaskedCamera, SensorModel, Truth, reference_camera
 from dappled.mocks.path import Path as FlightPath
 from dappled.mocks.path import TruePose
 from dappled.mocks.terrain import DETAIL_TEXEL_M, EXTENT_M, TEXEL_M
+from dappled.products import camera_pose
 from tests.flight.makers import deliver, wish
 
 START_NS = 1_795_256_103_000_000_000
 CAMERA, MASK = "reference-36mm", "reference-5x5"
 F_NUMBER = 14.8
+
+
+Told = Callable[[int, TruePose], TruePose]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +73,7 @@ def fly(
     seed: int = 3,
     times_s: Sequence[float] = (1.0, 1.6, 2.2),
     path: FlightPath | None = None,
-    told: Callable[[int, TruePose], TruePose] = lambda _, pose: pose,
+    told: Told = lambda _, pose: pose,
     noise: bool = True,
 ) -> Flown:
     """Frames triggered at these times; the ledger gets the pose that `told` makes of each true one."""
@@ -117,6 +122,12 @@ def as_recorded(true: TruePose) -> Pose:
     )
 
 
+def turned(attitude: Quaternion, by: NDArray[np.float64]) -> Quaternion:
+    """An attitude turned by a small rotation matrix about body axes."""
+    x, y, z, w = (float(v) for v in Rotation.from_matrix(camera_pose.matrix_of(attitude) @ by).as_quat())
+    return w, x, y, z
+
+
 def calibration_file(folder: Path, sensor: SensorModel, seed: int) -> Path:
     """What `dappled calibrate` makes of a bench frame of the same body."""
     bench = reference_camera(seed, scale=0.5, scene="white")
@@ -146,14 +157,7 @@ def true_ground(truth: Truth, row: int, column: int) -> NDArray[np.float64]:
     rows, columns = 1388, 1844
     y = (truth.grid[0, 0] * row - (rows - 1) / 2) * 0.01 / 50.0
     x = (truth.grid[1, 1] * column - (columns - 1) / 2) * 0.01 / 50.0
-    w, a, b, c = truth.pose.attitude
-    turn = np.array(
-        [
-            [1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b)],
-            [2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a)],
-            [2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b)],
-        ]
-    )
+    turn = camera_pose.matrix_of(truth.pose.attitude)
     ned = np.array(truth.pose.position_ned_m) + turn @ np.array([-y, x, 1.0]) * float(truth.depth_m[row, column])
     return np.array([ned[0], ned[1], -ned[2]])
 

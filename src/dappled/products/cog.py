@@ -51,9 +51,7 @@ def write_pieces(
     uint8 with 2 or 4 bands is a picture whose last band is alpha; floats hold NaN where nothing is known.
     Raises MapError.
     """
-    rasterio, windows, enums, shutil = (
-        need(name) for name in ("rasterio", "rasterio.windows", "rasterio.enums", "rasterio.shutil")
-    )
+    rasterio, windows, shutil = (need(name) for name in ("rasterio", "rasterio.windows", "rasterio.shutil"))
     rows, columns = grid.shape
     profile: dict[str, Any] = {
         "driver": "GTiff",
@@ -68,7 +66,9 @@ def write_pieces(
         "blockysize": TILE,
         "bigtiff": "if_safer",
     }
-    if dtype != "uint8":
+    if dtype == "uint8":  # said at its birth: a GeoTIFF keeps what is said of bands later in a file beside it
+        profile |= {"alpha": "yes", "photometric": "rgb" if bands == 4 else "minisblack"}
+    else:
         profile["nodata"] = float("nan")
     durable.make_folder(path.parent)
     with tempfile.TemporaryDirectory(prefix=".maps-", dir=path.parent) as scratch:
@@ -78,10 +78,6 @@ def write_pieces(
                 for at_rows, at_columns, values in pieces:
                     window = windows.Window.from_slices(at_rows, at_columns)
                     target.write(np.moveaxis(values, -1, 0), window=window)
-                if dtype == "uint8" and bands in (2, 4):
-                    colours = enums.ColorInterp
-                    shown = (colours.gray,) if bands == 2 else (colours.red, colours.green, colours.blue)
-                    target.colorinterp = (*shown, colours.alpha)
                 for number, name in enumerate(names, 1):
                     target.set_band_description(number, name)
                 target.update_tags(**tags)
