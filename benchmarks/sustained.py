@@ -25,7 +25,8 @@ from dappled.daemon.books import LiveBook
 from dappled.daemon.clock import SystemClock
 from dappled.daemon.development import Developed
 from dappled.daemon.shutter import Shutter, Wish
-from dappled.daemon.street import Names, Story, Street, Watchers
+from dappled.daemon.story import Names, Story, Watchers
+from dappled.daemon.street import Street
 from dappled.daemon.tagger import BodyLatency, Exposure
 from dappled.daemon.telemetry_pose import nothing
 from dappled.drivers.camera import (

@@ -15,7 +15,8 @@ from dappled.daemon.books import LiveBook
 from dappled.daemon.clock import RecordedClock, SystemClock
 from dappled.daemon.development import Developed, DevelopmentError
 from dappled.daemon.shutter import Shutter, Verdict, Wish
-from dappled.daemon.street import Names, Story, Street, Watchers
+from dappled.daemon.story import Names, Story, Watchers
+from dappled.daemon.street import Street
 from dappled.daemon.tagger import BodyLatency
 from dappled.drivers.camera import (
     Arrival,

@@ -10,7 +10,8 @@ import pytest
 
 from dappled.daemon import replay
 from dappled.daemon.replay import Progress, RecordedTelemetry, ReplayError
-from dappled.daemon.street import Names, Story, Street, Watchers
+from dappled.daemon.story import Names, Story, Watchers
+from dappled.daemon.street import Street
 from dappled.daemon.tagger import BodyLatency
 from dappled.drivers.camera import Arrival, Event, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.replay import ReplayCamera

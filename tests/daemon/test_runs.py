@@ -11,7 +11,7 @@ import pytest
 
 from dappled.daemon import runs
 from dappled.daemon.runs import Run, RunBook
-from dappled.daemon.street import Names
+from dappled.daemon.story import Names
 from dappled.drivers.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import recording

@@ -14,7 +14,7 @@ from dappled.config.settings import PoseSettings, PublishSettings, RecordSetting
 from dappled.daemon import service as module
 from dappled.daemon.service import Service
 from dappled.daemon.shutter import Wish
-from dappled.daemon.street import Story, Watchers
+from dappled.daemon.story import Story, Watchers
 from dappled.errors import DappledError
 from dappled.flight import check, layout
 from dappled.flight.errors import FlightError
@@ -34,7 +34,7 @@ def settings(tmp_path: Path) -> Iterator[Settings]:
     with tempfile.TemporaryDirectory(prefix="dpl-") as sockets:
         yield configuration.resolve(
             Settings(
-                record=RecordSettings(str(tmp_path / "flights"), 0),
+                record=RecordSettings(directory=str(tmp_path / "flights"), min_free_mb=0),
                 pose=PoseSettings(0.0),
                 publish=PublishSettings(slices=f"ipc://{sockets}/s"),
             )

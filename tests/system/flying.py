@@ -14,7 +14,7 @@ from dappled.config.schema import Source
 from dappled.config.settings import Settings
 from dappled.daemon.service import Service
 from dappled.daemon.shutter import Verdict, Wish
-from dappled.daemon.street import Story, Watchers
+from dappled.daemon.story import Story, Watchers
 from dappled.flight import check, summary
 from dappled.flight.ledger import LedgerReader
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from dappled.daemon.street import Story
+from dappled.daemon.story import Story
 from dappled.flight.ledger import LedgerReader
 from dappled.mocks.body import Body, BodyOptions, pattern
 from dappled.mocks.eos450d import thumbnail

@@ -23,7 +23,8 @@ from dappled.daemon.development import WorkerDeveloper
 from dappled.daemon.publisher import Publisher
 from dappled.daemon.replay import Progress, RecordedTelemetry, ReplayError
 from dappled.daemon.runs import Run, RunBook
-from dappled.daemon.street import Names, Story, Street, Watchers
+from dappled.daemon.story import Names, Story, Watchers
+from dappled.daemon.street import Street
 from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency
 from dappled.drivers.camera import Identity
 from dappled.drivers.darkroom import Recipe

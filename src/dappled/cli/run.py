@@ -24,7 +24,7 @@ from dappled.daemon import health
 from dappled.daemon.notify import Notifier
 from dappled.daemon.service import Service
 from dappled.daemon.stages import Stage
-from dappled.daemon.street import Story, Watchers
+from dappled.daemon.story import Story, Watchers
 from dappled.drivers.camera import StateChanged
 from dappled.errors import DappledError
 

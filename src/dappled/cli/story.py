@@ -7,7 +7,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 
 from dappled.daemon import wire
-from dappled.daemon.street import Story
+from dappled.daemon.story import Story
 
 _SHORT = {"wish to trigger": "wish", "trigger call": "call", "trigger to file": "file"}
 

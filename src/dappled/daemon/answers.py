@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from dappled.daemon.development import Developer
+from dappled.daemon.headers import frame_header, slices_header
 from dappled.daemon.publisher import Reply
 from dappled.daemon.stages import Stage
-from dappled.daemon.street import Book, frame_header, slices_header
+from dappled.daemon.story import Book
 from dappled.daemon.wire import Message, WireError
 from dappled.errors import sentence
 

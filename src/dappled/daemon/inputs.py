@@ -14,7 +14,7 @@ from typing import Any
 
 from dappled.config import profiles
 from dappled.config.settings import Settings
-from dappled.daemon.street import Names
+from dappled.daemon.story import Names
 from dappled.drivers.darkroom import Darkroom, Recipe, camera_name
 from dappled.drivers.kept_recipe import FILES, FOLDER, of_flight
 from dappled.errors import DappledError

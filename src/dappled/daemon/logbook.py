@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from dappled.daemon.street import Story
+from dappled.daemon.story import Story
 from dappled.errors import sentence
 
 Level = Literal["info", "warning"]

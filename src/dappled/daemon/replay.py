@@ -11,7 +11,8 @@ from time import sleep
 
 from dappled.daemon.books import Expected, ReplayBook
 from dappled.daemon.clock import RecordedClock
-from dappled.daemon.street import Story, Street
+from dappled.daemon.story import Story
+from dappled.daemon.street import Street
 from dappled.daemon.tagger import Exposure
 from dappled.daemon.telemetry import Telemetry, first_position_utc_ns
 from dappled.drivers.mavlink_framing import Decoder, Message

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from dappled.daemon import inputs
-from dappled.daemon.street import Names
+from dappled.daemon.story import Names
 from dappled.drivers.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import layout, lock

@@ -14,15 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import dappled
-from dappled.config import profiles
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.daemon import curve, health, inputs, links, utc
+from dappled.daemon import curve, ground_facts, health, inputs, links, utc
 from dappled.daemon.answers import Answers
 from dappled.daemon.books import LiveBook
 from dappled.daemon.cameras import open_camera
 from dappled.daemon.clock import Clock, SystemClock
-from dappled.daemon.component import CameraFacts, Captured, Component, Storage
+from dappled.daemon.component import Captured, Component
 from dappled.daemon.console import acts
 from dappled.daemon.console import process as console_process
 from dappled.daemon.development import DevelopmentError, WorkerDeveloper
@@ -31,7 +30,8 @@ from dappled.daemon.logbook import Logbook, of_story
 from dappled.daemon.publisher import Publisher, Reply
 from dappled.daemon.reload import merge
 from dappled.daemon.shutter import Shutter, Verdict, Wish
-from dappled.daemon.street import Names, Story, Street, Watchers
+from dappled.daemon.story import Names, Story, Watchers
+from dappled.daemon.street import Street
 from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency, Exposure
 from dappled.daemon.telemetry import Telemetry, UtcCorrection
 from dappled.daemon.utc import UtcLearner
@@ -42,7 +42,6 @@ from dappled.drivers.shutter_line import UsesAutopilot
 from dappled.errors import DappledError, report
 from dappled.flight import layout
 from dappled.flight import recording as flights
-from dappled.flight.ledger import LedgerReader
 from dappled.flight.records import Pose, Shot
 
 log = logging.getLogger(__name__)
@@ -76,7 +75,7 @@ class Service:
         self._notes: deque[tuple[str, str]] = deque(maxlen=1000)
         self._said: set[str] = set()
         self._focal_length_mm: float | None = None
-        self._chip = _sensor(settings, "")
+        self._chip = ground_facts.chip(settings, "")
         self._began_monotonic_ns = self._clock.monotonic_ns()
         self._logbook = Logbook(self._clock.utc_ns)
         self._recipe: Recipe | None = None
@@ -194,8 +193,8 @@ class Service:
             self._shutter,
             self._clock,
             knobs,
-            facts=self._camera_facts,
-            storage=self._storage,
+            facts=lambda: ground_facts.camera(self._street.identity, self._focal_length_mm, self._chip),
+            storage=lambda: ground_facts.storage(self.folder),
             lookup=self._lookup,
             healthy=lambda: not self._street.dead(),
             pose=lambda: self._telemetry.pose_at(self._clock.utc_ns(), 0.0),
@@ -334,7 +333,7 @@ class Service:
         self._changed()
         if change.identity not in (None, self._identity) and self._recording is not None:
             who = self._identity = change.identity
-            self._chip = _sensor(self.settings, who.model)
+            self._chip = ground_facts.chip(self.settings, who.model)
             facts = {"make": who.make, "model": who.model, "serial": who.serial, "port": who.port}
             try:
                 self._recording.add_facts({"camera": facts})
@@ -388,13 +387,7 @@ class Service:
 
     def _story_tagged(self, story: Story) -> None:
         index = story.shot.index
-        if story.tag is not None and story.frame is not None:
-            captured = Captured(index, True, self._utc.utc_ns(story.tag.utc_ns), story.tag.pose, story.frame.name)
-        elif story.where is not None:  # exposed; its file stays at the camera for now
-            exposure, pose = story.where
-            captured = Captured(index, True, self._utc.utc_ns(exposure.utc_ns), pose)
-        else:
-            captured = Captured(index, story.frame is not None, url=story.frame.name if story.frame else "")
+        captured = ground_facts.of_story(story, self._utc.utc_ns)
         if self._component is not None:
             self._component.announce(captured)
             if not captured.ok:
@@ -417,40 +410,9 @@ class Service:
 
     def _lookup(self, index: int) -> Captured | None:
         assert self._recording is not None
-        try:
-            entry = self._recording.index.lookup(index)
-            if entry is None or entry.state not in ("safe", "failed") or self._street.in_hand(index):
-                return None  # unknown, or still on its way: its own message will come
-            root = Path(self.settings.record.directory)
-            with LedgerReader.open(layout.FlightFolder(root / entry.flight).ledger) as ledger:
-                tag = ledger.tag(index)
-                ok = entry.state == "safe" or index in ledger.following()
-                correction_ns = ledger.utc_correction_ns()
-        except DappledError as error:  # such as an old flight that was moved away
-            report(log, f"image {index} can't be looked up", error)
-            return None
-        if tag is None:
-            return Captured(index, ok, url=entry.frame or "")
-        utc_ns = None if correction_ns is None else tag.utc_ns + correction_ns
-        return Captured(index, ok, utc_ns, tag.pose, entry.frame or "")
-
-    def _camera_facts(self) -> CameraFacts:
-        who = self._street.identity
-        major, minor, patch = (int(part) for part in dappled.__version__.split(".")[:3])
-        return CameraFacts(
-            vendor=who.make if who else "dappled",
-            model=who.model if who else "masked camera",
-            firmware=(major, minor, patch),
-            focal_length_mm=self._focal_length_mm,
-            **self._chip,
-        )
-
-    def _storage(self) -> Storage | None:
-        try:
-            usage = shutil.disk_usage(self.folder)
-        except OSError:
-            return None
-        return Storage(usage.total, usage.used, usage.free)
+        if self._street.in_hand(index):
+            return None  # its own message will come
+        return ground_facts.of_record(index, self._recording.index)
 
     # beginning and end
 
@@ -500,22 +462,3 @@ def _warm_up(developer: WorkerDeveloper) -> None:
         developer.warm_up()
     except DevelopmentError as error:
         log.warning("decoding will fail: %s", error)
-
-
-def _sensor(settings: Settings, model: str) -> dict[str, Any]:
-    """Sensor size and pixels of the camera, for CAMERA_INFORMATION; nothing where they aren't known."""
-    name = settings.camera.profile
-    try:
-        profile = profiles.camera_for_model(model) if name == "auto" else profiles.camera(name)
-    except DappledError:
-        profile = None
-    if profile is None:
-        return {}
-    chip = profile.raw[0].sensor
-    height_mm, width_mm = chip.size_mm
-    return {
-        "sensor_width_mm": width_mm,
-        "sensor_height_mm": height_mm,
-        "columns": chip.shape[1],
-        "rows": chip.shape[0],
-    }

@@ -11,19 +11,20 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from dataclasses import replace
+from typing import Any
 
 from dappled.daemon import camera_clock, tagger, wire
 from dappled.daemon.camera_clock import CameraClock
 from dappled.daemon.development import Developed, Developer
+from dappled.daemon.headers import frame_header, slices_header
 from dappled.daemon.publisher import Publisher
 from dappled.daemon.stages import Stage
+from dappled.daemon.story import Book, Names, PoseSource, Story, Watchers
 from dappled.daemon.tagger import BodyLatency, Exposure
 from dappled.drivers import rawfile
 from dappled.drivers.camera import (
     Arrival,
-    Blob,
     Camera,
     Companion,
     Deferred,
@@ -37,100 +38,10 @@ from dappled.drivers.camera import (
 )
 from dappled.drivers.darkroom import camera_name
 from dappled.errors import DappledError, report, sentence
-from dappled.flight.entries import Result
-from dappled.flight.records import Frame, Pose, Shot, Tag
+from dappled.flight.records import Frame, Shot, Tag
 
 log = logging.getLogger(__name__)
 GIVEN_UP = 16  # failed shots whose file is still known for theirs when it comes after all
-
-
-class Book(Protocol):
-    """What the street writes down, or, in a replay, compares. Raises FlightError where it can't."""
-
-    def frame(self, index: int) -> Frame | None:
-        """A frame that is safe."""
-
-    def tag(self, index: int) -> Tag | None:
-        """The tag of a frame, once known."""
-
-    def fired(self, event: Fired) -> None:
-        """The trigger call was made."""
-
-    def failed(self, index: int, reason: str) -> None:
-        """A shot will bring no frame."""
-
-    def record(self, index: int | None, name: str, blob: Blob) -> Frame:
-        """Make a file safe; when this returns it is."""
-
-    def follows(self, index: int, reason: str) -> None:
-        """A shot was fired, and its file stays at the camera for now."""
-
-    def companion(self, index: int, name: str, blob: Blob) -> None:
-        """Make a file safe that stands beside a frame."""
-
-    def path(self, frame: Frame) -> str:
-        """Where the frame's file stands."""
-
-    def tagged(self, tag: Tag) -> None:
-        """A frame's tag is known."""
-
-    def decoded(self, result: Result) -> None:
-        """A frame's slices are known."""
-
-    def event(self, kind: str, text: str, index: int | None = None) -> None:
-        """Something happened."""
-
-
-# (image index, exposure as expected) → exposure as known better, and its pose; waits, bounded
-PoseSource = Callable[[int, Exposure], tuple[Exposure, Pose]]
-
-
-@dataclass(slots=True)
-class Story:
-    """One shot on its way down the street, for those who watch: filled in as it goes. Times in milliseconds.
-
-    `over`: its watchers were told that it is finished. `follows` says, for a shot whose file stays at the camera, how
-    it will come; `where` is then when and where it was exposed, as far as that is known without the file.
-    """
-
-    shot: Shot
-    fired: Fired | None = None
-    frame: Frame | None = None
-    tag: Tag | None = None
-    developed: Developed | None = None
-    problem: str = ""
-    doubt: str = ""
-    follows: str = ""
-    where: tuple[Exposure, Pose] | None = None
-    ms: dict[str, float] = field(default_factory=dict)
-    over: bool = False
-
-    @property
-    def open(self) -> bool:
-        """Whether its file is waited for."""
-        return self.frame is None and not self.follows
-
-
-@dataclass(frozen=True, slots=True)
-class Watchers:
-    """Who is told what: `settled` when a shot is safe (True) or failed, `tagged` when its tag is known or there will be
-    none, `finished` once, when nothing more is expected of it, `camera` at every change of the camera's state,
-    `settings` at every change of its settings."""
-
-    settled: Callable[[int, bool], None] = lambda index, ok: None
-    tagged: Callable[[Story], None] = lambda story: None
-    finished: Callable[[Story], None] = lambda story: None
-    camera: Callable[[StateChanged], None] = lambda change: None
-    settings: Callable[[SettingsChanged], None] = lambda change: None
-
-
-@dataclass(frozen=True, slots=True)
-class Names:
-    """What headers and tags call things. `camera` "auto" takes the model that the frame names."""
-
-    camera: str
-    mask: str
-    law: str
 
 
 class Street:
@@ -495,30 +406,3 @@ class Street:
             told(*facts)
         except Exception as error:  # noqa: BLE001  # whoever is told, the street goes on
             report(log, "street", error)
-
-
-def slices_header(tag: Tag, developed: Developed) -> dict[str, object]:
-    """The facts of a `slices` message, live or asked for."""
-    return {
-        **wire.frame_facts(tag, developed.law),
-        "carriers": developed.carriers,
-        "carriers_from": developed.carriers_from,
-        "carriers_found": developed.carriers_found,
-        "grid": developed.grid,
-        **developed.seen,
-        "slices_sha256": developed.sha256,
-        "arrays": developed.arrays,
-    }
-
-
-def frame_header(tag: Tag, frame: Frame, law: str | None) -> dict[str, object]:
-    """The facts of a `frame` message, live or asked for."""
-    return {
-        **wire.frame_facts(tag, law),
-        "utc_sigma_ns": tag.utc_sigma_ns,
-        "time_source": tag.time_source,
-        "exposure_s": tag.exposure_s,
-        "iso": tag.iso,
-        "name": frame.name,
-        "size": frame.size,
-    }

@@ -1,0 +1,34 @@
+"""The headers of messages about a frame, the same whether live or asked for."""
+
+from __future__ import annotations
+
+from dappled.daemon import wire
+from dappled.daemon.development import Developed
+from dappled.flight.records import Frame, Tag
+
+
+def slices_header(tag: Tag, developed: Developed) -> dict[str, object]:
+    """The facts of a `slices` message, live or asked for."""
+    return {
+        **wire.frame_facts(tag, developed.law),
+        "carriers": developed.carriers,
+        "carriers_from": developed.carriers_from,
+        "carriers_found": developed.carriers_found,
+        "grid": developed.grid,
+        **developed.seen,
+        "slices_sha256": developed.sha256,
+        "arrays": developed.arrays,
+    }
+
+
+def frame_header(tag: Tag, frame: Frame, law: str | None) -> dict[str, object]:
+    """The facts of a `frame` message, live or asked for."""
+    return {
+        **wire.frame_facts(tag, law),
+        "utc_sigma_ns": tag.utc_sigma_ns,
+        "time_source": tag.time_source,
+        "exposure_s": tag.exposure_s,
+        "iso": tag.iso,
+        "name": frame.name,
+        "size": frame.size,
+    }
