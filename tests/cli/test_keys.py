@@ -1,0 +1,38 @@
+"""`dappled keys`: files with the right modes, and a sentence where something stands in the way."""
+
+from __future__ import annotations
+
+import json
+import stat
+from pathlib import Path
+
+import pytest
+
+from dappled.cli import main
+from dappled.daemon import curve
+
+
+def test_a_pair_is_made_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["keys", "make", "vehicle", "-o", str(tmp_path), "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    own = curve.load_own(Path(made["secret"]))
+    assert main(["keys", "show", made["public"]]) == 0
+    assert capsys.readouterr().out.strip() == own.public.decode()
+    assert main(["keys", "make", "vehicle", "-o", str(tmp_path)]) == 1
+    assert "is there already" in capsys.readouterr().err
+
+
+def test_a_token_is_made_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "token"
+    assert main(["keys", "token", str(path)]) == 0
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert len(path.read_text().strip()) == 32
+    assert path.read_text().strip() not in capsys.readouterr().out
+    assert main(["keys", "token", str(path)]) == 1
+    assert main(["keys", "token", str(tmp_path / "no" / "folder")]) == 1
+    assert "can't be written" in capsys.readouterr().err
+
+
+def test_watch_wants_both_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["watch", "tcp://127.0.0.1:1", "--keys", str(tmp_path / "a")]) == 1
+    assert "go together" in capsys.readouterr().err

@@ -1,0 +1,127 @@
+"""Who may speak to the console: every rule by the request that breaks it."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dappled.daemon.console import access
+from dappled.daemon.console.access import Access, Request
+
+TOKEN = "sesame-sesame-sesame"  # noqa: S105  # it opens nothing
+HOST = {"host": "10.0.0.7:8080"}
+OURS = {**HOST, "origin": "http://10.0.0.7:8080", "content-type": "application/json", "content-length": "2"}
+
+
+def status(rules: Access, method: str, path: str, headers: dict[str, str], query: str = "") -> int:
+    refusal = rules.judge(Request(method, path, headers, query))
+    return 200 if refusal is None else refusal.status
+
+
+@pytest.fixture
+def rules() -> Access:
+    return Access(TOKEN, ["drone.lan"])
+
+
+@pytest.mark.parametrize(
+    ("host", "code"),
+    [
+        ("127.0.0.1:8080", 200),
+        ("localhost:8080", 200),
+        ("LOCALHOST", 200),
+        ("[::1]:8080", 200),
+        ("drone.lan:8080", 200),
+        ("10.0.0.7", 200),
+        ("evil.example:8080", 421),
+        ("", 421),
+        ("127.0.0.1.evil.example", 421),
+    ],
+)
+def test_it_answers_to_its_own_names_only(rules: Access, host: str, code: int) -> None:
+    assert status(rules, "GET", "/", {"host": host}) == code
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({}, 401),  # all is well but the token
+        ({"origin": "http://evil.example"}, 403),
+        ({"origin": ""}, 403),
+        ({"origin": "null"}, 403),
+        ({"content-type": "text/plain"}, 415),
+        ({"content-type": "application/x-www-form-urlencoded"}, 415),
+        ({"content-length": "99999"}, 413),
+        ({"content-length": "x"}, 411),
+        ({"content-length": ""}, 411),
+    ],
+)
+def test_only_the_page_itself_changes_anything(rules: Access, change: dict[str, str], code: int) -> None:
+    assert status(rules, "POST", "/api/shoot", {**OURS, **change}) == code
+
+
+def test_a_form_of_another_page_has_no_origin_of_ours(rules: Access) -> None:
+    headers = {name: value for name, value in OURS.items() if name != "origin"}
+    assert status(rules, "POST", "/api/shoot", headers) == 403
+
+
+@pytest.mark.parametrize("method", ["PUT", "DELETE", "OPTIONS", "PATCH", "CONNECT"])
+def test_other_methods_are_refused(rules: Access, method: str) -> None:
+    assert status(rules, method, "/api/shoot", OURS) == 405
+
+
+@pytest.mark.parametrize(
+    ("headers", "code"),
+    [
+        ({"cookie": f"{access.COOKIE}={TOKEN}"}, 200),
+        ({"cookie": f"other=1; {access.COOKIE}={TOKEN}"}, 200),
+        ({"authorization": f"Bearer {TOKEN}"}, 200),
+        ({"authorization": f"Basic {TOKEN}"}, 401),
+        ({"cookie": f"{access.COOKIE}=guess"}, 401),
+        ({"authorization": "Bearer guess"}, 403),
+        ({}, 401),
+    ],
+)
+def test_the_token_opens(rules: Access, headers: dict[str, str], code: int) -> None:
+    assert status(rules, "GET", "/api/state", {**HOST, **headers}) == code
+    assert status(rules, "GET", "/static/main.js", HOST) == 200  # holds nothing that is not public
+
+
+def test_a_globe_brings_the_token_in_its_address(rules: Access) -> None:
+    assert status(rules, "GET", "/kml", HOST, f"token={TOKEN}") == 200
+    assert status(rules, "GET", "/kml", HOST) == 401
+    assert status(rules, "GET", "/api/state", HOST, f"token={TOKEN}") == 401  # others' addresses end in logs
+
+
+def test_guesses_are_few() -> None:
+    now = [0.0]
+    rules = Access(TOKEN, clock=lambda: now[0])
+    codes = [refusal.status if (refusal := rules.try_token(f"guess {n}")) else 200 for n in range(access.GUESSES + 2)]
+    assert codes == [403] * access.GUESSES + [429, 429]
+    refusal = rules.try_token(TOKEN)  # the right one waits too: else guesses went on
+    assert refusal is not None
+    assert refusal.status == 429
+    now[0] = access.GUESS_WINDOW_S + 1
+    assert rules.try_token(TOKEN) is None
+    assert rules.refused == access.GUESSES + 3
+
+
+def test_without_a_token_loopback_is_open() -> None:
+    rules = Access("")
+    assert rules.open
+    assert status(rules, "GET", "/api/state", {"host": "127.0.0.1:1"}) == 200
+    assert status(rules, "POST", "/api/shoot", {**OURS, "origin": "http://evil.example"}) == 403
+
+
+@given(
+    st.sampled_from(["GET", "POST", "HEAD", "PUT"]),
+    st.text(max_size=40),
+    st.dictionaries(
+        st.sampled_from(["host", "origin", "cookie", "authorization", "content-length"]), st.text(max_size=60)
+    ),
+    st.text(max_size=60),
+)
+def test_nothing_strange_gets_in(method: str, path: str, headers: dict[str, str], query: str) -> None:
+    rules = Access(TOKEN)
+    refusal = rules.judge(Request(method, "/api/" + path, headers, query))
+    assert refusal is not None or path == "login"

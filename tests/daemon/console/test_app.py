@@ -1,0 +1,330 @@
+"""The application over HTTP, with a daemon's stream and socket that the test holds the other ends of."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import uvicorn
+
+from dappled.daemon import wire
+from dappled.daemon.console import app, hub
+from dappled.daemon.console.access import Access
+from dappled.daemon.console.control import Control
+from dappled.daemon.console.feed import Feed
+from dappled.daemon.console.hub import Hub
+from dappled.daemon.console.studio import Studio
+from dappled.daemon.publisher import Publisher, Reply
+from dappled.daemon.wire import Message
+from dappled.drivers.camera_channel import Channel, ChannelError
+from dappled.products import camera_pose
+
+STACK = (np.random.default_rng(1).random((2, 30, 40)) + 0.1).astype(np.complex64)
+POSE = {
+    "source": "interpolated", "utc_ns": 1, "latitude_deg": 41.6, "longitude_deg": -91.5, "altitude_msl_m": 223.0,
+    "height_above_home_m": 20.0, "attitude": [1.0, 0.0, 0.0, 0.0], "position_sigma_m": 0.1, "attitude_sigma_deg": 1.0,
+}  # fmt: skip
+HEALTH = {
+    "utc_ns": 1_800_000_000_000_000_000, "camera": {"state": "ready", "reason": ""},
+    "link": {"urls": 1, "packets": 5, "positions": 5}, "disk": {"free_bytes": 10**11, "folder": "/x"},
+    "shots": {"wished": 0, "safe": 0, "failed": 0, "pending": 0, "refused": 0}, "stages": [], "problems": [],
+    "interval_s": None, "clock": {"source": "timesync", "sigma_ms": 0.1}, "vehicle": None, "min_free_bytes": 0,
+    "decode": {"mask": "m", "calibration": "c", "running": True},
+}  # fmt: skip
+
+
+def frame(index: int) -> dict[str, Any]:
+    facts = {"frame": index, "utc_ns": 1, "pose": POSE, "focal_length_mm": 50.0, "f_number": 8.0, "law": "geometric"}
+    more = {"camera": "reference-36mm", "mask": "reference-5x5", "sha256": "0" * 64, "utc_sigma_ns": 1, "iso": 100.0}
+    return {**facts, **more, "time_source": "t", "exposure_s": 0.01, "name": "frames/x.dng", "size": 5_000_000}
+
+
+def slices(index: int) -> tuple[dict[str, Any], bytes]:
+    facts = {name: frame(index)[name] for name in ("frame", "utc_ns", "pose", "camera", "mask", "law", "sha256")}
+    header = {
+        **facts, "focal_length_mm": 50.0, "f_number": None, "carriers": [[0, 0, 0.0, 0.0], [0, 1, 0.0, 0.2]],
+        "carriers_from": "predicted", "carriers_found": 0, "grid": [[46.3, 0.0, 0.0], [0.0, 46.1, 0.0]],
+        "frame_shape": [1388, 1844], "mosaic": True, "noise_rms": 0.01, "predicted": [], "slices_sha256": "0" * 64,
+        "arrays": [wire.describe_array("slices", STACK, "1")],
+    }  # fmt: skip
+    return header, STACK.tobytes()
+
+
+@dataclass
+class Rig:
+    """A console at work: its address, the stream that feeds it, and what it asked of the daemon."""
+
+    url: str
+    publisher: Publisher
+    parts: app.Parts
+    asked: list[dict[str, Any]] = field(default_factory=list)
+    answer: dict[str, Any] = field(default_factory=lambda: {"ok": True, "text": "shot 0", "lines": []})
+
+    def client(self, **headers: str) -> httpx.Client:
+        return httpx.Client(base_url=self.url, timeout=20, headers=headers, trust_env=False)
+
+    def post(self, path: str, body: Any, **headers: str) -> httpx.Response:
+        given = {"origin": self.url, **headers}
+        with self.client(**given) as client:
+            return client.post(path, json=body)
+
+
+def eventually(condition: Callable[[], object], what: str) -> None:
+    until = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < until, f"never: {what}"
+        threading.Event().wait(0.01)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    def answer(request: Mapping[str, Any], reply: Reply) -> None:
+        if request.get("frame", 101) > 100:
+            reply(Message("error", {"error": f"there is no frame {request.get('frame')} in this flight"}))
+        else:
+            reply(Message("slices", *slices(request["frame"])))
+
+    endpoint = f"ipc://{tmp_path}/s"
+    publisher = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer, capacity=1000)
+    publisher.start()
+    here, there = Channel.pair()
+    pages = Hub()
+    studio = Studio(None, camera_pose.NADIR.ravel().tolist())
+    feed = Feed(
+        endpoint, endpoint + ".ask", tell=pages.tell, thumb=studio.thumb, corners=studio.corners,
+        watched=lambda: made.parts.watched(),  # noqa: PLW0108  # it is made after
+    )  # fmt: skip
+    parts = app.Parts(feed, pages, studio, Control(Channel(there)), Access(""), None)
+    listener = socket.create_server(("127.0.0.1", 0))
+    made = Rig(f"http://127.0.0.1:{listener.getsockname()[1]}", publisher, parts)
+    server = uvicorn.Server(
+        uvicorn.Config(app.make(parts), lifespan="off", ws="none", http="h11", log_config=None,
+                       timeout_graceful_shutdown=1)
+    )  # fmt: skip
+
+    async def serve() -> None:
+        tasks = [asyncio.create_task(feed.run()), asyncio.create_task(app.follow_log(parts))]
+        await server.serve(sockets=[listener])
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def daemon() -> None:
+        try:
+            while True:
+                question = here.receive(0.2)
+                if question is not None:
+                    if question.body["do"] != "log":
+                        made.asked.append(dict(question.body))
+                    here.send({**made.answer, "number": question.body["number"]})
+        except ChannelError:
+            return
+
+    threads = [threading.Thread(target=lambda: asyncio.run(serve())), threading.Thread(target=daemon)]
+    for thread in threads:
+        thread.start()
+    eventually(lambda: server.started, "the server is up")
+    try:
+        yield made
+    finally:
+        server.should_exit = True
+        threads[0].join(20)
+        there.close()
+        threads[1].join(20)
+        here.close()
+        parts.workers.shutdown()
+        parts.askers.shutdown()
+        publisher.stop(0.1)
+        listener.close()
+
+
+def seen(rig: Rig, index: int) -> None:
+    """Publish a frame until the console has it: a subscription takes effect some time after it is asked for."""
+
+    def there() -> bool:
+        rig.publisher.publish("frame", frame(index))
+        threading.Event().wait(0.02)
+        return index in rig.parts.feed.frames
+
+    eventually(there, f"frame {index} is there")
+
+
+def test_the_page_and_its_parts_are_served_under_strict_rules(rig: Rig) -> None:
+    with rig.client() as client:
+        page = client.get("/")
+        assert "<title>dappled</title>" in page.text
+        assert "default-src 'none'" in page.headers["content-security-policy"]
+        assert page.headers["cache-control"] == "no-store"
+        for part in ("main.js", "stage.js", "refocus.js", "map.js", "format.js", "console.css", "icon.svg"):
+            assert client.get(f"/static/{part}").status_code == 200
+        assert client.get("/static/../app.py").status_code == 404
+        assert "http" not in page.text.replace("http-equiv", "")  # nothing from elsewhere
+
+
+def test_a_wish_goes_to_the_daemon_with_its_number(rig: Rig) -> None:
+    assert rig.post("/api/shoot", {"sequence": 7}).json() == {"ok": True, "text": "shot 0", "lines": []}
+    assert rig.post("/api/interval", {"sequence": 8, "interval_s": 2.5, "count": 3}).status_code == 200
+    assert rig.post("/api/interval/stop", {}).status_code == 200
+    asked = [{key: value for key, value in one.items() if key != "number"} for one in rig.asked]
+    assert asked == [
+        {"do": "shoot", "sequence": 7},
+        {"do": "interval", "sequence": 8, "interval_s": 2.5, "count": 3},
+        {"do": "stop interval"},
+    ]
+
+
+def test_a_refusal_comes_with_its_sentence(rig: Rig) -> None:
+    rig.answer = {"ok": False, "error": "the camera is absent"}
+    answer = rig.post("/api/shoot", {"sequence": 1})
+    assert (answer.status_code, answer.json()["error"]) == (409, "the camera is absent")
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "code"),
+    [
+        ("/api/shoot", {}, 422),
+        ("/api/shoot", {"sequence": -1}, 422),
+        ("/api/shoot", {"sequence": True}, 422),
+        ("/api/shoot", {"sequence": "1"}, 422),
+        ("/api/shoot", [1], 422),
+        ("/api/interval", {"sequence": 1, "interval_s": -1, "count": 1}, 422),
+        ("/api/interval", {"sequence": 1, "interval_s": "2", "count": 1}, 422),
+        ("/api/interval", {"sequence": 1, "interval_s": 2, "count": 1.5}, 422),
+        ("/api/nothing", {}, 404),
+    ],
+)
+def test_a_malformed_wish_is_refused_in_words_and_asks_nothing(rig: Rig, path: str, body: Any, code: int) -> None:
+    answer = rig.post(path, body)
+    assert answer.status_code == code
+    assert "Traceback" not in answer.text
+    assert rig.asked == []
+
+
+def test_nothing_changes_by_get_or_from_elsewhere(rig: Rig) -> None:
+    with rig.client() as client:
+        for path in ("/api/shoot", "/api/interval", "/api/interval/stop", "/api/login"):
+            assert client.get(path).status_code == 405
+    assert rig.post("/api/shoot", {"sequence": 1}, origin="http://evil.example").status_code == 403
+    assert rig.post("/api/shoot", {"sequence": 1}, host="evil.example").status_code == 421
+    assert rig.post("/api/shoot", {"sequence": 1, "x": "y" * 5000}).status_code == 413
+    assert rig.asked == []
+
+
+def test_a_frame_s_pictures(rig: Rig) -> None:
+    seen(rig, 4)
+    with rig.client() as client:
+        kinds = {"thumb.jpg": "image/jpeg", "mean.jpg": "image/jpeg", "slices.jpg": "image/jpeg",
+                 "spectrum.jpg": "image/jpeg", "map.png": "image/png"}  # fmt: skip
+        for name, kind in kinds.items():
+            answer = client.get(f"/api/frames/4/{name}")
+            assert (answer.status_code, answer.headers["content-type"]) == (200, kind), name
+        assert "no mask is named" in client.get("/api/frames/4/views.json").json()["error"]
+        assert "no depth" in client.get("/api/frames/4/depth.png").json()["error"]
+        assert client.get("/api/frames/4/fish.jpg").status_code == 404
+        assert client.get("/api/frames/5/mean.jpg").status_code == 404
+        assert client.get("/api/frames/-1/mean.jpg").status_code == 404
+        for disparity in ("nan", "99", "x"):
+            assert client.get(f"/api/frames/4/refocus.jpg?disparity={disparity}").status_code == 422
+
+
+def test_slices_that_the_daemon_can_t_give_are_a_sentence(rig: Rig) -> None:
+    seen(rig, 101)
+    with rig.client() as client:
+        assert client.get("/api/frames/101/mean.jpg").json()["error"] == "there is no frame 101 in this flight"
+
+
+def test_a_depth_message_becomes_a_picture(rig: Rig) -> None:
+    seen(rig, 4)
+    disparity = np.linspace(-1, 1, 12, dtype=np.float32).reshape(3, 4)
+    sigma = np.full((3, 4), 0.01, dtype=np.float32)
+    arrays = [wire.describe_array("disparity", disparity, "px"), wire.describe_array("sigma", sigma, "px")]
+
+    def told() -> bool:
+        rig.parts.globe_s = time.monotonic()  # somebody watches
+        rig.publisher.publish("depth", {"frame": 4, "arrays": arrays}, disparity.tobytes() + sigma.tobytes())
+        threading.Event().wait(0.02)
+        return rig.parts.feed.frames[4].depth is not None
+
+    eventually(told, "the depth is there")
+    with rig.client() as client:
+        assert client.get("/api/frames/4/depth.png").content.startswith(b"\x89PNG")
+
+
+def test_a_globe_gets_link_overlay_and_picture(rig: Rig) -> None:
+    seen(rig, 4)
+    with rig.client() as client:
+        assert f"{rig.url}/kml/latest.kml" in client.get("/kml").text
+        latest = client.get("/kml/latest.kml").text
+        assert f"{rig.url}/kml/4.png" in latest
+        assert "<LatLonBox>" in latest
+        assert client.get("/kml/4.png").headers["content-type"] == "image/png"
+
+
+def events(lines: Iterator[str], kind: str) -> dict[str, Any]:
+    for line in lines:
+        if line.startswith("data: "):
+            event: dict[str, Any] = json.loads(line.removeprefix("data: "))
+            if event["is"] == kind:
+                return event
+    raise AssertionError(f"the stream ended without {kind}")
+
+
+def test_a_page_hears_state_frames_and_log(rig: Rig) -> None:
+    rig.answer["lines"] = [{"number": 1, "utc_ns": 1, "level": "info", "text": "camera ready"}]
+    seen(rig, 4)
+    with rig.client() as client, client.stream("GET", "/api/events") as stream:
+        assert stream.headers["content-type"].startswith("text/event-stream")
+        lines = stream.iter_lines()
+        assert events(lines, "frame")["tag"]["frame"] == 4
+        assert events(lines, "log")["lines"][0]["text"] == "camera ready"
+        rig.publisher.publish("health", HEALTH)
+        state = events(lines, "state")
+        while state["health"] is None:
+            state = events(lines, "state")
+        assert state["verdict"] == "caution"  # no position
+        assert {"name": "Camera", "state": "go", "text": "ready"} in state["checks"]
+        eventually(rig.parts.watched, "the page counts")
+    eventually(lambda: len(rig.parts.hub) == 0, "a page that went away is forgotten")
+
+
+def test_pages_are_not_without_number(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hub, "PAGES", 0)
+    with rig.client() as client:
+        assert client.get("/api/events").status_code == 503
+
+
+def test_a_page_that_stops_reading_costs_a_bounded_queue() -> None:
+    async def flood() -> tuple[int, list[str]]:
+        pages = Hub()
+        reading = pages.listen([{"is": "ready"}])
+        await anext(reading)
+        waiting: asyncio.Future[str] = asyncio.ensure_future(anext(reading))
+        await asyncio.sleep(0)
+        pages.tell({"is": "n", "n": -1})
+        await waiting
+        for n in range(hub.WAITING + 36):
+            pages.tell({"is": "n", "n": n})
+        got = [await anext(reading) for _ in range(hub.WAITING)]
+        await reading.aclose()  # type: ignore[attr-defined]  # it is a generator
+        return pages.dropped, got
+
+    dropped, got = asyncio.run(flood())
+    assert dropped == 36
+    assert json.loads(got[0].removeprefix("data: "))["n"] == 36  # the oldest went
+    assert json.loads(got[-1].removeprefix("data: "))["n"] == hub.WAITING + 35
+
+
+def test_messages_that_are_none_are_passed_over(rig: Rig) -> None:
+    rig.publisher.publish("frame", {"frame": 1})
+    rig.publisher.publish("health", {"camera": None})
+    seen(rig, 4)

@@ -1,0 +1,177 @@
+"""The daemon's side of the console: its door, and a process that is kept running."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from dappled.config.settings import ConsoleSettings, PublishSettings, Settings
+from dappled.daemon.clock import SystemClock
+from dappled.daemon.console import acts, process
+from dappled.daemon.console.process import Console, ConsoleError
+from dappled.daemon.curve import KeyFileError
+from dappled.daemon.logbook import Logbook
+from dappled.daemon.shutter import Shutter
+from tests.daemon.fakes import Rig, rig
+
+TOKEN = "a-token-of-many-letters"  # noqa: S105  # it opens nothing
+
+
+def token_file(folder: Path, text: str = TOKEN, mode: int = 0o600) -> str:
+    path = folder / "token"
+    path.write_text(text)
+    path.chmod(mode)
+    return str(path)
+
+
+@pytest.mark.parametrize("bind", ["8080", "127.0.0.1", "127.0.0.1:x", ":8080", "127.0.0.1:99999", "127.0.0.1:-1"])
+def test_an_address_that_is_none(bind: str) -> None:
+    with pytest.raises(ConsoleError, match="must be host:port"):
+        process.listen(ConsoleSettings(bind=bind))
+
+
+@pytest.mark.parametrize("bind", ["0.0.0.0:0", "192.0.2.1:0", "[::]:0", "drone.lan:0"])
+def test_beyond_loopback_a_token_is_needed(bind: str) -> None:
+    with pytest.raises(ConsoleError, match="open to the network without a token"):
+        process.listen(ConsoleSettings(bind=bind))
+
+
+def test_with_a_token_it_opens_wider(tmp_path: Path) -> None:
+    listener, token = process.listen(ConsoleSettings(bind="0.0.0.0:0", token=token_file(tmp_path)))
+    with listener:
+        assert token == TOKEN
+        assert process.url(listener).startswith("http://127.0.0.1:")
+
+
+def test_a_token_that_others_can_read_or_guess_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(KeyFileError, match="chmod 600"):
+        process.listen(ConsoleSettings(bind="127.0.0.1:0", token=token_file(tmp_path, mode=0o644)))
+    with pytest.raises(ConsoleError, match="holds no token"):
+        process.listen(ConsoleSettings(bind="127.0.0.1:0", token=token_file(tmp_path, "short")))
+    with pytest.raises(KeyFileError, match="can't be read"):
+        process.listen(ConsoleSettings(bind="127.0.0.1:0", token=str(tmp_path / "none")))
+
+
+def test_a_port_that_is_taken_is_refused_in_words() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(ConsoleError, match="can't listen on"):
+        process.listen(ConsoleSettings(bind=f"127.0.0.1:{taken.getsockname()[1]}"))
+
+
+def test_loopback_of_ipv6_too() -> None:
+    if not socket.has_ipv6 or not Path("/proc/net/if_inet6").exists():
+        pytest.skip("this machine has no IPv6")
+    listener, token = process.listen(ConsoleSettings(bind="[::1]:0"))
+    with listener:
+        assert (token, process.url(listener)[:13]) == ("", "http://[::1]:")
+
+
+def test_without_a_bind_there_is_no_door() -> None:
+    with ExitStack() as stack:
+        assert process.open_door(Settings(), stack) is None
+
+
+@pytest.mark.parametrize(("slices", "private"), [("ipc:///x/s", False), ("tcp://127.0.0.1:5555", True)])
+def test_a_stream_over_tcp_gets_a_door_of_the_daemon_s_own(slices: str, private: bool) -> None:
+    settings = replace(Settings(), publish=PublishSettings(slices=slices), console=ConsoleSettings(bind="127.0.0.1:0"))
+    with ExitStack() as stack:
+        door = process.open_door(settings, stack)
+        assert door is not None
+        assert door.private.startswith("ipc://") is private
+
+
+def running(console: Console) -> subprocess.Popen[bytes] | None:
+    return console._process
+
+
+def test_a_console_that_dies_is_started_again_and_the_socket_stays(tmp_path: Path) -> None:
+    asked: list[Mapping[str, Any]] = []
+
+    def act(request: Mapping[str, Any]) -> Mapping[str, Any]:
+        asked.append(request)
+        return {"ok": True, "text": "shot 5"}
+
+    listener, _ = process.listen(ConsoleSettings(bind="127.0.0.1:0"))
+    url = process.url(listener)
+    setup = {"token": "", "hosts": [], "map": "", "endpoint": f"ipc://{tmp_path}/s", "ask": "", "recipe": None,
+             "mount": [1, 0, 0, 0, 1, 0, 0, 0, 1]}  # fmt: skip
+    console = Console(listener, setup, act)
+    console.start()
+    try:
+        with httpx.Client(base_url=url, timeout=30, headers={"origin": url.rstrip("/")}, trust_env=False) as client:
+            assert client.post("/api/shoot", json={"sequence": 1}).json()["text"] == "shot 5"
+            first = running(console)
+            assert first is not None
+            assert os.getpriority(os.PRIO_PROCESS, first.pid) >= 15
+            first.kill()
+            until = time.monotonic() + 30
+            while running(console) in (first, None):
+                assert time.monotonic() < until
+                threading.Event().wait(0.01)
+        with httpx.Client(base_url=url, timeout=30, trust_env=False) as client:
+            assert client.get("/api/state").json()["verdict"] is None  # nothing was heard of the daemon yet
+    finally:
+        console.stop()
+    assert first.poll() is not None
+    assert running(console) is None
+    with pytest.raises(httpx.ConnectError):
+        httpx.get(url, trust_env=False)
+
+
+@pytest.fixture
+def street(tmp_path: Path) -> Any:
+    with rig(tmp_path) as one:
+        one.shutter.start()
+        yield one
+        one.shutter.stop()
+
+
+def do(shutter: Shutter, **request: Any) -> dict[str, Any]:
+    return acts.act(request, shutter, Logbook(lambda: 0))
+
+
+def test_a_number_that_comes_twice_is_one_wish(street: Rig) -> None:
+    assert do(street.shutter, do="shoot", sequence=5) == {"ok": True, "index": 0, "text": "shot 0"}
+    assert do(street.shutter, do="shoot", sequence=5)["text"] == "already shot 0"
+    assert do(street.shutter, do="shoot", sequence=6)["index"] == 1
+    street.ended(1)
+    assert street.shutter.statistics().shots == 2
+
+
+def test_an_interval_and_its_end() -> None:
+    shutter = Shutter(next_index=0, note=lambda _: None, fire=lambda _: None, clock=SystemClock(), capacity=1000)
+    shutter.start()
+    assert do(shutter, do="interval", sequence=1, interval_s=0.05, count=0)["ok"]
+    until = time.monotonic() + 20
+    while shutter.statistics().shots < 3:
+        assert time.monotonic() < until
+        threading.Event().wait(0.01)
+    assert do(shutter, do="stop interval")["text"] == "the interval is stopped"
+    assert do(shutter, do="stop interval")["text"] == "no interval was running"
+    answer = do(shutter, do="interval", sequence=2, interval_s=-1, count=0)
+    assert (answer["ok"], answer["error"]) == (False, "an interval is 0 to 86400 s, and a count 0 or more")
+    shutter.stop()
+
+
+def test_a_refusal_is_told(street: Rig) -> None:
+    street.shutter.stop()
+    assert do(street.shutter, do="shoot", sequence=1)["error"] == "the daemon is stopping"
+
+
+def test_the_log_is_told_from_a_number_on(street: Rig) -> None:
+    book = Logbook(lambda: 7)
+    book.add("one")
+    book.add("two", "warning")
+    told = acts.act({"do": "log", "after": 1}, street.shutter, book)
+    assert told["lines"] == [{"number": 2, "utc_ns": 7, "level": "warning", "text": "two"}]
+    assert acts.act({"do": "nothing"}, street.shutter, book) == {"ok": True}
