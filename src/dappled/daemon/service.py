@@ -257,6 +257,11 @@ class Service:
         return self._recording.folder.path
 
     @property
+    def utc_learnt(self) -> bool:
+        """Whether the autopilot has told UTC to a machine that didn't know it."""
+        return self._utc.learnt is not None
+
+    @property
     def wished(self) -> int:
         """Shots so far."""
         return self._shutter.statistics().shots
