@@ -297,6 +297,16 @@ def test_a_page_hears_state_frames_and_log(rig: Rig) -> None:
     eventually(lambda: len(rig.parts.hub) == 0, "a page that went away is forgotten")
 
 
+def test_metrics_for_whoever_scrapes(rig: Rig) -> None:
+    with rig.client() as client:
+        assert client.get("/metrics").status_code == 503
+        rig.publisher.publish("health", HEALTH)
+        eventually(lambda: client.get("/metrics").status_code == 200, "the daemon is heard")
+        answer = client.get("/metrics")
+    assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")
+    assert 'dappled_camera_state{state="ready"} 1.0' in answer.text
+
+
 def test_pages_are_not_without_number(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub, "PAGES", 0)
     with rig.client() as client:

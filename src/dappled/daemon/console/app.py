@@ -19,6 +19,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from dappled.daemon import metrics
 from dappled.daemon.console import access, kml, pictures
 from dappled.daemon.console.access import Access, Refusal
 from dappled.daemon.console.background import Background
@@ -78,6 +79,7 @@ def make(parts: Parts) -> ASGIApp:
         Route("/api/interval/stop", _act(parts, _stop), methods=["POST"]),
         Route("/api/frames/{frame:int}/{name}", _picture(parts)),
         Route("/api/map", _map(parts)),
+        Route("/metrics", _metrics(parts)),
         Route("/kml", _kml_link(parts)),
         Route("/kml/latest.kml", _kml_latest(parts)),
         Route("/kml/{frame:int}.png", _kml_picture(parts)),
@@ -161,6 +163,16 @@ def _state(parts: Parts) -> Endpoint:
         return JSONResponse({**parts.feed.state(), "console": own, "newest": parts.feed.newest()})
 
     return state
+
+
+def _metrics(parts: Parts) -> Endpoint:
+    async def answer(_: Request) -> Response:
+        health = parts.feed.health
+        if health is None:
+            return _refused(Refusal(503, "the daemon has not been heard yet: ask again"))
+        return Response(metrics.text(health), media_type=metrics.CONTENT_TYPE)
+
+    return answer
 
 
 def _about(parts: Parts) -> dict[str, Any]:
