@@ -36,6 +36,14 @@ def test_a_used_buffer_leaves_nothing_behind() -> None:
     assert used.apply(plane).half.tobytes() == fresh.half.tobytes()
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_one_pixel_that_is_no_number_is_told(value: float) -> None:
+    plane = np.random.default_rng(1).random((90, 130)).astype(np.float32)
+    plane[71, 33] = value
+    with pytest.raises(DecodeError, match="NaN or infinite"), np.errstate(invalid="ignore"):
+        Transform((90, 130)).apply(plane)
+
+
 def test_another_shape_is_refused() -> None:
     with pytest.raises(DecodeError, match="this transform is for"):
         Transform((90, 130)).apply(np.zeros((90, 131), dtype=np.float32))

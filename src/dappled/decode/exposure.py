@@ -263,6 +263,9 @@ class Developer:
             own = mean[colour]
             gain = np.where(own > floor, np.clip(wanted / np.maximum(own, floor), 0.1, 10), 1.0)
             gain = (gain * (self.scale[colour] * gains[colour])).astype(np.float32)
+            if gain.min() == gain.max():  # as for the reference itself
+                factors[row, :, column::b] = gain[0, 0]
+                return
             below, share_above = self.across[column]
             slope = np.diff(gain, axis=1, append=gain[:, -1:])
             line = np.take(slope, below, axis=1)

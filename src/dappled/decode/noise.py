@@ -21,7 +21,8 @@ class Noise:
 
     def __init__(self, spectrum: Spectrum) -> None:
         sides = spectrum.padded[0], spectrum.columns
-        edges = [np.array_split(np.arange(side), count) for side, count in zip(sides, _PARTS, strict=True)]
+        counts = [max(1, min(most, side // 4)) for most, side in zip(_PARTS, sides, strict=True)]
+        edges = [np.array_split(np.arange(side), count) for side, count in zip(sides, counts, strict=True)]
         self._spectrum = spectrum
         self._high, self._wide = (min(_SIDE, *(part.size for part in parts)) for parts in edges)
         self._corners = [(int(rows[0]), int(columns[0])) for rows in edges[0] for columns in edges[1]]

@@ -269,10 +269,16 @@ def check_shape(mosaic: NDArray[Any]) -> None:
     """Raises DecodeError for what isn't a single plane of a size that can be decoded."""
     if mosaic.ndim != 2:
         raise DecodeError(f"a raw mosaic has two axes, this array has {mosaic.ndim}: give one plane")
-    if min(mosaic.shape) < _SMALLEST_SIDE:
-        raise DecodeError(f"the frame is {_size(mosaic)}: too small to hold carriers")
-    if mosaic.size > LARGEST_PIXELS:
-        raise DecodeError(f"the frame is {_size(mosaic)}: more than {LARGEST_PIXELS // 10**6} megapixels, cut it first")
+    check_sides((mosaic.shape[0], mosaic.shape[1]))
+
+
+def check_sides(shape: tuple[int, int]) -> None:
+    """Raises DecodeError for frames that are too small to hold carriers, or too large for memory."""
+    size = f"{shape[0]}×{shape[1]} px"
+    if min(shape) < _SMALLEST_SIDE:
+        raise DecodeError(f"the frame is {size}: too small to hold carriers")
+    if shape[0] * shape[1] > LARGEST_PIXELS:
+        raise DecodeError(f"the frame is {size}: more than {LARGEST_PIXELS // 10**6} megapixels, cut it first")
 
 
 def check_frame(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -10,7 +11,7 @@ from scipy import fft
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.exposure import Exposure, Laid, rows_at_once
-from dappled.decode.plane import Plane
+from dappled.decode.plane import Plane, check_sides
 from dappled.decode.spectrum import TILE, Complex, Spectrum, padded_shape
 from dappled.decode.threads import each, share, spans
 
@@ -26,6 +27,8 @@ class Transform:
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:
+        """Raises DecodeError for a shape that can't be decoded."""
+        check_sides(shape)
         self.shape = shape
         self.padded = padded_shape(shape)
         count = -(-(self.padded[1] // 2 + 1) // TILE)
@@ -63,7 +66,10 @@ class Transform:
 
         each(down, spans(len(tiles), _TILES), workers)
         tiles[0, 0, 0] -= level * self.padded[0] * self.padded[1]
-        return Spectrum(tiles, columns, self.shape, self.padded, level)
+        spectrum = Spectrum(tiles, columns, self.shape, self.padded, level)
+        if not math.isfinite(spectrum.mean):  # the mean has seen every pixel
+            raise DecodeError("the frame holds NaN or infinite values")
+        return spectrum
 
 
 def _into_tiles(lines: Complex, tiles: Complex) -> None:
