@@ -88,7 +88,7 @@ class Simulation:
                 latency_sigma_ms=LATENCY_SIGMA_MS,
             ),
             mask=replace(given.mask, profile=MASK),
-            mavlink=replace(given.mavlink, url=links),
+            mavlink=replace(given.mavlink, url=links, keys=_keys(given)),
             decode=replace(given.decode, calibration=str(calibration), white="", dark=""),
         )
 
@@ -144,9 +144,9 @@ class Simulation:
         return path
 
 
-def free_port() -> int:
-    """A UDP port of loopback that nobody uses at the moment."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
+    """A port of loopback that nobody uses at the moment, of UDP or as `kind` says."""
+    with socket.socket(socket.AF_INET, kind) as one:
         one.bind(("127.0.0.1", 0))
         port: int = one.getsockname()[1]
         return port

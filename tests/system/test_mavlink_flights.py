@@ -1,0 +1,119 @@
+"""What the MAVLink camera says over several runs of the whole daemon, and what a pilot is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dappled.config.schema import ConfigError
+from dappled.daemon.knobs import code
+from dappled.drivers import mavlink_signing
+from dappled.drivers.mavlink import mavlink
+from dappled.drivers.mavlink_signing import EPOCH_UNIX_S, UNITS_PER_S
+from dappled.mocks.body import Body, BodyOptions
+from dappled.mocks.simulation import Simulation, World
+from tests.daemon.mavlink_rig import Peer
+from tests.system.flying import Flying, eventually, flying, settings_of, told
+
+ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
+URL = "udpin:127.0.0.1:0"
+
+
+def ground(daemon: Flying) -> Peer:
+    daemon.until_ready()
+    return Peer(daemon.service._links.port(0))
+
+
+def shoot(peer: Peer, sequence: int) -> tuple[int, int]:
+    peer.command(2000, 0, 0, 1, sequence)
+    assert peer.ack(2000) == ACCEPTED
+    ended = peer.one("CAMERA_IMAGE_CAPTURED")
+    return ended.image_index, ended.capture_result
+
+
+def test_indices_go_on_and_every_photograph_of_an_earlier_flight_can_be_asked_for(tmp_path: Path) -> None:
+    with Body.start(BodyOptions(picture="pattern:50000:CR2")) as body:
+        settings = settings_of(tmp_path, camera={"port": body.port}, mavlink={"url": URL})
+        with flying(settings) as daemon, ground(daemon) as peer:
+            peer.heartbeat()
+            assert shoot(peer, 1) == (0, 1)
+            body.fault("error")
+            assert shoot(peer, 2) == (1, 0)
+            assert "image 1 failed" in peer.one("STATUSTEXT").text
+        with flying(settings) as daemon, ground(daemon) as peer:
+            peer.heartbeat()
+            assert shoot(peer, 1) == (2, 1)
+            for index, ok, url in ((0, 1, "frames/000000.cr2"), (1, 0, ""), (2, 1, "frames/000002.cr2")):
+                peer.command(512, 263, index)
+                assert peer.ack(512) == ACCEPTED
+                old = peer.one("CAMERA_IMAGE_CAPTURED")
+                assert (old.image_index, old.capture_result, old.file_url) == (index, ok, url)
+            peer.command(512, 262)
+            assert peer.one("CAMERA_CAPTURE_STATUS").image_count == 3
+
+
+def test_a_signed_link_through_a_restart(tmp_path: Path) -> None:
+    mavlink_signing.make_key(tmp_path / "radio.key")
+    key = mavlink_signing.read_key(tmp_path / "radio.key")
+    with Body.start(BodyOptions(picture="pattern:50000:CR2")) as body:
+        settings = settings_of(
+            tmp_path, camera={"port": body.port}, mavlink={"url": URL, "keys": [str(tmp_path / "radio.key")]}
+        )
+        old = b""
+        for run, fresh in ((0, True), (1, False)):
+            with flying(settings) as daemon, ground(daemon) as peer:
+                signing = peer.packer.signing
+                signing.secret_key, signing.sign_outgoing = key, True
+                signing.timestamp = (daemon.service._clock.utc_ns() // 10_000) - EPOCH_UNIX_S * UNITS_PER_S
+                if fresh:
+                    old = peer.packed(mavlink.MAVLink_command_long_message(1, 100, 2000, 0, 0, 0, 1, 7, 0, 0, 0))
+                peer.raw(old)  # good the first time, replayed after the restart
+                assert shoot(peer, 8) == ((0, 1) if fresh else (2, 1))
+                if fresh:
+                    assert peer.one("CAMERA_IMAGE_CAPTURED").image_index == 1
+                counts = daemon.service._links.statistics()[0].signing
+                assert counts is not None
+                assert counts.replayed == run
+    assert (tmp_path / "flights" / ".mavlink-signing").stat().st_mode & 0o777 == 0o600
+
+
+def test_a_pilot_is_told_of_a_camera_that_went_and_came_back(tmp_path: Path) -> None:
+    with Body.start(BodyOptions(picture="pattern:50000:CR2")) as body:
+        settings = settings_of(tmp_path, camera={"port": body.port}, mavlink={"url": URL})
+        with flying(settings) as daemon, ground(daemon) as peer:
+            peer.heartbeat()
+            body.fault("unplug")
+            said = peer.until(lambda m: m.get_type() == "STATUSTEXT" and "the camera is" in m.text, "camera gone")
+            assert said.severity <= mavlink.MAV_SEVERITY_WARNING
+            peer.command(2000, 0, 0, 1, 1)
+            assert peer.ack(2000) == mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+            body.fault("clear")
+            daemon.until_ready()
+            assert shoot(peer, 2) == (0, 1)
+            folder = daemon.service.folder
+        assert any(event.startswith("refused: IMAGE_START_CAPTURE from mavlink:255/190") for event in told(folder))
+
+
+@pytest.mark.parametrize("keys", [["a", "b"], ["a", "b", "c"]])
+def test_keys_that_do_not_match_the_links_are_refused_in_one_sentence(tmp_path: Path, keys: list[str]) -> None:
+    settings = settings_of(tmp_path, mavlink={"url": URL, "keys": keys})
+    with pytest.raises(ConfigError, match="name one for each link"), flying(settings):
+        pass
+
+
+def test_decoding_is_switched_from_the_ground_and_the_flight_says_so(tmp_path: Path) -> None:
+    settings = settings_of(tmp_path, mavlink={"url": URL})
+    with Simulation(World(), settings, tmp_path) as simulated, flying(simulated) as daemon:
+        daemon.until_ready()
+        with Peer(daemon.service._links.port(2)) as peer:
+            peer.heartbeat()
+            peer.one("HEARTBEAT")
+            for value, decoded in (("off", False), ("on", True)):
+                raw = code(value).to_bytes(4, "little")
+                peer.send(mavlink.MAVLink_param_ext_set_message(1, 100, b"LF_DECODE", raw, 5))
+                assert peer.one("PARAM_EXT_ACK").param_result == mavlink.PARAM_ACK_ACCEPTED
+                story = daemon.shoot()
+                assert (story.developed is not None) == decoded
+                assert story.problem == ""
+            eventually(lambda: "decoding: off" in "\n".join(told(daemon.service.folder)), "the event")
