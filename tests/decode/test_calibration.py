@@ -6,7 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dappled.decode.calibration import Calibration, CalibrationFrame, at_centre, at_corner, calibrate, origin_of
+from dappled.decode.calibrated import Calibration, at_centre, at_corner
+from dappled.decode.calibration import CalibrationFrame, calibrate, origin_of
 from dappled.decode.carriers import Lattice
 from dappled.decode.errors import DecodeError
 from dappled.decode.masks import Mask

@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dappled.decode.calibration import Calibration, CalibrationFrame, calibrate
+from dappled.decode.calibrated import Calibration
+from dappled.decode.calibration import CalibrationFrame, calibrate
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.errors import DecodeError
 from dappled.decode.masks import Mask

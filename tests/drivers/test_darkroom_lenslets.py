@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
-from dappled.decode.calibration import at_corner
+from dappled.decode.calibrated import at_corner
 from dappled.decode.carriers import Carrier
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField

@@ -3,25 +3,37 @@
 from __future__ import annotations
 
 import argparse
-import math
+import json
+import sys
+from dataclasses import dataclass
 from pathlib import Path
 
-import tomli_w
+from tqdm import tqdm
 
-from dappled.cli import calibrate_lens, common
+from dappled.cli import calibrate_lens, calibrate_target, common
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
-from dappled.decode.calibration import Calibration, CalibrationFrame, calibrate
-from dappled.drivers import rawfile
+from dappled.decode import calibration_report as report
+from dappled.decode.calibrated import Calibration
+from dappled.decode.calibration import CalibrationFrame, Sight, of_sights, sight_of
+from dappled.drivers import calibration_files
 from dappled.drivers.darkroom import Darkroom, DarkroomError
+from dappled.errors import DappledError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "example: dappled calibrate white-f22.dng --camera canon-eos-450d --mask mask-2 -o calibration.toml"
+    parser.epilog = (
+        "examples:\n  dappled calibrate white-f22.dng --camera canon-eos-450d --mask mask-2 -o calibration.toml\n"
+        "  dappled calibrate zoom/*.RAF --mask mask-2 --dark dark.RAF -o calibration.toml"
+    )
     common.frames(parser, "+")
     common.add_recipe(parser, mask_needed=False)
     calibrate_lens.add(parser)
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="calibration to write (.toml)")
+    calibrate_target.add(parser)
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE", help="calibration to write: FILE.toml and FILE.npz"
+    )
+    parser.add_argument("--json", action="store_true", help="the report as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -30,44 +42,97 @@ def run(arguments: argparse.Namespace) -> int:
         return calibrate_lens.run(
             common.recipe(arguments), arguments.frames, arguments.board, arguments.output, arguments.focal_length
         )
+    if arguments.target and arguments.mask:
+        return calibrate_target.run(
+            common.recipe(arguments), arguments.frames, arguments.target, arguments.output, arguments.focal_length
+        )
     if not arguments.mask:
         raise ConfigError("which mask? Name its profile or TOML file with --mask")
     if arguments.mask == profiles.LENSLET:
         raise ConfigError("a lenslet array needs no calibration: give its white frame with --white when decoding")
-    found = from_frames(
-        Darkroom(common.recipe(arguments)), arguments.frames, arguments.focal_length, arguments.f_number
-    )
-    arguments.output.write_text(tomli_w.dumps(found.to_dict()), encoding="utf-8")
-    for fit in found.fits:
-        seen = f"{2 * fit.found - 1} carriers, residual {fit.residual_bins:.3f} bins"
-        sits = f"turned by {math.degrees(fit.rotation_rad):.3f}°, mask {fit.mask_distance_mm:.4f} mm before the sensor"
-        print(f"{fit.focal_length_mm:g} mm: {seen}, {sits}")
-    print(f"written to {arguments.output}")
-    return 0
+    darkroom = Darkroom(common.recipe(arguments))
+    darkroom.check()
+    seen, bad = _sights(darkroom, arguments)
+    if not seen:
+        raise DarkroomError("no frame is left to calibrate on")
+    camera = darkroom.camera(seen[0].model)
+    found = _fitted(darkroom, seen, choose_law=not arguments.law)
+    written = calibration_files.save(arguments.output, found)
+    if arguments.json:
+        print(json.dumps(report.as_values(found, camera.mask_distance_mm), indent=2))
+    else:
+        print(report.as_text(found, camera.mask_distance_mm))
+        print(f"written to {written[0]} and {written[1]}")
+    if not any(law.explains for law in report.law_fits(found, camera.mask_distance_mm)):
+        print(f"dappled calibrate: {found.verdict}: are mask, camera and focal length the right ones?", file=sys.stderr)
+    if bad:
+        print(f"{bad} of {len(arguments.frames)} frames could not be used", file=sys.stderr)
+    return 1 if bad else 0
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What a calibration frame shows, and of which camera and size it is."""
+
+    sight: Sight
+    shape: tuple[int, int]
+    model: str
 
 
 def from_frames(
     darkroom: Darkroom, frames: list[Path], focal_length_mm: float | None = None, f_number: float | None = None
 ) -> Calibration:
-    """The calibration that these frames show. Raises DappledError."""
-    seen = []
-    shape, model = (0, 0), ""
-    for path in frames:
-        raw = rawfile.read(path)
-        with darkroom.naming(path):
-            plane = darkroom.plane(raw)
-        length, stop = focal_length_mm or raw.focal_length_mm, f_number or raw.f_number
-        if length is None or stop is None:
-            raise DarkroomError(f"{path} doesn't say its focal length and f-number: give --focal-length and --f-number")
-        seen.append(CalibrationFrame(plane, length, stop))
-        shape, model = (plane.shape[0], plane.shape[1]), raw.camera_model or ""
-    camera = darkroom.camera(model)
-    with darkroom.naming(frames[0]):
-        return calibrate(
-            seen,
-            sensor=camera.sensor(shape),
-            mask=profiles.mask(darkroom.recipe.mask).mask,
-            law=darkroom.recipe.law or camera.law,
-            mask_distance_mm=camera.mask_distance_mm,
+    """The calibration that these frames show. Raises DappledError at the first bad one."""
+    return _fitted(darkroom, [_seen(darkroom, path, focal_length_mm, f_number) for path in frames])
+
+
+def _sights(darkroom: Darkroom, arguments: argparse.Namespace) -> tuple[list[Seen], int]:
+    """What the good frames show, and how many were bad; those are told on the way."""
+    good: list[Seen] = []
+    bad = 0
+    paths = arguments.frames
+    for path in tqdm(paths, unit="frame", disable=len(paths) < 2 or not sys.stderr.isatty()):
+        try:
+            one = _seen(darkroom, path, arguments.focal_length, arguments.f_number)
+            if good and (one.shape, one.model) != (good[0].shape, good[0].model):
+                first, this = (f"{s.model} {s.shape[0]} × {s.shape[1]}" for s in (good[0], one))
+                raise DarkroomError(f"{path} is of another camera or size ({this}, the first {first})")
+            good.append(one)
+        except DappledError as error:
+            if len(paths) == 1:
+                raise
+            bad += 1
+            print(f"dappled calibrate: {error}", file=sys.stderr)
+    return good, bad
+
+
+def _seen(darkroom: Darkroom, path: Path, focal_length_mm: float | None, f_number: float | None) -> Seen:
+    raw = darkroom.read(path)
+    length, stop = focal_length_mm or raw.focal_length_mm, f_number or raw.f_number
+    if length is None or stop is None:
+        raise DarkroomError(f"{path} doesn't say its focal length and f-number: give --focal-length and --f-number")
+    camera = darkroom.camera(raw.camera_model or "")
+    with darkroom.naming(path):
+        plane = darkroom.plane(raw)
+        shape = plane.shape[0], plane.shape[1]
+        sight = sight_of(
+            CalibrationFrame(plane, length, stop),
+            camera.sensor(shape),
+            profiles.mask(darkroom.recipe.mask).mask,
+            darkroom.recipe.law or camera.law,
+            camera.mask_distance_mm,
             workers=2,
         )
+    return Seen(sight, shape, raw.camera_model or "")
+
+
+def _fitted(darkroom: Darkroom, seen: list[Seen], *, choose_law: bool = False) -> Calibration:
+    camera = darkroom.camera(seen[0].model)
+    return of_sights(
+        [one.sight for one in seen],
+        sensor=camera.sensor(seen[0].shape),
+        mask=profiles.mask(darkroom.recipe.mask).mask,
+        law=darkroom.recipe.law or camera.law,
+        mask_distance_mm=camera.mask_distance_mm,
+        choose_law=choose_law,
+    )

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.calibrated import Calibration, LatticeFit, at_centre
 from dappled.decode.carriers import LAWS, Carrier, Lattice, Sensor
 from dappled.decode.errors import DecodeError
-from dappled.decode.lattice import candidates, fit, residual_bins
+from dappled.decode.lattice import candidates, find_lattice, fit, residual_bins
+from dappled.decode.laws import PLAUSIBLE, judge, steps_bins
 from dappled.decode.masks import Mask, Order
 from dappled.decode.peaks import Measured, measure
 from dappled.decode.prediction import lattice_rotation
@@ -26,7 +28,7 @@ from dappled.decode.spectrum import Spectrum
 from dappled.decode.views import Aperture, angular_frequencies, kappa, transfer
 
 _SEARCH = 0.12  # of a carrier's frequency: 2° of rotation and, under the fd law, 10 % of the mask's distance
-_PLAUSIBLE = 0.35  # relative: a fitted mask distance further from the stated one is not believed
+_ENOUGH = 0.6  # of a mask's carriers: a prediction near which so many stand is the right one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,122 +40,6 @@ class CalibrationFrame:
     f_number: float
 
 
-@dataclass(frozen=True, slots=True)
-class LatticeFit:
-    """What the frames of one focal length showed.
-
-    `lattice` in cycles/pixel. `origin` is x0 in cycles of ky and kx, at the frame's centre. `transfer` holds M_k, real
-    and signed, for each of the mask's half orders (DC first, 1.0), the aperture's own share divided out.
-    `residual_bins` is the rms distance of the measured carriers from the lattice in bins of the padded transform,
-    `phase_residual_rad` that of their phases from the origin's, `found` how many carriers of the half plane were seen.
-    """
-
-    focal_length_mm: float
-    f_number: float
-    lattice: Lattice
-    rotation_rad: float
-    mask_distance_mm: float
-    distance_fitted: bool
-    origin: tuple[float, float]
-    transfer: tuple[float, ...]
-    residual_bins: float
-    phase_residual_rad: float
-    found: int
-
-
-@dataclass(frozen=True, slots=True)
-class Calibration:
-    """A camera and mask as fitted; one or more focal lengths, rising. `shape` is the frames'."""
-
-    shape: tuple[int, int]
-    law: str
-    mask: Mask
-    sensor: Sensor
-    fits: tuple[LatticeFit, ...]
-
-    def nearest(self, focal_length_mm: float) -> LatticeFit:
-        """The fit at the nearest focal length."""
-        return min(self.fits, key=lambda f: abs(math.log(f.focal_length_mm / focal_length_mm)))
-
-    def lattice_at(self, focal_length_mm: float) -> Lattice:
-        """The lattice at a focal length: the law's, corrected as at the fits (linear between, constant beyond)."""
-        lengths = [f.focal_length_mm for f in self.fits]
-        corrections = [
-            np.linalg.solve(self._law(f.focal_length_mm, f.mask_distance_mm), f.lattice.matrix()) for f in self.fits
-        ]
-        distances = [f.mask_distance_mm for f in self.fits]
-        distance = float(np.interp(focal_length_mm, lengths, distances))
-        correction = np.array(
-            [[np.interp(focal_length_mm, lengths, [c[i, j] for c in corrections]) for j in (0, 1)] for i in (0, 1)]
-        )
-        (ay, ax), (by, bx) = self._law(focal_length_mm, distance) @ correction
-        return Lattice((float(ay), float(ax)), (float(by), float(bx)))
-
-    def _law(self, focal_length_mm: float, mask_distance_mm: float) -> NDArray[np.float64]:
-        return LAWS[self.law](self.mask, self.sensor, mask_distance_mm, focal_length_mm).matrix()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for a TOML file."""
-        return {
-            "kind": "dappled calibration",
-            "version": 1,
-            "shape": list(self.shape),
-            "law": self.law,
-            "mask": {
-                "frequency_per_mm": self.mask.frequency_per_mm,
-                "p": self.mask.p,
-                "pattern": self.mask.pattern,
-                "harmonics": self.mask.harmonics,
-            },
-            "sensor": _sensor_values(self.sensor),
-            "fits": [
-                {
-                    "focal_length_mm": f.focal_length_mm,
-                    "f_number": f.f_number,
-                    "lattice": {"ky": list(f.lattice.ky), "kx": list(f.lattice.kx)},
-                    "rotation_rad": f.rotation_rad,
-                    "mask_distance_mm": f.mask_distance_mm,
-                    "distance_fitted": f.distance_fitted,
-                    "origin": list(f.origin),
-                    "transfer": list(f.transfer),
-                    "residual_bins": f.residual_bins,
-                    "phase_residual_rad": f.phase_residual_rad,
-                    "found": f.found,
-                }
-                for f in self.fits
-            ],
-        }
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Calibration:
-        """The inverse of `to_dict`. Raises DecodeError with the name of what is missing or wrong."""
-        if values.get("kind") != "dappled calibration" or values.get("version") != 1:
-            raise DecodeError("this is no calibration of version 1: make one with `dappled calibrate`")
-        try:
-            shape = _pair(values["shape"])
-            mask = Mask(**values["mask"])
-            sensor = _sensor_of({"shape": shape, **values["sensor"]})
-            fits = tuple(
-                LatticeFit(
-                    **{
-                        **entry,
-                        "lattice": Lattice(_pair(entry["lattice"]["ky"]), _pair(entry["lattice"]["kx"])),
-                        "origin": _pair(entry["origin"]),
-                        "transfer": tuple(float(m) for m in entry["transfer"]),
-                    }
-                )
-                for entry in values["fits"]
-            )
-            law = values["law"]
-        except (KeyError, TypeError, ValueError) as error:
-            raise DecodeError(f"the calibration is incomplete or wrong ({error}): make it anew") from error
-        if law not in LAWS:
-            raise DecodeError(f"the calibration names the law {law!r}; known are {', '.join(LAWS)}")
-        if not fits or any(len(f.transfer) != len(mask.half_orders()) for f in fits):
-            raise DecodeError("the calibration's transfer doesn't fit its mask: make it anew")
-        return cls((int(shape[0]), int(shape[1])), law, mask, sensor, fits)
-
-
 def calibrate(
     frames: Sequence[CalibrationFrame],
     *,
@@ -162,47 +48,185 @@ def calibrate(
     law: str,
     mask_distance_mm: float,
     aperture: Aperture | None = None,
+    choose_law: bool = False,
     workers: int = 1,
 ) -> Calibration:
     """The calibration that stopped-down frames show; frames of one focal length are averaged.
 
-    `mask_distance_mm` is the stated one; the fitted one follows from the lattice and the law. Raises DecodeError where
-    the carriers can't be found.
+    `mask_distance_mm` is the stated one; the fitted one follows from the lattice and the law. With `choose_law` frames
+    at several focal lengths may show that the other law is right. Raises DecodeError where the carriers can't be found.
     """
     if not frames:
         raise DecodeError("a calibration needs at least one frame")
     if law not in LAWS:
         raise DecodeError(f"unknown law {law!r}; known are {', '.join(LAWS)}")
     aperture = aperture or Aperture(mask.views_per_axis)
+    return of_sights(
+        [sight_of(frame, sensor, mask, law, mask_distance_mm, workers=workers) for frame in frames],
+        sensor=sensor,
+        mask=mask,
+        law=law,
+        mask_distance_mm=mask_distance_mm,
+        aperture=aperture,
+        choose_law=choose_law,
+    )
+
+
+def of_sights(
+    sights: Sequence[Sight],
+    *,
+    sensor: Sensor,
+    mask: Mask,
+    law: str,
+    mask_distance_mm: float,
+    aperture: Aperture | None = None,
+    choose_law: bool = False,
+) -> Calibration:
+    """`calibrate` from what was seen in each frame, which is little to keep."""
+    aperture = aperture or Aperture(mask.views_per_axis)
+    steps = [(sight.focal_length_mm, steps_bins(sight.lattice, sensor)) for sight in sights]
+    verdict = judge(steps, sensor=sensor, mask=mask, stated_mm=mask_distance_mm, asked=law)
+    if choose_law and verdict.law is not None:
+        law = verdict.law
+    fitted = next(fit for fit in verdict.fits if fit.law == law)
+    several = fitted.explains and (fitted.pupil_mm is not None or fitted.offset_bins is not None)
+    pupil = fitted.pupil_mm or 0.0 if several else 0.0
     fits = []
-    for length in sorted({frame.focal_length_mm for frame in frames}):
+    for length in sorted({sight.focal_length_mm for sight in sights}):
         seen = [
-            _fit_frame(
-                frame,
-                sensor=sensor,
-                mask=mask,
-                law=law,
-                mask_distance_mm=mask_distance_mm,
+            _fit_of(
+                sight,
+                sensor,
+                mask,
+                law,
+                stated_mm=mask_distance_mm,
+                known_mm=fitted.mask_distance_mm if several else None,
                 aperture=aperture,
-                workers=workers,
             )
-            for frame in frames
-            if frame.focal_length_mm == length
+            for sight in sights
+            if sight.focal_length_mm == length
         ]
         fits.append(_mean(seen))
-    return Calibration(sensor.shape, law, mask, sensor, tuple(fits))
+    return Calibration(sensor.shape, law, mask, sensor, tuple(fits), pupil, verdict.sentence)
 
 
-def at_corner(origin: tuple[float, float], lattice: Lattice, shape: tuple[int, int]) -> tuple[float, float]:
-    """The origin in cycles at pixel (0, 0) for one at the frame's centre."""
-    shift = lattice.matrix() @ ((np.array(shape) - 1) / 2)
-    return float(origin[0] - shift[0]), float(origin[1] - shift[1])
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """What one calibration frame shows: its lattice, the carriers seen, and each slice's factor on the mean's.
+
+    `relative` complex (K,) belongs to `orders`, DC first.
+    """
+
+    focal_length_mm: float
+    f_number: float
+    lattice: Lattice
+    residual_bins: float
+    found: tuple[tuple[Carrier, Measured], ...]
+    orders: tuple[Order, ...]
+    relative: NDArray[np.complex128]
 
 
-def at_centre(origin: tuple[float, float], lattice: Lattice, shape: tuple[int, int]) -> tuple[float, float]:
-    """The inverse of `at_corner`, cycles from −0.5 to 0.5."""
-    shift = lattice.matrix() @ ((np.array(shape) - 1) / 2)
-    return _turn(origin[0] + shift[0]), _turn(origin[1] + shift[1])
+def sight_of(
+    frame: CalibrationFrame, sensor: Sensor, mask: Mask, law: str, mask_distance_mm: float, *, workers: int = 1
+) -> Sight:
+    """Find the mask's carriers in a frame: near the law's prediction, near the other law's, or wherever they are."""
+    if frame.plane.shape != sensor.shape:
+        raise DecodeError(f"the calibration frame is {frame.plane.shape}, the camera's are {sensor.shape}")
+    spectrum = Spectrum.of(frame.plane, workers=workers)
+    lattice, found = _located(
+        spectrum,
+        sensor=sensor,
+        mask=mask,
+        law=law,
+        mask_distance_mm=mask_distance_mm,
+        focal_length_mm=frame.focal_length_mm,
+    )
+    orders = [(c.ky, c.kx) for c in lattice.carriers(mask.half_orders()) if c.on_sensor]
+    lattice = refine(spectrum, lattice, orders, workers)
+    residual = residual_bins(lattice.carriers([(c.ky, c.kx) for c, _ in found]), [m for _, m in found], spectrum)
+    carriers = [c for c in lattice.carriers(orders) if c.on_sensor]
+    values = extract(spectrum, carriers, lattice=lattice, workers=workers).values
+    return Sight(
+        frame.focal_length_mm,
+        frame.f_number,
+        lattice,
+        residual,
+        tuple(found),
+        tuple((c.ky, c.kx) for c in carriers),
+        relative_transfer(values),
+    )
+
+
+def _located(
+    spectrum: Spectrum, *, sensor: Sensor, mask: Mask, law: str, mask_distance_mm: float, focal_length_mm: float
+) -> tuple[Lattice, list[tuple[Carrier, Measured]]]:
+    """The lattice that most of the mask's carriers stand on, and those; the law's own prediction is asked first."""
+    best: tuple[Lattice, list[tuple[Carrier, Measured]]] | None = None
+    most = 0.0
+    first = ""
+    guesses = _guesses(
+        spectrum,
+        sensor=sensor,
+        mask=mask,
+        law=law,
+        mask_distance_mm=mask_distance_mm,
+        focal_length_mm=focal_length_mm,
+    )
+    for guess in guesses:
+        try:
+            lattice, found, share = _verified(spectrum, guess(), mask)
+        except DecodeError as error:
+            first = first or str(error)
+            continue
+        if share > _ENOUGH:
+            return lattice, found
+        if share > most:
+            best, most = (lattice, found), share
+    if best is None:
+        raise DecodeError(first)
+    return best
+
+
+def _guesses(
+    spectrum: Spectrum, *, sensor: Sensor, mask: Mask, law: str, mask_distance_mm: float, focal_length_mm: float
+) -> list[Callable[[], Lattice]]:
+    """Where to look for the lattice, the likeliest place first."""
+
+    def near(name: str) -> Lattice:
+        predicted = LAWS[name](mask, sensor, mask_distance_mm, focal_length_mm)
+        orders = [(c.ky, c.kx) for c in predicted.carriers(mask.half_orders()) if c.on_sensor]
+        return search(spectrum, predicted, orders)
+
+    def anywhere() -> Lattice:
+        found = find_lattice(spectrum).lattice
+        if mask.pattern == "full":
+            return found
+        (ay, ax), (by, bx) = found.ky, found.kx  # a diagonal mask's shortest steps are (1, 1) and (1, -1)
+        sums, differences = ((ay + by) / 2, (ax + bx) / 2), ((ay - by) / 2, (ax - bx) / 2)
+        ky, kx = sorted((sums, differences), key=lambda v: -abs(v[0]))
+        return Lattice(ky if ky[0] > 0 else (-ky[0], -ky[1]), kx if kx[1] > 0 else (-kx[0], -kx[1]))
+
+    others = [name for name in LAWS if name != law]
+    return [*(partial(near, name) for name in (law, *others)), anywhere]
+
+
+def _verified(
+    spectrum: Spectrum, lattice: Lattice, mask: Mask
+) -> tuple[Lattice, list[tuple[Carrier, Measured]], float]:
+    """A lattice fitted to the carriers that stand near it, those, and what share of them all they are."""
+    found: list[tuple[Carrier, Measured]] = []
+    looked: list[Carrier] = []
+    for radius in (4.0, 2.0, 2.0):
+        looked = [c for c in lattice.carriers(mask.half_orders()) if c.on_sensor and (c.ky, c.kx) != (0, 0)]
+        peaks = measure(spectrum, looked, radius)
+        found = [(c, m) for c, m in zip(looked, peaks, strict=True) if m is not None]
+        if len(found) < 2 or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in found]) < 2:
+            raise DecodeError(
+                f"only {len(found)} of {len(looked)} carriers show: calibrate on a frame at a small aperture "
+                "(an eighth of the widest)"
+            )
+        lattice = fit(found)
+    return lattice, found, len(found) / len(looked)
 
 
 def search(spectrum: Spectrum, predicted: Lattice, orders: Sequence[Order], tolerance: float = _SEARCH) -> Lattice:
@@ -304,69 +328,54 @@ def _ramp(product: NDArray[np.complex64], blocks: int = 8) -> tuple[NDArray[np.f
     return slope[:2], float(abs(whole) * coherence**4)
 
 
-def _fit_frame(
-    frame: CalibrationFrame,
-    *,
+def _fit_of(
+    sight: Sight,
     sensor: Sensor,
     mask: Mask,
     law: str,
-    mask_distance_mm: float,
+    *,
+    stated_mm: float,
+    known_mm: float | None,
     aperture: Aperture,
-    workers: int,
 ) -> LatticeFit:
-    if frame.plane.shape != sensor.shape:
-        raise DecodeError(f"the calibration frame is {frame.plane.shape}, the camera's are {sensor.shape}")
-    predicted = LAWS[law](mask, sensor, mask_distance_mm, frame.focal_length_mm)
-    orders = [(c.ky, c.kx) for c in predicted.carriers(mask.half_orders()) if c.on_sensor]
-    spectrum = Spectrum.of(frame.plane, workers=workers)
-    lattice = search(spectrum, predicted, orders)
-    found: list[tuple[Carrier, Measured]] = []
-    for radius in (4.0, 2.0, 2.0):
-        looked = lattice.carriers([order for order in orders if order != (0, 0)])
-        peaks = measure(spectrum, looked, radius)
-        found = [(c, m) for c, m in zip(looked, peaks, strict=True) if m is not None]
-        if len(found) < 2 or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in found]) < 2:
-            raise DecodeError(
-                f"only {len(found)} of {len(looked)} carriers show: calibrate on a frame at a small aperture "
-                "(an eighth of the widest)"
-            )
-        lattice = fit(found)
-    lattice = refine(spectrum, lattice, orders, workers)
-    seen = [m for _, m in found]
-    residual = residual_bins(lattice.carriers([(c.ky, c.kx) for c, _ in found]), seen, spectrum)
-    distance, fitted, rotation = _distance(
-        lattice, frame.focal_length_mm, sensor=sensor, mask=mask, law=law, stated_mm=mask_distance_mm
+    """`known_mm` is the distance that a law fitted to several focal lengths found; None: this one's own."""
+    distance, fitted = (
+        (known_mm, True)
+        if known_mm is not None
+        else _distance(sight.lattice, sight.focal_length_mm, sensor=sensor, mask=mask, law=law, stated_mm=stated_mm)
     )
-    carriers = [c for c in lattice.carriers(orders) if c.on_sensor]
-    values = extract(spectrum, carriers, lattice=lattice, workers=workers).values
-    seen_orders = [(c.ky, c.kx) for c in carriers]
-    cycles = kappa(mask.frequency_per_mm, distance, frame.focal_length_mm, frame.f_number)
-    through = aperture.transform(angular_frequencies(seen_orders, cycles, rotation)).real
-    measured = relative_transfer(values) / np.where(np.abs(through) < 0.05, np.nan, through)
+    rotation = lattice_rotation(sight.lattice, sensor)
+    cycles = kappa(mask.frequency_per_mm, distance, sight.focal_length_mm, sight.f_number)
+    through = aperture.transform(angular_frequencies(sight.orders, cycles, rotation)).real
+    measured = sight.relative / np.where(np.abs(through) < 0.05, np.nan, through)
     usable = np.isfinite(measured)
     usable[0] = False
-    origin, phase_residual = origin_of([o for o, u in zip(seen_orders, usable, strict=True) if u], measured[usable])
-    magnitudes = (measured * np.conj(transfer(seen_orders, np.ones(len(seen_orders)), origin))).real
-    known = dict(zip(seen_orders, np.nan_to_num(magnitudes), strict=True))
+    orders = [order for order, use in zip(sight.orders, usable, strict=True) if use]
+    if np.linalg.matrix_rank(orders) < 2:
+        raise DecodeError("too few carriers show at this aperture: calibrate on a frame at an eighth of the widest")
+    origin, phase_residual = origin_of(orders, measured[usable])
+    magnitudes = (measured * np.conj(transfer(sight.orders, np.ones(len(sight.orders)), origin))).real
+    known = dict(zip(sight.orders, np.nan_to_num(magnitudes), strict=True))
     return LatticeFit(
-        focal_length_mm=frame.focal_length_mm,
-        f_number=frame.f_number,
-        lattice=lattice,
+        focal_length_mm=sight.focal_length_mm,
+        f_number=sight.f_number,
+        lattice=sight.lattice,
         rotation_rad=rotation,
         mask_distance_mm=distance,
         distance_fitted=fitted,
-        origin=at_centre(origin, lattice, sensor.shape),
+        origin=at_centre(origin, sight.lattice, sensor.shape),
         transfer=tuple(float(known.get(order, 0.0)) if order != (0, 0) else 1.0 for order in mask.half_orders()),
-        residual_bins=residual,
+        residual_bins=sight.residual_bins,
         phase_residual_rad=phase_residual,
-        found=len(found) + 1,
+        found=len(sight.found) + 1,
+        seen=tuple((c.ky, c.kx, m.fy, m.fx, m.strength) for c, m in sight.found),
     )
 
 
 def _distance(
     lattice: Lattice, focal_length_mm: float, *, sensor: Sensor, mask: Mask, law: str, stated_mm: float
-) -> tuple[float, bool, float]:
-    """(mask distance in mm, whether it was fitted, rotation): from the lattice's size on the chip, by the law.
+) -> tuple[float, bool]:
+    """(mask distance in mm, whether it was fitted): from the lattice's size on the chip, by the law.
 
     A distance far from the stated one means a mask whose printed frequency isn't the stated one: the stated distance
     is kept then.
@@ -374,14 +383,13 @@ def _distance(
     to_sensor = np.array([sensor.row_mm, sensor.column_mm])  # (row, column) steps as (y, x) mm
     per_mm = lattice.matrix() @ np.linalg.inv(to_sensor).T  # rows: cycles/mm along y and x
     size = math.sqrt(abs(float(np.linalg.det(per_mm))))
-    rotation = lattice_rotation(lattice, sensor)
     if law == "geometric":
         distance = (1 - size / mask.frequency_per_mm) * focal_length_mm
     else:
         expected = LAWS[law](mask, sensor, stated_mm, focal_length_mm).matrix() @ np.linalg.inv(to_sensor).T
         distance = stated_mm * size / math.sqrt(abs(float(np.linalg.det(expected))))
-    believed = abs(distance / stated_mm - 1) <= _PLAUSIBLE
-    return (distance if believed else stated_mm), believed, rotation
+    believed = abs(distance / stated_mm - 1) <= PLAUSIBLE
+    return (distance if believed else stated_mm), believed
 
 
 def _mean(fits: list[LatticeFit]) -> LatticeFit:
@@ -403,25 +411,3 @@ def _mean(fits: list[LatticeFit]) -> LatticeFit:
         phase_residual_rad=float(np.sqrt(np.mean([f.phase_residual_rad**2 for f in fits]))),
         found=min(f.found for f in fits),
     )
-
-
-def _sensor_values(sensor: Sensor) -> dict[str, Any]:
-    values: dict[str, Any] = {"row_mm": list(sensor.row_mm), "column_mm": list(sensor.column_mm)}
-    if sensor.picture is not None:
-        values["picture"] = {"shape": list(sensor.picture.shape), **_sensor_values(sensor.picture)}
-    return values
-
-
-def _sensor_of(values: Mapping[str, Any]) -> Sensor:
-    height, width = _pair(values["shape"])
-    picture = _sensor_of(values["picture"]) if "picture" in values else None
-    return Sensor((int(height), int(width)), _pair(values["row_mm"]), _pair(values["column_mm"]), picture)
-
-
-def _pair(values: Sequence[float]) -> tuple[float, float]:
-    first, second = values
-    return float(first), float(second)
-
-
-def _turn(cycles: float) -> float:
-    return float(cycles - round(cycles))

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.aperture import used_aperture
-from dappled.decode.calibration import Calibration, at_corner, origin_of, relative_transfer
+from dappled.decode.calibrated import Calibration, at_corner
+from dappled.decode.calibration import origin_of, relative_transfer
 from dappled.decode.carriers import LAWS, Carrier, Lattice, Sensor
 from dappled.decode.errors import DecodeError
 from dappled.decode.lattice import fit, residual_bins

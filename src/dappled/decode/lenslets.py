@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.calibration import at_centre, at_corner, relative_transfer
+from dappled.decode.calibrated import at_centre, at_corner
+from dappled.decode.calibration import relative_transfer
 from dappled.decode.carriers import Carrier, Lattice
 from dappled.decode.decoder import DecodeReport, light_field, no_views
 from dappled.decode.errors import DecodeError

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
-from dappled.config.schema import read_toml
 from dappled.decode import plane as planes
-from dappled.decode.calibration import Calibration
+from dappled.decode.calibrated import Calibration
 from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
 from dappled.decode.errors import DecodeError
 from dappled.decode.exposure import Developer, Exposure, developer
@@ -26,7 +25,7 @@ from dappled.decode.lightfield import LightField
 from dappled.decode.plane import Plane
 from dappled.decode.stagger import spread
 from dappled.decode.transform import Source
-from dappled.drivers import rawfile
+from dappled.drivers import calibration_files, rawfile
 from dappled.drivers.rawfile import RawFile
 from dappled.errors import DappledError
 
@@ -236,20 +235,19 @@ class Darkroom:
             with _named(recipe.white):
                 return LensletDecoder.with_white(self.plane(white), workers=recipe.workers, rolloff=rolloff)
         camera = self.camera(model)
+        known = self._calibration() if recipe.calibration else None
         return MaskDecoder(
             camera.sensor(shape),
             profiles.mask(recipe.mask).mask,
-            recipe.law or camera.law,
+            recipe.law or (camera.law if known is None else known.law),
             camera.mask_distance_mm,
-            calibration=self._calibration() if recipe.calibration else None,
+            calibration=known,
             workers=recipe.workers,
             colours=colours,
         )
 
     def _calibration(self) -> Calibration:
-        tables, _ = read_toml(Path(self.recipe.calibration))
-        with _named(self.recipe.calibration):
-            return Calibration.from_dict(tables)
+        return calibration_files.load(Path(self.recipe.calibration))
 
     def _dark_frame(self) -> NDArray[Any] | None:
         if self.recipe.dark and self._dark is None:
