@@ -247,6 +247,7 @@ def write_footprints(made: Survey, output: Path) -> Path:
         footprints.feature(one, made.ground, made.projection, made.facts.get(one.name, {})) for one in made.photographs
     ]
     path = output / "footprints.geojson"
+    durable.make_folder(output)
     durable.write_file(path, footprints.collection(features))
     return path
 
@@ -264,5 +265,6 @@ def write_report(made: Survey, output: Path, files: Sequence[Path]) -> Path:
         "files": [path.name for path in files],
     }
     path = output / "report.json"
+    durable.make_folder(output)
     durable.write_file(path, (json.dumps(facts, indent=1, allow_nan=False) + "\n").encode())
     return path

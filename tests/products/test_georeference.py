@@ -1,0 +1,219 @@
+"""`dappled georeference` from a flight on disk to files, and what it says of frames that can't be mapped."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+import rasterio
+
+from dappled.cli import main
+from dappled.errors import DappledError
+from dappled.flight import recording
+from dappled.flight.records import Tag
+from dappled.mocks.path import TruePose, from_euler
+from dappled.products import camera_pose, difference, georeference, photographs
+from dappled.products.earth import Projection
+from dappled.products.georeference import Options
+from dappled.products.ground import Flat
+from dappled.products.photographs import Mounting, PhotographError
+from tests.flight.makers import deliver, pose, wish
+from tests.products import flown
+from tests.products.flown import Flown
+from tests.products.test_eye import eye_at
+from tests.products.test_maps import painted, photograph, survey
+
+
+def words(flight: Flown, output: Path, *more: str) -> list[str]:
+    recipe = flight.recipe
+    given = ["--camera", recipe.camera, "--mask", recipe.mask, "--calibration", recipe.calibration]
+    return ["georeference", str(flight.folder), "-o", str(output), *given, *more]
+
+
+def test_a_flight_becomes_maps(short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = sorted(path for path in short_flight.folder.rglob("*"))
+    more = ["--each", "--as", "kmz", "cog", "footprints", "--refine", "neighbours"]
+    assert main(words(short_flight, tmp_path, *more)) == 0
+    said = capsys.readouterr().out
+    assert "2 frames on EPSG:32615" in said
+    assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")) == [
+        "footprints.geojson",
+        "frames/000000.kmz",
+        "frames/000000.tif",
+        "frames/000001.kmz",
+        "frames/000001.tif",
+        "mosaic.kmz",
+        "mosaic.tif",
+        "report.json",
+    ]
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [frame["refined"] for frame in report["frames"]] == [True, True]
+    assert all(frame["shift_m"] < 0.1 for frame in report["frames"])
+    with rasterio.open(tmp_path / "mosaic.tif") as read:
+        truth = short_flight.truths[0].pose
+        assert truth is not None
+        east, north = Projection("EPSG:32615").to_map(truth.latitude_deg, truth.longitude_deg)
+        assert read.bounds.left < east < read.bounds.right
+        assert read.bounds.bottom < north < read.bounds.top
+        assert read.count == 4
+        assert (read.read(4) > 0).mean() > 0.4
+    assert sorted(path for path in short_flight.folder.rglob("*")) == before  # the recording is as it was
+
+
+def test_neighbouring_frames_have_one_colour(short_flight: Flown, tmp_path: Path) -> None:
+    assert main(words(short_flight, tmp_path, "--each", "--as", "cog")) == 0
+    pictures = []
+    for name in ("000000", "000001"):
+        with rasterio.open(tmp_path / "frames" / f"{name}.tif") as read:
+            window = read.window(*common(tmp_path))
+            pictures.append(read.read(window=window).astype(float))
+    rows, columns = (min(a, b) for a, b in zip(pictures[0].shape[1:], pictures[1].shape[1:], strict=True))
+    a, b = (picture[:, :rows, :columns] for picture in pictures)
+    both = (a[3] > 0) & (b[3] > 0)
+    assert both.sum() > 1000
+    for band in range(3):
+        assert a[band][both].mean() == pytest.approx(b[band][both].mean(), abs=4)
+    assert a[0][both].mean() - a[2][both].mean() > 5  # earth and grass are no greys
+
+
+def common(folder: Path) -> tuple[float, float, float, float]:
+    boxes = []
+    for name in ("000000", "000001"):
+        with rasterio.open(folder / "frames" / f"{name}.tif") as read:
+            boxes.append(read.bounds)
+    a, b = boxes
+    return max(a.left, b.left), max(a.bottom, b.bottom), min(a.right, b.right), min(a.top, b.top)
+
+
+def test_terrain_and_difference(short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    more = ["--as", "terrain", "difference", "--against", str(short_flight.folder), "--gsd", "0.05"]
+    assert main(words(short_flight, tmp_path, *more)) == 0
+    capsys.readouterr()
+    points = laspy.read(tmp_path / "terrain.las")
+    assert len(points.points) > 500
+    crs = points.header.parse_crs()
+    assert crs is not None
+    assert "EGM96" in crs.name
+    assert list(points.point_format.extra_dimension_names) == ["sigma"]
+    assert 198 < points.z.min() < points.z.max() < 216
+    with rasterio.open(tmp_path / "terrain.tif") as read:
+        height, sigma = read.read()
+        assert read.descriptions[0] == "height above sea level, m"
+        assert np.isfinite(height).sum() == len(points.points) == np.isfinite(sigma).sum()
+    with rasterio.open(tmp_path / "difference.tif") as read:
+        assert np.nanmax(np.abs(read.read(1))) < 1e-4  # a flight differs from itself by nothing
+    with rasterio.open(tmp_path / "height-difference.tif") as read:
+        assert np.nanmax(np.abs(read.read(1))) < 1e-4
+
+
+def test_a_change_on_the_ground_stands_out_of_another_hours_light() -> None:
+    eye, ground = eye_at(height_m=100.0), Flat(0.0)
+    image = painted(eye, ground)
+    later = 0.7 * image + 0.05
+    later[100:120, 140:160] += 0.3
+    first, second = (survey(photograph(eye, one)) for one in (image, later))
+    made = difference.of_pictures(first, second)
+    changed = np.abs(np.nan_to_num(made.values)) > 0.2
+    met = ground.meet(eye, np.array([[150.0, 110.0]]))[0]
+    rows, columns = np.nonzero(changed)
+    x, y = made.grid.axes()
+    assert np.hypot(x[columns].mean() - met[0], y[rows].mean() - met[1]) < 0.5
+    assert 0.6 < changed.sum() * 0.01 / (20 * 20 * eye.gsd_m(0.0) ** 2) < 1.6
+    assert np.nanmedian(np.abs(made.values)) < 0.05
+    elsewhere = survey(photograph(eye.moved(np.array([500.0, 0, 0, 0, 0, 0])), image))
+    with pytest.raises(difference.DifferenceError, match="no ground in common"):
+        difference.of_pictures(first, elsewhere)
+
+
+def test_frames_that_cant_be_placed_are_named_and_the_flight_goes_on(tmp_path: Path, short_flight: Flown) -> None:
+    """A frame without a tag, one without a position, one that looks at the horizon, and a good one."""
+    raw = sorted((short_flight.folder / "frames").iterdir())[0].read_bytes()
+    good = flown.as_recorded(true_pose(short_flight))
+    level = from_euler(0.0, math.radians(85), 0.0)
+    poses = [None, replace(good, latitude_rad=None), replace(good, attitude=level), replace(good, attitude=None), good]
+    begun = recording.begin(tmp_path / "flights", lambda: flown.START_NS)
+    for index, one in enumerate(poses):
+        wish(begun, index)
+        frame = deliver(begun, index, raw, f"IMG_{index}.DNG")
+        if one is not None:
+            begun.ledger.add_tag(replace(tagged(frame.sha256, index), pose=one))
+    begun.close()
+    broken = replace(short_flight, folder=begun.folder.path)
+    assert main(words(broken, tmp_path / "maps", "--as", "footprints")) == 0
+    report = json.loads((tmp_path / "maps" / "report.json").read_text())
+    assert [frame["name"] for frame in report["frames"]] == ["000004"]
+    why = {row["name"]: row["why"] for row in report["left_out"]}
+    assert "never tagged" in why["frames/000000.dng"]
+    assert "no position is known" in why["frames/000001.dng"]
+    assert "looks above the horizon" in why["000002"]
+    assert "no attitude is known" in why["frames/000003.dng"]
+
+
+def true_pose(flight: Flown) -> TruePose:
+    pose_of_first = flight.truths[0].pose
+    assert pose_of_first is not None
+    return pose_of_first
+
+
+def tagged(sha256: str, index: int) -> Tag:
+    return Tag(index, 1, 1, "hot shoe", 50.0, flown.F_NUMBER, 0.001, 100, flown.CAMERA, flown.MASK, sha256, pose())
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--crs", "EPSG:4326"], "no map in metres"),
+        (["--crs", "EPSG:32633"], "is no map of"),
+        (["--terrain", "none.tif"], "none.tif can't be read"),
+        (["--frames", "zero"], "write numbers as 0,3-5"),
+        (["--frames", "77"], "can be put on a map"),
+        (["--ground", "5000"], "can be put on a map"),
+        (["--as", "difference"], "--against FLIGHT go together"),
+        (["--terrain", "x.tif", "--terrain-heights", "ellipsoid", "--geoid", "no.gtx"], "no geoid grid no.gtx"),
+        (["--refine", "a.tif", "b.tif", "--frames", "0"], "one base map"),
+        (["--view", "9,9", "--frames", "0"], "there is no view 9,9"),
+        (["--mount", *"110010001"], "is no rotation"),
+    ],
+)
+def test_a_wrong_call_is_a_sentence(
+    short_flight: Flown, tmp_path: Path, more: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words(short_flight, tmp_path, *more)) in (1, 2)
+    err = capsys.readouterr().err
+    assert said in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_the_lever_arm_and_the_mount_reach_the_map(short_flight: Flown) -> None:
+    frames, tags = photographs.recorded(short_flight.folder)
+    turned = tuple((np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]) @ camera_pose.NADIR).ravel())
+    plain = photographs.station(frames[0], tags[0], Mounting())
+    moved = photographs.station(frames[0], tags[0], Mounting((0.0, 0.0, 1.0), turned))
+    assert plain.camera.altitude_msl_m - moved.camera.altitude_msl_m == pytest.approx(1.0, abs=0.02)
+    assert moved.camera_to_ned.T @ plain.camera_to_ned == pytest.approx(
+        camera_pose.NADIR.T @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ camera_pose.NADIR, abs=1e-9
+    )
+
+
+def test_one_view_is_seen_from_aside(short_flight: Flown, tmp_path: Path) -> None:
+    more = ["--view", "0,4", "--as", "kmz", "--frames", "0", "--each", "--quad"]
+    assert main(words(short_flight, tmp_path / "v", *more)) == 0
+    with zipfile.ZipFile(tmp_path / "v" / "frames" / "000000.kmz") as archive:
+        assert b"LatLonQuad" in archive.read("doc.kml")
+
+
+def test_a_flight_that_doesnt_know_its_height_asks_for_the_ground(short_flight: Flown) -> None:
+    frames, tags = photographs.recorded(short_flight.folder)
+    unknown = replace(tags[0], pose=replace(tags[0].pose, height_above_home_m=None))
+    station = photographs.station(frames[0], unknown, Mounting())
+    assert georeference.level_of([station], Options(ground_m=12.0)) == 12.0
+    with pytest.raises(DappledError, match="--ground or --terrain"):
+        georeference.level_of([station], Options())
+    with pytest.raises(PhotographError, match="never tagged"):
+        photographs.station(frames[0], None, Mounting())
