@@ -150,3 +150,11 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
         one.bind(("127.0.0.1", 0))
         port: int = one.getsockname()[1]
         return port
+
+
+def _keys(given: Settings) -> tuple[str, ...]:
+    """Signing keys for the links as they are with the simulated ones, which are not signed."""
+    keys, links = given.mavlink.keys, len(given.mavlink.url)
+    if not keys:
+        return ()
+    return ("", "", *(keys * links if len(keys) == 1 else keys))

@@ -13,6 +13,7 @@ import argparse
 import json
 import random
 import signal
+import socket
 import sys
 import tempfile
 import threading
@@ -30,7 +31,7 @@ from dappled.daemon.ground_client import GroundClient
 from dappled.drivers.mavlink import mavlink
 from dappled.flight import check, summary
 from dappled.flight.errors import FlightError
-from dappled.mocks.simulation import Simulation, World
+from dappled.mocks.simulation import Simulation, World, free_port
 from dappled.mocks.supervised import Resources, Supervised
 from dappled.mocks.troubles import Troubles
 
@@ -81,11 +82,12 @@ def soak(plan: Plan, folder: Path, tell: Callable[[str], None] = lambda _: None)
         tables = configuration.to_tables(simulated)
         tables["record"]["directory"] = str(root)
         tables["publish"] |= {"slices": f"ipc://{folder}/s", "ask": f"ipc://{folder}/a"}
+        tables["console"]["bind"] = f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         config.write_text(tomli_w.dumps(tables), encoding="utf-8")
         daemon = stack.enter_context(Supervised(config, folder / "daemon.log"))
         ground = stack.enter_context(GroundClient(simulation.ground_url))
         ground.find_camera(START_S)
-        troubles = stack.enter_context(Troubles(simulation, daemon, config, f"ipc://{folder}/s", chance))
+        troubles = stack.enter_context(Troubles(simulation, daemon, config, chance))
         wisher = _Wisher(ground, plan.interval_s, answers)
         stack.callback(wisher.stop)
         wisher.start()

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from dappled.config import settings as configuration
 from dappled.mocks.simulation import Simulation
 from dappled.mocks.supervised import Supervised
 
@@ -23,15 +24,17 @@ HEAR_S = 5.0
 
 
 class Troubles:
-    """Strikes at camera, link, disk, subscribers, and processes. Use as a context manager."""
+    """Strikes at camera, link, disk, subscribers, console, and processes. Use as a context manager."""
 
-    def __init__(
-        self, simulation: Simulation, daemon: Supervised, config: Path, stream: str, chance: random.Random
-    ) -> None:
-        self._simulation, self._daemon, self._config, self._stream = simulation, daemon, config, stream
+    def __init__(self, simulation: Simulation, daemon: Supervised, config: Path, chance: random.Random) -> None:
+        """`config` is the daemon's: it names the stream and the console, and is written anew to fill the disk."""
+        self._simulation, self._daemon, self._config = simulation, daemon, config
+        settings = configuration.load(config)
+        self._stream, self._console = settings.publish.slices, settings.console.bind
         self._chance = chance
         self._settings = config.read_text(encoding="utf-8")
         self._watchers: list[subprocess.Popen[bytes]] = []
+        self._pages: list[socket.socket] = []
         self._full = False
         self.counts: Counter[str] = Counter()
         self._known: dict[str, Callable[[], None]] = {
@@ -39,9 +42,11 @@ class Troubles:
             "decode process killed": lambda: self._kill_child("decode_worker"),
             "autopilot reboots": simulation.reboot_autopilot,
             "noise on the link": self._noise,
-            "disk full, or free again": self._disk,
+            "disk full": self._disk,
             "subscriber hangs": lambda: self._watch(signal.SIGSTOP),
             "subscriber killed": lambda: self._watch(signal.SIGKILL),
+            "console process killed": lambda: self._kill_child("daemon.console"),
+            "page stops reading": self._page,
         }
         for fault in CAMERA:
             self._known[f"camera: {fault}"] = lambda fault=fault: simulation.body.fault(fault)  # type: ignore[misc]  # bound now
@@ -53,7 +58,9 @@ class Troubles:
         self.clear()
 
     def strike(self, *, daemon_may_die: bool) -> str:
-        """Do one of them, by chance; its name."""
+        """Do one of them, by chance; its name. A full disk is free again by the next one."""
+        if self._full:
+            self._disk()
         names = [*self._known, *(["daemon killed"] if daemon_may_die else [])]
         name = self._chance.choice(names)
         self.counts[name] += 1
@@ -71,6 +78,9 @@ class Troubles:
         for watcher in self._watchers:
             _end(watcher)
         self._watchers.clear()
+        for page in self._pages:
+            page.close()
+        self._pages.clear()
 
     def _kill_child(self, name: str) -> None:
         with suppress(FileNotFoundError, ProcessLookupError):  # it, or the daemon, is just starting or ending
@@ -94,6 +104,16 @@ class Troubles:
         self._config.write_text(changed, encoding="utf-8")
         with suppress(ProcessLookupError):
             self._daemon.signal(signal.SIGHUP)
+
+    def _page(self) -> None:
+        """A page that asks for events and never reads them."""
+        host, _, port = self._console.partition(":")
+        with suppress(OSError):  # the console may be starting
+            page = socket.create_connection((host, int(port)), 2.0)
+            self._pages.append(page)
+            page.sendall(f"GET /api/events HTTP/1.1\r\nHost: {self._console}\r\n\r\n".encode())
+        if len(self._pages) > 4:
+            self._pages.pop(0).close()
 
     def _watch(self, then: signal.Signals) -> None:
         """A subscriber that connects, hears something, and then hangs or dies."""
