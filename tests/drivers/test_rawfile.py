@@ -83,6 +83,15 @@ def test_exposure_is_read_from_exif() -> None:
     assert (told.focal_length_mm, told.taken, told.make) == (14.8, "2026-11-21T10:15:03", "dappled")
 
 
+@pytest.mark.parametrize(
+    ("written", "sigma_mm"), [((33, 1), 0.5), ((148, 10), 0.05), ((14800, 1000), 0.05), ((0, 1), None)]
+)
+def test_a_focal_length_is_known_to_half_of_its_rounding(written: tuple[int, int], sigma_mm: float | None) -> None:
+    file = dng(mosaic(), focal=(37386, RATIONAL, 1, written))
+    assert read(file).focal_sigma_mm == sigma_mm
+    assert read_metadata(file).focal_sigma_mm == sigma_mm
+
+
 def test_zero_in_exif_is_unknown() -> None:
     file = dng(
         mosaic(),

@@ -25,7 +25,7 @@ from dappled.decode.plane import Plane
 from dappled.decode.prediction import crossed_orders, lattice_rotation
 from dappled.decode.slices import default_size
 from dappled.decode.spectrum import Spectrum, padded_shape
-from dappled.drivers.darkroom import Darkroom, DarkroomError
+from dappled.drivers.darkroom import Darkroom, DarkroomError, known_to
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -115,7 +115,9 @@ def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
             rows = _both_halves([(Carrier(0, 0, 0.0, 0.0), measure_mean()), *pairs])
             main = frozenset(found.orders) | {(0, 0)}
             return plane, Table(shape, "found", None, found.lattice, rows, main, found, "found", found.rotation_rad)
-        decoder = darkroom.mask_decoder(shape, raw.camera_model or "")
+        decoder = known_to(
+            darkroom.mask_decoder(shape, raw.camera_model or ""), None if arguments.focal_length else raw.focal_sigma_mm
+        )
         length = arguments.focal_length or raw.focal_length_mm
         if length is None:
             raise DarkroomError(f"{arguments.frames} doesn't say its focal length: give --focal-length MM")

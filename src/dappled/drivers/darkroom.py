@@ -121,6 +121,8 @@ class Darkroom:
                 exposure, chroma = self._expose(raw, colour=self.recipe.colour and views)
                 plane = self._where_taken(exposure, raw)
             decoder = self.decoder(plane.shape, raw.camera_model or "", colours=raw.cfa is not None)
+            if isinstance(decoder, MaskDecoder):
+                decoder = known_to(decoder, None if focal_length_mm else raw.focal_sigma_mm)
             focal_length_mm = focal_length_mm or raw.focal_length_mm
             f_number = f_number or raw.f_number
             with _timed(ms, "slices and views" if views else "slices"):
@@ -262,6 +264,11 @@ class Darkroom:
                 white = planes.to_plane(raw.mosaic, black=black, white=raw.white, cfa=cfa)
                 self._gains[shape] = planes.white_gain(white, cell_px=math.sqrt(white.size) / 32)
         return self._gains[shape]
+
+
+def known_to(decoder: MaskDecoder, focal_sigma_mm: float | None) -> MaskDecoder:
+    """The same decoder for a frame whose focal length is known to this; None: as the decoder has it."""
+    return decoder if focal_sigma_mm is None else replace(decoder, focal_sigma_mm=focal_sigma_mm)
 
 
 def _one_index_a_colour(raw: RawFile) -> tuple[NDArray[np.int64] | None, float | tuple[float, ...]]:

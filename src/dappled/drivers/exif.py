@@ -24,7 +24,7 @@ _BAD = (OSError, ValueError, SyntaxError, KeyError, TypeError, IndexError, struc
 @dataclass(frozen=True, slots=True)
 class Exposure:
     """Camera and exposure as the file tells them; None where it does not. `taken` is local time without a zone, ISO
-    8601 ("2008-04-15T13:11:23" or with a fraction)."""
+    8601 ("2008-04-15T13:11:23" or with a fraction). `focal_sigma_mm` is half of what the focal length is rounded to."""
 
     make: str | None = None
     model: str | None = None
@@ -33,6 +33,7 @@ class Exposure:
     exposure_s: float | None = None
     iso: float | None = None
     taken: str | None = None
+    focal_sigma_mm: float | None = None
 
 
 def read(file: BinaryIO) -> Exposure:
@@ -70,7 +71,19 @@ def _from(exif: Image.Exif) -> Exposure:
         exposure_s=positive(detail.get(_EXPOSURE, exif.get(_EXPOSURE))),
         iso=positive(detail.get(_ISO, exif.get(_ISO))),
         taken=_time(detail.get(_TAKEN) or exif.get(_TAKEN) or exif.get(_DATETIME), detail.get(_SUBSECONDS)),
+        focal_sigma_mm=_rounding(detail.get(_FOCAL, exif.get(_FOCAL))),
     )
+
+
+def _rounding(focal: object) -> float | None:
+    """Half of the last decimal that a body writes: 33/1 is known to 0.5 mm, 148/10 to 0.05 mm; not below 0.05 mm.
+
+    Bodies step their zoom coarser than finer fractions say. None for an unknown length.
+    """
+    if positive(focal) is None:
+        return None
+    denominator = getattr(focal, "denominator", 1)
+    return 0.5 if denominator == 1 else 0.05
 
 
 def positive(value: object) -> float | None:

@@ -48,7 +48,7 @@ class RawFile:
     units; `black` is one number, or one for each colour index. `cfa` is an int array (a, b) of colour indices that
     repeats over the mosaic from its pixel (0, 0), or None for a single colour; `colour_names[i]` names index i.
     `balance` are the file's own white balance gains by colour index, green 1. `taken` is the camera's local time
-    without a zone, ISO 8601.
+    without a zone, ISO 8601. `focal_sigma_mm` is half of what the file rounds its focal length to.
     """
 
     mosaic: Values
@@ -64,6 +64,7 @@ class RawFile:
     iso: float | None
     taken: str | None
     balance: tuple[float, ...] | None
+    focal_sigma_mm: float | None = None
 
 
 def read(source: Source, name: str | None = None) -> RawFile:
@@ -292,6 +293,7 @@ def _with(exposure: Exposure, mosaic: Values, **known: Any) -> RawFile:
         exposure_s=exposure.exposure_s,
         iso=exposure.iso,
         taken=exposure.taken,
+        focal_sigma_mm=exposure.focal_sigma_mm,
         **known,
     )
 
