@@ -18,9 +18,12 @@ from dappled.daemon.stages import Stage
 from dappled.daemon.street import Street
 from dappled.daemon.telemetry import Telemetry
 from dappled.drivers.mavlink import LinkStatistics
+from dappled.drivers.mavlink_signing import SigningStatistics
 
 WELL = Settings(
-    mask=MaskSettings("mask-1"), mavlink=MavlinkSettings(("udpin:127.0.0.1:1",)), record=RecordSettings(min_free_mb=0)
+    mask=MaskSettings("mask-1"),
+    mavlink=MavlinkSettings(("udpin:127.0.0.1:1",)),
+    record=RecordSettings(warn_free_mb=0, min_free_mb=0),
 )
 S = 10**9
 LINK = LinkStatistics("udpin:127.0.0.1:1", 5, 5, 0, 0, 0, 0, 100 * S, None)
@@ -65,9 +68,14 @@ def test_well(tmp_path: Path) -> None:
         ({"link": replace(LINK, last_heard_monotonic_ns=95 * S)}, "nobody was heard for 5 s"),
         ({"link": replace(LINK, last_heard_monotonic_ns=None)}, "nobody was heard for 5 s"),
         ({"link": replace(LINK, error="link down")}, "link down"),
+        (
+            {"link": replace(LINK, last_heard_monotonic_ns=None, signing=SigningStatistics(0, 3, 1, 0, 7))},
+            "7 packets were unsigned, 3 forged, 1 too old",
+        ),
         ({"settings": replace(WELL, mavlink=MavlinkSettings())}, "no MAVLink link is configured"),
         ({"settings": replace(WELL, mask=MaskSettings())}, "no mask is configured"),
         ({"settings": replace(WELL, record=RecordSettings(min_free_mb=10_000_000))}, "disk nearly full"),
+        ({"settings": replace(WELL, record=RecordSettings(warn_free_mb=10_000_000))}, "the disk is filling up"),
         ({"dead": ["capture"]}, "the capture thread has ended: restart dappled"),
         ({"items": 3}, "decode fell behind: 2 frames are only in the record"),
     ],

@@ -10,7 +10,22 @@ from dappled.daemon import metrics
 
 HEALTH: dict[str, Any] = {
     "camera": {"state": "faulted", "reason": "it hangs"},
-    "link": {"urls": 1, "packets": 1234, "positions": 56},
+    "link": {
+        "urls": 1,
+        "packets": 1234,
+        "positions": 56,
+        "each": [
+            {
+                "url": "udpin:0.0.0.0:14560",
+                "in": 1200,
+                "out": 34,
+                "bad": 2,
+                "unsent": 0,
+                "unlogged": 0,
+                "signing": {"good": 9, "forged": 3, "replayed": 1, "unsigned_taken": 0, "unsigned_refused": 5},
+            }
+        ],
+    },
     "disk": {"free_bytes": None, "folder": "/x"},
     "shots": {"wished": 9, "safe": 7, "failed": 1, "pending": 1, "refused": 3},
     "stages": [

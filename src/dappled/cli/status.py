@@ -60,6 +60,7 @@ def screen(told: Mapping[str, Any]) -> str:
         f"flight    {told['flight']}",
         f"camera    {camera['state']}{reason}",
         f"link      {link['urls']} open, {link['packets']} packets, {link['positions']} positions",
+        *(f"          {_link(one)}" for one in link["each"]),
         f"disk      {free}, {disk['folder']}",
         f"shots     {_counts(shots, 'wished', 'safe', 'failed', 'pending', 'refused')}",
     ]
@@ -68,6 +69,14 @@ def screen(told: Mapping[str, Any]) -> str:
             lines.append(f"{stage['name']:9} {_counts(stage, 'done', 'waiting', 'failed', 'dropped')}")
     lines += [f"problem   {text}" for text in told["problems"]] or ["all is well"]
     return "\n".join(lines)
+
+
+def _link(facts: Mapping[str, Any]) -> str:
+    signing = facts["signing"]
+    signed = ""
+    if signing is not None:
+        signed = f"; signed: {_counts(signing, 'good', 'forged', 'replayed', 'unsigned_taken', 'unsigned_refused')}"
+    return f"{facts['url']}: {_counts(facts, 'in', 'out', 'bad', 'unsent')}{signed}".replace("_", " ")
 
 
 def _counts(facts: Mapping[str, Any], *names: str) -> str:

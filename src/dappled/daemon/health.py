@@ -49,10 +49,14 @@ def record(
         if link.error:
             problems.append(link.error)
         elif monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS:
-            problems.append(f"MAVLink link {link.url}: nobody was heard for 5 s")
+            problems.append(f"MAVLink link {link.url}: {_silence(link)}")
     free = _free(folder)
     if free is not None and free < settings.record.min_free_mb * 1_000_000:
         problems.append(f"disk nearly full: {free // 1_000_000} MB left, new shots are refused")
+    elif free is not None and free < settings.record.warn_free_mb * 1_000_000:
+        problems.append(
+            f"the disk is filling up: {free // 10**6} MB left, below {settings.record.min_free_mb} MB shots are refused"
+        )
     if not settings.mask.profile:
         problems.append("no mask is configured: frames are kept, not decoded (set mask.profile)")
     stages = [asdict(stage.statistics()) for stage in street.stages]
@@ -62,7 +66,12 @@ def record(
     return {
         "utc_ns": utc_ns,
         "camera": {"state": street.camera_state, "reason": street.camera_reason},
-        "link": {"urls": len(links), "packets": telemetry.packets, "positions": telemetry.positions},
+        "link": {
+            "urls": len(links),
+            "packets": telemetry.packets,
+            "positions": telemetry.positions,
+            "each": [_counters(link) for link in links],
+        },
         "disk": {"free_bytes": free, "folder": str(folder)},
         "shots": {
             "wished": shutter.shots,
@@ -82,6 +91,30 @@ def record(
             "running": decoding,
         },
         "min_free_bytes": settings.record.min_free_mb * 1_000_000,
+    }
+
+
+def _silence(link: LinkStatistics) -> str:
+    """Why a link is of no use, as far as can be told from here."""
+    signing = link.signing
+    if signing is None or signing.refused == 0:
+        return "nobody was heard for 5 s"
+    return (
+        f"nobody was heard for 5 s whose signature counts ({signing.unsigned_refused} packets were unsigned, "
+        f"{signing.forged} forged, {signing.replayed} too old); give both sides the same key"
+    )
+
+
+def _counters(link: LinkStatistics) -> dict[str, Any]:
+    """What went over a link."""
+    return {
+        "url": link.url,
+        "in": link.packets_in,
+        "out": link.packets_out,
+        "bad": link.packets_bad,
+        "unsent": link.packets_unsent,
+        "unlogged": link.packets_unlogged,
+        "signing": None if link.signing is None else asdict(link.signing),
     }
 
 

@@ -167,6 +167,11 @@ class SigningStatistics:
     unsigned_taken: int
     unsigned_refused: int
 
+    @property
+    def refused(self) -> int:
+        """Packets that were dropped."""
+        return self.forged + self.replayed + self.unsigned_refused
+
 
 class Guard:
     """Signing on one link: signs what goes out, judges what comes in. Used under the link's lock.
