@@ -17,6 +17,7 @@ from dappled.errors import DappledError
 VERBS: dict[str, tuple[str, str]] = {
     "run": ("run", "the daemon: fire, record, tag, decode, publish"),
     "replay": ("replay", "a recorded flight, or a folder of frames, through the same daemon"),
+    "doctor": ("doctor", "what is missing on this machine; a test shot, and its latency"),
     "status": ("status", "how the running daemon is"),
     "watch": ("watch", "subscribe: show and save what arrives"),
     "keys": ("keys", "keys for who may subscribe over the network, and the console's token"),

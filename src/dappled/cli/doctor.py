@@ -1,0 +1,220 @@
+"""`dappled doctor`: what is missing on this machine, and whether the next flight will bring good frames."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from dappled.cli.common import whole
+from dappled.config import settings as configuration
+from dappled.config.settings import Settings
+from dappled.daemon import checkup, examination, inputs, trial
+from dappled.daemon.checkup import Finding
+from dappled.daemon.trial import Latency
+from dappled.drivers import usb_bus
+from dappled.errors import DappledError
+
+_WORDS = {"ok": "ok", "note": "note", "wrong": "WRONG", "go": "go", "caution": "caution", "no-go": "NO GO"}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "examples:\n  dappled doctor\n  dappled doctor --config dappled.toml --test-shot\n"
+        "  dappled doctor --simulate --latency 10\n\nexits 1 while something stands in the way"
+    )
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings (default: every default)")
+    parser.add_argument("--simulate", action="store_true", help="look at a simulated camera and autopilot")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulation (default 1)")
+    parser.add_argument("--test-shot", action="store_true", help="fire one frame and say go or no-go")
+    parser.add_argument("--latency", type=whole, nargs="?", const=10, metavar="N", help="time N shots (default 10)")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the test flight here")
+    parser.add_argument("--watch", action="store_true", help="say which cameras come and go on USB, until ^C")
+    parser.add_argument("--json", action="store_true", help="as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    settings = configuration.load(arguments.config)
+    if arguments.watch:
+        return _watch()
+    with tempfile.TemporaryDirectory(prefix="dpl-") as place, ExitStack() as stack:
+        folder = Path(place)
+        truth = None
+        if arguments.simulate:
+            settings, truth = stack.enter_context(_simulated(settings, arguments.seed, folder))
+        findings = checkup.checkup(settings)
+        told: dict[str, Any] = {"checks": [asdict(one) for one in findings]}
+        ready = all(one.state != "wrong" for one in findings if one.name in ("camera", "disk"))
+        good = not checkup.next_step(findings)
+        lines = _findings(findings)
+        if (arguments.test_shot or arguments.latency) and ready:
+            more, shot = _shoot(settings, arguments, folder, truth)
+            lines, told, good = [*lines, *more], {**told, **shot}, good and shot["verdict"] != "no-go"
+        elif arguments.test_shot or arguments.latency:
+            lines.append("no shot was fired: the camera or the disk is not ready")
+    lines.append(_last(findings, told.get("verdict")))
+    told["next"] = checkup.next_step(findings)
+    print(json.dumps(told, indent=2) if arguments.json else "\n".join(lines))
+    return 0 if good else 1
+
+
+def _findings(findings: Sequence[Finding]) -> list[str]:
+    return [f"{_WORDS[one.state]:8} {one.name:11} {one.text}" for one in findings]
+
+
+def _last(findings: Sequence[Finding], verdict: str | None) -> str:
+    todo = checkup.next_step(findings)
+    if todo:
+        return f"next: {todo}"
+    if verdict is not None:
+        return {"go": "GO", "caution": "GO, with the cautions above", "no-go": "NO GO"}[verdict]
+    return "nothing stands in the way; next: dappled doctor --test-shot"
+
+
+def _shoot(
+    settings: Settings, arguments: argparse.Namespace, folder: Path, truth: Path | None
+) -> tuple[list[str], dict[str, Any]]:
+    """The lines and the facts of the test shots."""
+    place = folder if arguments.keep is None else arguments.keep
+    place.mkdir(parents=True, exist_ok=True)
+    count = arguments.latency or 1
+    _, recipe = inputs.recipe(settings)
+    ours = settings if arguments.test_shot else replace(settings, decode=replace(settings.decode, enabled=False))
+    latencies: list[Latency] = []
+    frame: Path | None = None
+    problem = ""
+    with trial.daemon(ours, folder, place) as daemon, _hot_shoe(ours, truth):
+        for _ in tqdm(range(count), unit="shot", disable=None, delay=1.0):
+            story = daemon.shoot()
+            if story.frame is None:
+                problem = story.problem or story.follows
+                break
+            latencies.append(trial.latency(story))
+            frame = frame or daemon.flight / story.frame.name
+        lines: list[str] = []
+        facts: dict[str, Any] = {"verdict": "go", "flight": str(daemon.flight) if arguments.keep else None}
+        if problem:
+            lines.append(f"{_WORDS['no-go']:8} {'test shot':11} {problem}")
+            facts["verdict"] = "no-go"
+        elif arguments.test_shot and frame is not None:
+            judged = _judged(frame, recipe)
+            facts |= {"test_shot": [asdict(one) for one in judged], "verdict": examination.verdict(judged)}
+            lines += [f"{_WORDS[one.state]:8} {one.name:11} {one.text}" for one in judged]
+    if arguments.latency and latencies:
+        timed = _timed(latencies, None if truth is None else _true_latencies(truth, len(latencies)))
+        lines += timed.pop("lines")
+        facts |= {"latency": timed}
+    return lines, facts
+
+
+def _judged(frame: Path, recipe: Any) -> list[examination.Finding]:
+    try:
+        return examination.examine(frame, recipe)
+    except DappledError as error:
+        return [examination.Finding("picture", "no-go", f"it is no picture: {error}", {})]
+
+
+_SPANS = {
+    "wish_to_trigger": "command to trigger call",
+    "trigger_call": "trigger call",
+    "to_exposure": "trigger call to exposure",
+    "to_file": "trigger call to file",
+    "recorded": "file to safe on disk",
+}
+
+
+def _timed(latencies: Sequence[Latency], truth_ms: list[float] | None) -> dict[str, Any]:
+    """Statistics in milliseconds, and the lines that say them."""
+    facts: dict[str, Any] = {}
+    lines = []
+    for name, title in _SPANS.items():
+        values = [value for one in latencies if (value := getattr(one, name)) is not None]
+        if not values:
+            facts[name] = None
+            lines.append(
+                f"         {title:26} nobody could see it: a hot shoe on the autopilot tells (docs/drivers.md)"
+            )
+            continue
+        facts[name] = {
+            "median": statistics.median(values),
+            "low": min(values),
+            "high": max(values),
+            "deviation": statistics.pstdev(values),
+            "shots": len(values),
+        }
+        one = facts[name]
+        lines.append(
+            f"         {title:26} {one['median']:8.1f} ms ({one['low']:.1f} to {one['high']:.1f}, "
+            f"σ {one['deviation']:.1f}, {one['shots']} shots)"
+        )
+    if facts["to_exposure"]:
+        mean = statistics.mean(value for one in latencies if (value := one.to_exposure) is not None)
+        lines.append(
+            f"         set camera.latency_ms = {mean:.0f}, latency_sigma_ms = {facts['to_exposure']['deviation']:.0f}"
+        )
+    if truth_ms is not None:
+        measured = [one.to_exposure for one in latencies]
+        errors = [a - b for a, b in zip(measured, truth_ms, strict=True) if a is not None]
+        facts["truth_ms"], facts["worst_error_ms"] = truth_ms, max((abs(e) for e in errors), default=None)
+        if errors:
+            lines.append(f"         the simulation's own times differ by at most {facts['worst_error_ms']:.1f} ms")
+    return {**facts, "lines": lines}
+
+
+def _watch() -> int:
+    """Cameras on USB as they come and go."""
+    before: list[usb_bus.UsbBody] = []
+    print("watching USB for cameras; ^C ends", file=sys.stderr)
+    while True:
+        now = usb_bus.bodies()
+        came, went = usb_bus.changes(before, now)
+        for word, bodies in (("gone", went), ("here", came)):
+            for body in bodies:
+                fires = "can be fired over USB" if body.fires else "USB can't fire it"
+                print(f"{word}  {body.port}  {body.maker} {body.name} ({body.mode}): {fires}", flush=True)
+        before = now
+        time.sleep(0.5)
+
+
+# --- the simulation -------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _simulated(settings: Settings, seed: int, folder: Path) -> Iterator[tuple[Settings, Path]]:
+    """Settings for a simulated camera and autopilot, and the folder where the simulation writes its truth."""
+    from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # a real flight doesn't load the mocks
+
+    truth = folder / "truth"
+    truth.mkdir()
+    with Simulation(World(seed=seed, truth=truth), settings, folder) as simulated:
+        yield simulated, truth
+
+
+@contextmanager
+def _hot_shoe(settings: Settings, truth: Path | None) -> Iterator[None]:
+    """The simulated body's contact, wired to the simulated autopilot."""
+    if truth is None:
+        yield
+        return
+    from dappled.mocks.hot_shoe import HotShoe  # noqa: PLC0415  # as above
+
+    shoe = HotShoe(truth, settings.mavlink.url[0])
+    try:
+        yield
+    finally:
+        shoe.close()
+
+
+def _true_latencies(truth: Path, count: int) -> list[float]:
+    """From trigger to exposure in milliseconds, as the simulation knows it."""
+    return [json.loads(path.read_text())["latency_s"] * 1e3 for path in sorted(truth.glob("*.json"))[:count]]

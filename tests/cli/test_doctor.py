@@ -1,0 +1,100 @@
+"""`dappled doctor` as a person calls it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from dappled.cli import main
+from dappled.drivers import usb_bus
+from dappled.drivers.usb_bus import CANON, UsbBody
+from tests.system.conftest import dappled
+
+
+def test_on_a_machine_without_any_camera_it_ends_with_what_to_do_next(capfd: pytest.CaptureFixture[str]) -> None:
+    if usb_bus.bodies():
+        pytest.skip("there is a camera on this machine")
+    assert main(["doctor"]) == 1
+    out = capfd.readouterr().out.splitlines()
+    assert len(out) <= 24  # one screen
+    assert out[-1].startswith("next: connect the camera")
+    assert main(["doctor", "--json"]) == 1
+    told = json.loads(capfd.readouterr().out)
+    assert told["next"].startswith("connect the camera")
+    assert {one["state"] for one in told["checks"]} <= {"ok", "note", "wrong"}
+
+
+def settings(folder: Path, picture: str) -> Path:
+    path = folder / "dappled.toml"
+    path.write_text(
+        f'[camera]\ndriver = "simulated"\n[camera.options]\npicture = "{picture}"\n'
+        f'[record]\ndirectory = "{folder}/flights"\n'
+    )
+    return path
+
+
+def test_with_a_camera_that_is_ready_it_says_so(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--config", str(settings(tmp_path, "pattern:1000:dng"))]) == 0
+    assert "--test-shot" in capfd.readouterr().out.splitlines()[-1]
+    assert not (tmp_path / "flights").exists()
+
+
+def test_a_test_shot_that_is_no_picture_is_no_go(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = settings(tmp_path, "pattern:1000:dng")
+    assert main(["doctor", "--config", str(path), "--test-shot", "--keep", str(tmp_path / "kept")]) == 1
+    out = capfd.readouterr().out
+    assert out.splitlines()[-1] == "NO GO"
+    assert "it is no picture" in out
+    assert len(list((tmp_path / "kept").rglob("frames/*.dng"))) == 1
+
+
+def test_a_camera_that_can_t_be_had_is_not_fired(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "dappled.toml"
+    path.write_text('[camera]\ndriver = "folder"\npickup = "/no/such"\n')
+    assert main(["doctor", "--config", str(path), "--latency", "3"]) == 1
+    out = capfd.readouterr().out
+    assert "/no/such" in out
+    assert "no shot was fired" in out
+
+
+def test_latency_is_measured_without_a_hot_shoe_as_far_as_it_can_be(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["doctor", "--config", str(settings(tmp_path, "pattern:1000:dng")), "--latency", "2", "--json"]) == 0
+    told = json.loads(capfd.readouterr().out)["latency"]
+    assert told["to_exposure"] is None
+    for name in ("wish_to_trigger", "trigger_call", "to_file", "recorded"):
+        assert told[name]["shots"] == 2
+        assert told[name]["low"] <= told[name]["median"] <= told[name]["high"]
+
+
+def test_bodies_that_come_and_go_are_told(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    body = UsbBody(1, 5, CANON, 0x3145, "PTP", "EOS 450D")
+    looks = iter([[], [body], [body], []])
+
+    def bodies() -> list[UsbBody]:
+        try:
+            return next(looks)
+        except StopIteration:
+            raise KeyboardInterrupt from None
+
+    monkeypatch.setattr(usb_bus, "bodies", bodies)
+    monkeypatch.setattr("dappled.cli.doctor.time.sleep", lambda seconds: None)
+    assert main(["doctor", "--watch"]) == 130
+    assert [line.split("  ")[0] for line in capfd.readouterr().out.splitlines()] == ["here", "gone"]
+
+
+@pytest.mark.slow
+def test_the_simulated_camera_is_go_and_its_latency_is_what_the_simulation_knows() -> None:
+    done = dappled("doctor", "--simulate", "--test-shot", "--latency", "4", "--json", timeout_s=110)
+    assert done.returncode == 0, done.stdout + done.stderr
+    told = json.loads(done.stdout)
+    assert told["verdict"] == "go"
+    assert {one["name"] for one in told["test_shot"]} == {"focal length", "exposure", "carriers", "focus", "motion"}
+    latency = told["latency"]
+    assert latency["to_exposure"]["shots"] >= 2
+    assert all(45 <= true_ms <= 75 for true_ms in latency["truth_ms"])
+    assert latency["worst_error_ms"] < 25
+    assert latency["to_file"]["low"] > latency["to_exposure"]["high"]
