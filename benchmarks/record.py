@@ -1,6 +1,7 @@
 """What recording costs: a durable frame against plain write + fsync, a note in the wish journal, a ledger row.
 
 python benchmarks/record.py [--json] [--directory DIR] [--megabytes 17] [--rounds 15]
+python benchmarks/record.py --sustained 300 [--json] [--directory DIR]      4 frames/s of 11 MB: see sustained.py
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import sustained
+
 from dappled.drivers.camera import Blob
 from dappled.flight import recording
 from dappled.flight.records import Cause, Shot
@@ -30,9 +33,13 @@ def main() -> None:
     parser.add_argument(
         "--pause", type=float, default=0.5, help="seconds between writes, so that a disk's cache recovers"
     )
+    parser.add_argument("--sustained", type=float, metavar="SECONDS", help="frames faster than they can be decoded")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=arguments.directory) as folder:
-        figures = measure(Path(folder), arguments.megabytes * 1_000_000, arguments.rounds, arguments.pause)
+        if arguments.sustained:
+            figures = sustained.measure(Path(folder), arguments.sustained, 4.0, 11_000_000, decode_s=2.0)
+        else:
+            figures = measure(Path(folder), arguments.megabytes * 1_000_000, arguments.rounds, arguments.pause)
     if arguments.json:
         print(json.dumps(figures))
     else:

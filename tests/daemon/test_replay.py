@@ -152,6 +152,18 @@ def test_a_folder_without_what_was_named(tmp_path: Path) -> None:
         replay.of_folder(tmp_path, "*.png", tmp_path / "empty.tlog", None, 1.0)
 
 
+def test_the_only_telemetry_beside_the_frames_is_theirs(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"a")
+    assert replay.of_folder(tmp_path, "*", None, 5, 1.0).telemetry is None
+    (tmp_path / "flight.tlog").write_bytes(b"")
+    assert replay.of_folder(tmp_path, "*", None, 5, 1.0).telemetry == tmp_path / "flight.tlog"
+    (tmp_path / "other.tlog").write_bytes(b"")
+    with pytest.raises(ReplayError, match=r"holds 2 \.tlog files"):
+        replay.of_folder(tmp_path, "*", None, 5, 1.0)
+    given = replay.of_folder(tmp_path, "*", tmp_path / "other.tlog", 5, 1.0)
+    assert given.telemetry == tmp_path / "other.tlog"
+
+
 def test_a_shot_that_never_ends_is_given_up(tmp_path: Path) -> None:
     flight = record(tmp_path)
     recording = replay.of_flight(flight)

@@ -73,6 +73,13 @@ def test_the_receivers_word_is_carried_along() -> None:
     late = link.pose(2.04, sigma_ms=500)
     assert late.position_sigma_m == pytest.approx(math.hypot(0.82, 2.5), abs=0.02)
     assert late.vertical_sigma_m == pytest.approx(math.hypot(1.5, 1.0), abs=0.02)
+    assert late.position_covariance_m2 is not None
+    nn, ne, nd, ee, ed, dd = late.position_covariance_m2
+    assert math.sqrt(nn + ee) == pytest.approx(late.position_sigma_m)
+    assert math.sqrt(dd) == pytest.approx(late.vertical_sigma_m)
+    assert (ne, ed) == (0.0, 0.0)  # it flies north and sinks: an unknown time is along that way
+    assert nd == pytest.approx(2.5 * 1.0, rel=0.01)
+    assert math.sqrt(ee) == pytest.approx(0.82 / math.sqrt(2), abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -121,6 +128,9 @@ def test_the_autopilots_own_attitude_accuracy_counts() -> None:
     assert told.pose(2.0).attitude_sigma_rad == pytest.approx(0.03)
     assert silent.pose(2.0).attitude_sigma_rad == pytest.approx(0.0, abs=1e-9)
     assert configured.pose(2.0).attitude_sigma_rad == pytest.approx(0.02)
+    found = configured.pose(2.0).attitude_covariance_rad2
+    assert found is not None
+    assert math.sqrt(found[0] + found[3] + found[5]) == pytest.approx(0.02)
 
 
 def gimbal(t_s: float, flags: int, boot_s: float = 0.0) -> Message:

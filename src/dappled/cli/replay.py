@@ -56,11 +56,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--run",
         dest="run_name",
         metavar="NAME",
-        help="name for results by another recipe, in the ledger (default: the time); with --verify: which to verify",
+        help="keep results in the ledger by this name (another recipe: default the time); with --verify: check them",
     )
     parser.add_argument("--camera", metavar="P", help="camera profile or TOML file")
     parser.add_argument("--mask", metavar="P", help="mask profile or TOML file, or lenslet")
-    parser.add_argument("--telemetry", type=Path, metavar="FILE", help=".tlog beside a folder of frames")
+    parser.add_argument(
+        "--telemetry", type=Path, metavar="FILE", help="of a folder of frames (default: the only .tlog in it)"
+    )
     parser.add_argument("--white", metavar="FILE", help="white frame")
     parser.add_argument("--dark", metavar="FILE", help="dark frame")
     parser.add_argument("--calibration", metavar="FILE", help="file written by dappled calibrate")
@@ -78,8 +80,8 @@ def run(arguments: argparse.Namespace) -> int:
     is_flight = (arguments.flight / layout.FlightFolder(arguments.flight).ledger.name).is_file()
     if arguments.verify and not is_flight:
         raise ReplayError(f"{arguments.flight} is no recorded flight: there are no hashes to verify")
-    if arguments.run_name and not (arguments.verify or _changed(arguments)):
-        raise ReplayError("--run names results by another recipe: give --calibration, --mask, --camera … or --verify")
+    if arguments.run_name and not is_flight:
+        raise ReplayError(f"{arguments.flight} is no recorded flight: --run names results in a flight's ledger")
     problems = list(check.check(arguments.flight).problems) if arguments.verify else []
     facts = layout.read_facts(layout.open_folder(arguments.flight)) if is_flight else {}
     recipe = _recipe(arguments, facts, settings)
@@ -87,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
     names, latency, recorded = _as_recorded(arguments, facts, recipe)
     with ExitStack() as stack:
         keep = None
-        if is_flight and recipe and _changed(arguments) and not arguments.verify:
+        if is_flight and recipe and (arguments.run_name or _changed(arguments)) and not arguments.verify:
             name = arguments.run_name or datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
             results = stack.enter_context(RunBook(arguments.flight, Run(name, recipe, names), time.time_ns))
             recipe, keep = results.run.recipe, results.decoded

@@ -12,6 +12,7 @@ from typing import Any
 
 from dappled.config.schema import ConfigError, Rule, Source, build, read_toml, setting
 
+DEPTH_METHODS = ("gradient", "contrast", "combined")  # fast to good
 SOCKET_MODES = ("0600", "0660", "0666")
 
 
@@ -70,6 +71,7 @@ class RecordSettings:
         "Who knows UTC: the system; the autopilot (learnt in flight, folders named by boot); auto judges the system",
         choices=("auto", "system", "autopilot"),
     )
+    warn_free_mb: int = setting(2000, "Below this free space a warning is given", unit="MB", low=0, high=10_000_000)
     min_free_mb: int = setting(500, "Below this free space new shots are refused", unit="MB", low=0, high=10_000_000)
 
 
@@ -107,6 +109,8 @@ class DecodeSettings:
     white: str = setting("", "White frame; empty: none")
     dark: str = setting("", "Dark frame; empty: none")
     workers: int = setting(1, "Threads of one decode; 1 leaves the other core to capture", low=1, high=64)
+    depth: str = setting("", "Depth in flight by this method; empty: none", choices=("", *DEPTH_METHODS))
+    depth_interval_s: float = setting(5.0, "At most one frame's depth in this time", unit="s", low=0, high=3600)
     queue: int = setting(4, "Frames that may wait; more stay in the record, to be decoded later", low=1, high=1000)
 
 
@@ -114,7 +118,7 @@ class DecodeSettings:
 class PublishSettings:
     slices: str = setting("", "ZeroMQ endpoint of the stream; empty: ipc in the user's runtime folder")
     ask: str = setting("", "ZeroMQ endpoint that answers questions about recorded frames; empty: beside the stream")
-    high_water_mark: int = setting(12, "Messages that may wait for a slow subscriber; 3 a frame", low=1, high=1000)
+    high_water_mark: int = setting(6, "Messages that may wait for a slow subscriber; 2 to 4 a frame", low=1, high=1000)
     preview_interval_s: float = setting(1.0, "At most one preview in this time", unit="s", low=0, high=3600)
     socket_mode: str = setting("0660", "Who may connect to ipc sockets, as chmod says it", choices=SOCKET_MODES)
     keys: str = setting("", "Secret CURVE key for tcp endpoints, made by dappled keys make; empty: none off loopback")

@@ -83,9 +83,11 @@ def of_folder(
     folder: Path, match: str, telemetry: Path | None, start_utc_ns: int | None, interval_s: float
 ) -> Recording:
     """Frames in a folder, in the order of their names; the first at `start_utc_ns` (None: the telemetry's first
-    position, or 1970 without telemetry), the others at `interval_s` after each other."""
+    position, or 1970 without telemetry), the others at `interval_s` after each other. A single .tlog in the folder is
+    the telemetry, where none is named."""
     if telemetry is not None and not telemetry.is_file():
         raise ReplayError(f"{telemetry}: there is no such telemetry file; check --telemetry")
+    telemetry = telemetry or _only_log(folder)
     paths = [path for path in sorted(folder.glob(match)) if path.suffix.lower() in FRAME_SUFFIXES and path.is_file()]
     if not paths:
         raise ReplayError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
@@ -103,6 +105,13 @@ def of_folder(
         files.append(Recorded(index, path, path.name, (utc_ns, utc_ns), utc_ns))
         expected.append(Expected(ShotRow(shot, "safe", None, utc_ns, utc_ns), frame))
     return Recording(folder, shots, files, expected, telemetry, {})
+
+
+def _only_log(folder: Path) -> Path | None:
+    logs = sorted(folder.glob("*.tlog"))
+    if len(logs) > 1:
+        raise ReplayError(f"{folder} holds {len(logs)} .tlog files: say which with --telemetry")
+    return logs[0] if logs else None
 
 
 class RecordedTelemetry:

@@ -17,7 +17,7 @@ from dappled.daemon.interpolation import (
     turned_by_heading,
 )
 from dappled.daemon.telemetry_samples import HALF_MS_NS, AttitudeSample, GimbalSample, GnssSample, PositionSample
-from dappled.flight.records import Gnss, Pose, Quaternion
+from dappled.flight.records import Gnss, Pose, Quaternion, Symmetric, Vector3
 
 NEAREST_NS = 10 * 10**9
 
@@ -49,7 +49,7 @@ def pose(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) -> Pose:
     own, as the autopilot tells it, else `attitude_sigma_rad`.
     """
     sigma_s = math.hypot(at.sigma_ns, HALF_MS_NS / math.sqrt(3)) / 1e9
-    attitude, attitude_sigma = _attitude(at, sigma_s, attitude_sigma_rad)
+    attitude, attitude_sigma, attitude_covariance = _attitude(at, sigma_s, attitude_sigma_rad)
     gimbal, gimbal_source = _gimbal(at, attitude)
     made = replace(
         nothing(at.utc_ns, packets),
@@ -59,6 +59,7 @@ def pose(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) -> Pose:
         gnss=_gnss(at),
         gimbal_attitude=gimbal,
         gimbal_source=gimbal_source,
+        attitude_covariance_rad2=attitude_covariance,
     )
     if not at.positions:
         return made
@@ -68,6 +69,10 @@ def pose(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) -> Pose:
     north, east, down = found.velocity_ned_m_s
     across_m = at.gnss.horizontal_sigma_m if at.gnss else None
     upright_m = at.gnss.vertical_sigma_m if at.gnss else None
+    covariance = None
+    if across_m is not None and upright_m is not None:
+        across = (across_m**2 + across_doubt_m**2) / 2  # of each axis
+        covariance = _symmetric(found.velocity_ned_m_s, blur_s, (across, across, upright_m**2 + upright_doubt_m**2))
     return replace(
         made,
         source="interpolated" if len(at.positions) == 2 and len(at.attitudes) != 1 else "nearest",
@@ -80,6 +85,7 @@ def pose(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) -> Pose:
         if across_m is None
         else math.hypot(across_m, math.hypot(north, east) * blur_s, across_doubt_m),
         vertical_sigma_m=None if upright_m is None else math.hypot(upright_m, down * blur_s, upright_doubt_m),
+        position_covariance_m2=covariance,
         age_ms=age_s * 1e3,
     )
 
@@ -138,20 +144,31 @@ def attitude(samples: Sequence[AttitudeSample], boot_ns: int) -> tuple[Quaternio
     return slerp(a.attitude, b.attitude, share), doubt
 
 
-def _attitude(at: Around, sigma_s: float, own_rad: float) -> tuple[Quaternion | None, float | None]:
+def _attitude(at: Around, sigma_s: float, own_rad: float) -> tuple[Quaternion | None, float | None, Symmetric | None]:
+    """Attitude, σ of the whole turn, and the covariance where the body's rates are known."""
     samples = at.attitudes
     if not samples:
-        return None, None
+        return None, None, None
     found, doubt = attitude(samples, at.boot_ns)
     told = max((sample.sigma_rad for sample in samples if sample.sigma_rad is not None), default=own_rad)
-    rate = max((norm(s.rates_rad_s) for s in samples if s.rates_rad_s is not None), default=None)
+    rates = max((s.rates_rad_s for s in samples if s.rates_rad_s is not None), key=norm, default=None)
     if len(samples) == 1:
-        age_s = abs(samples[0].boot_ns - at.boot_ns) / 1e9
-        return found, None if rate is None else math.hypot(rate * math.hypot(sigma_s, age_s), told)
-    if rate is None:
-        span_s = (samples[1].boot_ns - samples[0].boot_ns) / 1e9
-        rate = turn_rad(samples[0].attitude, samples[1].attitude) / span_s
-    return found, math.hypot(rate * sigma_s, doubt, told)
+        sigma_s = math.hypot(sigma_s, abs(samples[0].boot_ns - at.boot_ns) / 1e9)
+    if rates is not None:
+        each = (doubt**2 + told**2) / 3  # of each axis
+        covariance = _symmetric(rates, sigma_s, (each, each, each))
+        return found, math.hypot(norm(rates) * sigma_s, doubt, told), covariance
+    if len(samples) == 1:
+        return found, None, None
+    span_s = (samples[1].boot_ns - samples[0].boot_ns) / 1e9
+    rate = turn_rad(samples[0].attitude, samples[1].attitude) / span_s
+    return found, math.hypot(rate * sigma_s, doubt, told), None
+
+
+def _symmetric(way: Vector3, sigma_s: float, own: Vector3) -> Symmetric:
+    """The covariance of what moves along `way` (per second) for a time known to `sigma_s`, with its own variances."""
+    x, y, z = (part * sigma_s for part in way)
+    return x * x + own[0], x * y, x * z, y * y + own[1], y * z, z * z + own[2]
 
 
 def _gimbal(at: Around, vehicle: Quaternion | None) -> tuple[Quaternion | None, str | None]:

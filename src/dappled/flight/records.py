@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+Symmetric = tuple[float, float, float, float, float, float]  # a 3 × 3 matrix's upper triangle: xx, xy, xz, yy, yz, zz
 ShotState = Literal["wished", "fired", "safe", "failed"]
 
 
@@ -74,7 +75,8 @@ class Pose:
     "interpolated", "nearest" (no sample on one side: marked, not hidden) or "none". `age_ms` is the time from
     mid-exposure to the nearest position sample. `telemetry_packets` is how many packets of telemetry.tlog were taken
     into account: a replay stops there too. `gimbal_attitude` is that of a gimbal's head (forward, right, down) to
-    north-east-down, where one reports it; `gimbal_source` names its message.
+    north-east-down, where one reports it; `gimbal_source` names its message. Covariances: the position's in
+    north-east-down, the attitude's in body axes (forward, right, down); what an unknown time adds lies along the way.
     """
 
     source: Literal["interpolated", "nearest", "none"]
@@ -94,6 +96,8 @@ class Pose:
     gnss: Gnss | None = None
     gimbal_attitude: Quaternion | None = None
     gimbal_source: str | None = None
+    position_covariance_m2: Symmetric | None = None
+    attitude_covariance_rad2: Symmetric | None = None
 
 
 @dataclass(frozen=True, slots=True)
