@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-import resource
 import threading
 import time
 from collections.abc import Sequence
@@ -129,10 +128,8 @@ def make(job: Job) -> Done:
         error = sentence(caught) if isinstance(caught, DappledError) else f"{job.frame.name}: {caught}"
     except Exception as caught:  # noqa: BLE001  one bad frame must not end the flight: its words go into the manifest
         error = f"{job.frame.name}: {sentence(caught)}"
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return Done(
-        job.key, Path(job.flight).name, job.frame.name, outputs, error, round(time.monotonic() - began, 3), peak_mb
-    )
+    seconds = round(time.monotonic() - began, 3)
+    return Done(job.key, Path(job.flight).name, job.frame.name, outputs, error, seconds, _peak_mb())
 
 
 def _made(job: Job) -> list[Output]:
@@ -236,6 +233,14 @@ def _projection(name: str) -> Projection:
     if name not in kept:
         kept[name] = Projection(name)
     return kept[name]
+
+
+def _peak_mb() -> float:
+    """The most memory that this process ever held. (getrusage counts its parent's, from before it began.)"""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return round(int(line.split()[1]) / 1024, 1)
+    return 0.0
 
 
 @cache
