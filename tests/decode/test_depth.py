@@ -121,7 +121,7 @@ def test_the_range_is_found(low: float, high: float) -> None:
 
 
 @given(st.floats(-0.9, 0.9), st.floats(0.05, 0.2))
-@settings(max_examples=30)
+@settings(max_examples=30, deadline=None)
 def test_a_peak_is_read_off_between_samples(where: float, width: float) -> None:
     grid = np.linspace(-1.5, 1.5, 61)
     likelihood = np.exp(-(((grid - where) / (4 * width)) ** 2)).astype(np.float32)[:, None, None]

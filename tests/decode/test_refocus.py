@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
@@ -32,6 +32,7 @@ def ramps(disparity: float, *, n: int = 5, side: int = 24) -> ViewStack:
 
 
 @given(st.floats(-1.5, 1.5), st.sampled_from([1, 2, 3, 5]))
+@settings(deadline=None)
 def test_a_plane_in_focus_is_the_middle_view(disparity: float, n: int) -> None:
     made = refocus.shift_and_add(ramps(disparity, n=n), disparity)
     truth = ramps(disparity, n=1).views[0, 0]
@@ -71,6 +72,7 @@ def test_alpha_is_equation_29(alpha: float) -> None:
 
 
 @given(st.floats(0.05, 20))
+@settings(deadline=None)
 def test_alpha_and_disparity_are_one(alpha: float) -> None:
     assert refocus.alpha_of_disparity(refocus.disparity_of_alpha(alpha)) == pytest.approx(alpha, rel=1e-9)
 

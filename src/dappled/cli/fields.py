@@ -6,8 +6,8 @@ import argparse
 import math
 from pathlib import Path
 
-from dappled.config.schema import read_toml
 from dappled.decode.ranging import Ranging
+from dappled.drivers import calibration_files
 from dappled.products import opened
 from dappled.products.opened import RANGING, OpenedLightField
 
@@ -35,7 +35,7 @@ def opened_field(arguments: argparse.Namespace) -> OpenedLightField:
     found = opened.light_field(arguments.field, focus_m=getattr(arguments, "focus", None))
     calibration = getattr(arguments, "calibration", None)
     if calibration is not None:
-        tables, _ = read_toml(calibration)
+        tables = calibration_files.tables(calibration)
         if RANGING not in tables:
             raise opened.OpenError(f"{calibration} knows no distances: make it anew with dappled calibrate --target")
         found = OpenedLightField(

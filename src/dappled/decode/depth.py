@@ -27,7 +27,7 @@ METHODS: Mapping[str, Callable[[Evidence, Search], DepthMap]] = {
     "stereo": depth_stereo.depth,
 }
 WINDOW = 13
-_FINEST, _MOST_LEVELS = 0.2, 64  # a step moves the outermost view by so much; no more disparities than these
+_FINEST, _MOST_LEVELS = 0.15, 64  # a step moves the outermost view by so much; no more disparities than these
 _COARSE_SIDE = 160  # px: pictures are made smaller than this to look for the range
 _WIDEST = 4.0  # px/view
 _SURE = 0.6  # the share of pixels, those with most texture, that the range is read off

@@ -15,8 +15,8 @@ Volume = NDArray[np.float32]
 Map = NDArray[np.float32]
 # Measured on simulated masked frames (SNR 100 and 50, windows 5 to 15): what scatters more than the noise alone, and
 # what the window's edge adds as the picture moves across it.
-_SCATTER = 1.25
-_EDGE, _EDGE_SHARE = 0.001, 0.0045  # px/view, and of the disparity
+_SCATTER = 1.2
+_EDGE, _EDGE_SHARE = 0.0009, 0.0036  # px/view, and of the disparity
 _LEAST_CONFIDENCE = 0.5
 _MOST_DISPARITIES = 400
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,18 +20,21 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.viewstack import ViewStack
 
 _FARTHEST_SIGMAS = 2.0  # a shift that is not clear of infinity by so many standard errors has no distance
+_NOMINAL = 0.02  # f-numbers and focal lengths are rounded, and nominal
 _FRESH_DISTANCES = 1.01  # targets whose distances differ by less tell the offset only
 
 
 @dataclass(frozen=True, slots=True)
 class Ranging:
     """S = `gain_px_m`/Z + `offset_px`, for a lens at `f_number` (None: the scale doesn't depend on it, as under
-    lenslets). `source` says in words where it is from."""
+    lenslets). `source` says in words where it is from, `gain_sigma_share` how well the gain is known, as a share of
+    it: all distances are off together by as much."""
 
     gain_px_m: float
     offset_px: float
     f_number: float | None = None
     source: str = "calibration"
+    gain_sigma_share: float = 0.0
 
     def __post_init__(self) -> None:
         """Raises DecodeError for numbers that are no lens."""
@@ -48,14 +51,14 @@ class Ranging:
             )
         sensor_m = 1e-3 / (1 / focal_length_mm - 1e-3 / focus_m)  # Eq 3
         gain = focal_length_mm / f_number * sensor_m / pixel_mm
-        return cls(gain, -gain / focus_m, f_number, "focal length, f-number and focus")
+        return cls(gain, -gain / focus_m, f_number, "focal length, f-number and focus", _NOMINAL)
 
     def at(self, f_number: float | None) -> Ranging:
         """The same lens at another f-number."""
         if self.f_number is None or f_number is None:
             return self
         scale = self.f_number / f_number
-        return Ranging(self.gain_px_m * scale, self.offset_px * scale, f_number, self.source)
+        return replace(self, gain_px_m=self.gain_px_m * scale, offset_px=self.offset_px * scale, f_number=f_number)
 
     def disparity(self, distance_m: float, stack: ViewStack) -> float:
         """The disparity of what is so far away, inf allowed. Raises DecodeError for a distance of 0 or less."""
@@ -70,8 +73,8 @@ class Ranging:
         with np.errstate(invalid="ignore", divide="ignore"):
             known = beyond > _FARTHEST_SIGMAS * error
             distance = np.where(known, np.float32(self.gain_px_m) / beyond, np.float32(np.nan))
-            # Eq 5: σ_Z = Z²·σ_S/gain
-            sigma = distance**2 * error / np.float32(self.gain_px_m)
+            # Eq 5: σ_Z = Z²·σ_S/gain, and a gain that is a share off makes all distances as much
+            sigma = np.hypot(distance**2 * error / np.float32(self.gain_px_m), self.gain_sigma_share * distance)
         return DistanceMap(distance.astype(np.float32), sigma.astype(np.float32))
 
     def to_dict(self) -> dict[str, Any]:
@@ -81,6 +84,7 @@ class Ranging:
             "offset_px": self.offset_px,
             "f_number": self.f_number,
             "source": self.source,
+            "gain_sigma_share": self.gain_sigma_share,
         }
 
     @classmethod
@@ -90,7 +94,7 @@ class Ranging:
             f_number = values.get("f_number")
             return cls(
                 float(values["gain_px_m"]), float(values["offset_px"]), None if f_number is None else float(f_number),
-                str(values.get("source", "calibration")),
+                str(values.get("source", "calibration")), float(values.get("gain_sigma_share", 0.0)),
             )  # fmt: skip
         except (KeyError, TypeError, ValueError) as error:
             raise DecodeError(f"the ranging is incomplete or wrong ({error}): calibrate with targets anew") from error
@@ -136,7 +140,8 @@ def fit_targets(targets: Sequence[Target], *, f_number: float | None, lens: Rang
                 "targets at one distance tell where the focus is, not the scale: add one at another distance"
             )
         gain = lens.gain_px_m
-        return Ranging(gain, float(np.mean(shifts - gain * inverse)), f_number, f"{len(targets)} target(s), lens' gain")
+        offset = float(np.mean(shifts - gain * inverse))
+        return Ranging(gain, offset, f_number, f"{len(targets)} target(s) and the lens", lens.gain_sigma_share)
     design = np.column_stack([inverse, np.ones_like(inverse)])
     gain, offset = np.linalg.lstsq(design, shifts, rcond=None)[0]
     if gain <= 0:

@@ -1,0 +1,208 @@
+"""Depth and refocusing of simulated masked frames against what the camera really saw: the figures that are promised.
+
+The frames go the whole way: exposed with noise onto a Bayer sensor, calibrated on a stopped-down bench frame, decoded.
+Raw SNR is that of a pixel at the metered level: shot noise alone, set by the full well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+from numpy.typing import NDArray
+from scipy import ndimage
+
+import dappled
+from dappled.cli import calibrate_target
+from dappled.cli.calibrate import from_frames
+from dappled.decode.depthmap import DepthMap
+from dappled.decode.refocus import along, shift_and_add
+from dappled.decode.viewstack import ViewStack
+from dappled.drivers.darkroom import Darkroom, Recipe
+from dappled.mocks.bench import Bench, Plane
+from dappled.mocks.masked_camera import LEVEL, MaskedCamera, Truth, reference_camera
+from dappled.mocks.synthesis import PASS, Grid
+from dappled.products.opened import OpenedFrame, OpenedLightField, with_ranging
+
+CAMERA, MASK = "reference-36mm", "reference-5x5"
+SCALE, BORDER = 0.5, 12
+METRES = (5.0, 10.0, 20.0, 40.0)
+GREEN = 1
+SNRS = [50.0, pytest.param(100.0, marks=pytest.mark.slow)]
+SEEDS = [3, pytest.param(4, marks=pytest.mark.slow)]
+Floats = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A decoded frame, and on its own grid the truth: distance, disparity, views (n, n, h, w)."""
+
+    found: OpenedLightField
+    distance_m: Floats
+    disparity: Floats
+    views: ViewStack
+
+    def inner(self, values: Any) -> Any:
+        return values[BORDER:-BORDER, BORDER:-BORDER]
+
+
+def with_snr(camera: MaskedCamera, snr: float) -> MaskedCamera:
+    return replace(camera, sensor=replace(camera.sensor, full_well_e=snr**2 / LEVEL))
+
+
+def strips(camera: MaskedCamera, seed: int) -> MaskedCamera:
+    """Boards at 5, 10, 20 and 40 m beside each other."""
+    height, width = (side * camera.sensor.pitch_mm for side in camera.sensor.shape)
+    finest = PASS * min(Grid.of(camera.sensor.shape, camera.lattice).half_band)
+    quarter = width / 4
+    left = [-width, *(-width / 2 + k * quarter for k in (1, 2, 3))]
+    near = [Plane(z, extent_mm=(-height, height, left[k], left[k + 1])) for k, z in enumerate(METRES[:3])]
+    return replace(camera, scene=Bench.of(seed, (Plane(METRES[3]), *near), camera.sensor.pitch_mm / finest))
+
+
+def target(camera: MaskedCamera, seed: int, metres: float) -> MaskedCamera:
+    """One board that fills the picture."""
+    finest = PASS * min(Grid.of(camera.sensor.shape, camera.lattice).half_band)
+    return replace(camera, scene=Bench.of(seed, (Plane(metres),), camera.sensor.pitch_mm / finest))
+
+
+@cache
+def shown(scene: str, seed: int, snr: float) -> Shown:
+    camera = with_snr(reference_camera(seed, scale=SCALE, scene="bench"), snr)
+    if scene == "strips":
+        camera = strips(camera, seed)
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "bench.dng").write_bytes(camera.bench_frame().file)
+        calibration = from_frames(Darkroom(Recipe(CAMERA, MASK)), [folder / "bench.dng"])
+        (folder / "c.toml").write_text(tomli_w.dumps(calibration.to_dict()))
+        exposure = camera.expose(0.0, 0)
+        (folder / "frame.dng").write_bytes(exposure.file)
+        frame = dappled.open(folder / "frame.dng", mask=MASK, calibration=str(folder / "c.toml"))
+        assert isinstance(frame, OpenedFrame)
+        targets = [1.5, 3.0, 9.0]
+        for metres in targets:
+            (folder / f"{metres:g}.dng").write_bytes(target(camera, seed, metres).expose(0.0, 1).file)
+        recipe = Recipe(CAMERA, MASK, calibration=str(folder / "c.toml"))
+        ranging, _ = calibrate_target.from_frames(recipe, [folder / f"{m:g}.dng" for m in targets], targets)
+        found = OpenedLightField(with_ranging(frame.light_field.field, ranging))
+    return _beside_truth(found, exposure.truth, camera)
+
+
+def _beside_truth(found: OpenedLightField, truth: Truth, camera: MaskedCamera) -> Shown:
+    grid = found.field.grid
+    rows, columns = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in found.views.shape[2:4]), indexing="ij")
+    at = np.array(
+        [(grid[0, 0] * rows + grid[0, 2]) / truth.grid[0, 0], (grid[1, 1] * columns + grid[1, 2]) / truth.grid[1, 1]]
+    )
+
+    def sampled(image: Floats, order: int) -> Floats:
+        return np.asarray(ndimage.map_coordinates(image, at, order=order, mode="nearest"), dtype=np.float32)
+
+    assert truth.depth_m is not None
+    assert truth.disparity_mm_per_mm is not None
+    step_mm = truth.aperture_points_mm[0, 1, 1] - truth.aperture_points_mm[0, 0, 1]
+    disparity = sampled(truth.disparity_mm_per_mm, 0) * step_mm / (grid[1, 1] * camera.sensor.pitch_mm)
+    views = np.stack([[sampled(view, 3) for view in line] for line in truth.views[..., GREEN]])
+    stack = found.stack
+    return Shown(found, sampled(truth.depth_m, 0), disparity, ViewStack(views, stack.row_steps, stack.column_steps))
+
+
+def bad_share(made: DepthMap, truth: Floats, limit: float = 0.07) -> float:
+    cut = (slice(BORDER, -BORDER),) * 2
+    return float(1 - np.mean(np.abs(made.disparity - truth)[cut] <= limit))
+
+
+def say(line: str) -> None:
+    print(line)  # noqa: T201  figures for people who run with -s
+
+
+@pytest.mark.parametrize("snr", SNRS)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_bad_pixels_and_honest_sigmas(seed: int, snr: float) -> None:
+    scene = shown("bench", seed, snr)
+    made = scene.found.depth("combined")
+    share = bad_share(made, scene.disparity)
+    known = scene.inner(made.known)
+    error = np.abs(scene.inner(made.disparity - scene.disparity))[known]
+    covered = float(np.mean(error <= scene.inner(made.sigma)[known]))
+    say(f"seed {seed}, SNR {snr:g}: BadPix 0.07 {share:.1%}, {known.mean():.0%} known, {covered:.0%} within σ")
+    assert share <= 0.09
+    assert known.mean() > 0.97
+
+
+@pytest.mark.parametrize("snr", SNRS)
+def test_distances_in_metres(snr: float) -> None:
+    """Well under a constant-plane guess wherever Eq 5 allows; and within the σ told for 68 ± 7 % of the pixels."""
+    scene = shown("strips", 7, snr)
+    made = scene.found.depth("combined")
+    distances = scene.found.distances(made)
+    truth, found, sigma = (scene.inner(v) for v in (scene.distance_m, distances.distance_m, distances.sigma_m))
+    plane = float(np.median(truth))
+    inside = np.isfinite(found)
+    for metres in METRES:
+        here = ndimage.binary_erosion(np.abs(truth - metres) < 0.01, iterations=8)
+        error = np.abs(found - truth)[here & inside]
+        guess = abs(plane - metres)
+        told = float(np.median(sigma[here & inside]))
+        say(
+            f"SNR {snr:g}, {metres:g} m: median error {np.median(error):.2f} m, σ {told:.2f} m, "
+            f"{inside[here].mean():.0%} known; a plane at {plane:.3g} m is {guess:.3g} m off"
+        )
+        assert inside[here].mean() > 0.9
+        assert np.median(error) < 0.35 * max(guess, 5.0)
+    covered = _covered(found, truth, sigma)
+    say(f"SNR {snr:g}: {covered:.0%} of all distances within σ")
+    assert covered == pytest.approx(0.68, abs=0.07)
+
+
+def _covered(found: Floats, truth: Floats, sigma: Floats) -> float:
+    inside = np.isfinite(found)
+    return float(np.mean(np.abs(found - truth)[inside] <= sigma[inside]))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("snr", SNRS)
+def test_sigmas_hold_on_a_scene_with_edges_and_a_leaning_board(seed: int, snr: float) -> None:
+    """All pixels, edges included."""
+    scene = shown("bench", seed, snr)
+    distances = scene.found.distances(scene.found.depth("combined"))
+    truth, found, sigma = (scene.inner(v) for v in (scene.distance_m, distances.distance_m, distances.sigma_m))
+    covered = _covered(found, truth, sigma)
+    say(f"seed {seed}, SNR {snr:g}: {covered:.0%} of all distances within σ")
+    assert covered == pytest.approx(0.68, abs=0.07)
+
+
+def test_beyond_what_equation_5_allows_is_unknown() -> None:
+    """The boards at 40 m through an aperture of a sixth can't be told from infinity."""
+    scene = shown("strips", 7, 50.0)
+    made = scene.found.depth("combined")
+    ranging = scene.found.metres()
+    far = replace(ranging, gain_px_m=ranging.gain_px_m / 6)
+    vague = DepthMap(made.disparity / np.float32(6), made.sigma, made.confidence, made.method)
+    distances = far.distances(vague, scene.found.stack)
+    here = np.abs(scene.distance_m - 40) < 0.01
+    assert np.isnan(distances.distance_m[here]).mean() > 0.6
+    assert np.isfinite(distances.distance_m[np.abs(scene.distance_m - 5) < 0.01]).mean() > 0.9
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("snr", SNRS)
+def test_refocus_against_the_simulator_s_own(seed: int, snr: float) -> None:
+    scene = shown("bench", seed, snr)
+    worst = np.inf
+    for disparity in np.linspace(0, float(scene.disparity.max()), 5):
+        truth = shift_and_add(scene.views, float(disparity))
+        error = scene.inner(scene.found.refocus(disparity=float(disparity)) - truth)
+        worst = min(worst, float(-10 * np.log10(np.mean(error**2))))
+    surface = along(scene.views, scene.disparity)
+    error = scene.inner(along(scene.found.stack, scene.disparity) - surface)
+    sharp = float(-10 * np.log10(np.mean(error**2)))
+    say(f"seed {seed}, SNR {snr:g}: refocus at worst {worst:.1f} dB, along the surface {sharp:.1f} dB")
+    assert worst >= 38
