@@ -12,8 +12,8 @@ from dappled.decode.spectrum import Spectrum, hann
 from dappled.decode.threads import each, spans
 
 _SIDE = 34  # bins of a part that is looked at, one of its edge for the window
-_PARTS = (16, 8)  # rows and columns of parts
-_AT_ONCE = 16
+_PARTS = (8, 8)  # rows and columns of parts
+_AT_ONCE = 8
 
 
 class Noise:
