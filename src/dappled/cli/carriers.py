@@ -15,7 +15,6 @@ from PIL import Image
 from dappled.cli import common
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
-from dappled.decode import pictures
 from dappled.decode.carriers import Carrier, Lattice
 from dappled.decode.decoder import CarriersFrom
 from dappled.decode.lattice import FoundLattice, find_lattice
@@ -25,6 +24,7 @@ from dappled.decode.plane import Plane
 from dappled.decode.prediction import crossed_orders, lattice_rotation
 from dappled.decode.slices import default_size
 from dappled.decode.spectrum import Spectrum, padded_shape
+from dappled.decode.spectrum_pictures import LOOKS, Look, around, spectrum_boxes
 from dappled.drivers.darkroom import Darkroom, DarkroomError, known_to
 
 
@@ -41,6 +41,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--shape", type=int, nargs=2, metavar=("H", "W"), help="predict only, for frames of this size")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the spectrum with its boxes")
+    parser.add_argument("--look", choices=LOOKS, help="of the picture (default: magnitude; phase with --around)")
+    parser.add_argument(
+        "--around", type=int, nargs=2, metavar=("KY", "KX"), help="draw the bins around this carrier, each a square"
+    )
     parser.add_argument("--json", action="store_true", help="as JSON")
 
 
@@ -56,7 +60,13 @@ class Table:
     main: frozenset[Order]
     found: FoundLattice | None = None
     carriers_from: CarriersFrom | None = None
+    own: Lattice | None = None
     rotation_rad: float | None = None
+
+    @property
+    def used(self) -> Lattice:
+        """What slices are cut at: the frame's own lattice where it shows one, else the predicted."""
+        return self.own or self.lattice
 
     @property
     def seen(self) -> int:
@@ -73,19 +83,33 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.picture:
         if plane is None:
             raise DarkroomError("--picture draws a frame's spectrum: name the frame")
-        Image.fromarray(picture(plane, table)).save(arguments.picture)
+        Image.fromarray(_picture(plane, table, arguments)).save(arguments.picture)
     print(json.dumps(_as_json(table), indent=2) if arguments.json else _as_text(table))
     return 0
 
 
-def picture(plane: Plane, table: Table) -> Any:
-    """The spectrum with a box a slice, uint8 RGB (Fig 42)."""
+def picture(plane: Plane, table: Table, look: Look = "magnitude") -> Any:
+    """The spectrum with a box a slice, uint8 RGB (Figs 36, 41, 42)."""
     half = [(c, m) for c, m in table.rows if (c.ky, c.kx) >= (0, 0) and c.on_sensor]
     high, wide = padded_shape(table.shape)
-    size = default_size(table.lattice, (high, wide))
-    return pictures.spectrum_boxes(
-        plane, [c for c, _ in half], (size[0] / high, size[1] / wide), measured=[m for _, m in half]
+    size = default_size(table.used, (high, wide))
+    return spectrum_boxes(
+        plane,
+        table.used.carriers([(c.ky, c.kx) for c, _ in half]),
+        (size[0] / high, size[1] / wide),
+        predicted=[c for c, _ in half],
+        measured=[m for _, m in half],
+        look=look,
     )
+
+
+def _picture(plane: Plane, table: Table, arguments: argparse.Namespace) -> Any:
+    if arguments.around is None:
+        return picture(plane, table, arguments.look or "magnitude")
+    (carrier,) = table.used.carriers([tuple(arguments.around)])
+    if not carrier.on_sensor:
+        raise DarkroomError(f"the carrier {carrier.ky} {carrier.kx} falls off the sensor: --around another one")
+    return around(plane, (carrier.fy, carrier.fx), look=arguments.look or "phase")
 
 
 def _predicted(arguments: argparse.Namespace) -> Table:
@@ -114,7 +138,9 @@ def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
             pairs = list(zip(found.carriers, found.measured, strict=True))
             rows = _both_halves([(Carrier(0, 0, 0.0, 0.0), measure_mean()), *pairs])
             main = frozenset(found.orders) | {(0, 0)}
-            return plane, Table(shape, "found", None, found.lattice, rows, main, found, "found", found.rotation_rad)
+            return plane, Table(
+                shape, "found", None, found.lattice, rows, main, found, "found", None, found.rotation_rad
+            )
         decoder = known_to(
             darkroom.mask_decoder(shape, raw.camera_model or ""), None if arguments.focal_length else raw.focal_sigma_mm
         )
@@ -136,7 +162,15 @@ def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
         rows = _both_halves([(c, known.get((c.ky, c.kx))) for c in halves])
         turned = lattice_rotation(used, decoder.sensor)
         return plane, Table(
-            shape, decoder.law, length, lattice, rows, _main(mask), carriers_from=carriers_from, rotation_rad=turned
+            shape,
+            decoder.law,
+            length,
+            lattice,
+            rows,
+            _main(mask),
+            carriers_from=carriers_from,
+            own=used,
+            rotation_rad=turned,
         )
 
 

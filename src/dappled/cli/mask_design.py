@@ -13,7 +13,7 @@ from PIL import Image
 
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
-from dappled.decode import optics, pictures, prediction, survey
+from dappled.decode import optics, prediction, spectrum_pictures, survey
 from dappled.decode.carriers import LAWS, Sensor
 from dappled.decode.design import DESIGNS, Design, Wish
 from dappled.decode.film import FILMS
@@ -124,7 +124,7 @@ def _picture(made: Design) -> Any:
     )
     carriers = [c for c in lattice.carriers(made.mask.half_orders()) if c.on_sensor]
     size = abs(lattice.ky[0]), abs(lattice.kx[1])
-    return pictures.spectrum_boxes(np.zeros((height // shrink, width // shrink), np.float32), carriers, size)
+    return spectrum_pictures.spectrum_boxes(np.zeros((height // shrink, width // shrink), np.float32), carriers, size)
 
 
 def _as_json(made: Design) -> dict[str, Any]:

@@ -1,19 +1,11 @@
-"""Pictures of what the decoder did: the slice mosaic (Fig 43), the spectrum with its boxes (Fig 42), the views."""
+"""Pictures of what the decoder did: the slice mosaic (Fig 43), the views side by side."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
-
-from dappled.decode.carriers import Carrier
-from dappled.decode.peaks import Measured
 
 Grey = NDArray[np.uint8]
-Colour = NDArray[np.uint8]
-_RED, _GREEN, _YELLOW = (230, 30, 30), (60, 220, 60), (250, 220, 40)
 
 
 def slice_mosaic(slices: NDArray[np.complex64], carriers: NDArray[np.float64], *, longest_side: int = 2400) -> Grey:
@@ -49,53 +41,6 @@ def view_mosaic(views: NDArray[np.float32], *, longest_side: int = 2400) -> NDAr
     return picture
 
 
-def spectrum_boxes(
-    plane: NDArray[np.float32],
-    carriers: Sequence[Carrier],
-    slice_cycles: tuple[float, float],
-    *,
-    measured: Sequence[Measured | None] = (),
-    longest_side: int = 1200,
-) -> Colour:
-    """uint8 RGB (H, W, 3): log magnitude of the spectrum, DC in the middle, at most `longest_side` px a side.
-
-    A red box of `slice_cycles` (height, width in cycles/pixel) around each carrier and its conjugate, a yellow cross
-    where it is predicted, a green ring where one was measured. Scaled down by the maximum, so that peaks stay.
-    """
-    windowed = (plane - np.float32(plane.mean())) * np.hanning(plane.shape[0]).astype(np.float32)[:, None]
-    windowed *= np.hanning(plane.shape[1]).astype(np.float32)
-    half = np.abs(fft.rfft2(windowed))
-    height, width = plane.shape
-    columns = np.arange(width) - width // 2
-    rows = np.arange(height) - height // 2
-    right = half[np.ix_(rows, columns[columns >= 0])]
-    left = half[np.ix_(-rows % height, -columns[columns < 0])]
-    log = np.log(_pooled(np.concatenate([left, right], axis=1), longest_side) + 1e-9)
-    low, high = np.quantile(log, [0.02, 0.9999])
-    grey = np.rint(255 * np.clip((log - low) / max(high - low, 1e-9), 0, 1)).astype(np.uint8)
-    picture: Colour = np.repeat(grey[:, :, None], 3, axis=2)
-    tall, wide = grey.shape
-
-    def place(fy: float, fx: float) -> tuple[int, int]:
-        return round((0.5 + fy) * tall), round((0.5 + fx) * wide)
-
-    for carrier in carriers:
-        for sign in (1, -1):
-            fy, fx = sign * carrier.fy, sign * carrier.fx
-            top, left_edge = place(fy - slice_cycles[0] / 2, fx - slice_cycles[1] / 2)
-            bottom, right_edge = place(fy + slice_cycles[0] / 2, fx + slice_cycles[1] / 2)
-            _box(picture, (top, bottom), (left_edge, right_edge), _RED)
-            row, column = place(fy, fx)
-            _line(picture, (row, row), (column - 3, column + 3), _YELLOW)
-            _line(picture, (row - 3, row + 3), (column, column), _YELLOW)
-    for peak in measured:
-        if peak is not None:
-            for sign in (1, -1):
-                row, column = place(sign * peak.fy, sign * peak.fx)
-                _box(picture, (row - 5, row + 5), (column - 5, column + 5), _GREEN)
-    return picture
-
-
 def _stretched(image: NDArray[np.floating]) -> Grey:
     high = max(float(np.quantile(image, 0.995)), 1e-12)
     grey: Grey = np.rint(255 * np.clip(image / high, 0, 1)).astype(np.uint8)
@@ -105,29 +50,3 @@ def _stretched(image: NDArray[np.floating]) -> Grey:
 def _smaller(picture: Grey, longest_side: int) -> Grey:
     step = max(1, -(-max(picture.shape) // longest_side))
     return np.ascontiguousarray(picture[::step, ::step])
-
-
-def _pooled(image: NDArray[np.floating], longest_side: int) -> NDArray[np.floating]:
-    """The largest value of each block; the shape is divided by the smallest whole number that makes it fit."""
-    step = max(1, -(-max(image.shape) // longest_side))
-    if step == 1:
-        return image
-    rows = np.maximum.reduceat(image, np.arange(0, image.shape[0], step), axis=0)
-    pooled: NDArray[np.floating] = np.maximum.reduceat(rows, np.arange(0, image.shape[1], step), axis=1)
-    return pooled
-
-
-def _box(picture: Colour, rows: tuple[int, int], columns: tuple[int, int], colour: tuple[int, int, int]) -> None:
-    for row in rows:
-        _line(picture, (row, row), columns, colour)
-    for column in columns:
-        _line(picture, rows, (column, column), colour)
-
-
-def _line(picture: Colour, rows: tuple[int, int], columns: tuple[int, int], colour: tuple[int, int, int]) -> None:
-    """A filled rectangle, ends included, as far as it lies in the picture."""
-    (top, bottom), (left, right) = rows, columns
-    height, width = picture.shape[:2]
-    if bottom < 0 or right < 0 or top >= height or left >= width:
-        return
-    picture[max(top, 0) : bottom + 1, max(left, 0) : right + 1] = colour
