@@ -13,6 +13,7 @@ from PIL import Image
 from dappled.cli.common import seconds, whole
 from dappled.config import settings
 from dappled.daemon.curve import ClientKeys, KeyFileError, load_own, load_public
+from dappled.daemon.memory import reuse_large_blocks
 from dappled.daemon.subscriber import Subscriber
 from dappled.daemon.wire import Message
 from dappled.decode.pictures import slice_mosaic
@@ -39,6 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     ask = arguments.ask or (f"{endpoint}.ask" if endpoint.startswith("ipc://") else "")
     if arguments.save:
         arguments.save.mkdir(parents=True, exist_ok=True)
+    reuse_large_blocks()
     frames: set[tuple[str, int]] = set()
     ended = False
     if bool(arguments.keys) != bool(arguments.server_key):

@@ -19,6 +19,7 @@ from PIL import Image
 
 from dappled.daemon import wire
 from dappled.daemon.development import NICENESS, serve
+from dappled.decode import depth, evidence
 from dappled.decode.pictures import slice_mosaic
 from dappled.drivers.camera import Blob
 from dappled.drivers.camera_channel import Message
@@ -26,6 +27,7 @@ from dappled.drivers.child import end_with_parent
 from dappled.drivers.darkroom import Darkroom, Development, Recipe
 from dappled.errors import sentence
 
+DEPTH_NICENESS = 14
 Reply = tuple[Mapping[str, Any], tuple[int, ...]]
 
 
@@ -47,6 +49,8 @@ class Worker:
             if body["do"] == "warm up":
                 self._darkroom.check()
                 return {"ready": True}, ()
+            if body["do"] == "depth":
+                return _depth(self._darkroom, body)
             return self._develop(self._darkroom, body["path"], body["focal_length_mm"], body["f_number"])
         except Exception as error:  # noqa: BLE001  # no frame may end the worker: the next one may be good
             return {"error": _naming(body.get("path"), error)}, ()
@@ -86,6 +90,27 @@ class Worker:
         file = io.BytesIO()
         Image.fromarray(mosaic).save(file, "JPEG", quality=80)
         return file.getvalue(), (mosaic.shape[1], mosaic.shape[0])
+
+
+def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> Reply:
+    """Disparity and its sigma of one frame, float32 (h, w) each, at a lower priority than decoding."""
+    if os.nice(0) < DEPTH_NICENESS:
+        os.nice(DEPTH_NICENESS - os.nice(0))
+    done = darkroom.develop(asked["path"], focal_length_mm=asked["focal_length_mm"], f_number=asked["f_number"])
+    field = done.light_field
+    found = depth.estimate(evidence.of_light_field(field), asked["method"])
+    both = [np.ascontiguousarray(one, dtype=np.float32) for one in (found.disparity, found.sigma)]
+    known = found.disparity[found.known]
+    facts = {
+        "arrays": [
+            wire.describe_array(name, one, "pixels of a view, from view to view")
+            for name, one in zip(("disparity", "sigma"), both, strict=True)
+        ],
+        "range_px": [float(edge) for edge in np.quantile(known, [0.02, 0.98])] if known.size else None,
+        "grid": field.grid.tolist(),
+        "law": field.attributes["law"],
+    }
+    return facts, (Blob.of(np.stack(both).tobytes(), "depth").fd,)
 
 
 def _seen(done: Development) -> dict[str, Any]:

@@ -68,6 +68,18 @@ class Developed:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class DepthFound:
+    """Depth of one frame. `body` holds disparity and sigma, float32 (h, w) each, as `arrays` says; `range_px` the 2nd
+    and 98th percentile of the known disparities, None where none is known; `grid` as in Developed."""
+
+    body: mmap.mmap
+    arrays: list[dict[str, Any]]
+    range_px: list[float] | None
+    grid: list[list[float]]
+    law: str
+
+
 class Developer(Protocol):
     """What the street and the answers need."""
 
@@ -111,6 +123,19 @@ class WorkerDeveloper:
             return _developed(
                 self._ask({"do": "develop", "path": path, "focal_length_mm": focal_length_mm, "f_number": f_number})
             )
+
+    def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> DepthFound:
+        """Decode a frame with its views, and estimate its depth. Raises DevelopmentError."""
+        facts = {"path": path, "focal_length_mm": focal_length_mm, "f_number": f_number, "method": method}
+        with self._turn:
+            answer = self._ask({"do": "depth", **facts})
+        (body_fd,) = answer.fds
+        try:
+            body = mmap.mmap(body_fd, 0, prot=mmap.PROT_READ)
+        finally:
+            os.close(body_fd)
+        told = answer.body
+        return DepthFound(body, told["arrays"], told["range_px"], told["grid"], told["law"])
 
     def close(self) -> None:
         """End the worker, also in the middle of a frame, which then is not decoded."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import shutil
 import threading
 from collections import deque
@@ -26,6 +27,7 @@ from dappled.daemon.console import acts
 from dappled.daemon.console import process as console_process
 from dappled.daemon.development import DevelopmentError, WorkerDeveloper
 from dappled.daemon.knobs import Knobs, OwnKnob
+from dappled.daemon.live_depth import LiveDepth
 from dappled.daemon.logbook import Logbook, of_story
 from dappled.daemon.publisher import Publisher, Reply
 from dappled.daemon.reload import merge
@@ -46,6 +48,7 @@ from dappled.flight.records import Pose, Shot
 
 log = logging.getLogger(__name__)
 HEALTH_S = 1.0
+_KIND = re.compile(r"\d+")  # a problem whose numbers change is still the same
 LOOK_S = 0.02
 
 
@@ -79,6 +82,7 @@ class Service:
         self._began_monotonic_ns = self._clock.monotonic_ns()
         self._logbook = Logbook(self._clock.utc_ns)
         self._recipe: Recipe | None = None
+        self._depth: LiveDepth | None = None
         self.console_url = ""
 
     # life
@@ -170,10 +174,27 @@ class Service:
         self._publisher.start(self._recording.folder.name)
         self._publisher.publish("start", self._start_header(names))
         stack.callback(self._say_end)
+        if self._recipe is not None and self.settings.decode.depth:
+            self._begin_depth(self._recipe, stack)
         self._street.start()
         stack.callback(lambda: self._street.stop(5.0))
         self._shutter.start()
         stack.callback(self._shutter.stop)
+
+    def _begin_depth(self, recipe: Recipe, stack: ExitStack) -> None:
+        """A decoder of its own: depth takes longer than a frame may wait."""
+        maker = WorkerDeveloper(recipe)
+        stack.callback(maker.close)
+        self._depth = LiveDepth(
+            maker,
+            method=self.settings.decode.depth,
+            interval_s=self.settings.decode.depth_interval_s,
+            path=lambda story: self._book.path(story.frame) if story.frame else "",
+            publish=self._publisher.publish,
+            give_way=self._street.decoding_idle,
+        )
+        self._depth.start()
+        stack.callback(self._depth.stop)
 
     def _knobs(self, camera: Camera, names: Names, recipe: Recipe | None) -> Knobs:
         """What a ground station may set: the body's settings; and here, whether frames are decoded in flight."""
@@ -328,13 +349,16 @@ class Service:
 
     def _finished(self, story: Story) -> None:
         self._logbook.add(*of_story(story))
+        if self._depth is not None:
+            self._depth.offer(story)
         self._outside.finished(story)
 
     def _camera_changed(self, change: StateChanged) -> None:
         log.info("camera %s %s", change.state, change.reason)
         if change.state != "busy" and not (change.state == "ready" and self._identity):
             reason = f": {change.reason}" if change.reason else ""
-            self._logbook.add(f"camera {change.state}{reason}", "info" if change.state == "ready" else "warning")
+            calm = change.state in ("ready", "starting")
+            self._logbook.add(f"camera {change.state}{reason}", "info" if calm else "warning")
         self._changed()
         if change.identity not in (None, self._identity) and self._recording is not None:
             who = self._identity = change.identity
@@ -403,11 +427,11 @@ class Service:
 
     def _tell_pilot(self, problems: list[str]) -> None:
         """Each problem once, when it comes up; and when the last has gone."""
-        component, now = self._component, set(problems)
+        component, now = self._component, {_KIND.sub("#", text) for text in problems}
         if component is None:
             return
         for text in problems:
-            if text not in self._said:
+            if _KIND.sub("#", text) not in self._said:
                 component.say(text)
         if self._said and not now:
             component.say("all is well again", mavlink.MAV_SEVERITY_INFO)

@@ -22,6 +22,7 @@ from dappled.daemon.console.control import Control
 from dappled.daemon.console.feed import Feed
 from dappled.daemon.console.hub import Hub
 from dappled.daemon.console.studio import Studio
+from dappled.daemon.memory import reuse_large_blocks
 from dappled.drivers.camera_channel import Channel
 from dappled.drivers.darkroom import Recipe
 from dappled.errors import DappledError
@@ -36,6 +37,7 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C is the daemon's to act on
     logging.basicConfig(level=logging.WARNING, handlers=[journal.handler()])
     os.nice(NICENESS)
+    reuse_large_blocks()
     channel = Channel(socket.socket(fileno=int(sys.argv[1])))
     listener = socket.socket(fileno=int(sys.argv[2]))
     first = channel.receive(10)

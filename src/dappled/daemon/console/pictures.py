@@ -128,7 +128,11 @@ def depth_colours(disparity: NDArray[np.float32], sigma: NDArray[np.float32] | N
         known &= np.isfinite(sigma)
     if not known.any():
         return np.full((*disparity.shape, 3), _UNKNOWN, dtype=np.uint8)
-    low, high = np.quantile(disparity[known], [0.02, 0.98])
+    inner = np.zeros_like(known)  # at the picture's rim disparities are worth little
+    inner[
+        known.shape[0] // 10 : -(known.shape[0] // 10) or None, known.shape[1] // 10 : -(known.shape[1] // 10) or None
+    ] = 1
+    low, high = np.quantile(disparity[known & inner if (known & inner).any() else known], [0.02, 0.98])
     span = max(float(high - low), 1e-6)
     if sigma is not None:
         known &= np.where(known, sigma, np.inf) < span / 4 + 1e-6

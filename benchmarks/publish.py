@@ -1,0 +1,324 @@
+"""What publishing costs: bytes over ipc against memcpy, a frame's way to a subscriber, and ten subscribers.
+
+python benchmarks/publish.py [--json] [--rounds 25] [--frames 8] [--directory DIR]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import signal
+import statistics
+import tempfile
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.config.settings import PublishSettings, RecordSettings, Settings
+from dappled.daemon import wire
+from dappled.daemon.memory import reuse_large_blocks
+from dappled.daemon.publisher import Publisher
+from dappled.daemon.subscriber import Subscriber
+from dappled.daemon.wire import Message
+
+SHAPE = (13, 572, 566)
+RAW_BYTES = 17_000_000
+DEADLINE_S = 60.0
+SPAWN = multiprocessing.get_context("spawn")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--rounds", type=int, default=25, help="of each measurement")
+    parser.add_argument("--frames", type=int, default=8, help="of the simulated flight")
+    parser.add_argument("--directory", type=Path, default=None, help="a folder on the disk to record to")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="dpl-", dir=arguments.directory) as folder:
+        root = Path(folder)
+        figures = {
+            **throughput(root, arguments.rounds),
+            **hung(root, arguments.rounds),
+            **latency(root, arguments.frames),
+        }
+    if arguments.json:
+        print(json.dumps(figures))
+    else:
+        for name, value in figures.items():
+            print(f"{name:44} {value:10.3f}")
+
+
+def stack(seed: int) -> NDArray[np.complex64]:
+    """Slices as a frame of the thesis' camera has them, in memory of their own."""
+    made = np.random.default_rng(seed).standard_normal((*SHAPE, 2), dtype=np.float32)
+    return made.view(np.complex64)[..., 0]
+
+
+def throughput(root: Path, rounds: int) -> dict[str, float]:
+    """Publish to received in another process, against one memcpy of the same bytes; they take turns.
+
+    The copy goes to memory that was in use before, as the fastest copy there is.
+    """
+    source = stack(1)
+    target = np.empty_like(source)
+    copies, sends = [], []
+    with publisher(root) as one, reader(root) as pipe:
+        greet(one, pipe)
+        for number in range(rounds):
+            began = time.perf_counter()
+            np.copyto(target, source)
+            copies.append(time.perf_counter() - began)
+            body = source.copy()  # a fresh buffer a frame, as the decoder hands them over
+            began = time.perf_counter()
+            one.publish("slices", header(number, body), body.data.cast("B"))
+            pipe.recv()
+            sends.append(time.perf_counter() - began)
+    megabytes = source.nbytes / 1e6
+    return {
+        "slices_MB": megabytes,
+        "memcpy_GB_s": megabytes / min(copies) / 1e3,
+        "ipc_GB_s": megabytes / min(sends) / 1e3,
+        "ipc_over_memcpy": min(copies) / min(sends),
+        "ipc_over_memcpy_medians": statistics.median(copies) / statistics.median(sends),
+    }
+
+
+def hung(root: Path, rounds: int) -> dict[str, float]:
+    """Durable frames of 17 MB recorded while slices go out: to nobody, and to ten subscribers of which three hang.
+
+    The two take turns. Also how many stacks of slices the publisher keeps alive at the most.
+    """
+    from dappled.drivers.camera import Blob  # noqa: PLC0415  # the subscribers' processes load none of it
+    from dappled.flight import recording  # noqa: PLC0415  # as above
+    from dappled.flight.records import Cause, Shot  # noqa: PLC0415  # as above
+
+    flight = recording.begin(root / "flights", time.time_ns)
+    data = os.urandom(RAW_BYTES)
+    times: dict[str, list[float]] = {"alone": [], "crowd": []}
+    wishes: dict[str, list[float]] = {"alone": [], "crowd": []}
+    alive: set[int] = set()
+    most = index = 0
+    lone = Publisher(f"ipc://{root}/lone", "", answer=_no_answer, flight="lone")
+    lone.start()
+    with publisher(root) as one, crowd(root, one) as readers:
+        for sleeper in readers[:3]:
+            os.kill(sleeper.pid or 0, signal.SIGSTOP)
+        for turn in range(2 * rounds):
+            name, through = ("crowd", one) if turn % 2 else ("alone", lone)
+            body = stack(turn % 4)
+            if name == "crowd":
+                alive.add(index)
+                weakref.finalize(body, alive.discard, index)
+            shot = Shot(index, Cause("benchmark", "frame"), time.time_ns(), time.monotonic_ns())
+            blob = Blob.of(data)
+            began = time.perf_counter()
+            flight.journal.note(shot)
+            wishes[name].append(time.perf_counter() - began)
+            flight.ledger.add_shot(shot)
+            if turn % 8 < 2:  # once a second
+                through.publish("health", {})
+            through.publish("frame", {"frame": index})
+            through.publish("slices", header(index, body), body.data.cast("B"))
+            del body
+            began = time.perf_counter()
+            flight.recorder.record(index, "IMG.CR2", blob, arrived_utc_ns=time.time_ns())
+            times[name].append(time.perf_counter() - began)
+            blob.close()
+            time.sleep(0.25)  # four frames a second
+            most = max(most, len(alive))
+            index += 1
+        for sleeper in readers[:3]:
+            os.kill(sleeper.pid or 0, signal.SIGCONT)
+    lone.stop(0.0)
+    flight.close()
+    return {
+        "record_ms_alone": statistics.median(times["alone"]) * 1e3,
+        "record_ms_ten_subscribers_three_hung": statistics.median(times["crowd"]) * 1e3,
+        "record_crowd_over_alone": statistics.median(times["crowd"]) / statistics.median(times["alone"]),
+        "wish_note_crowd_over_alone": statistics.median(wishes["crowd"]) / statistics.median(wishes["alone"]),
+        "most_frames_kept_for_the_hung": float(most),
+    }
+
+
+@dataclass
+class Ears:
+    """What two subscribers of a flight heard, and what the daemon said of each shot. Times are monotonic."""
+
+    endpoint: str
+    frames: int
+    safe_ns: dict[int, int] = field(default_factory=dict)
+    decode_ms: dict[int, float] = field(default_factory=dict)
+    received_ns: dict[int, int] = field(default_factory=dict)
+    again: set[int] = field(default_factory=set)
+    over: threading.Event = field(default_factory=threading.Event)
+
+    def settled(self, index: int, _ok: bool) -> None:
+        self.safe_ns[index] = time.monotonic_ns()
+
+    def finished(self, story: Any) -> None:
+        self.decode_ms[story.shot.index] = story.ms.get("decode", float("nan"))
+
+    def listen(self) -> None:
+        with Subscriber(self.endpoint, topics=["slices"]) as subscriber:
+            while not self.over.is_set():
+                message = subscriber.receive(0.1)
+                if message is not None:
+                    self.received_ns.setdefault(message.header["frame"], time.monotonic_ns())
+
+    def listen_die_and_come_back(self) -> None:
+        """Takes one message and dies; comes back late and asks for all."""
+        with Subscriber(self.endpoint, topics=["slices"]) as subscriber:
+            subscriber.receive(DEADLINE_S)
+        _wait(lambda: len(self.decode_ms) >= self.frames)
+        with Subscriber(self.endpoint, f"{self.endpoint}.ask", from_start=True) as subscriber:
+            until = time.monotonic() + DEADLINE_S
+            while not self.whole() and time.monotonic() < until:
+                message = subscriber.receive(0.2)
+                if message is not None and message.topic == "slices":
+                    self.again.add(message.header["frame"])
+
+    def whole(self) -> bool:
+        return self.again >= set(range(self.frames))
+
+
+def latency(root: Path, frames: int) -> dict[str, float]:
+    """A simulated flight: from "safe on disk" to "received by a subscriber", less the decode; and what a subscriber
+    that was killed and started again has at the end."""
+    from dappled.config import settings as configuration  # noqa: PLC0415  # the subscribers' processes load none of it
+    from dappled.daemon.service import Service  # noqa: PLC0415  # as above
+    from dappled.daemon.story import Watchers  # noqa: PLC0415  # as above
+    from dappled.daemon.wishes import Wish  # noqa: PLC0415  # as above
+    from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # as above
+
+    ears = Ears(f"ipc://{root}/flight", frames)
+    settings = configuration.resolve(
+        Settings(
+            record=RecordSettings(directory=str(root / "simulated"), min_free_mb=0),
+            publish=PublishSettings(slices=ears.endpoint),
+        )
+    )
+    with Simulation(World(seed=2), settings, root) as simulated:
+        service = Service(simulated, watchers=Watchers(finished=ears.finished, settled=ears.settled))
+        service.start()
+        threads = [threading.Thread(target=work) for work in (service.run, ears.listen, ears.listen_die_and_come_back)]
+        for thread in threads:
+            thread.start()
+        try:
+            _wait(lambda: service.health()["camera"]["state"] == "ready")
+            for number in range(frames + 1):  # by the last one's seq who came late sees what there was before
+                service.wish(Wish("benchmark", "console", number))
+                _wait(lambda: len(ears.decode_ms) > number)  # noqa: B023  # it is called before the next round
+            threads[2].join(DEADLINE_S)
+        finally:
+            ears.over.set()
+            service.ask_to_stop()
+            for thread in threads:
+                thread.join(5)
+            service.stop()
+    beside = [
+        (at_ns - ears.safe_ns[index]) / 1e6 - ears.decode_ms[index] for index, at_ns in sorted(ears.received_ns.items())
+    ]
+    return {
+        "safe_to_received_less_decode_median_ms": statistics.median(beside),
+        "safe_to_received_less_decode_worst_ms": max(beside),
+        "frames_of_a_subscriber_started_again": len(ears.again & set(range(frames))) / frames,
+    }
+
+
+def header(number: int, body: NDArray[np.complex64]) -> dict[str, Any]:
+    return {"frame": number, "arrays": [wire.describe_array("slices", body, "1.0 = sensor white")]}
+
+
+def _no_answer(_: object, reply: Callable[[Message], None]) -> None:
+    reply(Message("error", {"error": "this benchmark has no record"}))
+
+
+@contextmanager
+def publisher(root: Path) -> Iterator[Publisher]:
+    """A publisher on `root`/s with the settings' high-water mark."""
+    mark = PublishSettings().high_water_mark
+    one = Publisher(f"ipc://{root}/s", "", answer=_no_answer, flight="benchmark", high_water_mark=mark)
+    one.start()
+    try:
+        yield one
+    finally:
+        one.stop(0.0)
+
+
+@contextmanager
+def reader(root: Path) -> Iterator[Connection]:
+    """A subscriber in a process of its own, that says through the pipe when a message has come."""
+    here, there = SPAWN.Pipe()
+    process = SPAWN.Process(target=_read, args=[f"ipc://{root}/s", there], daemon=True)
+    process.start()
+    try:
+        yield here
+    finally:
+        process.kill()
+        process.join()
+
+
+@contextmanager
+def crowd(root: Path, one: Publisher) -> Iterator[list[BaseProcess]]:
+    """Ten subscribers, each in a process of its own, all of them connected."""
+    pipes, processes = [], []
+    for _ in range(10):
+        here, there = SPAWN.Pipe()
+        process = SPAWN.Process(target=_read, args=[f"ipc://{root}/s", there, True], daemon=True)
+        process.start()
+        pipes.append(here)
+        processes.append(process)
+    try:
+        for pipe in pipes:
+            greet(one, pipe)
+        yield list(processes)
+    finally:
+        for process in processes:
+            process.kill()
+            process.join()
+
+
+def greet(one: Publisher, pipe: Connection) -> None:
+    """Publish until the reader has heard something, and nothing of that is left in the pipe."""
+    until = time.monotonic() + DEADLINE_S
+    while not pipe.poll(0.05):
+        if time.monotonic() > until:
+            raise TimeoutError("a subscriber never came")
+        one.publish("health", {})
+    while pipe.poll(0.2):
+        pipe.recv()
+
+
+def _read(endpoint: str, pipe: Connection, once: bool = False) -> None:
+    said = False
+    reuse_large_blocks()
+    with Subscriber(endpoint) as subscriber:
+        while True:
+            message = subscriber.receive(60.0)
+            if message is not None and not (once and said):
+                pipe.send(message.topic)
+                said = True
+
+
+def _wait(condition: Callable[[], bool]) -> None:
+    until = time.monotonic() + DEADLINE_S
+    while not condition():
+        if time.monotonic() > until:
+            raise TimeoutError("the simulated flight stands still")
+        time.sleep(0.002)
+
+
+if __name__ == "__main__":
+    main()
