@@ -103,13 +103,10 @@ def _centred(plane: NDArray[np.float32], *, windowed: bool) -> NDArray[np.comple
 
 def _pictured(centred: NDArray[np.complex64], look: Look, longest_side: int) -> Colour:
     """Scaled down by the strongest bin of each block, so that peaks stay."""
-    log = np.log(np.abs(centred) + np.float32(1e-9))
-    if look == "laplacian":
-        log = _above_neighbours(log)
-        bright = _bright(_pooled(log, longest_side), 0.5, 0.9999)
-        return np.repeat(bright[:, :, None], 3, axis=2)
-    if look == "magnitude":
-        bright = _bright(_pooled(log, longest_side), 0.02, 0.9999)
+    if look != "phase":
+        size = np.abs(centred)
+        shown = np.log((size if look == "magnitude" else _above_neighbours(size)) + np.float32(1e-9))
+        bright = _bright(_pooled(shown, longest_side), 0.02 if look == "magnitude" else 0.5, 0.9999)
         return np.repeat(bright[:, :, None], 3, axis=2)
     strongest = _strongest(centred, longest_side)
     size = np.abs(strongest)
@@ -119,10 +116,10 @@ def _pictured(centred: NDArray[np.complex64], look: Look, longest_side: int) -> 
     return np.stack([bright, green, np.zeros_like(bright)], axis=2)
 
 
-def _above_neighbours(log: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The Laplacian of the log magnitude, turned so that peaks are bright (Fig 41)."""
-    ring = sum(np.roll(log, step, axis) for step in (1, -1) for axis in (0, 1))
-    return np.asarray(4 * log - ring, dtype=np.float32)
+def _above_neighbours(size: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The Laplacian of the magnitude where it is negative, turned positive: bins that stand above their neighbours."""
+    ring = sum(np.roll(size, step, axis) for step in (1, -1) for axis in (0, 1))
+    return np.asarray(np.maximum(4 * size - ring, 0), dtype=np.float32)
 
 
 def _bright(values: NDArray[np.floating], low_share: float, high_share: float) -> NDArray[np.uint8]:
