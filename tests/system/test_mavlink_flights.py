@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled.cli import main
 from dappled.config.schema import ConfigError
 from dappled.daemon.knobs import code
 from dappled.drivers import mavlink_signing
@@ -75,6 +76,10 @@ def test_a_signed_link_through_a_restart(tmp_path: Path) -> None:
                 counts = daemon.service._links.statistics()[0].signing
                 assert counts is not None
                 assert counts.replayed == run
+        with flying(settings) as daemon:  # and dappled's own ground station, with the same key
+            daemon.until_ready()
+            url = f"udpout:127.0.0.1:{daemon.service._links.port(0)}"
+            assert main(["trigger", "--url", url, "--key", str(tmp_path / "radio.key")]) == 0
     assert (tmp_path / "flights" / ".mavlink-signing").stat().st_mode & 0o777 == 0o600
 
 
@@ -102,6 +107,7 @@ def test_keys_that_do_not_match_the_links_are_refused_in_one_sentence(tmp_path: 
         pass
 
 
+@pytest.mark.slow
 def test_decoding_is_switched_from_the_ground_and_the_flight_says_so(tmp_path: Path) -> None:
     settings = settings_of(tmp_path, mavlink={"url": URL})
     with Simulation(World(), settings, tmp_path) as simulated, flying(simulated) as daemon:

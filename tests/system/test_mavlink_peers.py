@@ -60,6 +60,7 @@ def run(script: str, folder: Path, *arguments: object) -> subprocess.Popen[bytes
     )
 
 
+@pytest.mark.slow
 def test_mavsdk_as_client(camera: Camera, tmp_path: Path) -> None:
     earlier = [camera.flying.shoot().shot.index for _ in range(2)]
     autopilot = Autopilot.start(f"udpout:127.0.0.1:{camera.port(0)}", seed=1, start_monotonic_ns=time.monotonic_ns())
@@ -94,6 +95,7 @@ def test_mavsdk_as_client(camera: Camera, tmp_path: Path) -> None:
     assert camera.iso() == "200"
 
 
+@pytest.mark.slow
 def test_mavsdk_as_autopilot_whose_system_is_adopted_and_whose_triggers_are_shots(
     camera: Camera, tmp_path: Path
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from pathlib import Path
 
 from dappled.cli.common import seconds, whole
 from dappled.daemon.ground_client import GroundClient, Outcome
@@ -19,11 +20,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--timeout", type=seconds, default=60.0, metavar="S", help="for the camera, and for each photograph"
     )
+    parser.add_argument("--key", type=Path, metavar="FILE", help="the link's signing key (dappled mavlink key)")
     parser.add_argument("--json", action="store_true", help="one JSON object a photograph")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    with GroundClient(arguments.url) as client:
+    with GroundClient(arguments.url, key_file=arguments.key) as client:
         client.find_camera(arguments.timeout)
         outcomes = client.capture(
             arguments.count,

@@ -7,9 +7,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 from dappled.daemon.clock import SystemClock
 from dappled.drivers.mavlink import MavlinkLinks, Message, Packet, mavlink
+from dappled.drivers.mavlink_signing import signing
 from dappled.errors import DappledError
 
 ACK_S = 0.5
@@ -38,24 +40,29 @@ class Outcome:
 class GroundClient:
     """One ground station on one link (a pymavlink connection string). Use as a context manager.
 
-    It sends heartbeats, each second, while open. Raises LinkError from `__enter__`.
+    It sends heartbeats, each second, while open. `key_file` signs the link; the signing time is kept beside it. Raises
+    LinkError from `__enter__`, SigningError for a key that can't be used.
     """
 
-    def __init__(self, url: str, *, system_id: int = 255, component_id: int = 190) -> None:
+    def __init__(
+        self, url: str, *, system_id: int = 255, component_id: int = 190, key_file: Path | None = None
+    ) -> None:
+        clock = SystemClock()
         self._links = MavlinkLinks(
             [url],
             system_id=system_id,
             component_id=component_id,
             tap=lambda _stamp, _raw: 0,
             on_packet=self._on_packet,
-            clock=SystemClock(),
+            clock=clock,
+            signing=signing([key_file], key_file.with_name(f"{key_file.name}.time"), clock) if key_file else None,
         )
         self._changed = threading.Condition()
         self._heard: deque[Message] = deque(maxlen=_KEPT)
         self._camera: tuple[int, int] | None = None
         self._stop = threading.Event()
         self._heart = threading.Thread(target=self._beat, name="ground heartbeat", daemon=True)
-        self._sequence = 0
+        self._sequence = time.time_ns() // 10**8 % 2**23  # another than that of a run just before; exact as a float
 
     def __enter__(self) -> GroundClient:
         self._links.start()
@@ -94,11 +101,15 @@ class GroundClient:
         with self._listening() as heard:
             for confirmation in range(ACK_TRIES):
                 asked = time.monotonic_ns()
-                self._links.send(mavlink.MAVLink_command_long_message(system, component, name, confirmation, *padded))
+                self.send_command(mavlink.MAVLink_command_long_message(system, component, name, confirmation, *padded))
                 ack = heard(lambda m: m.get_type() == "COMMAND_ACK" and m.command == name and self._mine(m), ACK_S)
                 if ack is not None:
                     return int(ack.result), (time.monotonic_ns() - asked) / 1e6
         return None, None
+
+    def send_command(self, message: Message) -> None:
+        """One COMMAND_LONG goes out; here a ground station of other manners would begin."""
+        self._links.send(message)
 
     def capture(
         self,

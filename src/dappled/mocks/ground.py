@@ -1,18 +1,48 @@
 """A simulated ground station in a process of its own: asks for photographs, prints how each one ended.
 
-`python -m dappled.mocks.ground --url udpout:127.0.0.1:14550 --count 8` ends with 0 if all were had.
+`python -m dappled.mocks.ground --url udpout:127.0.0.1:14550 --count 8` ends with 0 if all were had. It can misbehave:
+see `MANNERS`; a bad radio is `mocks.bad_link`.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+import os
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 
-from dappled.daemon.ground_client import GroundClient, GroundError, Outcome
-from dappled.drivers.mavlink import LinkError
+from dappled.daemon.ground_client import ACK_TRIES, GroundClient, GroundError, Outcome
+from dappled.drivers.mavlink import LinkError, Message, mavlink
+
+MANNERS = {
+    "deaf": "hears no answer: each command is repeated four times, and never says so (confirmation 0)",
+    "nan": "what a command doesn't need is NaN",
+    "dies": "is gone as soon as it has asked for a photograph",
+}
+
+
+class RudeClient(GroundClient):
+    """A ground station with these manners."""
+
+    def __init__(self, url: str, manners: Sequence[str]) -> None:
+        super().__init__(url)
+        self._manners = manners
+
+    def send_command(self, message: Message) -> None:
+        """See `MANNERS`."""
+        if "nan" in self._manners:
+            for name in ("param5", "param6", "param7"):
+                setattr(message, name, math.nan)
+        if "deaf" in self._manners:
+            message.confirmation = 0
+        for _ in range(ACK_TRIES if "deaf" in self._manners else 1):
+            super().send_command(message)
+        if "dies" in self._manners and message.command == mavlink.MAV_CMD_IMAGE_START_CAPTURE:
+            os._exit(9)
 
 
 class GroundStation:
@@ -22,10 +52,13 @@ class GroundStation:
         self._process = process
 
     @classmethod
-    def start(cls, url: str, count: int, interval_s: float = 0.0, timeout_s: float = 60.0) -> GroundStation:
-        """Start one that asks for `count` photographs; its lines (JSON) are read by `wait`."""
+    def start(
+        cls, url: str, count: int, interval_s: float = 0.0, timeout_s: float = 60.0, manners: Sequence[str] = ()
+    ) -> GroundStation:
+        """Start one that asks for `count` photographs; its lines (JSON) are read by `wait`. See MANNERS."""
         command = [sys.executable, "-m", "dappled.mocks.ground", "--url", url, "--count", str(count)]
         command += ["--interval", str(interval_s), "--timeout", str(timeout_s)]
+        command += [text for one in manners for text in ("--manners", one)]
         return cls(subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True))
 
     def running(self) -> bool:
@@ -58,10 +91,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--timeout", type=float, default=60.0, help="seconds to wait for the camera, and for each photo"
     )
+    parser.add_argument("--manners", action="append", choices=list(MANNERS), default=[], help="how it misbehaves")
     wanted = parser.parse_args(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C reaches the whole group; the starter ends us
     try:
-        with GroundClient(wanted.url) as client:
+        with RudeClient(wanted.url, wanted.manners) as client:
             client.find_camera(wanted.timeout)
             outcomes = client.capture(
                 wanted.count,
