@@ -57,4 +57,11 @@ def summary(made: Development) -> str:
     views = f"{rows} × {columns} views" if rows else "no views (they need a calibration, or carriers to be seen)"
     size = " × ".join(str(n) for n in field.slices.shape)
     found = f"{made.carriers_found} of {made.carriers_predicted} carriers seen"
-    return f"slices {size}, {views}; {found}, {made.report.carriers_from}"
+    whole = f"slices {size}, {views}; {found}, {made.report.carriers_from}"
+    if made.carriers_found == 0:
+        whose = "calibration's" if made.report.carriers_from == "calibrated" else "law's"
+        whole += (
+            f": no carriers in this frame, cut at the {whose} prediction; unless it was taken near the mask's ideal "
+            "aperture, mask, camera or focal length are not the right ones"
+        )
+    return whole

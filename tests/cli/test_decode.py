@@ -1,0 +1,111 @@
+"""Bad frames and wrong words at the decoder's door: a sentence each, and a batch that goes on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dappled.cli import main
+from dappled.mocks.lens import Installation
+from dappled.mocks.masked_camera import reference_camera
+
+MASK = "reference-5x5"
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A stopped-down frame of the boards on a quarter of the sensor, and a profile that knows it."""
+    folder = tmp_path_factory.mktemp("frames")
+    camera = reference_camera(6, scale=0.25, scene="bench")  # its mask sits where the aperture is the ideal one
+    (folder / "stopped.dng").write_bytes(camera.expose(0.0, 0, f_number=59.2).file)
+    (folder / "open.dng").write_bytes(camera.expose(0.0, 1).file)
+    (folder / "quarter.toml").write_text(
+        'law = "geometric"\nmask_distance_mm = 0.48\n[[raw]]\nname = "a quarter"\nshape = [694, 922]\n'
+        "row_mm = [0.01, 0.0]\ncolumn_mm = [0.0, 0.01]\n"
+    )
+    return folder / "stopped.dng"
+
+
+def _told(capsys: pytest.CaptureFixture[str], folder: Path, *words: str, mask: str = MASK) -> tuple[int, str, str]:
+    code = main(["decode", *words, "--camera", str(folder / "quarter.toml"), "--mask", mask])
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err
+    return code, out, err
+
+
+def test_a_frame_says_what_was_seen(stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = _told(capsys, stopped.parent, str(stopped), "-o", str(tmp_path / "a.npz"))
+    assert code == 0
+    assert "24 of 24 carriers seen, measured" in out
+
+
+def test_a_wrong_mask_and_a_frame_that_shows_no_carriers_are_told(
+    stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text("frequency_per_mm = 9.3\np = 2\n")
+    for frame, mask in ((stopped, str(wrong)), (stopped.with_name("open.dng"), MASK)):
+        code, out, _ = _told(capsys, stopped.parent, str(frame), "-o", str(tmp_path / f"{frame.stem}.npz"), mask=mask)
+        assert code == 0
+        assert "no carriers in this frame, cut at the law's prediction" in out
+
+
+def test_a_wrong_focal_length_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    camera = reference_camera(2, scale=0.25, scene="bench", law="fd")
+    camera = replace(camera, installation=Installation(0.01, (0.001, 0.002), 1.03))
+    path = tmp_path / "fd.dng"
+    path.write_bytes(camera.expose(0.0, 0, f_number=92.0).file)
+    pitch = camera.sensor.pitch_mm
+    (tmp_path / "quarter.toml").write_text(
+        'law = "fd"\nmask_distance_mm = 1.01\n[[raw]]\nname = "a quarter"\nshape = [694, 922]\n'
+        f"row_mm = [{pitch}, 0.0]\ncolumn_mm = [0.0, {pitch}]\n"
+    )
+    for length, words in (("13", "measured"), ("20", "focal length are not the right ones")):
+        wanted = [str(path), "--focal-length", length, "-o", str(tmp_path / f"{length}.npz")]
+        code, out, _ = _told(capsys, tmp_path, *wanted, mask="mask-2-full")
+        assert code == 0
+        assert words in out
+
+
+def test_missing_exif_asks_for_the_focal_length(
+    stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frame = np.random.default_rng(0).random((694, 922)).astype(np.float32)
+    np.save(tmp_path / "plain.npy", frame)
+    code, _, err = _told(capsys, stopped.parent, str(tmp_path / "plain.npy"), "-o", str(tmp_path / "a.npz"))
+    assert code == 1
+    assert "plain.npy" in err
+    assert "--focal-length" in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("which", ["--white", "--dark"])
+def test_a_white_or_dark_frame_of_another_size_is_refused(
+    which: str, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "other.npy", np.random.default_rng(0).random((600, 922)).astype(np.float32))
+    words = [str(stopped), which, str(tmp_path / "other.npy"), "-o", str(tmp_path / "a.npz")]
+    code, _, err = _told(capsys, stopped.parent, *words)
+    assert code == 1
+    assert "600×922" in err
+    assert "694×922" in err
+
+
+def test_a_batch_goes_on_past_bad_frames_and_says_so(
+    stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad, black = tmp_path / "bad.dng", tmp_path / "black.npy"
+    bad.write_bytes(stopped.read_bytes()[:5000])
+    np.save(black, np.zeros((694, 922), dtype=np.uint16))
+    folder = tmp_path / "decoded"
+    code, out, err = _told(capsys, stopped.parent, str(bad), str(black), str(stopped), "-o", str(folder))
+    assert code == 1
+    assert [path.stem for path in folder.iterdir()] == ["stopped"]
+    assert "stopped" in out
+    lines = err.strip().splitlines()
+    assert "bad.dng" in lines[0]
+    assert "black.npy" in lines[1]
+    assert lines[2] == "2 of 3 frames could not be decoded"
