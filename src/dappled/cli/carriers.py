@@ -16,12 +16,12 @@ from dappled.cli import common
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
 from dappled.decode.carriers import Carrier, Lattice
-from dappled.decode.decoder import CarriersFrom
 from dappled.decode.lattice import FoundLattice, find_lattice
 from dappled.decode.masks import Mask, Order
 from dappled.decode.peaks import Measured, measure
 from dappled.decode.plane import Plane
 from dappled.decode.prediction import crossed_orders, lattice_rotation
+from dappled.decode.report import CarriersFrom
 from dappled.decode.slices import default_size
 from dappled.decode.spectrum import Spectrum, padded_shape
 from dappled.decode.spectrum_pictures import LOOKS, Look, around, spectrum_boxes

@@ -7,9 +7,9 @@ same bytes.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,50 +19,21 @@ from dappled.decode.calibrated import Calibration, at_corner
 from dappled.decode.calibration import origin_of, relative_transfer
 from dappled.decode.carriers import LAWS, Carrier, Lattice, Sensor
 from dappled.decode.errors import DecodeError
-from dappled.decode.lattice import fit, residual_bins
 from dappled.decode.lightfield import LightField
 from dappled.decode.masks import Mask, Order
 from dappled.decode.noise import Noise
+from dappled.decode.ownlattice import STRONG, STRONGER, own_lattice, turn_between
 from dappled.decode.peaks import Measured, measure
 from dappled.decode.plan import Plans
+from dappled.decode.report import CarriersFrom, DecodeReport, ViewsFrom, light_field, no_views
 from dappled.decode.slices import Slices, default_size, extract
 from dappled.decode.spectrum import Spectrum, padded_shape
 from dappled.decode.threads import each
 from dappled.decode.transform import Source, Transform
 from dappled.decode.views import Aperture, Views, angular_frequencies, from_slices, kappa, transfer
 
-CarriersFrom = Literal["measured", "calibrated", "predicted", "found"]
-ViewsFrom = Literal["calibration", "frame", "white", "none"]
-_ENOUGH = 4  # peaks of a half plane, in both directions, before a frame's own lattice is believed
-_STRONG = 0.02  # of the mean; at the ideal aperture parallax alone leaves up to a thousandth
-_STRONGER = 0.1  # what it takes against a calibration: weak peaks are pulled aside by parallax
-_ALIKE_BINS = 0.5  # rms from their lattice
 _ROTATION = 0.04  # of a carrier's frequency: the search without a calibration allows for 2.3°
 _LEAST_THROUGH = 0.1  # a carrier of which the aperture leaves less doesn't tell the mask's transfer
-
-
-@dataclass(frozen=True, slots=True)
-class DecodeReport:
-    """Which carriers a frame was decoded at, and why.
-
-    `predicted` are the half plane's carriers on the sensor as predicted, (0, 0) first, `measured` what was seen near
-    each (None: nothing there), `used` those that the slices were cut at. `carriers_from`: "measured" in this frame;
-    "calibrated": predicted by the calibration, as too little was to be seen; "predicted": by the law alone; "found":
-    a lattice that nobody had named. `views_from`: whose phases and transfer made the views. `noise_rms` is the
-    plane's white noise, 1.0 = sensor white.
-    """
-
-    predicted: tuple[Carrier, ...]
-    measured: tuple[Measured | None, ...]
-    used: tuple[Carrier, ...]
-    carriers_from: CarriersFrom
-    views_from: ViewsFrom
-    noise_rms: float
-
-    @property
-    def found(self) -> int:
-        """How many carriers were seen, the mean (0, 0) included; suspect ones don't count."""
-        return sum(m is not None and not m.suspect for m in self.measured)
 
 
 class Decoder(Protocol):
@@ -199,8 +170,8 @@ class MaskDecoder:
             measured[k] = measure(spectrum, [predicted[k]], radii[k])[0]
 
         each(look, range(len(predicted)), self.workers)
-        least = _STRONGER if self.calibration is not None else _STRONG
-        own = _own_lattice(spectrum, predicted, measured, least)
+        least = STRONGER if self.calibration is not None else STRONG
+        own = own_lattice(spectrum, predicted, measured, least)
         if own is None:
             if self.calibration is not None:
                 return lattice, measured, "calibrated"
@@ -269,7 +240,7 @@ class MaskDecoder:
             ).kappa
             views_from: ViewsFrom = "calibration"
         elif carriers_from == "measured":
-            rotation = _rotation(lattice, self.lattice_at(focal_length_mm))
+            rotation = turn_between(lattice, self.lattice_at(focal_length_mm))
             through = aperture.transform(angular_frequencies(orders, cycles, rotation)).real
             keep = np.abs(through) > _LEAST_THROUGH
             if np.linalg.matrix_rank([order for order, usable in zip(orders, keep, strict=True) if usable]) < 2:
@@ -295,44 +266,6 @@ class MaskDecoder:
         return views, offsets, views_from, told
 
 
-def _own_lattice(
-    spectrum: Spectrum, predicted: Sequence[Carrier], measured: Sequence[Measured | None], least: float
-) -> Lattice | None:
-    """The lattice that this frame's own peaks show, or None where they are too few, too weak or not on a lattice."""
-    pairs = _believed(predicted, measured, least)
-    for radius in (3.0, 2.0):
-        if len(pairs) < _ENOUGH or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in pairs]) < 2:
-            return None
-        lattice = fit(pairs)
-        looked = lattice.carriers([(c.ky, c.kx) for c in predicted])
-        pairs = _believed(looked, measure(spectrum, looked, radius), least)
-    if len(pairs) < _ENOUGH or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in pairs]) < 2:
-        return None
-    lattice = fit(pairs)
-    carriers = lattice.carriers([(c.ky, c.kx) for c, _ in pairs])
-    if residual_bins(carriers, [m for _, m in pairs], spectrum) > _ALIKE_BINS:
-        return None
-    return lattice
-
-
-def _believed(
-    carriers: Sequence[Carrier], measured: Sequence[Measured | None], least: float
-) -> list[tuple[Carrier, Measured]]:
-    return [
-        (c, m)
-        for c, m in zip(carriers, measured, strict=True)
-        if m is not None and not m.suspect and m.strength >= least and (c.ky, c.kx) != (0, 0)
-    ]
-
-
-def _rotation(lattice: Lattice, predicted: Lattice) -> float:
-    """The turn from one lattice to another, mean of both vectors', as `Lattice.rotated` counts."""
-    turns = []
-    for (ay, ax), (by, bx) in zip((lattice.ky, lattice.kx), (predicted.ky, predicted.kx), strict=True):
-        turns.append(math.atan2(by * ax - bx * ay, by * ay + bx * ax))
-    return sum(turns) / 2
-
-
 def _own_transfer(
     slices: NDArray[np.complex64], orders: Sequence[Order], through: NDArray[np.float64], keep: NDArray[np.bool_]
 ) -> NDArray[np.complex128]:
@@ -343,31 +276,3 @@ def _own_transfer(
     origin, _ = origin_of([order for order, usable in zip(orders, used, strict=True) if usable], seen[used])
     turns = transfer(orders, np.ones(len(orders)), origin)
     return np.where(keep, (seen * np.conj(turns)).real, 0.0) * turns
-
-
-def no_views(slices: Slices) -> tuple[Views, NDArray[np.float64]]:
-    """The views (0, 0, h, w) and offsets (0, 0, 2) of slices alone."""
-    return np.zeros((0, 0, *slices.values.shape[1:]), dtype=np.float32), np.zeros((0, 0, 2))
-
-
-def light_field(
-    slices: Slices,
-    views: Views,
-    offsets: NDArray[np.float64],
-    *,
-    shape: tuple[int, ...],
-    report: DecodeReport,
-    facts: Mapping[str, Any],
-) -> LightField:
-    """The light field's value, its attributes the facts and what the report says in numbers and words."""
-    rows = np.array([(c.ky, c.kx, c.fy, c.fx) for c in slices.carriers], dtype=np.float64)
-    attributes = {
-        "shape": [int(side) for side in shape],
-        **facts,
-        "carriers_from": report.carriers_from,
-        "views_from": report.views_from,
-        "carriers_predicted": len(report.predicted),
-        "carriers_found": report.found,
-        "noise_rms": report.noise_rms,
-    }
-    return LightField(slices.values, rows, views, offsets, slices.grid, attributes)

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from dappled.decode.calibrated import at_centre, at_corner
 from dappled.decode.calibration import relative_transfer
 from dappled.decode.carriers import Carrier, Lattice
-from dappled.decode.decoder import DecodeReport, light_field, no_views
 from dappled.decode.errors import DecodeError
 from dappled.decode.lattice import FoundLattice, find_lattice
 from dappled.decode.lightfield import LightField
 from dappled.decode.noise import noise_rms
 from dappled.decode.plan import Plan, Plans
+from dappled.decode.report import DecodeReport, light_field, no_views
 from dappled.decode.slices import Slices, default_size
 from dappled.decode.spectrum import Spectrum
 from dappled.decode.transform import Source

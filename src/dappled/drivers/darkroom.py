@@ -17,12 +17,13 @@ from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode import plane as planes
 from dappled.decode.calibrated import Calibration
-from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
+from dappled.decode.decoder import Decoder, MaskDecoder
 from dappled.decode.errors import DecodeError
 from dappled.decode.exposure import Developer, Exposure, developer
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
 from dappled.decode.plane import Plane
+from dappled.decode.report import DecodeReport
 from dappled.decode.stagger import spread
 from dappled.decode.transform import Source
 from dappled.drivers import calibration_files, rawfile
