@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from dappled.decode.carriers import Carrier
+from dappled.decode.latest import Latest
 from dappled.decode.slices import SlicePlan, Slices, plan_slices
 from dappled.decode.spectrum import Spectrum
 from dappled.decode.transform import Source, Transform
@@ -24,7 +25,7 @@ class Plan:
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self._transform = Transform(shape)
-        self._layouts: dict[Any, SlicePlan] = {}
+        self._layouts: Latest[SlicePlan] = Latest(_KEPT)
 
     def spectrum(self, source: Source, *, workers: int = 1, largest_fx: float = 0.5) -> Spectrum:
         """The frame's spectrum up to `largest_fx` cycles/pixel along columns."""
@@ -42,12 +43,7 @@ class Plan:
     ) -> Slices:
         """As `slices.extract`; the same carriers and choices are laid out only once. Other work is done `beside`."""
         key = tuple(carriers), size, tuple(sorted(choices.items()))
-        layout = self._layouts.pop(key, None)
-        if layout is None:
-            layout = plan_slices(spectrum.shape, spectrum.padded, carriers, size, **choices)
-            while len(self._layouts) >= _KEPT:
-                del self._layouts[next(iter(self._layouts))]
-        self._layouts[key] = layout  # the latest stand last
+        layout = self._layouts.of(key, lambda: plan_slices(spectrum.shape, spectrum.padded, carriers, size, **choices))
         return layout.apply(spectrum, workers=workers, beside=beside)
 
 

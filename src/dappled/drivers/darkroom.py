@@ -20,6 +20,7 @@ from dappled.decode.calibrated import Calibration
 from dappled.decode.decoder import Decoder, MaskDecoder
 from dappled.decode.errors import DecodeError
 from dappled.decode.exposure import Developer, Exposure, developer
+from dappled.decode.latest import Latest
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
 from dappled.decode.plane import Plane
@@ -29,6 +30,8 @@ from dappled.decode.transform import Source
 from dappled.drivers import calibration_files, rawfile
 from dappled.drivers.rawfile import RawFile
 from dappled.errors import DappledError
+
+_KEPT = 4  # developers: some bodies say another black level with every frame
 
 
 class DarkroomError(DappledError):
@@ -87,7 +90,7 @@ class Darkroom:
         self._dark: NDArray[Any] | None = None
         self._gains: dict[tuple[int, int], Plane] = {}
         self._balance: NDArray[np.float64] | None = None
-        self._developers: dict[Any, Developer] = {}
+        self._developers: Latest[Developer] = Latest(_KEPT)
         self._staggered: dict[tuple[tuple[int, int], str], bool] = {}
 
     def check(self) -> None:
@@ -180,12 +183,11 @@ class Darkroom:
         planes.check_shape(raw.mosaic)
         shape = raw.mosaic.shape[0], raw.mosaic.shape[1]
         key = shape, None if cfa is None else (cfa.shape, cfa.tobytes()), black, raw.white
-        if key not in self._developers:
-            self._developers[key] = developer(
-                shape, black=black, white=raw.white, cfa=cfa, balance=balance, reference=reference
-            )
+        develop = self._developers.of(
+            key, lambda: developer(shape, black=black, white=raw.white, cfa=cfa, balance=balance, reference=reference)
+        )
         flat = self._gain(shape) if self.recipe.white and not lenslets else None
-        return self._developers[key].expose(raw.mosaic, dark=dark, flat=flat, workers=workers), chroma
+        return develop.expose(raw.mosaic, dark=dark, flat=flat, workers=workers), chroma
 
     def _white_balance(self) -> NDArray[np.float64] | None:
         """The gains that make the white frame grey; None without one."""
