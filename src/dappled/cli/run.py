@@ -43,6 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulation (default 1)")
     parser.add_argument("--for", dest="seconds", type=seconds, metavar="SECONDS", help="end after this time")
     parser.add_argument("--frames", type=whole, metavar="N", help="end after N frames; a simulated ground station asks")
+    parser.add_argument("--console", metavar="HOST:PORT", help="serve the operator's console here (as console.bind)")
     parser.add_argument("--json", action="store_true", help="one JSON object a frame")
 
 
@@ -58,6 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run(arguments: argparse.Namespace) -> int:
     settings = configuration.load(arguments.config)
+    if arguments.console:
+        settings = replace(settings, console=replace(settings.console, bind=arguments.console))
     if not arguments.simulate:
         return _serve(settings, arguments, None)
     from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # a real flight doesn't load the mocks

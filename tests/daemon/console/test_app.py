@@ -287,11 +287,14 @@ def test_a_page_hears_state_frames_and_log(rig: Rig) -> None:
         lines = stream.iter_lines()
         assert events(lines, "frame")["tag"]["frame"] == 4
         assert events(lines, "log")["lines"][0]["text"] == "camera ready"
-        rig.publisher.publish("health", HEALTH)
+        vehicle = {"latitude_deg": 41.0, "longitude_deg": 2.0, "yaw_deg": None, "position_sigma_m": None, "age_ms": 1.0}
+        for _ in range(2):
+            rig.publisher.publish("health", HEALTH | {"vehicle": vehicle})
         state = events(lines, "state")
         while state["health"] is None:
             state = events(lines, "state")
-        assert state["verdict"] == "caution"  # no position
+        assert state["verdict"] == "caution"  # no attitude
+        assert list(rig.parts.feed.path) == [(2.0, 41.0)]
         assert {"name": "Camera", "state": "go", "text": "ready"} in state["checks"]
         eventually(rig.parts.watched, "the page counts")
     eventually(lambda: len(rig.parts.hub) == 0, "a page that went away is forgotten")
@@ -300,7 +303,9 @@ def test_a_page_hears_state_frames_and_log(rig: Rig) -> None:
 def test_metrics_for_whoever_scrapes(rig: Rig) -> None:
     with rig.client() as client:
         assert client.get("/metrics").status_code == 503
-        rig.publisher.publish("health", HEALTH)
+        vehicle = {"latitude_deg": 41.0, "longitude_deg": 2.0, "yaw_deg": None, "position_sigma_m": None, "age_ms": 1.0}
+        for _ in range(2):
+            rig.publisher.publish("health", HEALTH | {"vehicle": vehicle})
         eventually(lambda: client.get("/metrics").status_code == 200, "the daemon is heard")
         answer = client.get("/metrics")
     assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")

@@ -181,6 +181,7 @@ def _about(parts: Parts) -> dict[str, Any]:
         "is": "about",
         "start": parts.feed.start,
         "map": None if background is None else background.bounds(),
+        "path": list(parts.feed.path),
     }
 
 

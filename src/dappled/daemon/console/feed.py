@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +18,7 @@ from dappled.daemon.wire import Message
 from dappled.errors import DappledError, report
 
 log = logging.getLogger(__name__)
-FRAMES, STACK_BYTES = 400, 72_000_000
+FRAMES, STACK_BYTES, PATH = 400, 72_000_000, 3600
 _ASK_S = 20.0
 
 Event = dict[str, Any]
@@ -63,6 +63,7 @@ class Feed:
         self._asked: dict[int, asyncio.Future[Message]] = {}
         self._stream: AsyncSubscriber | None = None
         self._bytes = self._sized = 0
+        self.path: deque[tuple[float, float]] = deque(maxlen=PATH)  # (longitude, latitude) of the vehicle
 
     async def run(self) -> None:
         """Receive for ever. Slices are listened to only while somebody watches."""
@@ -151,6 +152,7 @@ class Feed:
         match message.topic:
             case "health":
                 self.health = header
+                self._follow(header.get("vehicle"))
                 self._tell(self.state())
             case "start":
                 self._begin(header)
@@ -165,6 +167,12 @@ class Feed:
             case "error":
                 asked = header.get("asked") or {}
                 self._answer(asked.get("frame"), FeedError(str(header.get("error"))))
+
+    def _follow(self, vehicle: dict[str, Any] | None) -> None:
+        if vehicle is not None and vehicle["latitude_deg"] is not None:
+            place = (vehicle["longitude_deg"], vehicle["latitude_deg"])
+            if not self.path or self.path[-1] != place:
+                self.path.append(place)
 
     def _begin(self, header: dict[str, Any]) -> None:
         self.start = header

@@ -12,7 +12,7 @@ let chosen = null, heardAt = 0, utcAt = null, connected = false, ended = false, 
 let sequence = Math.floor(Math.random() * 2 ** 30);
 
 const handlers = {
-  about(event) { map.setBackground(event.map); if (event.start) began(event.start); },
+  about(event) { map.setBackground(event.map); map.setPath(event.path); if (event.start) began(event.start); },
   start(event) { began(event.start); },
   state(event) { if (event.health) showState(event); },
   frame: showFrame,

@@ -27,6 +27,11 @@ export class FieldMap {
     return [east * METRES * Math.cos(this.origin[1] * Math.PI / 180), (lat - this.origin[1]) * METRES];
   }
 
+  setPath(path) {
+    if (path.length > this.track.length) this.track = path;
+    this.redraw();
+  }
+
   setVehicle(vehicle) {
     this.vehicle = vehicle;
     if (vehicle) {
