@@ -208,8 +208,11 @@ def test_the_clock_is_fitted_once_while_nothing_better_is_known(monkeypatch: pyt
     for _ in range(100):
         assert not link.telemetry.bracketed(START_NS + 30 * 10**9)
     assert len(fits) == 1
-    link.vehicle(STEPS / 10)
-    assert not link.telemetry.bracketed(START_NS + 30 * 10**9)
+    for step in range(STEPS, 2 * STEPS):
+        link.vehicle(step / 10)
+        assert not link.telemetry.bracketed(START_NS + 30 * 10**9)
+    assert len(fits) == 1  # nor for packets that come while the instant is far
+    assert link.telemetry.bracketed(START_NS + 7 * 10**9)
     assert len(fits) == 2
 
 

@@ -80,6 +80,7 @@ FAULTS = [
     Fault("a frame's row", lambda f: alter(f, "UPDATE shots SET state = 'safe' WHERE idx = 2"), "has no frame for it"),
     Fault("a pose", lambda f: alter(f, "UPDATE poses SET record = record || ' '"), "the pose of frame 0 was changed"),
     Fault("a tag", lambda f: alter(f, "UPDATE tags SET record = record || ' '"), "the tag of frame 1 was changed"),
+    Fault("a result", lambda f: alter(f, "UPDATE results SET slices_sha256 = 'cd'"), "contradicts itself"),
     Fault("a tag's text", lambda f: alter(f, "UPDATE tags SET record = '[]'"), "can't be read"),
     Fault("a hash", lambda f: alter(f, "UPDATE frames SET sha256 = 'x' WHERE idx = 0"), "about other bytes"),
     Fault("its end", lambda f: alter(f, "DELETE FROM facts WHERE key = 'closed_utc_ns'"), "never closed"),

@@ -27,6 +27,7 @@ HISTORY_NS = TIMESYNC_WINDOW_NS + 60 * 10**9
 POSITION_GAP_NS = 2_500_000_000
 ATTITUDE_GAP_NS = 1_500_000_000
 _ALIVE_NS = 5 * 10**9
+_HINT_NS = 50_000_000  # more than a clock is fitted anew by while one frame waits
 _PRUNE_EVERY = 256
 
 
@@ -96,15 +97,11 @@ class Telemetry:
         Attitude counts only if there was any in the last five seconds.
         """
         with self._lock:
+            hint = self._time.lately(self._packets)
+            if hint is not None and not self._reached(hint.boot_ns(utc_ns) - _HINT_NS):
+                return False  # far from it: no new fit for every packet that comes while somebody waits
             clock = self._clock(self._packets)
-            if clock is None:
-                return False
-            boot_ns = clock.boot_ns(utc_ns)
-            positions, attitudes = self._positions[-1:], self._attitudes[-1:]
-            if not positions or positions[0].boot_ns < boot_ns:
-                return False
-            alive = bool(attitudes) and attitudes[0].boot_ns >= positions[0].boot_ns - _ALIVE_NS
-            return not alive or attitudes[0].boot_ns >= boot_ns
+            return clock is not None and self._reached(clock.boot_ns(utc_ns))
 
     def settled(self, exposure: Exposure) -> bool:
         """Whether waiting longer would not make this exposure's pose better: samples from after it are there; from an
@@ -235,6 +232,13 @@ class Telemetry:
 
     def _clock(self, limit: int) -> BootClock | None:
         return self._time.clock(limit, (self._positions, self._attitudes))
+
+    def _reached(self, boot_ns: int) -> bool:
+        positions, attitudes = self._positions[-1:], self._attitudes[-1:]
+        if not positions or positions[0].boot_ns < boot_ns:
+            return False
+        alive = bool(attitudes) and attitudes[0].boot_ns >= positions[0].boot_ns - _ALIVE_NS
+        return not alive or attitudes[0].boot_ns >= boot_ns
 
     def _around(self, utc_ns: int, boot_ns: int, sigma_ns: float, limit: int) -> Around:
         first = self._time.first(limit)

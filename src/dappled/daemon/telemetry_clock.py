@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from dappled.daemon import telemetry_history as history
 from dappled.daemon.boot_clock import Answer, BootClock, from_arrivals, from_timesync
@@ -18,6 +18,7 @@ REBOOT_BACK_NS = 2 * 10**9
 REBOOT_CONFIRM_NS = 500_000_000
 _REQUESTS_KEPT = 64
 _BOOTS_KEPT = 8
+_Key = tuple[str | int, ...]  # what a fit was made from: its kind, the boot's first packet, the last packets
 
 
 class AutopilotTime:
@@ -34,7 +35,7 @@ class AutopilotTime:
         self._requests: dict[int, int] = {}
         self._boots: list[int] = [0]  # packet numbers at which the autopilot's time began anew
         self._back_since_ns: int | None = None
-        self._fitted: tuple[object, BootClock | None] = (None, None)
+        self._fitted: tuple[_Key | None, BootClock | None] = (None, None)
         self.now_boot_ns: int | None = None
         self.unix_minus_boot_ns: int | None = None
         self.answers_seen = self.reboots = 0
@@ -88,20 +89,25 @@ class AutopilotTime:
         """The autopilot's clock against ours, from the packets below `limit`: by TIMESYNC, else by when the samples of
         `histories` arrived; None while unknown."""
         first = self.first(limit)
-        end = history.place(self._answers, limit)
-        if end and self._answers[end - 1].number >= first:
-            key = ("timesync", first, self._answers[end - 1].number)
-            if self._fitted[0] != key:
-                answers = history.between(self._answers, first, limit)
-                self._fitted = (key, from_timesync(history.last(answers, TIMESYNC_WINDOW_NS)))
-            if self._fitted[1] is not None:
-                return self._fitted[1]
+        answers = history.between(self._answers, first, limit)
+        if answers:
+            key = ("timesync", first, answers[-1].number)
+            clock = self._fit(key, lambda: from_timesync(history.last(answers, TIMESYNC_WINDOW_NS)))
+            if clock is not None:
+                return clock
         tails = [history.last(history.between(one, first, limit), ARRIVAL_WINDOW_NS) for one in histories]
-        newest = ("arrival", first, *(tail[-1].number for tail in tails if tail))
-        if self._fitted[0] != newest:
-            arrivals = [(sample.boot_ns, sample.stamp_ns) for tail in tails for sample in tail]
-            self._fitted = (newest, from_arrivals(arrivals))
+        key = ("arrival", first, *(tail[-1].number for tail in tails if tail))
+        return self._fit(key, lambda: from_arrivals([(one.boot_ns, one.stamp_ns) for tail in tails for one in tail]))
+
+    def _fit(self, key: _Key, make: Callable[[], BootClock | None]) -> BootClock | None:
+        if self._fitted[0] != key:
+            self._fitted = (key, make())
         return self._fitted[1]
+
+    def lately(self, limit: int) -> BootClock | None:
+        """The clock as it was last fitted, perhaps from older packets of this boot: a hint that costs nothing."""
+        key, fitted = self._fitted
+        return fitted if key is not None and key[1] == self.first(limit) else None
 
     def prune(self, before_ns: int) -> None:
         """Forget what came before."""

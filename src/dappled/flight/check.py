@@ -119,13 +119,14 @@ def _shots(folder: FlightFolder, ledger: LedgerReader, notes: list[str]) -> Iter
 
 
 def _records(ledger: LedgerReader) -> Iterator[str]:
-    """Poses and tags against their digests, and tags against frames."""
+    """Poses and tags against their digests, results against their hashes, and tags against frames."""
     for table in ("poses", "tags"):
         for index, (sha256, text) in ledger.digests(table).items():
             if hashlib.sha256(text.encode()).hexdigest() != sha256:
                 yield f"the {table[:-1]} of frame {index} was changed: its SHA-256 is not the one noted"
     frames = {frame.index: frame.sha256 for frame in ledger.frames()}
     try:
+        yield from ledger.contradictions()
         tags = ledger.tags()
     except FlightError as error:
         yield str(error)

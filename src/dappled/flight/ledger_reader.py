@@ -135,6 +135,15 @@ class LedgerReader:
         rows = self._rows("SELECT record FROM results WHERE idx = ? AND run = ?", index, run)
         return self._load(ledger_schema.result, rows[0][0]) if rows else None
 
+    def contradictions(self) -> list[str]:
+        """Results whose record and column say different hashes, in sentences."""
+        rows = self._rows("SELECT idx, run, slices_sha256, record FROM results ORDER BY idx, run")
+        return [
+            f"the result of frame {index} in run {run} contradicts itself"
+            for index, run, sha256, text in rows
+            if self._load(ledger_schema.result, text).slices_sha256 != sha256
+        ]
+
     def runs(self) -> dict[str, int]:
         """How many results each run has; "live" is the flight itself."""
         return dict(self._rows("SELECT run, count(*) FROM results GROUP BY run ORDER BY min(rowid)"))
