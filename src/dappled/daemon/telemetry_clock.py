@@ -91,12 +91,12 @@ class AutopilotTime:
         first = self.first(limit)
         answers = history.between(self._answers, first, limit)
         if answers:
-            key = ("timesync", first, answers[-1].number)
-            clock = self._fit(key, lambda: from_timesync(history.last(answers, TIMESYNC_WINDOW_NS)))
+            told: _Key = ("timesync", first, answers[-1].number)
+            clock = self._fit(told, lambda: from_timesync(history.last(answers, TIMESYNC_WINDOW_NS)))
             if clock is not None:
                 return clock
         tails = [history.last(history.between(one, first, limit), ARRIVAL_WINDOW_NS) for one in histories]
-        key = ("arrival", first, *(tail[-1].number for tail in tails if tail))
+        key: _Key = ("arrival", first, *(tail[-1].number for tail in tails if tail))
         return self._fit(key, lambda: from_arrivals([(one.boot_ns, one.stamp_ns) for tail in tails for one in tail]))
 
     def _fit(self, key: _Key, make: Callable[[], BootClock | None]) -> BootClock | None:
