@@ -19,6 +19,7 @@ from dappled.errors import DappledError
 from dappled.flight import layout
 from dappled.products import difference, drawings, earth, georeference, terrain
 from dappled.products.georeference import Options, Progress, Survey
+from dappled.products.hyperstereo import HyperstereoError
 from dappled.products.photographs import Mounting
 
 KINDS = ("kmz", "cog", "footprints", "terrain", "difference")
@@ -91,11 +92,14 @@ def run(arguments: argparse.Namespace) -> int:
         progress = stack.enter_context(Bar())
         made = _survey(folder.path, arguments, progress, stack)
         files = _draw(made, output, arguments)
-        terrain_of = None
+        terrain_of, missing = None, ""
         if "terrain" in arguments.kinds:
-            terrain_of = terrain.of(made, progress)
-            files.append(terrain.write_raster(made, terrain_of, output / "terrain.tif"))
-            files.append(terrain.write_points(made, terrain_of, output / "terrain.las"))
+            try:
+                terrain_of = terrain.of(made, progress)
+                files.append(terrain.write_raster(made, terrain_of, output / "terrain.tif"))
+                files.append(terrain.write_points(made, terrain_of, output / "terrain.las"))
+            except HyperstereoError as error:  # the maps are there all the same
+                missing = str(error)
         if arguments.against is not None:
             arguments.crs = made.projection.name
             other = _survey(layout.open_folder(arguments.against).path, arguments, progress, stack)
@@ -104,6 +108,8 @@ def run(arguments: argparse.Namespace) -> int:
             if terrain_of is not None:
                 raised = difference.of_heights(terrain_of, terrain.of(other, progress))
                 files.append(difference.write(made, other, raised, output / "height-difference.tif", "m"))
+    if missing:
+        made = replace(made, notes=(*made.notes, missing))
     report = georeference.write_report(made, output, files)
     if arguments.json:
         print(report.read_text(), end="")
@@ -113,7 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
             print(path)
     for why in (*(why for _, why in made.left), *made.notes):
         print(why, file=sys.stderr)
-    return 0
+    return 1 if missing else 0
 
 
 def _survey(flight: Path, arguments: argparse.Namespace, progress: Progress, stack: ExitStack) -> Survey:

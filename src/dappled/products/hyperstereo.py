@@ -25,7 +25,7 @@ Single = NDArray[np.float32]
 LEAST_OVERLAP = 0.2  # of a frame, for a pair
 _PIXEL_SIGMA = 0.12  # of a match, in pixels
 _STEP_PX = 0.7  # of parallax between heights
-_LEAST_SCORE = 0.6
+_LEAST_SCORE = 0.88  # below, edges and what only seems to be seen twice: wrong more often than not
 _MOST_PARTNERS = 3
 
 
@@ -173,7 +173,7 @@ def _sweep(
     known = (score >= _LEAST_SCORE) & (top == inner)
     step = levels[1] - levels[0]
     height = np.where(known, levels[0] + (inner + aside) * step, np.nan)
-    sigma = _PIXEL_SIGMA / slope / np.maximum(score, 1e-3)
+    sigma = _PIXEL_SIGMA / slope * np.maximum((1 - score) / 0.02, 1)  # the less alike, the worse
     return Surface(part, height.astype(np.float32), np.where(known, sigma, np.nan).astype(np.float32), score)
 
 
