@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -103,7 +104,12 @@ def replay(tmp_path: Path, **digests: str | None) -> tuple[ReplayBook, Frame]:
     frame = Frame(0, "000000.dng", "IMG.DNG", len(DATA), durable.hash_descriptor(blob.fd, blob.size), 5)
     blob.close()
     row = ShotRow(SHOT, "safe", None, 30, 40)
-    given = {"pose_sha256": digest(no_pose()), "tag_sha256": digest(tag(frame)), "slices_sha256": "5" * 64, **digests}
+    given: dict[str, Any] = {
+        "pose_sha256": digest(no_pose()),
+        "tag_sha256": digest(tag(frame)),
+        "slices_sha256": "5" * 64,
+        **digests,
+    }
     return ReplayBook(tmp_path, [Expected(row, frame, **given)]), frame
 
 
