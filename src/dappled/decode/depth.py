@@ -15,7 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from dappled.decode import depth_combined, depth_contrast, depth_gradient, depth_stereo
-from dappled.decode.depthmap import DepthMap, Search, windowed
+from dappled.decode.depthmap import DepthMap, Search, peaked, windowed
 from dappled.decode.errors import DecodeError
 from dappled.decode.evidence import Evidence
 from dappled.decode.viewstack import ViewStack
@@ -77,8 +77,9 @@ def disparity_range(evidence: Evidence, *, workers: int = 1) -> tuple[float, flo
     textured = margin >= np.quantile(margin, 1 - _SURE)
     edge = max(3, min(margin.shape) // 10)
     textured[:edge] = textured[-edge or None :] = False
-    best = ndimage.median_filter(disparities[likelihood.argmax(axis=0)], 3)
+    peaks, _ = peaked(likelihood, disparities, likelihood.argmax(axis=0))
+    best = ndimage.median_filter(peaks, 3)
     found = best[textured] if textured.any() else best.ravel()
     low, high = (float(x) for x in np.quantile(found, [0.002, 0.998]))
-    margin_px = 1.5 * (disparities[1] - disparities[0])
+    margin_px = 0.5 * (disparities[1] - disparities[0])
     return max(low - margin_px, -1.2 * widest), min(high + margin_px, 1.2 * widest)

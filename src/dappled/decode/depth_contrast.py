@@ -44,8 +44,8 @@ def explained(evidence: Evidence, disparities: NDArray[np.float64], *, workers: 
     margins = ((0, 0), (0, 0), (_PAD, shape[0] - height - _PAD), (_PAD, shape[1] - width - _PAD))
     spectra = fft.rfft2(np.pad(images, margins, mode="symmetric"), workers=workers, overwrite_x=True)
     fy, fx = fft.fftfreq(shape[0]), fft.rfftfreq(shape[1])
-    # For one product a column: (fx, v·fy, u) @ (fx, u, D).
-    columns = np.ascontiguousarray(spectra.transpose(3, 0, 2, 1)).reshape(len(fx), -1, count_u)
+    # For products (fy, u) @ (u, D), one a column and row of views: too small for BLAS to start threads of its own.
+    columns = np.ascontiguousarray(spectra.transpose(3, 0, 2, 1))
     lags = evidence.lags()
     spacing = [abs(s[1] - s[0]) if len(s) > 1 else 0.0 for s in (stack.row_steps, stack.column_steps)]
     signs = [np.sign(s[-1] - s[0]) for s in (stack.row_steps, stack.column_steps)]
@@ -56,8 +56,7 @@ def explained(evidence: Evidence, disparities: NDArray[np.float64], *, workers: 
     def one(part: slice) -> None:
         chosen = disparities[part]
         turn_x = np.exp(2j * np.pi * fx[:, None, None] * stack.column_steps[None, :, None] * chosen)
-        summed = columns @ turn_x.astype(np.complex64)
-        summed = summed.reshape(len(fx), count_v, len(fy), len(chosen))
+        summed = columns @ turn_x.astype(np.complex64)[:, None]
         turn_y = np.exp(2j * np.pi * stack.row_steps[:, None, None] * fy[:, None] * chosen).astype(np.complex64)
         total = summed[:, 0] * turn_y[0]
         for v in range(1, count_v):

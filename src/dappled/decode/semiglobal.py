@@ -16,30 +16,33 @@ Volume = NDArray[np.float32]
 
 def smoothed(cost: Volume, *, small: float, large: float, workers: int = 1) -> Volume:
     """float32 (D, h, w), the mean over four directions; `small` and `large` are P1 and P2 in the cost's unit."""
-    ways = [(axis, backwards) for axis in (0, 1) for backwards in (False, True)]
-    sums = [np.empty(0, dtype=np.float32)] * len(ways)
-
-    def one(number: int) -> None:
-        axis, backwards = ways[number]
+    total = np.empty_like(cost)
+    for axis in (0, 1):
         lines = np.ascontiguousarray(np.moveaxis(cost, axis + 1, 0))  # (n, D, m)
-        order = range(len(lines) - 1, -1, -1) if backwards else range(len(lines))
-        previous: NDArray[np.float32] | None = None
-        scratch = np.empty_like(lines[0])
-        for i in order:
-            if previous is not None:
-                least = previous.min(axis=0)
-                best = np.minimum(previous, least + np.float32(large), out=scratch)
-                if len(best) > 1:
-                    np.minimum(best[1:], previous[:-1] + np.float32(small), out=best[1:])
-                    np.minimum(best[:-1], previous[1:] + np.float32(small), out=best[:-1])
-                best -= least
-                lines[i] += best
-            previous = lines[i]
-        sums[number] = np.moveaxis(lines, 0, axis + 1)
+        paths = [np.empty_like(lines), np.empty_like(lines)]
 
-    each(one, range(len(ways)), workers)
-    total = sums[0].astype(np.float32, order="C")
-    for part in sums[1:]:
-        total += part
-    total /= np.float32(len(ways))
+        def one(way: int, lines: Volume = lines, paths: list[Volume] = paths) -> None:
+            _along(lines[::-1] if way else lines, paths[way][::-1] if way else paths[way], small, large)
+
+        each(one, (0, 1), workers)
+        paths[0] += paths[1]
+        if axis == 0:
+            total[...] = np.moveaxis(paths[0], 0, 1)
+        else:
+            total += np.moveaxis(paths[0], 0, 2)
+    total *= np.float32(0.25)
     return total
+
+
+def _along(lines: Volume, out: Volume, small: float, large: float) -> None:
+    """The paths' costs (n, D, m) from the first line to the last."""
+    out[0] = lines[0]
+    for i in range(1, len(lines)):
+        previous, best = out[i - 1], out[i]
+        least = previous.min(axis=0)
+        np.minimum(previous, least + np.float32(large), out=best)
+        if len(best) > 1:
+            np.minimum(best[1:], previous[:-1] + np.float32(small), out=best[1:])
+            np.minimum(best[:-1], previous[1:] + np.float32(small), out=best[:-1])
+        best -= least
+        best += lines[i]
