@@ -6,6 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# No test fails for the speed of the machine it runs on.
+settings.register_profile("dappled", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("dappled")
 
 
 @pytest.fixture(scope="session")
