@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ import zmq
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.daemon import publisher as publisher_module
 from dappled.daemon import wire
 from dappled.daemon.publisher import Publisher, Reply
 from dappled.daemon.subscriber import AsyncSubscriber, Subscriber, subscribe, subscribe_async
@@ -288,16 +286,6 @@ def test_any_parts_are_a_message_or_an_error(parts: list[bytes]) -> None:
     except WireError:
         return
     assert isinstance(message.header, dict)
-
-
-@given(st.binary(max_size=200))
-def test_any_question_is_understood_or_refused(data: bytes) -> None:
-    question: Callable[[list[bytes]], dict[str, Any]] = publisher_module._question
-    try:
-        assert question([data])["get"] in ("start", "frame", "slices")
-    except WireError:
-        return
-    assert json.loads(data)
 
 
 def test_a_body_that_is_too_short_is_named() -> None:

@@ -80,7 +80,7 @@ def record(
             "pending": shutter.pending,
             "refused": shutter.refused,
         },
-        "stages": [*stages, {"name": "publish", "sent": dict(publisher.sent), "dropped": dict(publisher.dropped)}],
+        "stages": [*stages, _publish(publisher)],
         "problems": problems,
         "interval_s": shutter.interval_s,
         "clock": None if clock is None else {"source": clock.source, "sigma_ms": clock.sigma_ns / 1e6},
@@ -115,6 +115,17 @@ def _counters(link: LinkStatistics) -> dict[str, Any]:
         "unsent": link.packets_unsent,
         "unlogged": link.packets_unlogged,
         "signing": None if link.signing is None else asdict(link.signing),
+    }
+
+
+def _publish(publisher: PublisherStatistics) -> dict[str, Any]:
+    return {
+        "name": "publish",
+        "sent": dict(publisher.sent),
+        "dropped": dict(publisher.dropped),
+        "questions": publisher.questions,
+        "refused": publisher.refused,
+        "wrong_keys": publisher.wrong_keys,
     }
 
 

@@ -8,7 +8,6 @@ sent, topic by topic, so a gap at a subscriber is that subscriber's own loss, an
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
 import select
@@ -20,7 +19,7 @@ from typing import Any
 
 import zmq
 
-from dappled.daemon import curve, endpoints, wire
+from dappled.daemon import curve, endpoints, questions, wire
 from dappled.daemon.curve import ServerKeys
 from dappled.daemon.wire import Message, WireError
 from dappled.errors import report
@@ -32,7 +31,6 @@ Answer = Callable[[Mapping[str, Any], Reply], None]
 DROP_ORDER = ("preview", "health", "depth", "slices")
 REMEMBERED = 65536  # slices whose frame number is known by sequence
 QUESTION_BYTES = 4096
-NICENESS = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +80,7 @@ class Publisher:
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._stopping = threading.Event()
         self._closed = False
-        self._context = _niced_context()
+        self._context = endpoints.niced_context()
         self._allowed = keys.allowed if keys else {}
         self._bound: list[str] = []
         try:
@@ -281,7 +279,7 @@ class Publisher:
             self._questions += 1
             self._open_questions += 1
             try:
-                request = _question(payload)
+                request = questions.parse(payload)
             except WireError as error:
                 self._refused += 1
                 self._reply_to(peer, None)(Message("error", {"error": str(error)}))
@@ -316,40 +314,6 @@ class Publisher:
         return reply
 
 
-def _niced_context() -> zmq.Context[Any]:
-    """A context whose own thread, which does the copying, comes after decoding. (It is made with the first socket, and
-    a thread inherits the niceness of the one that makes it.)"""
-    made: zmq.Context[Any] = zmq.Context()
-
-    def begin() -> None:
-        me = threading.get_native_id()
-        os.setpriority(os.PRIO_PROCESS, me, os.getpriority(os.PRIO_PROCESS, me) + NICENESS)
-        made.socket(zmq.PAIR).close()
-
-    maker = threading.Thread(target=begin, name="publisher's maker")
-    maker.start()
-    maker.join()
-    return made
-
-
 def _parts(message: Message, header: Mapping[str, Any]) -> list[Any]:
     body = [] if message.body is None else [message.body]
     return [message.topic.encode(), wire.encode(header), *body]
-
-
-def _question(payload: list[bytes]) -> dict[str, Any]:
-    """One JSON object with `get` and, unless it asks for the start, `frame` or `seq`. Raises WireError."""
-    try:
-        request = json.loads(payload[0]) if len(payload) == 1 else None
-    except (ValueError, RecursionError):
-        request = None
-    topics = ("start", "frame", "slices")
-    if not isinstance(request, dict):
-        raise WireError('a question is one JSON object such as {"get": "slices", "frame": 42}')
-    if request.get("get") not in topics:
-        raise WireError(f'a question\'s "get" is one of {", ".join(topics)}')
-    if request["get"] != "start":
-        number = request.get("frame", request.get("seq"))
-        if not isinstance(number, int) or isinstance(number, bool) or number < 0:
-            raise WireError("a question names a frame (or, for slices, a seq) by a whole number from 0")
-    return request

@@ -23,6 +23,7 @@ from dappled.daemon.console.access import Access
 from dappled.daemon.console.control import Control
 from dappled.daemon.console.feed import Feed
 from dappled.daemon.console.hub import Hub
+from dappled.daemon.console.parts import Parts
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.publisher import Publisher, Reply
 from dappled.daemon.wire import Message
@@ -66,7 +67,7 @@ class Rig:
 
     url: str
     publisher: Publisher
-    parts: app.Parts
+    parts: Parts
     asked: list[dict[str, Any]] = field(default_factory=list)
     answer: dict[str, Any] = field(default_factory=lambda: {"ok": True, "text": "shot 0", "lines": []})
 
@@ -104,7 +105,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         endpoint, endpoint + ".ask", tell=pages.tell, thumb=studio.thumb, corners=studio.corners,
         watched=lambda: made.parts.watched(),  # noqa: PLW0108  # it is made after
     )  # fmt: skip
-    parts = app.Parts(feed, pages, studio, Control(Channel(there)), Access(""), None)
+    parts = Parts(feed, pages, studio, Control(Channel(there)), Access(""), None)
     listener = socket.create_server(("127.0.0.1", 0))
     made = Rig(f"http://127.0.0.1:{listener.getsockname()[1]}", publisher, parts)
     server = uvicorn.Server(

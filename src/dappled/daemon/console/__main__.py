@@ -21,6 +21,7 @@ from dappled.daemon.console.access import Access
 from dappled.daemon.console.control import Control
 from dappled.daemon.console.feed import Feed
 from dappled.daemon.console.hub import Hub
+from dappled.daemon.console.parts import Parts
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.memory import reuse_large_blocks
 from dappled.drivers.camera_channel import Channel
@@ -50,7 +51,7 @@ def main() -> int:
 async def _serve(channel: Channel, listener: socket.socket, setup: Mapping[str, Any]) -> None:
     recipe = setup["recipe"]
     hub, studio = Hub(), Studio(None if recipe is None else Recipe(**recipe), setup["mount"])
-    parts = app.Parts(
+    parts = Parts(
         feed=Feed(
             setup["endpoint"],
             setup["ask"],

@@ -109,7 +109,7 @@ class Access:
         return Refusal(413, f"a body is at most {BODY_BYTES} bytes") if int(length) > BODY_BYTES else None
 
     def _known(self, request: Request) -> Refusal | None:
-        guarded = request.path.startswith(("/api/", "/kml")) and request.path != "/api/login"
+        guarded = request.path.startswith(("/api/", "/kml", "/metrics")) and request.path != "/api/login"
         if not guarded or not self._token:
             return None
         if self._right(_cookie(request.headers.get("cookie", ""))):

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 from collections.abc import AsyncIterator, Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -17,52 +14,21 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp
 
 from dappled.daemon import metrics
-from dappled.daemon.console import access, kml, pictures
-from dappled.daemon.console.access import Access, Refusal
-from dappled.daemon.console.background import Background
-from dappled.daemon.console.control import Control, ControlError
-from dappled.daemon.console.feed import Feed, FeedError
-from dappled.daemon.console.footprint import Rectified
-from dappled.daemon.console.hub import Hub
-from dappled.daemon.console.studio import Studio, StudioError
+from dappled.daemon.console import access, globe, pictures
+from dappled.daemon.console.access import Refusal
+from dappled.daemon.console.control import ControlError
+from dappled.daemon.console.feed import FeedError
+from dappled.daemon.console.guard import Guard, refused
+from dappled.daemon.console.parts import Parts, file, make_picture, rectified_png
+from dappled.daemon.console.studio import StudioError
 from dappled.errors import DappledError
 
-GLOBE_S = 30.0  # a virtual globe that asked this long ago still watches
-_PICTURES = (
-    "thumb.jpg",
-    "mean.jpg",
-    "slices.jpg",
-    "spectrum.jpg",
-    "views.jpg",
-    "views.json",
-    "refocus.jpg",
-    "depth.png",
-    "map.png",
-)
+_PICTURES = "thumb.jpg, mean.jpg, slices.jpg, spectrum.jpg, views.jpg, views.json, refocus.jpg, depth.png and, north up, map.png"
 _DISPARITY_PX = 8.0
-_MAP_PX, _KML_PX = 320, 1024
-
-
-@dataclass(slots=True)
-class Parts:
-    """What the application is made of. `workers` makes pictures, one at a time; `askers` wait for the daemon."""
-
-    feed: Feed
-    hub: Hub
-    studio: Studio
-    control: Control
-    access: Access
-    background: Background | None
-    globe_s: float = -1e9
-    workers: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, "pictures"))
-    askers: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2, "questions"))
-
-    def watched(self) -> bool:
-        """Whether anybody looks."""
-        return len(self.hub) > 0 or time.monotonic() - self.globe_s < GLOBE_S
+_MAP_PX = 320
 
 
 def make(parts: Parts) -> ASGIApp:
@@ -80,46 +46,19 @@ def make(parts: Parts) -> ASGIApp:
         Route("/api/frames/{frame:int}/{name}", _picture(parts)),
         Route("/api/map", _map(parts)),
         Route("/metrics", _metrics(parts)),
-        Route("/kml", _kml_link(parts)),
-        Route("/kml/latest.kml", _kml_latest(parts)),
-        Route("/kml/{frame:int}.png", _kml_picture(parts)),
+        Route("/kml", globe.link(parts)),
+        Route("/kml/latest.kml", globe.latest(parts)),
+        Route("/kml/{frame:int}.png", globe.picture(parts)),
     ]
-    return _Guard(Starlette(routes=routes, exception_handlers={DappledError: _told}), parts.access)
-
-
-class _Guard:
-    """Every request is judged first, and every answer gets the headers that keep browsers strict."""
-
-    def __init__(self, inner: ASGIApp, rules: Access) -> None:
-        self._inner, self._rules = inner, rules
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            return
-        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
-        query = scope["query_string"].decode("latin-1")
-
-        async def strictly(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                more = [(name.encode(), value.encode()) for name, value in access.HEADERS.items()]
-                if not any(name == b"cache-control" for name, _ in message["headers"]):
-                    more.append((b"cache-control", b"no-store"))
-                message = {**message, "headers": [*message["headers"], *more]}
-            await send(message)
-
-        refusal = self._rules.judge(access.Request(scope["method"], scope["path"], headers, query))
-        if refusal is not None:
-            await _refused(refusal)(scope, receive, strictly)
-        else:
-            await self._inner(scope, receive, strictly)
+    return Guard(Starlette(routes=routes, exception_handlers={DappledError: _told}), parts.access)
 
 
 Endpoint = Callable[[Request], Any]
 
 
-def _page(file: Path) -> Endpoint:
+def _page(path: Path) -> Endpoint:
     async def page(_: Request) -> Response:
-        return FileResponse(file)
+        return FileResponse(path)
 
     return page
 
@@ -130,7 +69,7 @@ def _login(parts: Parts) -> Endpoint:
         token = body.get("token")
         refusal = parts.access.try_token(token if isinstance(token, str) else "")
         if refusal is not None:
-            return _refused(refusal)
+            return refused(refusal)
         answer = JSONResponse({"ok": True})
         answer.set_cookie(access.COOKIE, str(token), httponly=True, samesite="strict", max_age=7 * 86400)
         return answer
@@ -141,7 +80,7 @@ def _login(parts: Parts) -> Endpoint:
 def _events(parts: Parts) -> Endpoint:
     async def events(_: Request) -> Response:
         if parts.hub.full:
-            return _refused(Refusal(503, "too many pages are open: close one"))
+            return refused(Refusal(503, "too many pages are open: close one"))
         feed = parts.feed
         first = [_about(parts), feed.state(), *(feed.frame_event(index) for index in feed.frames), {"is": "ready"}]
         if log := await _log(parts, 0):
@@ -169,7 +108,7 @@ def _metrics(parts: Parts) -> Endpoint:
     async def answer(_: Request) -> Response:
         health = parts.feed.health
         if health is None:
-            return _refused(Refusal(503, "the daemon has not been heard yet: ask again"))
+            return refused(Refusal(503, "the daemon has not been heard yet: ask again"))
         return Response(metrics.text(health), media_type=metrics.CONTENT_TYPE)
 
     return answer
@@ -250,17 +189,17 @@ def _picture(parts: Parts) -> Endpoint:
         if seen is None:
             raise FeedError(f"there is no frame {frame} here")
         if name == "thumb.jpg" and seen.thumb is not None:
-            return _file(await _make(parts, pictures.jpeg, seen.thumb), name)
+            return file(await make_picture(parts, pictures.jpeg, seen.thumb), name)
         if name == "map.png":
-            return _file(await _rectified_png(parts, frame, _MAP_PX), name)
+            return file(await rectified_png(parts, frame, _MAP_PX), name)
         if name == "depth.png":
             if seen.depth is None:
                 raise FeedError(f"frame {frame} has no depth (any more)")
-            return _file(await _make(parts, parts.studio.depth, seen.depth), name)
+            return file(await make_picture(parts, parts.studio.depth, seen.depth), name)
         message = await parts.feed.slices(frame)
         studio = parts.studio
         if name == "refocus.jpg":
-            return _file(await _make(parts, studio.refocused, message, _disparity(request)), name)
+            return file(await make_picture(parts, studio.refocused, message, _disparity(request)), name)
         makers: dict[str, Callable[..., Any]] = {
             "thumb.jpg": lambda one: pictures.jpeg(studio.thumb(one)),
             "mean.jpg": studio.mean,
@@ -270,15 +209,10 @@ def _picture(parts: Parts) -> Endpoint:
             "views.json": lambda one: json.dumps(studio.views(one)[0]).encode(),
         }
         if name not in makers:
-            raise FeedError(f"a frame has {', '.join(_PICTURES)}, no {name}")
-        return _file(await _make(parts, makers[name], message), name)
+            raise FeedError(f"a frame has {_PICTURES}, no {name}")
+        return file(await make_picture(parts, makers[name], message), name)
 
     return picture
-
-
-async def _make(parts: Parts, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Make a picture on the one thread for that."""
-    return await asyncio.get_running_loop().run_in_executor(parts.workers, function, *arguments)
 
 
 def _disparity(request: Request) -> float:
@@ -291,27 +225,6 @@ def _disparity(request: Request) -> float:
     return disparity
 
 
-async def _rectified(parts: Parts, frame: int, longest_side: int, *, sharp: bool = False) -> Rectified | None:
-    seen = parts.feed.frames.get(frame)
-    if seen is None:
-        raise FeedError(f"there is no frame {frame} here")
-    picture, header = seen.thumb, dict(seen.tag)
-    if sharp or picture is None:
-        message = await parts.feed.slices(frame)
-        header["frame_shape"] = message.header["frame_shape"]
-        picture = await _make(parts, parts.studio.full, message)
-    found: Rectified | None = await _make(parts, parts.studio.rectified, header, picture, longest_side)
-    return found
-
-
-async def _rectified_png(parts: Parts, frame: int, longest_side: int, *, sharp: bool = False) -> bytes:
-    one = await _rectified(parts, frame, longest_side, sharp=sharp)
-    if one is None:
-        raise FeedError(f"where frame {frame} lies on the ground is not known")
-    made: bytes = await _make(parts, pictures.png, one.picture)
-    return made
-
-
 def _map(parts: Parts) -> Endpoint:
     async def background(_: Request) -> Response:
         if parts.background is None:
@@ -319,48 +232,6 @@ def _map(parts: Parts) -> Endpoint:
         return FileResponse(parts.background.file, headers={"cache-control": "private, max-age=3600"})
 
     return background
-
-
-def _kml_link(parts: Parts) -> Endpoint:
-    async def link(request: Request) -> Response:
-        parts.globe_s = time.monotonic()
-        return Response(kml.network_link(_absolute(request, "/kml/latest.kml")), media_type=kml.MEDIA_TYPE)
-
-    return link
-
-
-def _kml_latest(parts: Parts) -> Endpoint:
-    async def latest(request: Request) -> Response:
-        parts.globe_s = time.monotonic()
-        frame, one = parts.feed.newest(), None
-        if frame is not None:
-            try:
-                one = await _rectified(parts, frame, _MAP_PX)
-            except FeedError:  # not decoded: the track is shown all the same
-                one = None
-        picture = _absolute(request, f"/kml/{frame}.png")
-        return Response(kml.latest(f"frame {frame}", picture, one, parts.feed.track()), media_type=kml.MEDIA_TYPE)
-
-    return latest
-
-
-def _kml_picture(parts: Parts) -> Endpoint:
-    async def picture(request: Request) -> Response:
-        parts.globe_s = time.monotonic()
-        return _file(await _rectified_png(parts, request.path_params["frame"], _KML_PX, sharp=True), "x.png")
-
-    return picture
-
-
-def _absolute(request: Request, path: str) -> str:
-    token = request.query_params.get("token")
-    tail = f"?token={token}" if token else ""
-    return f"{request.url.scheme}://{request.headers['host']}{path}{tail}"
-
-
-def _file(data: bytes, name: str) -> Response:
-    kind = {"jpg": "image/jpeg", "png": "image/png", "json": "application/json"}[name.rpartition(".")[2]]
-    return Response(data, media_type=kind)
 
 
 async def _body(request: Request) -> dict[str, Any]:
@@ -371,10 +242,6 @@ async def _body(request: Request) -> dict[str, Any]:
     if not isinstance(body, dict):
         raise StudioError("a request's body is one JSON object")
     return body
-
-
-def _refused(refusal: Refusal) -> Response:
-    return JSONResponse({"error": refusal.text}, status_code=refusal.status)
 
 
 async def _told(_: Request, error: Exception) -> Response:

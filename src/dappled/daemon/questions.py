@@ -1,0 +1,26 @@
+"""Questions about recorded frames, as they come over the wire."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from dappled.daemon.wire import WireError
+
+
+def parse(payload: list[bytes]) -> dict[str, Any]:
+    """One JSON object with `get` and, unless it asks for the start, `frame` or `seq`. Raises WireError."""
+    try:
+        request = json.loads(payload[0]) if len(payload) == 1 else None
+    except (ValueError, RecursionError):
+        request = None
+    topics = ("start", "frame", "slices")
+    if not isinstance(request, dict):
+        raise WireError('a question is one JSON object such as {"get": "slices", "frame": 42}')
+    if request.get("get") not in topics:
+        raise WireError(f'a question\'s "get" is one of {", ".join(topics)}')
+    if request["get"] != "start":
+        number = request.get("frame", request.get("seq"))
+        if not isinstance(number, int) or isinstance(number, bool) or number < 0:
+            raise WireError("a question names a frame (or, for slices, a seq) by a whole number from 0")
+    return request

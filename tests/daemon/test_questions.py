@@ -1,0 +1,32 @@
+"""Any bytes are a question, or a sentence."""
+
+from __future__ import annotations
+
+import json
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dappled.daemon import questions
+from dappled.daemon.wire import WireError
+
+
+@given(
+    st.binary(max_size=200)
+    | st.builds(
+        lambda value: json.dumps(value).encode(),
+        st.recursive(
+            st.none() | st.booleans() | st.integers() | st.sampled_from(["start", "frame", "slices", "get"]),
+            lambda inner: (
+                st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["get", "frame", "seq"]), inner)
+            ),
+        ),
+    )
+)
+def test_any_question_is_understood_or_refused(data: bytes) -> None:
+    try:
+        request = questions.parse([data])
+    except WireError:
+        return
+    assert request["get"] in ("start", "frame", "slices")
+    assert json.loads(data) == request
