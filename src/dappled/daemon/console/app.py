@@ -26,7 +26,10 @@ from dappled.daemon.console.parts import Parts, file, make_picture, rectified_pn
 from dappled.daemon.console.studio import StudioError
 from dappled.errors import DappledError
 
-_PICTURES = "thumb.jpg, mean.jpg, slices.jpg, spectrum.jpg, views.jpg, views.json, refocus.jpg, depth.png and, north up, map.png"
+_PICTURES = (
+    "thumb.jpg, mean.jpg, slices.jpg, spectrum.jpg, views.jpg, views.json, refocus.jpg, depth.png, "
+    "and map.png, which is north up"
+)
 _DISPARITY_PX = 8.0
 _MAP_PX = 320
 
