@@ -201,6 +201,16 @@ def test_the_lever_arm_and_the_mount_reach_the_map(short_flight: Flown) -> None:
     )
 
 
+def test_a_camera_on_a_gimbal_looks_where_the_gimbal_does(short_flight: Flown) -> None:
+    frames, tags = photographs.recorded(short_flight.folder)
+    aside = from_euler(0.1, 0.2, 0.3)
+    hung = replace(tags[0], pose=replace(tags[0].pose, gimbal_attitude=aside))
+    found = photographs.station(frames[0], hung, Mounting(on_gimbal=True))
+    assert found.camera_to_ned == pytest.approx(camera_pose.matrix_of(aside) @ camera_pose.NADIR)
+    with pytest.raises(PhotographError, match="no attitude of the gimbal"):
+        photographs.station(frames[0], tags[0], Mounting(on_gimbal=True))
+
+
 def test_one_view_is_seen_from_aside(short_flight: Flown, tmp_path: Path) -> None:
     more = ["--view", "0,4", "--as", "kmz", "--frames", "0", "--each", "--quad"]
     assert main(words(short_flight, tmp_path / "v", *more)) == 0

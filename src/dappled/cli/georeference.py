@@ -183,7 +183,11 @@ def options(facts: Mapping[str, Any], arguments: argparse.Namespace) -> Options:
     mount = arguments.mount or recorded.get("mount") or plain.mount
     ellipsoidal = arguments.terrain_heights == "ellipsoid"
     return Options(
-        mounting=Mounting((float(lever[0]), float(lever[1]), float(lever[2])), tuple(map(float, mount))),
+        mounting=Mounting(
+            (float(lever[0]), float(lever[1]), float(lever[2])),
+            tuple(map(float, mount)),
+            bool(recorded.get("on_gimbal", False)),
+        ),
         ground_m=arguments.ground,
         terrain=arguments.terrain,
         terrain_geoid=earth.geoid(arguments.geoid) if ellipsoidal else None,

@@ -82,10 +82,12 @@ class Photograph:
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """How the camera sits on the vehicle: antenna to camera in body axes, and camera axes to body axes."""
+    """How the camera sits on the vehicle: antenna to camera in body axes, and camera axes to body axes, or with
+    `on_gimbal` to those of the gimbal's head, whose recorded attitude then counts."""
 
     lever_m: Vector3 = (0.0, 0.0, 0.0)
     mount: tuple[float, ...] = tuple(camera_pose.NADIR.ravel().tolist())
+    on_gimbal: bool = False
 
     @property
     def matrix(self) -> Matrix:
@@ -119,12 +121,14 @@ def station(frame: Frame, tag: Tag | None, mounting: Mounting) -> Station:
     """Where a frame was taken. Raises PhotographError where that isn't known."""
     if tag is None:
         raise PhotographError(f"{frame.name} was never tagged: nobody knows where it was taken")
-    camera = camera_pose.of(tag.pose, mounting.lever_m, mounting.matrix)
+    camera = camera_pose.of(tag.pose, mounting.lever_m, mounting.matrix, on_gimbal=mounting.on_gimbal)
     if camera is None:
         raise PhotographError(f"no position is known for {frame.name}: there was no telemetry at its exposure")
-    if tag.pose.attitude is None:
-        raise PhotographError(f"no attitude is known for {frame.name}: there was none in its telemetry")
-    return Station(frame, tag, camera, camera_pose.matrix_of(tag.pose.attitude) @ mounting.matrix)
+    attitude = tag.pose.gimbal_attitude if mounting.on_gimbal else tag.pose.attitude
+    if attitude is None:
+        whose = "of the gimbal " if mounting.on_gimbal else ""
+        raise PhotographError(f"no attitude {whose}is known for {frame.name}: there was none in its telemetry")
+    return Station(frame, tag, camera, camera_pose.matrix_of(attitude) @ mounting.matrix)
 
 
 def lens_of(profile: CameraProfile, focal_length_mm: float) -> Lens:
