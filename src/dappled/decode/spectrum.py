@@ -12,7 +12,7 @@ from scipy import fft
 from dappled.decode.errors import DecodeError
 
 Complex = NDArray[np.complex64]
-TILE = 32  # columns that lie together in memory: a tile of them stays in the cache while it is transformed
+TILE = 24  # columns that lie together in memory: a tile of them stays in the cache while it is transformed
 
 
 def padded_shape(shape: tuple[int, int]) -> tuple[int, int]:
