@@ -11,11 +11,11 @@ import tomli_w
 from tqdm import tqdm
 
 from dappled.config import profiles
-from dappled.decode.ranging import Ranging, Target, fit_targets, target_shift
+from dappled.decode.ranging import RANGING, Ranging, Target, fit_targets, target_shift
 from dappled.drivers import calibration_files
 from dappled.drivers.darkroom import Darkroom, DarkroomError, Recipe
 from dappled.products import opened
-from dappled.products.opened import RANGING, OpenedLightField
+from dappled.products.opened import OpenedLightField
 
 
 def add(parser: argparse.ArgumentParser) -> None:

@@ -6,10 +6,10 @@ import argparse
 import math
 from pathlib import Path
 
-from dappled.decode.ranging import Ranging
+from dappled.decode.ranging import RANGING, Ranging
 from dappled.drivers import calibration_files
 from dappled.products import opened
-from dappled.products.opened import RANGING, OpenedLightField
+from dappled.products.opened import OpenedLightField
 
 
 def add_field(parser: argparse.ArgumentParser, *, ranged: bool = True) -> None:

@@ -19,6 +19,7 @@ from dappled.decode.depthmap import DepthMap, Map
 from dappled.decode.errors import DecodeError
 from dappled.decode.viewstack import ViewStack
 
+RANGING = "ranging"  # the attribute of light fields, and the table of calibrations
 _FARTHEST_SIGMAS = 2.0  # a shift that is not clear of infinity by so many standard errors has no distance
 _NOMINAL = 0.02  # f-numbers and focal lengths are rounded, and nominal
 _FRESH_DISTANCES = 1.01  # targets whose distances differ by less tell the offset only

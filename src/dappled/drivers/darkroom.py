@@ -24,6 +24,7 @@ from dappled.decode.latest import Latest
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
 from dappled.decode.plane import Plane
+from dappled.decode.ranging import RANGING
 from dappled.decode.report import DecodeReport
 from dappled.decode.stagger import spread
 from dappled.decode.transform import Source
@@ -99,7 +100,7 @@ class Darkroom:
             profiles.camera(self.recipe.camera)
         if self.recipe.mask != profiles.LENSLET:
             profiles.mask(self.recipe.mask)
-        if self.recipe.calibration:
+        if self.recipe.calibration and self.recipe.mask != profiles.LENSLET:
             self._calibration()
         for path in (self.recipe.white, self.recipe.dark):
             if path:
@@ -137,7 +138,12 @@ class Darkroom:
                     light_field = replace(
                         light_field, views=planes.coloured(light_field.views, light_field.grid, chroma, plane.shape)
                     )
-        attributes = {**light_field.attributes, "camera": self.camera_name(raw.camera_model), "mask": self.recipe.mask}
+        attributes = {
+            **light_field.attributes,
+            "camera": self.camera_name(raw.camera_model),
+            "mask": self.recipe.mask,
+            **(self._ranging() if views else {}),
+        }
         return Development(replace(light_field, attributes=attributes), report, raw, ms)
 
     def plane(self, raw: RawFile) -> Plane:
@@ -250,6 +256,11 @@ class Darkroom:
             workers=recipe.workers,
             colours=colours,
         )
+
+    def _ranging(self) -> dict[str, Any]:
+        """What leads from disparity to metres, where the calibration was made with targets too."""
+        told = calibration_files.tables(Path(self.recipe.calibration)) if self.recipe.calibration else {}
+        return {RANGING: told[RANGING]} if RANGING in told else {}
 
     def _calibration(self) -> Calibration:
         return calibration_files.load(Path(self.recipe.calibration))

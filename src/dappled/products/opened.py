@@ -28,7 +28,7 @@ from dappled.decode.depthmap import DepthMap
 from dappled.decode.errors import DecodeError
 from dappled.decode.evidence import Evidence
 from dappled.decode.lightfield import LightField
-from dappled.decode.ranging import DistanceMap, Ranging
+from dappled.decode.ranging import RANGING, DistanceMap, Ranging
 from dappled.decode.refocus import FocalPlane
 from dappled.decode.stereo_pair import StereoPair, eyes
 from dappled.decode.viewstack import ViewStack
@@ -39,7 +39,6 @@ from dappled.flight import layout, summary
 from dappled.flight.records import Tag
 from dappled.products import lightfiles, viewfolders
 
-RANGING = "ranging"  # the attribute of a light field that leads to metres
 _LIGHT_FIELDS = (".zarr", ".npz", ".h5")
 
 

@@ -1,0 +1,59 @@
+"""`dappled calibrate --target`, from frames of boards at known distances to metres by command."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from dappled.cli import main
+from dappled.mocks.masked_camera import reference_camera
+from tests.system.test_depth import target
+
+SEED = 5
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("targets")
+    camera = reference_camera(SEED, scale=0.5, scene="bench")
+    (made / "bench.dng").write_bytes(camera.bench_frame().file)
+    for metres in (2, 6):
+        (made / f"{metres}.dng").write_bytes(target(camera, SEED, metres).expose(0.0, metres).file)
+    assert main(["calibrate", str(made / "bench.dng"), "--mask", "reference-5x5", "-o", str(made / "c.toml")]) == 0
+    return made
+
+
+def test_targets_lead_to_metres(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with_mask = ["--mask", "reference-5x5", "--calibration", str(folder / "c.toml")]
+    frames = [str(folder / f"{metres}.dng") for metres in (2, 6)]
+    assert main(["calibrate", *frames, "--target", "2", "6", *with_mask, "-o", str(folder / "m.toml")]) == 0
+    assert "px·m" in capsys.readouterr().out
+    told = tomllib.loads((folder / "m.toml").read_text())["ranging"]
+    assert told["gain_px_m"] == pytest.approx(33.5, rel=0.01)
+    words = ["--mask", "reference-5x5", "--calibration", str(folder / "m.toml"), "-o", str(folder / "lf.npz")]
+    assert main(["decode", str(folder / "6.dng"), *words]) == 0
+    capsys.readouterr()
+    assert main(["depth", str(folder / "lf.npz"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["distance_m"][1] == pytest.approx(6.0, rel=0.01)
+    assert found["distances_from"] == "2 targets"
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--target", "2"], "give --target a distance a frame"),
+        (["--target", "6", "2"], "in the order of the frames"),
+    ],
+)
+def test_wrong_targets_are_told(
+    folder: Path, more: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = [str(folder / f"{metres}.dng") for metres in (2, 6)]
+    with_mask = ["--mask", "reference-5x5", "--calibration", str(folder / "c.toml"), "-o", str(tmp_path / "m.toml")]
+    assert main(["calibrate", *frames, *more, *with_mask]) == 1
+    assert words in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
