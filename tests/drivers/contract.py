@@ -69,9 +69,9 @@ def until_shot_ends(camera: Camera, shot: int) -> list[Event]:
 
 
 def until_quiet(camera: Camera) -> None:
-    """Until no event came for a second: a camera tells its settings some time after it is ready."""
+    """Until no event came for a while: a camera may tell its settings after it is ready."""
     deadline = time.monotonic() + PATIENCE_S
-    while camera.next_event(1.0) is not None:
+    while camera.next_event(0.3) is not None:
         assert time.monotonic() < deadline, "events without end"
 
 
