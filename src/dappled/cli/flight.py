@@ -7,6 +7,7 @@ import json
 import math
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,7 +17,8 @@ from tqdm import tqdm
 
 from dappled.cli import flight_pickup
 from dappled.config import settings
-from dappled.flight import check, index, offload, summary
+from dappled.flight import accounts, check, index, offload, summary
+from dappled.flight.accounts import Account
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LIVE
 
@@ -136,13 +138,14 @@ def _check(flight: Path, as_json: bool) -> int:
 
 
 def _report(flight: Path, as_json: bool) -> int:
-    found = summary.report(flight)
+    found, books = summary.report(flight), accounts.accounts(flight)
     if as_json:
-        print(json.dumps({**_plain(found), "balanced": found.balanced}, indent=2))
+        sources = [asdict(one) for one in books]
+        print(json.dumps({**_plain(found), "sources": sources, "balanced": found.balanced}, indent=2))
     else:
         print(f"{found.flight}{'' if found.closed else ' (still open)'}")
-        for source, count in found.by_source.items():
-            print(f"  {count:6d} shots wished for by {source}")
+        for line in _table(books):
+            print(f"  {line}")
         if found.refused:
             print(f"  {found.refused:6d} wishes refused, each with its reason (dappled flight show --json: events)")
         print(f"  {found.wishes:6d} shots: {found.safe} safe, {found.failed} failed, {found.open} open")
@@ -151,6 +154,15 @@ def _report(flight: Path, as_json: bool) -> int:
             print(f"  {found.strays:6d} files without a shot of their own")
         print("the books balance" if found.balanced else "THE BOOKS DO NOT BALANCE: run `dappled flight check`")
     return 0 if found.balanced else 1
+
+
+def _table(books: Sequence[Account]) -> Iterator[str]:
+    """A line for each source, below one of headings; nothing for a flight without a wish."""
+    names = ("wishes", "refused", "shots", "safe", "failed", "open", "tagged", "decoded")
+    if books:
+        yield f"{'source':24}" + "".join(f"{name:>9}" for name in names)
+    for one in books:
+        yield f"{one.source:24}" + "".join(f"{getattr(one, name):9d}" for name in names)
 
 
 def _offload(flight: Path, destination: Path, prune: bool, as_json: bool) -> int:
