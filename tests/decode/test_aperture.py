@@ -39,6 +39,24 @@ def test_the_aperture_is_found_behind_a_rounded_f_number(kappa: float, off: floa
     assert 0 < found.sigma < 0.02
 
 
+@pytest.mark.parametrize("kappa", [0.8, 0.9, 1.1])
+def test_beams_are_told_from_a_filled_aperture(kappa: float) -> None:
+    for true, filled in ((Aperture(5), False), (Aperture(5, 15), True)):
+        found = used_aperture(
+            _slices(kappa, 0.01, true, texture=0.01),
+            TRANSFERS,
+            ORDERS,
+            nominal_kappa=1.01 * kappa,
+            rotation_rad=0.01,
+            aperture=Aperture(5),
+        )
+        assert (found.fitted, found.filled) == (True, filled)
+        assert found.kappa == pytest.approx(kappa, abs=0.002)
+        cells = found.cells(ORDERS, Aperture(5), 0.01)
+        assert cells[0] == 1
+        assert (cells.min() < 0.8) == filled
+
+
 @pytest.mark.parametrize("aperture", [Aperture(5, 9, round=True)])
 def test_another_shape_of_aperture_is_not_fitted(aperture: Aperture) -> None:
     found = used_aperture(

@@ -21,16 +21,25 @@ from dappled.decode.views import Aperture, angular_frequencies
 ROUNDING = 0.05  # relative: f-numbers are off by no more (nominal f/22 is 22.6, f/3.5 is 3.56)
 _NOMINAL_SIGMA = 0.02  # relative: how far an f-number is believed
 _TEXTURE = 1.5e-3  # of the mean: what the scene adds to the mean of a slice
+_EVIDENCE = 9.0  # squared deviations: less than that doesn't tell a filled aperture from beams (at κ = 1 nothing does)
 _AGREEMENT = 6.0  # times their own error: means further from any aperture's are some other aperture's
 
 
 @dataclass(frozen=True, slots=True)
 class UsedAperture:
-    """κ in periods of the mask's fundamental, and its standard error; `fitted` False is the f-number's own."""
+    """κ in periods of the mask's fundamental, and its standard error; `fitted` False is the f-number's own.
+
+    `filled`: light comes through the whole of each view's cell, not through a beam in its middle.
+    """
 
     kappa: float
     sigma: float
     fitted: bool
+    filled: bool = False
+
+    def cells(self, orders: Sequence[Order], aperture: Aperture, rotation_rad: float) -> NDArray[np.float64]:
+        """(K,) what one view's cell leaves of each carrier: 1 for beams."""
+        return _cells(angular_frequencies(orders, self.kappa, rotation_rad), aperture, self.filled)
 
 
 def used_aperture(
@@ -56,23 +65,48 @@ def used_aperture(
     error = _TEXTURE / np.abs(transfers[known])
     wanted = [order for order, usable in zip(orders, known, strict=True) if usable]
 
-    def misfit(kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Squared deviations (κ, K) in units of their error."""
-        there = np.array([aperture.transform(angular_frequencies(wanted, k, rotation_rad)).real for k in kappa])
-        return np.asarray(((there - seen) / error) ** 2)
-
     shares = 1 + ROUNDING * np.linspace(-1, 1, 201)
-    deviations = misfit(nominal_kappa * shares)
-    cost = deviations.sum(axis=1) + ((shares - 1) / _NOMINAL_SIGMA) ** 2
+    beams, filled = (
+        _fitted(
+            seen, error, wanted, nominal_kappa * shares, rotation_rad=rotation_rad, aperture=aperture, filled=filled
+        )
+        for filled in (False, True)
+    )
+    best = filled if filled[1] + _EVIDENCE < beams[1] else beams
+    return nominal if best[0] is None else best[0]
+
+
+def _fitted(
+    seen: NDArray[np.float64],
+    error: NDArray[np.float64],
+    orders: Sequence[Order],
+    kappas: NDArray[np.float64],
+    *,
+    rotation_rad: float,
+    aperture: Aperture,
+    filled: bool,
+) -> tuple[UsedAperture | None, float]:
+    """The most probable of evenly spaced `kappas` (the nominal one in the middle), and its cost; None for no fit."""
+    nominal = float(kappas[len(kappas) // 2])
+    angular = [angular_frequencies(orders, float(kappa), rotation_rad) for kappa in kappas]
+    there = np.array([aperture.transform(a).real * _cells(a, aperture, filled) for a in angular])
+    deviations = ((there - seen) / error) ** 2
+    cost = deviations.sum(axis=1) + ((kappas / nominal - 1) / _NOMINAL_SIGMA) ** 2
     best = int(np.argmin(cost))
-    if best in (0, len(shares) - 1) or float(deviations[best].mean()) > _AGREEMENT**2:
-        return nominal
+    if best in (0, len(kappas) - 1) or float(deviations[best].mean()) > _AGREEMENT**2:
+        return None, math.inf
     below, centre, above = (float(c) for c in cost[best - 1 : best + 2])
     curvature = below - 2 * centre + above
-    step = float(shares[1] - shares[0])
-    share = float(shares[best]) + 0.5 * step * (below - above) / curvature
-    sigma = step * math.sqrt(2 / curvature)
-    return UsedAperture(nominal_kappa * share, nominal_kappa * sigma, True)
+    step = float(kappas[1] - kappas[0])
+    kappa = float(kappas[best]) + 0.5 * step * (below - above) / curvature
+    return UsedAperture(kappa, step * math.sqrt(2 / curvature), True, filled), centre
+
+
+def _cells(angular: NDArray[np.float64], aperture: Aperture, filled: bool) -> NDArray[np.float64]:
+    """(K,) the transform of one square cell, 1/N of the aperture wide; 1 for a beam."""
+    if not filled:
+        return np.ones(len(angular))
+    return np.asarray(np.sinc(angular / aperture.views).prod(axis=1))
 
 
 def mean_of_slices(slices: NDArray[np.complex64]) -> NDArray[np.complex128]:

@@ -235,9 +235,11 @@ class MaskDecoder:
             origin = at_corner(known.origin, lattice, self.sensor.shape)
             transfers = transfer(orders, [magnitudes[order] for order in orders], origin)
             rotation = known.rotation_rad
-            cycles = used_aperture(
+            width = used_aperture(
                 slices.values, transfers, orders, nominal_kappa=cycles, rotation_rad=rotation, aperture=aperture
-            ).kappa
+            )
+            cycles = width.kappa
+            transfers = transfers * width.cells(orders, aperture, rotation)
             views_from: ViewsFrom = "calibration"
         elif carriers_from == "measured":
             rotation = turn_between(lattice, self.lattice_at(focal_length_mm))
