@@ -402,3 +402,19 @@ def test_no_parameters_crash_it(command: int, parameters: list[float], confirmat
     for message in rig.sent:
         message.pack(mavlink.MAVLink(None))
     rig.tick(1)
+
+
+def test_the_autopilot_is_given_orders_and_its_refusal_is_told() -> None:
+    rig = Rig()
+    assert rig.component.order(181, (0, 1)) is not None  # nobody was heard yet
+    rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3), sender=(1, 1))
+    rig.tick(4)
+    assert rig.component.order(181, (0, 1)) is None
+    (order,) = rig.of("COMMAND_LONG")[-1:]
+    assert (order.target_system, order.target_component, order.command) == (1, 1, 181)
+    assert (order.param1, order.param2, order.param7) == (0, 1, 0)
+    for command, result, words in ((181, 0, 0), (999, 2, 0), (181, 2, 1)):
+        rig.sent.clear()
+        rig.hear(mavlink.MAVLink_command_ack_message(command, result, 0, 0, 1, 100), sender=(1, 1))
+        assert len(rig.of("STATUSTEXT")) >= words
+        assert bool(rig.of("STATUSTEXT")) == bool(words)

@@ -59,6 +59,7 @@ class TestContractToTheCard(CameraContract):
         camera.stop()
 
 
+@pytest.mark.slow
 class TestContractToMemory(CameraContract):
     @pytest.fixture
     def rig(self, make: Make) -> Iterator[Rig]:
@@ -168,6 +169,7 @@ def test_a_busy_body_is_asked_again(make: Make, body: Body, target: str) -> None
     assert body.releases == 1
 
 
+@pytest.mark.slow
 def test_a_body_that_stays_busy_fails_the_shot_and_takes_the_next(make: Make, body: Body) -> None:
     camera = make(timeouts={"busy_s": 0.2})
     camera.start()
@@ -298,6 +300,7 @@ def test_a_link_dropped_in_mid_exposure_loses_no_file_on_the_card() -> None:
             camera.stop()
 
 
+@pytest.mark.slow
 def test_a_silent_body_costs_the_shot_and_the_process_but_not_the_camera(make: Make, body: Body) -> None:
     camera = make(timeouts={"answer_s": 1.5})
     camera.start()
@@ -331,6 +334,7 @@ def test_a_silent_body_is_given_up_by_libgphoto2_itself_and_served_again(make: M
     assert of_shots(_ended(until_shot_ends(camera, 3)))[-1] == (Arrival, 3)
 
 
+@pytest.mark.slow
 def test_stop_does_not_wait_for_a_silent_body(make: Make, body: Body) -> None:
     camera = make()
     camera.start()
@@ -400,6 +404,7 @@ def test_what_a_dead_process_had_fired_is_fetched_by_the_next_one(body: Body) ->
         camera.stop()
 
 
+@pytest.mark.slow
 def test_a_process_that_keeps_dying_is_not_started_for_ever(body: Body) -> None:
     started: list[subprocess.Popen[bytes]] = []
 
@@ -549,6 +554,7 @@ def test_of_two_bodies_of_one_model_the_one_with_the_serial_number_is_taken(want
             camera.stop()
 
 
+@pytest.mark.slow
 def test_after_a_break_the_same_body_is_taken_again_and_not_its_twin() -> None:
     with (
         Body.start(BodyOptions(picture="pattern:1000:cr2", serial="0000000001")) as one,
@@ -590,6 +596,7 @@ def test_a_body_that_comes_back_under_another_address_is_found() -> None:
             camera.stop()
 
 
+@pytest.mark.slow
 def test_a_silent_body_on_usb_has_its_port_reset(body: Body) -> None:
     resets: list[str] = []
     settings = parse_settings({"port": body.port, "timeouts": {"answer_s": 1.5}})

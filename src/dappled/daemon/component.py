@@ -77,6 +77,7 @@ class Component:
         self._commands = CameraCommands(shutter, clock, self._telling, knobs, self._intervals)
         self._parameters = Parameters(knobs)
         self._files = FtpServer(self._telling.files)
+        self._ordered: set[int] = set()  # commands that we gave the autopilot
         self._identity = Identity(links.system_id, clock.monotonic_ns())
         self._requests = AutopilotRequests()
         self._copies = Copies()
@@ -180,6 +181,22 @@ class Component:
     def _is_copy(self, packet: Packet) -> bool:
         return self._copies.is_copy(packet, self._clock.monotonic_ns())
 
+    def _ordered_result(self, packet: Packet) -> None:
+        """The autopilot's answer to an order of ours: a refusal is told, since nobody else would hear of it."""
+        message = packet.message
+        ours = message.get_srcSystem() == self._identity.system_id and message.target_component in (
+            0,
+            self._links.component_id,
+        )
+        if (
+            ours
+            and message.command in self._ordered
+            and message.result not in (ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
+        ):
+            result = mavlink.enums["MAV_RESULT"].get(message.result)
+            word = result.name.removeprefix("MAV_RESULT_").lower() if result else message.result
+            self.say(f"the autopilot did not fire the camera: command {message.command} {word}")
+
     # what goes out
 
     def order(self, number: int, parameters: Sequence[float]) -> str | None:
@@ -188,6 +205,7 @@ class Component:
         if autopilot is None:
             return "no autopilot was heard on the MAVLink links"
         system, link = autopilot
+        self._ordered.add(number)
         seven = (*parameters, *(0.0,) * (7 - len(parameters)))
         sent = self._links.send(mavlink.MAVLink_command_long_message(system, 1, number, 0, *seven), link)
         return None if sent else "its link takes no more messages"
@@ -258,6 +276,7 @@ class Component:
 _HANDLERS: dict[str, Callable[[Component, Packet], None]] = {
     "COMMAND_LONG": Component._command,
     "COMMAND_INT": Component._command,
+    "COMMAND_ACK": Component._ordered_result,
     "CAMERA_TRIGGER": Component._trigger,
     "CAMERA_FEEDBACK": Component._trigger,
     "PARAM_EXT_REQUEST_LIST": Component._parameter,
