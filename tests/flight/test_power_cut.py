@@ -128,7 +128,7 @@ LONG: list[tuple[Left, int]] = [
     ("all", 0),
     ("data", 0),
     ("names", 0),
-    *(("some", seed * 100_000) for seed in range(1, 7)),
+    *(("some", seed * 100_000) for seed in (1, 2)),
 ]
 
 
