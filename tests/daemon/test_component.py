@@ -333,6 +333,27 @@ def test_feedback_is_a_shot_only_where_the_autopilot_fires(counts: bool) -> None
     assert rig.fired == ([5] if counts else [])
 
 
+def test_the_echo_of_an_order_is_no_wish_and_the_next_trigger_is_one() -> None:
+    rig = Rig(feedback_is_shot=True)
+    rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), AUTOPILOT)
+    rig.tick(4)
+    fire = mavlink.MAVLink_command_long_message(0, 0, mavlink.MAV_CMD_DO_DIGICAM_CONTROL, 0, 0, 0, 0, 0, 1, 0, 0)
+    feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+    for turn in range(2):
+        assert rig.component.order(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1)) is None
+        rig.clock.advance(0.05)
+        for message in (mavlink.MAVLink_camera_trigger_message(1, turn), fire, feedback):
+            rig.hear(message, AUTOPILOT)
+        rig.clock.advance(0.5)
+    assert rig.fired == []
+    rig.hear(mavlink.MAVLink_camera_trigger_message(9, 9), AUTOPILOT)
+    assert rig.fired == [5]
+    rig.component.order(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1))
+    rig.clock.advance(2.1)
+    rig.hear(mavlink.MAVLink_camera_trigger_message(10, 10), AUTOPILOT)
+    assert rig.fired == [5, 6]
+
+
 def test_zoom_and_focus_by_hand_are_refused_in_words() -> None:
     rig = Rig()
     rig.tick(4)

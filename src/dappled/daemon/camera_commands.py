@@ -43,6 +43,12 @@ class CameraCommands:
 
     # photographs
 
+    def fires(self, command: Command) -> bool:
+        """Whether it asks for one photograph now."""
+        if command.name == mavlink.MAV_CMD_IMAGE_START_CAPTURE:
+            return command.whole(3, 1) == 1
+        return command.name == mavlink.MAV_CMD_DO_DIGICAM_CONTROL and command.whole(5) == 1
+
     def _start_capture(self, command: Command) -> Answer:
         count = command.whole(3, 1)
         wish = Wish(command.source, "IMAGE_START_CAPTURE", command.whole(4), command.confirmation, command.link)

@@ -16,11 +16,12 @@ from dappled.daemon.autopilot import AutopilotRequests
 from dappled.daemon.camera_commands import CameraCommands
 from dappled.daemon.camera_messages import CameraFacts, Captured, Storage
 from dappled.daemon.clock import Clock
-from dappled.daemon.commands import ACCEPTED, UNSUPPORTED, Command
+from dappled.daemon.commands import ACCEPTED, UNSUPPORTED, Answer, Command
 from dappled.daemon.copies import Copies
 from dappled.daemon.ftp_server import FtpServer
 from dappled.daemon.identity import Identity
 from dappled.daemon.knobs import Knobs
+from dappled.daemon.orders import Orders
 from dappled.daemon.parameters import Parameters, Reply
 from dappled.daemon.periodic import MessageIntervals
 from dappled.daemon.pilot import PilotLines
@@ -77,7 +78,7 @@ class Component:
         self._commands = CameraCommands(shutter, clock, self._telling, knobs, self._intervals)
         self._parameters = Parameters(knobs)
         self._files = FtpServer(self._telling.files)
-        self._ordered: set[int] = set()  # commands that we gave the autopilot
+        self._orders = Orders()
         self._identity = Identity(links.system_id, clock.monotonic_ns())
         self._requests = AutopilotRequests()
         self._copies = Copies()
@@ -115,7 +116,8 @@ class Component:
         if self._is_copy(packet):
             self._acknowledge_again(command)
             return
-        answer = self._commands.answer(command)
+        echo = self._commands.fires(command) and self._is_echo(packet, str(command.name))
+        answer = Answer(ACCEPTED) if echo else self._commands.answer(command)
         if not command.broadcast or answer.result == ACCEPTED:  # a broadcast is for whoever can: never refused
             self._acknowledge(command, answer.result)
             self._results.append((command, answer.result))
@@ -148,6 +150,8 @@ class Component:
             return
         if name == "CAMERA_FEEDBACK" and not self._feedback_is_shot:
             return  # the hot shoe's time of a shot that is known already: telemetry has it
+        if self._is_echo(packet, name):
+            return
         source = f"mavlink:{message.get_srcSystem()}/{message.get_srcComponent()}"
         sequence = message.seq if name == "CAMERA_TRIGGER" else message.img_idx
         verdict = self._shutter.wish(Wish(source, name, sequence, 0, packet.link, acknowledged=False))
@@ -181,6 +185,13 @@ class Component:
     def _is_copy(self, packet: Packet) -> bool:
         return self._copies.is_copy(packet, self._clock.monotonic_ns())
 
+    def _is_echo(self, packet: Packet, kind: str) -> bool:
+        """Whether our own autopilot only tells that it does what we ordered."""
+        message = packet.message
+        if (message.get_srcSystem(), message.get_srcComponent()) != (self._identity.system_id, 1):
+            return False
+        return self._orders.is_echo(kind, packet.link, self._clock.monotonic_ns())
+
     def _ordered_result(self, packet: Packet) -> None:
         """The autopilot's answer to an order of ours: a refusal is told, since nobody else would hear of it."""
         message = packet.message
@@ -190,7 +201,7 @@ class Component:
         )
         if (
             ours
-            and message.command in self._ordered
+            and message.command in self._orders.commands
             and message.result not in (ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
         ):
             result = mavlink.enums["MAV_RESULT"].get(message.result)
@@ -205,7 +216,7 @@ class Component:
         if autopilot is None:
             return "no autopilot was heard on the MAVLink links"
         system, link = autopilot
-        self._ordered.add(number)
+        self._orders.given(number, self._clock.monotonic_ns())
         seven = (*parameters, *(0.0,) * (7 - len(parameters)))
         sent = self._links.send(mavlink.MAVLink_command_long_message(system, 1, number, 0, *seven), link)
         return None if sent else "its link takes no more messages"
