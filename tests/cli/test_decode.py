@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dappled.cli import main
+from dappled.mocks.dng import Exif, encode
 from dappled.mocks.lens import Installation
 from dappled.mocks.masked_camera import reference_camera
 
@@ -68,6 +69,28 @@ def test_a_wrong_focal_length_is_told(tmp_path: Path, capsys: pytest.CaptureFixt
         code, out, _ = _told(capsys, tmp_path, *wanted, mask="mask-2-full")
         assert code == 0
         assert words in out
+
+
+def test_carriers_are_found_and_cut_as_far_off_as_exif_rounds_the_focal_length(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """EXIF says 13 mm and means 13.4: under the fd law the outermost carriers stand 30 thousandths farther in."""
+    for length in (12.6, 13.4):
+        camera = reference_camera(2, scale=0.25, scene="bench", law="fd")
+        optics = replace(camera.optics, focal_length_mm=length)
+        camera = replace(camera, optics=optics, installation=Installation(0.01, (0.001, 0.002), 1.01))
+        raw = camera.expose(0.0, 0, f_number=92.0).raw
+        exif = Exif("dappled", "Simulated Masked Camera", "1", 13.0, 92.0, 1e-3, 100, 0)
+        path = tmp_path / f"{length}.dng"
+        path.write_bytes(encode(raw, black=camera.sensor.black, white=camera.sensor.white, exif=exif))
+        pitch = camera.sensor.pitch_mm
+        (tmp_path / "quarter.toml").write_text(
+            'law = "fd"\nmask_distance_mm = 1.01\n[[raw]]\nname = "a quarter"\nshape = [694, 922]\n'
+            f"row_mm = [{pitch}, 0.0]\ncolumn_mm = [0.0, {pitch}]\n"
+        )
+        code, out, err = _told(capsys, tmp_path, str(path), "-o", str(tmp_path / f"{length}.npz"), mask="mask-2-full")
+        assert (code, err) == (0, "")
+        assert "24 of 24 carriers seen, measured" in out
 
 
 def test_missing_exif_asks_for_the_focal_length(

@@ -149,10 +149,11 @@ class MaskDecoder:
     def largest_fx(self, focal_length_mm: float) -> float:
         """The largest frequency along columns that slices and searches ask for, in cycles/pixel."""
         predicted = self.predict(focal_length_mm)
-        reach = max(abs(c.fx) for c in predicted) * (1 + _ROTATION)
-        width = self.slice_size(self.lattice_at(focal_length_mm))[1]
         wide = padded_shape(self.sensor.shape)[1]
-        return min(0.5, reach + max(width / 2, max(self._radii(predicted, focal_length_mm)) + 8) / wide)
+        width = self.slice_size(self.lattice_at(focal_length_mm))[1]
+        radii = self._radii(predicted, focal_length_mm)
+        outermost = max(abs(c.fx) + radius / wide for c, radius in zip(predicted, radii, strict=True))
+        return min(0.5, outermost + (width / 2 * (1 + _ROTATION) + 8) / wide)
 
     def slice_size(self, lattice: Lattice) -> tuple[int, int]:
         """(height, width) of the bands in bins of the padded transform."""
