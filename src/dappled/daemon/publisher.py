@@ -241,7 +241,8 @@ class Publisher:
             self._zap.send_multipart(answer)
             if name is None:
                 self._wrong_keys += 1
-                log.warning("a peer with a key that is not on the list was turned away")
+                if self._wrong_keys == 1 or self._wrong_keys % 100 == 0:  # such a peer tries again and again
+                    log.warning("a peer whose key is not on the list was turned away (%d times)", self._wrong_keys)
             else:
                 log.info("%s came with its key", name)
 

@@ -26,7 +26,7 @@ from dappled.daemon.console.studio import Studio
 from dappled.daemon.memory import reuse_large_blocks
 from dappled.drivers.camera_channel import Channel
 from dappled.drivers.darkroom import Recipe
-from dappled.errors import DappledError
+from dappled.errors import DappledError, report
 
 NICENESS = 15  # below the decoder's 10: looking comes last
 _CONNECTIONS = 64
@@ -83,11 +83,21 @@ async def _serve(channel: Channel, listener: socket.socket, setup: Mapping[str, 
         )
     )
     tasks = [asyncio.create_task(parts.feed.run()), asyncio.create_task(app.follow_log(parts))]
+    for task in tasks:
+        task.add_done_callback(lambda done: _end(done, server))
     watcher = asyncio.create_task(_until_gone(parts.control, server))
     await server.serve(sockets=[listener])
     for task in (*tasks, watcher):
         task.cancel()
     await asyncio.gather(*tasks, watcher, return_exceptions=True)
+
+
+def _end(task: asyncio.Task[None], server: uvicorn.Server) -> None:
+    """A part that ended takes the process with it: the daemon starts a whole one."""
+    if not task.cancelled():
+        if (error := task.exception()) is not None:
+            report(log, "console", error)
+        server.should_exit = True
 
 
 async def _until_gone(control: Control, server: uvicorn.Server) -> None:

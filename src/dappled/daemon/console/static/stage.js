@@ -63,7 +63,12 @@ export class Stage {
       $(`tab-${name}`).tabIndex = chosen ? 0 : -1;
     }
     $("panel").setAttribute("aria-labelledby", `tab-${this.tab}`);
-    $("focus").toggleAttribute("data-off", this.tab !== "refocus");
+    this.knob();
+  }
+
+  // The slider is there when there is something to focus.
+  knob() {
+    $("focus").toggleAttribute("data-off", this.tab !== "refocus" || !this.layout);
   }
 
   async load() {
@@ -71,6 +76,7 @@ export class Stage {
     if (!frame) return;
     const index = frame.tag.frame, base = `/api/frames/${index}/`;
     $("which").textContent = `frame ${index}`;
+    $("empty").textContent = `Waiting for the picture of frame ${index}.`;
     try {
       if (tab === "refocus") await this.loadViews(base, turn);
       else await this.loadPicture(`${base}${{ views: "views.jpg", slices: "slices.jpg", spectrum: "spectrum.jpg", depth: "depth.png" }[tab]}`, tab, turn);
@@ -83,6 +89,7 @@ export class Stage {
   async fall(base, turn, why) {
     if (this.tab === "refocus") {
       this.layout = this.bitmap = null;
+      this.knob();
       try {
         await this.loadPicture(`${base}mean.jpg`, "mean", turn);
         if (turn === this.turn) $("caption").textContent = `The mean picture. ${why}`;
@@ -107,6 +114,7 @@ export class Stage {
     if (turn !== this.turn) return;
     this.layout = layout;
     this.bitmap = bitmap;
+    this.knob();
     this.aspect = layout.tile[1] / layout.tile[0];
     show($("empty"), false);
     show($("overlay"), false);

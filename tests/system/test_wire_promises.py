@@ -1,0 +1,104 @@
+"""What the stream promises: keys by the command line, nothing lost to a killed subscriber, nothing open unasked."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from dappled.cli import main
+from dappled.mocks.simulation import free_port
+from tests.system.conftest import dappled
+
+
+def watch(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "dappled", "watch", *arguments]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.slow
+def test_who_is_on_the_list_receives_and_a_stranger_does_not(tmp_path: Path) -> None:
+    for name, folder in (("vehicle", "keys"), ("laptop", "clients"), ("stranger", "keys")):
+        assert main(["keys", "make", name, "-o", str(tmp_path / folder)]) == 0
+    stream, ask = (f"tcp://127.0.0.1:{free_port()}" for _ in range(2))
+    (tmp_path / "dappled.toml").write_text(
+        f'[record]\ndirectory = "flights"\n[publish]\nslices = "{stream}"\nask = "{ask}"\n'
+        'keys = "keys/vehicle.key_secret"\nclients = "clients"\n'
+    )
+    endpoint = [stream, "--ask", ask, "--server-key", "keys/vehicle.key"]
+    friend = watch(tmp_path, *endpoint, "--keys", "clients/laptop.key_secret", "--count", "2", "--timeout", "60")
+    stranger = watch(tmp_path, *endpoint, "--keys", "keys/stranger.key_secret")
+    bare = watch(tmp_path, stream)
+    try:
+        flown = dappled("run", "--simulate", "--frames", "2", "--config", "dappled.toml", cwd=tmp_path)
+        said, complaints = friend.communicate(timeout=60)
+        assert flown.returncode == 0, flown.stderr
+        assert friend.returncode == 0, complaints
+        assert "2 frames received" in said
+    finally:
+        heard = []
+        for one in (friend, stranger, bare):
+            one.kill()
+            heard.append(one.communicate()[0])
+    assert heard[1:] == ["", ""]
+    assert "not on the list" in flown.stderr
+
+
+@pytest.mark.slow
+def test_a_subscriber_that_was_killed_and_started_again_ends_with_every_frame(tmp_path: Path, sockets: Path) -> None:
+    frames = 6
+    endpoint = f"ipc://{sockets}/killed"
+    (tmp_path / "dappled.toml").write_text(f'[record]\ndirectory = "flights"\n[publish]\nslices = "{endpoint}"\n')
+    first = watch(tmp_path, endpoint, "--json")
+    run = [sys.executable, "-m", "dappled", "run", "--simulate", "--frames", str(frames), "--config", "dappled.toml"]
+    daemon = subprocess.Popen(run, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    again = None
+    try:
+        assert first.stdout is not None
+        deadline = time.monotonic() + 60
+        for line in first.stdout:
+            assert time.monotonic() < deadline
+            if json.loads(line)["topic"] == "slices":
+                break
+        first.kill()
+        again = watch(tmp_path, endpoint, "--from-start", "--save", "received", "--timeout", "60")
+        reader = threading.Thread(target=daemon.communicate)
+        reader.start()
+        said, complaints = again.communicate(timeout=90)
+        reader.join(60)
+        assert again.returncode == 0, complaints
+    finally:
+        for one in (first, daemon, again):
+            if one is not None:
+                one.kill()
+        first.communicate()
+    assert f"{frames} frames received" in said
+    kept = sorted(int(path.stem) for path in (tmp_path / "received").glob("*.npy"))
+    assert kept == list(range(frames))
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ('[publish]\nslices = "tcp://0.0.0.0:5555"\n', "dappled keys make"),
+        (
+            '[publish]\nslices = "tcp://0.0.0.0:5555"\nkeys = "none"\nclients = "none"\n',
+            "can't be read as a secret key",
+        ),
+        ('[publish]\nkeys = "none"\n', "go together"),
+        ('[console]\nbind = "0.0.0.0:0"\n', "dappled keys token"),
+        ('[console]\nbind = "here"\n', "must be host:port"),
+    ],
+)
+def test_what_would_be_open_is_refused_before_anything_begins(tables: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "dappled.toml").write_text('[record]\ndirectory = "flights"\n' + tables)
+    run = dappled("run", "--config", "dappled.toml", cwd=tmp_path)
+    assert run.returncode == 1
+    assert words in run.stderr
+    assert len(run.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "flights").exists()
