@@ -3,8 +3,9 @@
 python benchmarks/batch.py [--json] [--frames 16] [--repeats 3] [--scale 1.0]
 
 One flight of simulated frames (10 MP at scale 1), each made into a light field and a map. Ratios are of times within
-one run, interleaved, the median over repeats. The clock starts when the workers are warm, as in a long batch; how long
-that takes is reported beside it. Memory is the largest of any worker's.
+one run, interleaved, the median over repeats; CPU seconds, which other work on the machine disturbs less, stand beside
+them. The clock starts when the workers are warm, as in a long batch; how long that takes is reported too. Memory is the
+largest of any worker's.
 """
 
 from __future__ import annotations
@@ -86,18 +87,23 @@ def _radians(degrees: float) -> float:
     return degrees * 3.141592653589793 / 180
 
 
-def timed(jobs: Sequence[Job], run: Callable[[Sequence[Job]], Iterator[Done]], warm: int) -> tuple[float, float, float]:
-    """(seconds for the jobs after so many that warm the workers up, seconds until then, largest memory in MB)."""
+def timed(
+    jobs: Sequence[Job], run: Callable[[Sequence[Job]], Iterator[Done]], warm: int
+) -> tuple[float, float, float, float]:
+    """(seconds for the jobs after so many that warm the workers up, seconds until then, largest memory in MB, CPU
+    seconds of a job)."""
     began = time.monotonic()
     started = 0.0
     peak = 0.0
+    cpu = []
     for number, done in enumerate(run(jobs), 1):
         if done.error is not None:
             raise SystemExit(done.error)
         peak = max(peak, done.peak_mb)
+        cpu += [done.cpu_seconds] if number > warm else []
         if number == warm:
             started = time.monotonic()
-    return time.monotonic() - started, started - began, peak
+    return time.monotonic() - started, started - began, peak, statistics.median(cpu)
 
 
 @contextmanager
@@ -139,7 +145,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="dappled-bench-") as name:
         folder = Path(name)
         jobs = flight(folder, arguments.frames + 4, arguments.scale)
-        ways: dict[str, list[tuple[float, float, float]]] = {"pool of 1": [], "pool of 2": [], "dask of 2": []}
+        ways: dict[str, list[tuple[float, float, float, float]]] = {"pool of 1": [], "pool of 2": [], "dask of 2": []}
         with dask(folder, 2) as url:
             for repeat in range(arguments.repeats):
                 shutil.rmtree(folder / "out", ignore_errors=True)
@@ -159,6 +165,7 @@ def main() -> None:
         "until_the_fourth_frame_s": {way: statistics.median(t[1] for t in runs) for way, runs in ways.items()},
         "two_workers_over_one": statistics.median(a[0] / b[0] for a, b in zip(one, two, strict=True)),
         "dask_over_pool": statistics.median(b[0] / a[0] for a, b in zip(two, cluster, strict=True)),
+        "cpu_seconds_per_frame": {way: min(t[3] for t in runs) for way, runs in ways.items()},
         "peak_mb_per_worker": peak,
     }
     if arguments.json:

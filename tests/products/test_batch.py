@@ -62,7 +62,7 @@ def answer(one: Job) -> Done:
         os.kill(os.getpid(), signal.SIGKILL)
     if name == "dies":
         os.kill(os.getpid(), signal.SIGKILL)
-    return Done(one.key, "flight", name, (), None, 0.0, 0.0)
+    return Done(one.key, "flight", name, (), None, 0.0, 0.0, 0.0)
 
 
 def test_a_batch_goes_on_where_it_was_stopped(
@@ -154,7 +154,7 @@ def test_two_batches_cant_share_a_folder(tmp_path: Path) -> None:
 
 def test_a_torn_manifest_keeps_its_whole_lines(tmp_path: Path) -> None:
     with Manifest(tmp_path) as manifest:
-        manifest.add(Done("a", "flight", "frames/0.dng", (batch.Output("x", 3, "00"),), None, 1.0, 2.0))
+        manifest.add(Done("a", "flight", "frames/0.dng", (batch.Output("x", 3, "00"),), None, 1.0, 1.0, 2.0))
     path = tmp_path / "manifest.jsonl"
     path.write_bytes(path.read_bytes() + b'{"key": "b", "fli')
     with Manifest(tmp_path) as manifest:
@@ -162,7 +162,7 @@ def test_a_torn_manifest_keeps_its_whole_lines(tmp_path: Path) -> None:
         assert not manifest.holds("a")  # what it made is not there
         (tmp_path / "x").write_bytes(b"123")
         assert manifest.holds("a")
-        manifest.add(Done("c", "flight", "frames/1.dng", (), "bad", 1.0, 2.0))
+        manifest.add(Done("c", "flight", "frames/1.dng", (), "bad", 1.0, 1.0, 2.0))
         assert not manifest.holds("c")
     assert len(path.read_text().splitlines()) == 2
     path.write_text("no manifest\n")

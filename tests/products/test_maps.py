@@ -171,6 +171,16 @@ def test_gdals_own_command_reads_the_cog(tmp_path: Path) -> None:
     assert np.hypot(x - eye.centre[0], y - eye.centre[1]) < 30
 
 
+@pytest.mark.skipif(shutil.which("gdalinfo") is None, reason="GDAL's command line is not installed")
+def test_gdals_own_command_reads_the_kmz(tmp_path: Path) -> None:
+    eye = eye_at(height_m=100.0)
+    path = drawings.mosaic_kmz(survey(photograph(eye, painted(eye, Flat(0.0), colour=True))), tmp_path / "m.kmz", 1.0)
+    said = json.loads(subprocess.run(["gdalinfo", "-json", str(path)], check=True, capture_output=True).stdout)  # noqa: S607  on PATH
+    assert [band["colorInterpretation"] for band in said["bands"]] == ["Red", "Green", "Blue", "Alpha"]
+    longitude, latitude = said["cornerCoordinates"]["center"]
+    assert (latitude, longitude) == pytest.approx((41.6, -91.5), abs=2e-4)
+
+
 def overlays(path: Path) -> tuple[ET.Element, dict[str, NDArray[np.uint8]]]:
     with zipfile.ZipFile(path) as archive:
         assert archive.testzip() is None

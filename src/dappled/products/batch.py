@@ -59,7 +59,7 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What became of a job. `error` is a sentence, or None; `peak_mb` the process' largest memory so far."""
+    """What became of a job. `error` is a sentence, or None; `cpu_seconds` and `peak_mb` (so far) are the process'."""
 
     key: str
     flight: str
@@ -67,6 +67,7 @@ class Done:
     outputs: tuple[Output, ...]
     error: str | None
     seconds: float
+    cpu_seconds: float
     peak_mb: float
 
 
@@ -119,7 +120,7 @@ def plan(flight: Path, recipe: Recipe, options: Options, kinds: Sequence[str], o
 def make(job: Job) -> Done:
     """Do a job. What is wrong with this frame is an error in the answer: it never stops the others."""
     _settle_memory()
-    began = time.monotonic()
+    began, cpu = time.monotonic(), time.process_time()
     outputs: tuple[Output, ...] = ()
     error = None
     try:
@@ -128,8 +129,8 @@ def make(job: Job) -> Done:
         error = sentence(caught) if isinstance(caught, DappledError) else f"{job.frame.name}: {caught}"
     except Exception as caught:  # noqa: BLE001  one bad frame must not end the flight: its words go into the manifest
         error = f"{job.frame.name}: {sentence(caught)}"
-    seconds = round(time.monotonic() - began, 3)
-    return Done(job.key, Path(job.flight).name, job.frame.name, outputs, error, seconds, _peak_mb())
+    seconds, cpu = round(time.monotonic() - began, 3), round(time.process_time() - cpu, 3)
+    return Done(job.key, Path(job.flight).name, job.frame.name, outputs, error, seconds, cpu, _peak_mb())
 
 
 def _made(job: Job) -> list[Output]:

@@ -101,7 +101,7 @@ def on_cluster(jobs: Sequence[Job], make: Make, scheduler: str) -> Iterator[Done
 
 def given_up(job: Job, why: str) -> Done:
     """The answer for a job that no worker could end."""
-    return Done(job.key, Path(job.flight).name, job.frame.name, (), why, 0.0, 0.0)
+    return Done(job.key, Path(job.flight).name, job.frame.name, (), why, 0.0, 0.0, 0.0)
 
 
 def _hired(make: Make) -> _Worker:
