@@ -15,7 +15,7 @@ from dappled.errors import DappledError
 
 INTERNAL = {  # caught where they arise, and told as another error or as an event
     "dappled.drivers.camera_channel.ChannelError",
-    "dappled.drivers.gphoto2_session.SessionError",
+    "dappled.drivers.gphoto2_protocol.SessionError",
     "dappled.mocks.ptp.MalformedPacketError",
 }
 

@@ -22,7 +22,7 @@ from dappled.drivers.camera import (
 )
 from dappled.drivers.camera_channel import Channel, ChannelError, message_event
 from dappled.drivers.gphoto2_process import CameraLoop
-from dappled.drivers.gphoto2_session import (
+from dappled.drivers.gphoto2_protocol import (
     AbsentError,
     BusyError,
     CameraFile,
@@ -88,6 +88,9 @@ class FakeCamera:
 
     def taken_s(self, file: CameraFile) -> int | None:
         return self.taken.get(file)
+
+    def about(self, file: CameraFile) -> tuple[int, int | None]:
+        return len(self.card[file]), self.taken.get(file)
 
     def settings(self) -> tuple[Setting, ...]:
         self._stumble("settings")

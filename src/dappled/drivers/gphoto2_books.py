@@ -9,7 +9,10 @@ from dappled.drivers.attribution import BodyClock, Claim
 from dappled.drivers.camera import Setting, State
 from dappled.drivers.gphoto2_before import LATE
 from dappled.drivers.gphoto2_pairs import Pairs
-from dappled.drivers.gphoto2_session import CameraFile, Session
+from dappled.drivers.gphoto2_protocol import (
+    CameraFile,
+    Session,
+)
 
 
 @dataclass(slots=True)

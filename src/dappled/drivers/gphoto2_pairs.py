@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from dappled.drivers.camera import Arrival, Setting
-from dappled.drivers.gphoto2_session import CameraFile
+from dappled.drivers.gphoto2_protocol import (
+    CameraFile,
+)
 
 _Stem = tuple[str, str]
 Waiting = tuple[CameraFile, Arrival, int | None]

@@ -33,10 +33,16 @@ from dappled.drivers.camera import (
 )
 from dappled.drivers.camera_channel import Channel, ChannelError, event_message
 from dappled.drivers.child import die_with_parent, raise_priority
+from dappled.drivers.file_names import (
+    true_name,
+)
 from dappled.drivers.gphoto2_before import LATE, Before
 from dappled.drivers.gphoto2_books import AtCamera, Books
+from dappled.drivers.gphoto2_finding import (
+    open_session,
+)
 from dappled.drivers.gphoto2_pairs import makes_pairs
-from dappled.drivers.gphoto2_session import (
+from dappled.drivers.gphoto2_protocol import (
     AbsentError,
     BusyError,
     CameraFile,
@@ -46,8 +52,6 @@ from dappled.drivers.gphoto2_session import (
     RefusedError,
     Session,
     SessionError,
-    open_session,
-    true_name,
 )
 from dappled.drivers.gphoto2_settings import GPhoto2Settings, parse_settings
 

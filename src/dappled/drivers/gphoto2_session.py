@@ -1,4 +1,4 @@
-"""libgphoto2's face: find a body, open it, fire it, drain its events, read its files. Only the camera's own process
+"""libgphoto2's face: fire an open body, drain its events, read its files, set it. Only the camera's own process
 imports this; every call may block for as long as libgphoto2 waits for a silent camera (up to 10 s), with the GIL held.
 """
 
@@ -7,122 +7,36 @@ from __future__ import annotations
 import contextlib
 import mmap
 import os
-import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import gphoto2 as gp
 
 from dappled.drivers.camera import Blob, Identity, Setting, SettingName
-from dappled.drivers.gphoto2_settings import CaptureTarget, GPhoto2Settings
+from dappled.drivers.gphoto2_protocol import (
+    BusyError,
+    CameraFile,
+    CameraNews,
+    CaptureComplete,
+    Fetched,
+    FileAdded,
+    LostError,
+    RefusedError,
+    SessionError,
+)
+from dappled.drivers.gphoto2_settings import CaptureTarget
 
 _CHUNK_BYTES = 1 << 20
-_MEMORY_FOLDER = "/"
 _FOLDERS = 256
 """More folders than a card has; a bound for the walk."""
-
-
-class SessionError(Exception):
-    """A call to the camera failed; one sentence."""
-
-
-class AbsentError(SessionError):
-    """No camera to open."""
-
-
-class HeldError(SessionError):
-    """The camera is there and can't be opened."""
-
-
-class LostError(SessionError):
-    """The session is unusable: close it and open another."""
-
-
-class BusyError(SessionError):
-    """The camera is at work; the same call may succeed later."""
-
-
-class RefusedError(SessionError):
-    """The camera said no to this call; the session goes on."""
-
-
-@dataclass(frozen=True, slots=True)
-class CameraFile:
-    """Where a file lies at the camera. Files in the camera's memory have the folder "/"."""
-
-    folder: str
-    name: str
-
-    @property
-    def in_memory(self) -> bool:
-        """Whether the file is in the camera's memory and not on its card."""
-        return self.folder == _MEMORY_FOLDER
-
-
-@dataclass(frozen=True, slots=True)
-class Fetched:
-    """A file's bytes, and when the body's own clock says that it was made: seconds of a clock that may be wrong, None
-    where the body doesn't say."""
-
-    blob: Blob
-    taken_s: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class FileAdded:
-    """The camera announced a file."""
-
-    file: CameraFile
-
-
-@dataclass(frozen=True, slots=True)
-class CaptureComplete:
-    """The camera has finished a capture."""
-
-
-CameraNews = FileAdded | CaptureComplete
-
-
-class Session(Protocol):
-    """What the camera's process needs of an open camera."""
-
-    @property
-    def identity(self) -> Identity:
-        """Who the camera is."""
-
-    @property
-    def keeps_files(self) -> bool:
-        """Whether pictures go to a card, where they outlive the session."""
-
-    def trigger(self) -> None:
-        """Release the shutter. Raises BusyError, RefusedError, LostError."""
-
-    def news(self) -> list[CameraNews]:
-        """All that happened since the last call. Raises LostError."""
-
-    def fetch(self, file: CameraFile) -> Fetched:
-        """A file's bytes. Raises BusyError, RefusedError, LostError."""
-
-    def taken_s(self, file: CameraFile) -> int | None:
-        """When a file on the card was made, by the body's clock. Raises LostError."""
-
-    def delete(self, file: CameraFile) -> None:
-        """Delete a file at the camera. Raises RefusedError, LostError."""
-
-    def files(self) -> frozenset[CameraFile]:
-        """All files on the card, as they were when the session was opened or later. Raises LostError."""
-
-    def settings(self) -> tuple[Setting, ...]:
-        """What can be read of the camera. Raises LostError."""
-
-    def change(self, name: SettingName, value: str) -> None:
-        """Set one of them. Raises BusyError, RefusedError, LostError."""
-
-    def close(self) -> None:
-        """End the session; never raises."""
-
-
+_DRAIN = 64
+"""Events taken at one go, so that a chattering camera can't keep the process from its commands."""
+_LOST = {gp.GP_ERROR_IO, gp.GP_ERROR_TIMEOUT, gp.GP_ERROR_IO_INIT, gp.GP_ERROR_IO_READ, gp.GP_ERROR_IO_WRITE} | {
+    gp.GP_ERROR_IO_USB_CLEAR_HALT,
+    gp.GP_ERROR_IO_USB_FIND,
+    gp.GP_ERROR_IO_USB_CLAIM,
+    gp.GP_ERROR_OS_FAILURE,
+    gp.GP_ERROR_LIBRARY,
+}
 _WIDGETS: dict[SettingName, tuple[str, ...]] = {
     "focal_length": ("focallength",),
     "aperture": ("aperture", "f-number"),
@@ -134,104 +48,6 @@ _WIDGETS: dict[SettingName, tuple[str, ...]] = {
     "free_shots": ("availableshots",),
 }
 """What libgphoto2 calls each setting; makers differ."""
-
-_HELD = {gp.GP_ERROR_IO_USB_CLAIM, gp.GP_ERROR_IO_LOCK, gp.GP_ERROR_CAMERA_BUSY, gp.GP_ERROR}
-_GONE = {gp.GP_ERROR_IO, gp.GP_ERROR_IO_USB_FIND, gp.GP_ERROR_MODEL_NOT_FOUND, gp.GP_ERROR_UNKNOWN_PORT}
-_LOST = {gp.GP_ERROR_IO, gp.GP_ERROR_TIMEOUT, gp.GP_ERROR_IO_INIT, gp.GP_ERROR_IO_READ, gp.GP_ERROR_IO_WRITE} | {
-    gp.GP_ERROR_IO_USB_CLEAR_HALT,
-    gp.GP_ERROR_IO_USB_FIND,
-    gp.GP_ERROR_IO_USB_CLAIM,
-    gp.GP_ERROR_OS_FAILURE,
-    gp.GP_ERROR_LIBRARY,
-}
-_DNG_VERSION = 50706
-_DRAIN = 64
-"""Events taken at one go, so that a chattering camera can't keep the process from its commands."""
-
-
-def open_session(settings: GPhoto2Settings, before: str | None = None) -> GPhoto2Session:
-    """The camera that the settings name, ready to fire; `before` is the serial number of the one that was open before,
-    which is preferred to others. Raises AbsentError, HeldError, LostError."""
-    trouble: list[SessionError] = []
-    spare: GPhoto2Session | None = None
-    others: list[str] = []
-    for model, port in _candidates(settings.port):
-        try:
-            session = _session(model, port, settings.capture_target)
-        except SessionError as error:
-            trouble.append(error)
-            continue
-        if before is None or session.identity.serial == before:
-            wanted = settings.serial is None or settings.serial in session.serials
-        else:
-            wanted = settings.serial is not None and settings.serial in session.serials
-        if wanted:
-            if spare is not None:
-                spare.close()
-            return session
-        if settings.serial is None and spare is None:
-            spare = session
-            continue
-        others.append(f"{session.identity.model} {session.identity.serial}")
-        session.close()
-    if spare is not None:
-        return spare
-    raise _nobody(settings, trouble, others)
-
-
-def _nobody(settings: GPhoto2Settings, trouble: list[SessionError], others: list[str]) -> SessionError:
-    for error in trouble:
-        if not isinstance(error, AbsentError):
-            return error
-    if others:
-        return AbsentError(f"no camera with serial number {settings.serial} is here, only {', '.join(others)}")
-    if trouble:
-        return trouble[0]
-    return AbsentError("no camera is on USB: connect it, switch it on, and set its USB mode to PTP or PC connection")
-
-
-def _session(model: str, port: str, target: CaptureTarget) -> GPhoto2Session:
-    camera = _opened(model, port)
-    try:
-        return GPhoto2Session(camera, port, target)
-    except gp.GPhoto2Error as error:
-        _exit(camera)
-        raise _translated(error, "set up") from error
-
-
-def _candidates(ports: str | None) -> Iterator[tuple[str, str]]:
-    """(model, port) of all cameras on the ports named: one, or several with commas between; None: all on USB."""
-    for port in [None] if ports is None else [each.strip() for each in ports.split(",")]:
-        if port is not None and port.startswith("ptpip:"):
-            yield "PTP/IP Camera", port
-            continue
-        found = gp.Camera.autodetect()
-        for index in range(found.count()):
-            where = found.get_value(index)
-            if port in (None, "usb:", where):
-                yield found.get_name(index), where
-
-
-def _opened(model: str, port: str) -> Any:
-    ports = gp.PortInfoList()
-    ports.load()
-    abilities = gp.CameraAbilitiesList()
-    abilities.load()
-    camera = gp.Camera()
-    try:
-        camera.set_port_info(ports[ports.lookup_path(port)])
-        camera.set_abilities(abilities[abilities.lookup_model(model)])
-        camera.init()
-    except gp.GPhoto2Error as error:
-        if error.code in _HELD:
-            raise HeldError(
-                f"the camera at {port} can't be opened ({error.string}): another program holds it, often the desktop's "
-                "gvfs-gphoto2-volume-monitor; end that program"
-            ) from error
-        if error.code in _GONE:
-            raise AbsentError(f"no camera answers at {port} ({error.string}): connect it and switch it on") from error
-        raise HeldError(f"the camera at {port} can't be opened: {error.string}; switch it off and on") from error
-    return camera
 
 
 class GPhoto2Session:
@@ -256,7 +72,7 @@ class GPhoto2Session:
         try:
             self._camera.trigger_capture()
         except gp.GPhoto2Error as error:
-            raise _translated(error, "release the shutter") from error
+            raise translated(error, "release the shutter") from error
 
     def news(self) -> list[CameraNews]:
         """All that happened since the last call, at most 64 events of it."""
@@ -282,7 +98,7 @@ class GPhoto2Session:
             size, taken_s = self._fill(fd, file)
         except gp.GPhoto2Error as error:
             os.close(fd)
-            raise _translated(error, f"send {file.name}") from error
+            raise translated(error, f"send {file.name}") from error
         except SessionError:
             os.close(fd)
             raise
@@ -346,7 +162,7 @@ class GPhoto2Session:
         try:
             info = self._camera.file_get_info(file.folder, file.name).file
         except gp.GPhoto2Error as error:
-            raise _translated(error, f"tell of {file.name}") from error
+            raise translated(error, f"tell of {file.name}") from error
         return info.size, _time(info)
 
     def delete(self, file: CameraFile) -> None:
@@ -354,7 +170,7 @@ class GPhoto2Session:
         try:
             self._camera.file_delete(file.folder, file.name)
         except gp.GPhoto2Error as error:
-            raise _translated(error, f"delete {file.name}") from error
+            raise translated(error, f"delete {file.name}") from error
 
     def files(self) -> frozenset[CameraFile]:
         """All files on the card, from libgphoto2's memory where it has them."""
@@ -386,7 +202,7 @@ class GPhoto2Session:
             widget.set_value(value)
             self._camera.set_single_config(widget.get_name(), widget)
         except gp.GPhoto2Error as error:
-            raise _translated(error, f"set {name} to {value}") from error
+            raise translated(error, f"set {name} to {value}") from error
         if name == "capture_target":
             self.keeps_files = "ram" not in value.lower()
 
@@ -409,7 +225,7 @@ class GPhoto2Session:
 
     def close(self) -> None:
         """End the session."""
-        _exit(self._camera)
+        let_go(self._camera)
 
     def _text(self, name: str) -> str:
         widget = self._widget((name,))
@@ -440,7 +256,8 @@ def _names(found: Any) -> list[str]:
     return [found.get_name(index) for index in range(found.count())]
 
 
-def _exit(camera: Any) -> None:
+def let_go(camera: Any) -> None:
+    """End a session; never raises."""
     with contextlib.suppress(gp.GPhoto2Error):  # it is being let go; a broken link can't be closed properly
         camera.exit()
 
@@ -449,40 +266,10 @@ def _sentence(error: gp.GPhoto2Error, what: str) -> str:
     return f"the camera could not {what}: {error.string} ({error.code})"
 
 
-def _translated(error: gp.GPhoto2Error, what: str) -> SessionError:
+def translated(error: gp.GPhoto2Error, what: str) -> SessionError:
+    """libgphoto2's error as one of ours; `what` the camera could not do."""
     if error.code == gp.GP_ERROR_CAMERA_BUSY:
         return BusyError(f"the camera is too busy to {what}")
     if error.code in _LOST:
         return LostError(_sentence(error, what))
     return RefusedError(_sentence(error, what))
-
-
-def true_name(name: str, head: bytes) -> str:
-    """The file's name with the extension that its first bytes call for.
-
-    For pictures from the camera's memory libgphoto2 makes the name up, from a format code that knows no DNG.
-    """
-    suffix = _suffix(head)
-    stem, dot, given = name.rpartition(".")
-    if suffix is None or not dot or given.lower() == suffix:
-        return name
-    return f"{stem}.{suffix.upper() if given.isupper() else suffix}"
-
-
-def _suffix(head: bytes) -> str | None:
-    if head.startswith(b"\xff\xd8\xff"):
-        return "jpg"
-    if head.startswith(b"FUJIFILMCCD-RAW"):
-        return "raf"
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(head[:4])
-    if order is None or len(head) < 16:
-        return None
-    if head[8:10] == b"CR":
-        return "cr2"
-    (first,) = struct.unpack_from(order + "I", head, 4)
-    if first + 2 > len(head):
-        return None
-    (count,) = struct.unpack_from(order + "H", head, first)
-    last = min(first + 2 + 12 * count, len(head) - 1)
-    tags = {struct.unpack_from(order + "H", head, at)[0] for at in range(first + 2, last, 12)}
-    return "dng" if _DNG_VERSION in tags else None

@@ -17,6 +17,8 @@ from typing import Any
 
 from dappled.drivers.camera import Blob, CameraError
 from dappled.drivers.camera_channel import Channel, ChannelError, Message
+from dappled.drivers.gphoto2_protocol import CameraFile, Session, SessionError
+from dappled.drivers.gphoto2_settings import GPhoto2Settings
 from dappled.drivers.pickup import SUFFIXES, Found
 
 _ANSWER_S = 60.0
@@ -100,25 +102,24 @@ class _Files:
     """The files of the camera at a port. libgphoto2 is imported here, in the child, and nowhere else."""
 
     def __init__(self, port: str) -> None:
-        from dappled.drivers import gphoto2_session  # noqa: PLC0415  # reason above
-        from dappled.drivers.gphoto2_settings import GPhoto2Settings  # noqa: PLC0415  # goes with it
+        from dappled.drivers.gphoto2_finding import open_session  # noqa: PLC0415  # reason above
 
-        self._library = gphoto2_session
+        self._open = open_session
         self._settings = GPhoto2Settings(port=None if port == "usb:" else port)
-        self._session: gphoto2_session.GPhoto2Session | None = None
+        self._session: Session | None = None
 
     def answer(self, question: Mapping[str, Any]) -> Blob | str:
         """What was asked for, or a sentence why it can't be had."""
         try:
             return self._list() if question["do"] == "list" else self._fetch(question["name"])
-        except self._library.SessionError as error:
+        except SessionError as error:
             return str(error)
 
     def _list(self) -> Blob:
         if self._session is not None:
             self._session.close()
             self._session = None
-        session = self._session = self._library.open_session(self._settings)
+        session = self._session = self._open(self._settings)
         rows = [
             (f"{file.folder}/{file.name}", *session.about(file))
             for file in sorted(session.files(), key=lambda file: (file.folder, file.name))
@@ -130,7 +131,7 @@ class _Files:
         if self._session is None:
             return "the camera was not listed yet"
         folder, _, name = path.rpartition("/")
-        return self._session.fetch(self._library.CameraFile(folder, name)).blob
+        return self._session.fetch(CameraFile(folder, name)).blob
 
 
 def _serve(channel: Channel, files: _Files) -> None:

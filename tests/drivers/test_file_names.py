@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.drivers.gphoto2_session import true_name
+from dappled.drivers.file_names import (
+    true_name,
+)
 
 
 def tiff(order: str, *tags: int) -> bytes:
