@@ -69,8 +69,9 @@ def test_fired_by_a_wire_and_picked_up_after_landing(
     assert "flight pickup" in str(reasons)
     pickup = ["flight", "pickup", str(flight), "--from", str(body.card), "--json"]
     assert main([*pickup, "--dry-run"]) == 0
-    assert summary.report(flight).frames == 0
-    capfd.readouterr()
+    assert (summary.report(flight).frames, summary.report(flight).following) == (0, 4)
+    assert main(["flight", "report", str(flight)]) == 0
+    assert "4 of the failed were fired" in capfd.readouterr().out
     assert main(pickup) == 0
     told = json.loads(capfd.readouterr().out)
     assert [pair["index"] for pair in told["pairs"]] == [0, 1, 2, 3]

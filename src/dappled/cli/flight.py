@@ -150,6 +150,10 @@ def _report(flight: Path, as_json: bool) -> int:
             print(f"  {found.refused:6d} wishes refused, each with its reason (dappled flight show --json: events)")
         print(f"  {found.wishes:6d} shots: {found.safe} safe, {found.failed} failed, {found.open} open")
         print(f"  {found.frames:6d} frames, {found.size / 1e6:.1f} MB: {found.tagged} tagged, {found.decoded} decoded")
+        if found.following:
+            print(f"  {found.following:6d} of the failed were fired, and their files follow: dappled flight pickup")
+        if found.companions:
+            print(f"  {found.companions:6d} files beside frames, such as the JPEG of a raw frame")
         if found.strays:
             print(f"  {found.strays:6d} files without a shot of their own")
         print("the books balance" if found.balanced else "THE BOOKS DO NOT BALANCE: run `dappled flight check`")

@@ -38,6 +38,8 @@ def line(story: Story) -> str:
     times = " ".join(f"{_SHORT.get(name, name)} {ms:.0f}" for name, ms in story.ms.items())
     if times:
         words.append(f"ms: {times}")
+    if story.frame is None and story.follows:
+        words.append(story.follows)
     if story.problem:
         words.append(f"PROBLEM: {story.problem}")
     return "  ".join(words)
@@ -55,6 +57,7 @@ def as_json(story: Story) -> str:
         "carriers_from": story.developed.carriers_from if story.developed else None,
         "slices_sha256": story.developed.sha256 if story.developed else None,
         "ms": {**story.ms, "decoder": dict(story.developed.ms) if story.developed else {}},
+        "follows": story.follows or None,
         "problem": story.problem or None,
     }
     return json.dumps(facts)

@@ -62,6 +62,8 @@ def of_story(story: Story) -> tuple[str, Level]:
     who = f"frame {story.shot.index}" if story.frame else f"shot {story.shot.index}"
     if story.problem:
         return f"{who}: {story.problem}", "warning"
+    if story.frame is None and story.follows:
+        return f"{who}: {story.follows}", "info"
     words = [f"{who} is safe"]
     if story.frame:
         words[0] += f", {story.frame.size / 1e6:.1f} MB"

@@ -18,7 +18,8 @@ from dappled.flight.records import Frame, Tag
 @dataclass(frozen=True, slots=True)
 class Balance:
     """The books of a flight: every wish that became a shot is safe, failed or still open; `refused` ones became none.
-    `by_source` counts shots. `began_utc_ns` is None where nobody ever knew UTC."""
+    `by_source` counts shots, `following` those of the failed whose files are still at the camera, `companions` files
+    beside frames. `began_utc_ns` is None where nobody ever knew UTC."""
 
     flight: str
     wishes: int
@@ -33,6 +34,8 @@ class Balance:
     by_source: Mapping[str, int]
     closed: bool
     refused: int = 0
+    following: int = 0
+    companions: int = 0
     began_utc_ns: int | None = None
 
     @property
@@ -98,6 +101,8 @@ def report(path: Path) -> Balance:
             size=sum(frame.size for frame in frames),
             by_source=dict(sorted(Counter(row.shot.cause.source for row in shots).items())),
             closed="closed_utc_ns" in facts,
+            following=len(ledger.following()),
+            companions=len(ledger.companions()),
             refused=sum(event.kind == "refused" for event in ledger.events()),
             began_utc_ns=None
             if correction_ns is None or "began_utc_ns" not in facts
