@@ -150,6 +150,7 @@ def test_a_dark_frame_is_taken_off_and_one_of_another_size_is_refused(
 ) -> None:
     dark = np.full((694, 922), 1024, dtype=np.uint16)
     dark[::7, ::5] += 300  # warm pixels
+    dark[100, 200] = 15000  # and one that glows
     np.save(tmp_path / "dark.npy", dark)
     words = ["calibrate", *frames("geometric")[:1], "--camera", str(profile), "--mask", MASK]
     assert main([*words, "--dark", str(tmp_path / "dark.npy"), "-o", str(tmp_path / "c.toml")]) == 0

@@ -18,6 +18,7 @@ from dappled.config.profiles import CameraProfile
 from dappled.decode import plane as planes
 from dappled.decode.calibrated import Calibration
 from dappled.decode.decoder import Decoder, MaskDecoder
+from dappled.decode.defects import Places, find_defects, mended
 from dappled.decode.errors import DecodeError
 from dappled.decode.exposure import Developer, Exposure, developer
 from dappled.decode.latest import Latest
@@ -89,6 +90,7 @@ class Darkroom:
         self.recipe = recipe
         self._decoders: dict[tuple[tuple[int, int], str, bool], Decoder] = {}
         self._dark: NDArray[Any] | None = None
+        self._defects: Places | None = None
         self._gains: dict[tuple[int, int], Plane] = {}
         self._balance: NDArray[np.float64] | None = None
         self._developers: Latest[Developer] = Latest(_KEPT)
@@ -172,6 +174,12 @@ class Darkroom:
         cfa, black = _one_index_a_colour(raw)
         balance = None if cfa is None or not lenslets else self._white_balance()
         dark = self._dark_frame()
+        if dark is not None and dark.shape == raw.mosaic.shape:
+            period = (1, 1) if cfa is None else (cfa.shape[0], cfa.shape[1])
+            if self._defects is None:
+                self._defects = find_defects(dark, period)
+                self._dark = dark = mended(dark, self._defects, period)
+            raw = replace(raw, mosaic=mended(raw.mosaic, self._defects, period))
         workers = self.recipe.workers
         reference: list[int] = []
         chroma = None
