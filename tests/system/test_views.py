@@ -67,6 +67,22 @@ def test_views_of_the_reference_camera_on_the_full_sensor(seed: int, tmp_path: P
         assert reached.views_db >= reached.mean_db + wanted.above_mean_db, reached
 
 
+def test_the_same_bytes_come_out_for_any_number_of_workers(tmp_path: Path) -> None:
+    camera = reference_camera(3, scale=0.5, scene="bench")
+    (tmp_path / "bench.dng").write_bytes(camera.bench_frame().file)
+    (tmp_path / "frame.dng").write_bytes(camera.expose(0.0, 0).file)
+    outcomes = set()
+    for workers in (1, 2, 3, 1):
+        recipe = Recipe(CAMERA, MASK, workers=workers, colour=True)
+        found = from_frames(Darkroom(recipe), [tmp_path / "bench.dng"])
+        text = tomli_w.dumps(found.to_dict())
+        (tmp_path / "calibration.toml").write_text(text)
+        made = Darkroom(replace(recipe, calibration=str(tmp_path / "calibration.toml"))).develop(tmp_path / "frame.dng")
+        field = made.light_field
+        outcomes.add((text, field.slices.tobytes(), field.views.tobytes(), field.carriers.tobytes()))
+    assert len(outcomes) == 1
+
+
 @pytest.mark.parametrize("seed", [6, 7])
 def test_views_of_a_scene_with_hardly_any_parallax_are_no_worse_than_their_mean(seed: int, tmp_path: Path) -> None:
     reached = _score(reference_camera(seed, scale=0.5, scene="terrain"), tmp_path, least_disparity_px=0.0)
