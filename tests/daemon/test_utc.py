@@ -56,10 +56,12 @@ def test_the_first_word_is_noted_and_then_only_much_better_ones() -> None:
     learner = UtcLearner(known=False, note=noted.append)
     assert learner.utc_ns(5) is None
     learner.look(None)
+    assert not learner.known
     for correction_ns, sigma_ns in ((100, 50), (101, 40), (102, 25), (103, 24)):
         learner.look(UtcCorrection(correction_ns, sigma_ns, "test"))
     assert [one.correction_ns for one in noted] == [100, 102]
     assert learner.utc_ns(5) == 107
+    assert learner.known
 
 
 def test_what_could_not_be_noted_is_tried_again() -> None:

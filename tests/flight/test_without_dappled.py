@@ -46,7 +46,7 @@ def read(flight: Path) -> list[str]:
 def test_the_reader_in_the_document_reads_a_flight(flight: Path) -> None:
     first, second, third = read(flight)
     assert first == (
-        "     0 frames/000000.cr2 intact 2026-11-21T10:15:03+00:00 41.6311134 -91.5414669 215.10 m ± 0.8 m"
+        "     0 frames/000000.cr2 intact 2026-11-21T10:15:03+00:00 41.6311134 -91.5414669 215.1 m ± 0.80 m"
     )
     assert second == "     1 frames/000001.cr2 intact"
     assert third == "     2 failed: the camera was gone"

@@ -30,12 +30,14 @@ def test_a_flight_learns_utc_and_replays(tmp_path: Path, sockets: Path) -> None:
     with simulation as simulated:
         service = Service(simulated, clock=SystemClock(utc_minus_monotonic_ns=0))
         service.start()
+        assert "UTC is not known yet" in "".join(service.health()["problems"])
         try:
             service.run(lambda: service.health()["camera"]["state"] == "ready")
             station = simulation.ground_station(1)
             service.run(lambda: not station.running())
             until = time.monotonic() + 30
             service.run(lambda: service.utc_learnt or time.monotonic() > until)
+            assert "UTC" not in "".join(service.health()["problems"])
         finally:
             service.stop()
         code, _ = station.wait(10)

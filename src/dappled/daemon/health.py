@@ -38,6 +38,7 @@ def record(
     clock: BootClock | None = None,
     vehicle: Pose | None = None,
     decoding: bool = False,
+    utc_known: bool = True,
 ) -> dict[str, Any]:
     """The facts of a `health` message; `problems` are sentences, none when all is well."""
     problems = [f"the {name} thread has ended: restart dappled" for name in street.dead()]
@@ -50,6 +51,10 @@ def record(
             problems.append(link.error)
         elif monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS:
             problems.append(f"MAVLink link {link.url}: {_silence(link)}")
+    if not utc_known:
+        problems.append(
+            "UTC is not known yet: the autopilot's satellites will tell it, and all stamps are put right then"
+        )
     free = _free(folder)
     if free is not None and free < settings.record.min_free_mb * 1_000_000:
         problems.append(f"disk nearly full: {free // 1_000_000} MB left, new shots are refused")

@@ -303,6 +303,7 @@ class Service:
             clock=self._telemetry.boot_clock(),
             vehicle=self._telemetry.pose_at(self._clock.utc_ns(), 0.0),
             decoding=self._recipe is not None,
+            utc_known=self._utc.known,
         )
 
     # wishes

@@ -47,6 +47,11 @@ class UtcLearner:
         self._known, self._note = known, note
         self.learnt: UtcCorrection | None = None
 
+    @property
+    def known(self) -> bool:
+        """Whether the stamps of this flight can be told as UTC."""
+        return self._known or self.learnt is not None
+
     def look(self, found: UtcCorrection | None) -> None:
         """What telemetry says now. Raises DappledError when it can't be noted; the next look tries again."""
         if self._known or found is None:
