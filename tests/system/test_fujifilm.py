@@ -13,12 +13,14 @@ from typing import Any
 import pytest
 
 from dappled.cli import main
-from dappled.drivers import shutter_line
+from dappled.drivers import gphoto2, shutter_line
 from dappled.drivers.mavlink import mavlink
 from dappled.flight import check, summary
 from dappled.flight.ledger import LedgerReader
+from dappled.mocks.body import Body, BodyOptions, pattern
 from dappled.mocks.finepix import FinePix
 from dappled.mocks.simulation import free_port
+from tests.drivers.contract import content, until_shot_ends, until_state
 from tests.system.flying import Flying, eventually, flying, settings_of
 
 Wrong = tuple[list[str], str]
@@ -202,3 +204,62 @@ def test_fired_by_the_autopilot_s_relay_and_the_ground_station_is_told(here: Pat
             assert body.pressed == 1
     finally:
         pixhawk.close()
+
+
+@contextmanager
+def other_hand(body: Body) -> Iterator[Callable[[int], None]]:
+    """Somebody else fires a body whose files lie on its card."""
+    camera = gphoto2.open_camera({"port": body.port})
+    camera.start()
+    until_state(camera, "ready")
+
+    def press(number: int) -> None:
+        camera.fire(number)
+        content(until_shot_ends(camera, number)[-1])  # type: ignore[arg-type]  # an Arrival, or the test fails there
+
+    try:
+        yield press
+    finally:
+        camera.stop()
+
+
+def outside(here: Path, body: Body, pickup: str) -> Any:
+    return settings_of(here, camera={"driver": "fujifilm", "shutter": "outside", "port": "", "pickup": pickup})
+
+
+@pytest.mark.slow
+def test_files_are_picked_up_over_ptp_after_landing(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with Body.start(BodyOptions(picture="pattern:200001:cr2", pairs=True, clock_offset_s=-7200.0)) as body:
+        with other_hand(body) as press, flying(outside(here, body, "later")) as daemon:
+            flight = daemon.service.folder
+            for number in range(3):
+                daemon.shoot()
+                press(number)
+        assert main(["flight", "pickup", str(flight), "--from", body.port, "--json"]) == 0
+    told = json.loads(capfd.readouterr().out)
+    assert [(pair["index"], pair["file"][-12:]) for pair in told["pairs"]] == [
+        (0, "IMG_0001.CR2"), (1, "IMG_0002.CR2"), (2, "IMG_0003.CR2"),
+    ]  # fmt: skip
+    assert check.check(flight).problems == ()
+    assert (summary.report(flight).safe, summary.report(flight).companions) == (3, 3)
+    with LedgerReader.open(flight / "flight.sqlite") as ledger:
+        for frame in ledger.frames():
+            assert (flight / frame.name).read_bytes() == pattern(frame.index + 1, 200_001)
+
+
+@pytest.mark.slow
+def test_files_are_picked_up_over_ptp_in_flight(here: Path) -> None:
+    with (
+        Body.start(BodyOptions(picture="pattern:200001:cr2")) as body,
+        flying(outside(here, body, body.port)) as daemon,
+    ):
+        body.fault("unplug")  # while it is fired it is no camera on the bus
+        eventually(lambda: daemon.camera == "ready", "the line is open")
+        body.fault("clear")
+        with other_hand(body) as press:
+            for number in range(3):
+                daemon.shoot()
+                press(number)
+        with LedgerReader.open(daemon.service.folder / "flight.sqlite") as ledger:
+            eventually(lambda: len(ledger.tags()) == 3, "all frames recorded and tagged")
+            assert [frame.camera_name for frame in ledger.frames()] == [f"IMG_000{n}.CR2" for n in (1, 2, 3)]

@@ -23,6 +23,8 @@ from dappled.drivers.pickup import SUFFIXES, Found
 
 _ANSWER_S = 60.0
 _START_S = 0.2
+_REST_S = 0.5
+"""A camera that nobody asks anything is let go, so that others may have it."""
 
 
 @dataclass(slots=True)
@@ -113,12 +115,17 @@ class _Files:
         try:
             return self._list() if question["do"] == "list" else self._fetch(question["name"])
         except SessionError as error:
+            self.rest()  # the next question opens it anew
             return str(error)
 
-    def _list(self) -> Blob:
+    def rest(self) -> None:
+        """Let go of the camera."""
         if self._session is not None:
             self._session.close()
             self._session = None
+
+    def _list(self) -> Blob:
+        self.rest()
         session = self._session = self._open(self._settings)
         rows = [
             (f"{file.folder}/{file.name}", *session.about(file))
@@ -127,17 +134,17 @@ class _Files:
         ]
         return Blob.of(json.dumps(rows).encode(), "listing")
 
-    def _fetch(self, path: str) -> Blob | str:
-        if self._session is None:
-            return "the camera was not listed yet"
+    def _fetch(self, path: str) -> Blob:
+        session = self._session = self._session or self._open(self._settings)
         folder, _, name = path.rpartition("/")
-        return self._session.fetch(CameraFile(folder, name)).blob
+        return session.fetch(CameraFile(folder, name)).blob
 
 
 def _serve(channel: Channel, files: _Files) -> None:
     while True:
-        question = channel.receive(3600)
+        question = channel.receive(_REST_S)
         if question is None:
+            files.rest()
             continue
         answer = files.answer(question.body)
         if isinstance(answer, str):
