@@ -153,7 +153,7 @@ class MaskDecoder:
         width = self.slice_size(self.lattice_at(focal_length_mm))[1]
         radii = self._radii(predicted, focal_length_mm)
         outermost = max(abs(c.fx) + radius / wide for c, radius in zip(predicted, radii, strict=True))
-        return min(0.5, outermost + (width / 2 * (1 + _ROTATION) + 8) / wide)
+        return min(0.5, outermost + max(width / 2 * (1 + _ROTATION), 8) / wide)
 
     def slice_size(self, lattice: Lattice) -> tuple[int, int]:
         """(height, width) of the bands in bins of the padded transform."""
