@@ -92,7 +92,9 @@ def test_the_command_keeps_the_lens_in_a_profile(
         "row_mm = [0.02, 0.0]\ncolumn_mm = [0.0, 0.02]\n"
     )
     frames = []
-    for number, picture in enumerate([*pictures, np.random.default_rng(1).random(SENSOR.shape)]):
+    for number, picture in enumerate(
+        [*pictures, np.linspace(0.2, 0.8, SENSOR.shape[0] * SENSOR.shape[1]).reshape(SENSOR.shape)]
+    ):
         frames.append(str(tmp_path / f"{number}.png"))
         Image.fromarray(np.round(65535 * np.clip(picture, 0, 1)).astype(np.uint16)).save(frames[-1])
     output = tmp_path / "calibrated.toml"

@@ -179,6 +179,7 @@ def tagged(sha256: str, index: int) -> Tag:
         (["--refine", "a.tif", "b.tif", "--frames", "0"], "one base map"),
         (["--view", "9,9", "--frames", "0"], "there is no view 9,9"),
         (["--mount", *"110010001"], "is no rotation"),
+        (["--between", "9", "3"], "the lower height comes first"),
     ],
 )
 def test_a_wrong_call_is_a_sentence(

@@ -39,15 +39,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--each", action="store_true", help="a kmz or cog of each frame too, in frames/")
     parser.add_argument("--quad", action="store_true", help="each frame's kmz as a LatLonQuad: the view itself")
     parser.add_argument("--against", type=Path, metavar="FLIGHT", help="for difference: the other, later flight")
+    parser.add_argument("--between", nargs=2, type=float, metavar=("LOW", "HIGH"),
+                        help="for terrain: heights to search, metres above sea level\n"
+                        "(default: 3 m below to 12 m above the ground that is given)")  # fmt: skip
     add_placing(parser)
     better = parser.add_argument_group("refinement")
     better.add_argument("--refine", nargs="+", default=[], metavar="WITH",
                         help="neighbours (frames against each other), a base map (GeoTIFF …), or both")  # fmt: skip
     better.add_argument("--gcp", type=Path, metavar="CSV",
                         help="control points: name, frame, column, row, latitude, longitude, altitude")  # fmt: skip
-    better.add_argument("--search", type=float, default=5.0, metavar="M",
+    better.add_argument("--search", type=positive, default=5.0, metavar="M",
                         help="how far off frames are looked for on the base map (default: 5 m)")  # fmt: skip
-    better.add_argument("--pose-sigma", nargs=2, type=float, metavar=("M", "DEG"),
+    better.add_argument("--pose-sigma", nargs=2, type=positive, metavar=("M", "DEG"),
                         help="how well poses are known, 1 σ (default: as recorded)")  # fmt: skip
     parser.add_argument("--json", action="store_true", help="the report as JSON")
 
@@ -66,8 +69,8 @@ def add_placing(parser: argparse.ArgumentParser) -> None:
     camera.add_argument("--camera", metavar="P", help="camera profile (default: the flight's)")
     camera.add_argument("--mask", metavar="P", help="mask profile (default: the flight's)")
     camera.add_argument("--calibration", metavar="FILE", help="mask calibration (default: the flight's)")
-    camera.add_argument("--focal-length", type=float, metavar="MM", help="where frames don't say")
-    camera.add_argument("--f-number", type=float, metavar="N", help="where frames don't say")
+    camera.add_argument("--focal-length", type=positive, metavar="MM", help="where frames don't say")
+    camera.add_argument("--f-number", type=positive, metavar="N", help="where frames don't say")
     camera.add_argument("--view", default="mean", metavar="VIEW",
                         help="mean, ground (all views, refocused there), or row,column of one")  # fmt: skip
     camera.add_argument("--grey", action="store_true", help="in grey (default: in colour where the frames have it)")
@@ -79,8 +82,16 @@ def add_placing(parser: argparse.ArgumentParser) -> None:
                         help="distance that the lens was focused at (default: infinity)")  # fmt: skip
     maps = parser.add_argument_group("map")
     maps.add_argument("--crs", metavar="EPSG:N", help="projection in metres (default: the UTM zone)")
-    maps.add_argument("--gsd", type=float, metavar="M", help="metres a map cell (default: the frames' own)")
+    maps.add_argument("--gsd", type=positive, metavar="M", help="metres a map cell (default: the frames' own)")
     maps.add_argument("--frames", metavar="N,A-B", help="only these frames")
+
+
+def positive(text: str) -> float:
+    """An argument that is a length or number above 0."""
+    number = float(text)
+    if not (math.isfinite(number) and number > 0):
+        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
+    return number
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -88,14 +99,17 @@ def run(arguments: argparse.Namespace) -> int:
     output = arguments.output or folder.path / "maps"
     if ("difference" in arguments.kinds) != (arguments.against is not None):
         raise DappledError("--as difference and --against FLIGHT go together")
+    if arguments.between and not arguments.between[0] < arguments.between[1]:
+        raise DappledError("--between: the lower height comes first")
     with ExitStack() as stack:
         progress = stack.enter_context(Bar())
         made = _survey(folder.path, arguments, progress, stack)
         files = _draw(made, output, arguments)
         terrain_of, missing = None, ""
+        low, high = arguments.between or (None, None)
         if "terrain" in arguments.kinds:
             try:
-                terrain_of = terrain.of(made, progress)
+                terrain_of = terrain.of(made, progress, lowest_m=low, highest_m=high)
                 files.append(terrain.write_raster(made, terrain_of, output / "terrain.tif"))
                 files.append(terrain.write_points(made, terrain_of, output / "terrain.las"))
             except HyperstereoError as error:  # the maps are there all the same
@@ -106,7 +120,8 @@ def run(arguments: argparse.Namespace) -> int:
             changed = difference.of_pictures(made, other)
             files.append(difference.write(made, other, changed, output / "difference.tif", "share of brightness"))
             if terrain_of is not None:
-                raised = difference.of_heights(terrain_of, terrain.of(other, progress))
+                found = terrain.of(other, progress, lowest_m=low, highest_m=high)
+                raised = difference.of_heights(terrain_of, found)
                 files.append(difference.write(made, other, raised, output / "height-difference.tif", "m"))
     if missing:
         made = replace(made, notes=(*made.notes, missing))

@@ -1,0 +1,29 @@
+"""What a person reads where a library of the ground extra is missing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from dappled.products.extras import MissingExtraError, need
+
+
+def test_a_missing_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)  # Python's own way to say: not there
+    with pytest.raises(MissingExtraError, match=r"opencv-python-headless: .*'dappled\[ground\]'"):
+        need("cv2")
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingExtraError, match=r"'dappled\[cluster\]'"):
+        need("distributed")
+    assert need("json").dumps([]) == "[]"
+
+
+def test_maps_can_be_imported_without_the_extras() -> None:
+    code = (
+        "import sys\n"
+        "for name in ('cv2', 'rasterio', 'laspy', 'h5py', 'distributed', 'rerun'): sys.modules[name] = None\n"
+        "import dappled.cli.georeference, dappled.cli.batch, dappled.products.refine, dappled.products.chessboard\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
