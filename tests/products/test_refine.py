@@ -28,7 +28,7 @@ from tests.products.flown import Flown
 from tests.products.test_eye import eye_at
 
 pytestmark = pytest.mark.slow
-TIMES = tuple(1.0 + 0.6 * k for k in range(6))
+TIMES = tuple(1.0 + 0.6 * k for k in range(5))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +169,8 @@ def test_a_base_map_of_something_else_is_refused_frame_by_frame(exact: Case, tmp
 
 
 def test_hyperstereo_finds_the_terrain_that_flat_ground_does_not_have(exact: Case) -> None:
-    flat = replace(exact.survey, ground=Flat(exact.flown.path.home_altitude_msl_m))
+    coarse = replace(exact.survey, photographs=exact.survey.photographs[:4], gsd_m=0.04)
+    flat = replace(coarse, ground=Flat(exact.flown.path.home_altitude_msl_m))
     made = terrain.of(flat, lambda *_: None).surface
     truth = load_ground(exact.folder / "relief.tif", flat.projection, made.grid.bounds)
     error = made.height_m - truth.heights(*made.grid.places(flat.projection))
@@ -181,9 +182,9 @@ def test_hyperstereo_finds_the_terrain_that_flat_ground_does_not_have(exact: Cas
     within = np.mean(np.abs(error[known]) < made.sigma_m[known])
     assert 0.5 < within < 0.9
     assert made.level_sigma_m > 0.05  # 2 cm of position over a baseline of 2.4 m at 20 m
-    differed = terrain.of(exact.survey, lambda *_: None)
+    differed = terrain.of(replace(coarse, gsd_m=0.08), lambda *_: None, highest_m=207.0)
     assert differed.difference_m is not None
-    assert np.nanmedian(np.abs(differed.difference_m)) < 0.02
+    assert np.nanmedian(np.abs(differed.difference_m)) < 0.05
 
 
 def test_frames_that_share_no_ground_have_no_heights(exact: Case) -> None:

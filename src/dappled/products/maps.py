@@ -71,7 +71,7 @@ class MapGrid:
         at_x, at_y = (np.linspace(line[0], line[-1], max(2, math.ceil(len(line) / _NODE) + 1)) for line in (x, y))
         node_x, node_y = np.meshgrid(at_x, at_y)
         nodes = projection.to_map(node_y, node_x)
-        aside, down = _between(x, at_x), _between(y, at_y)
+        aside, down = between(x, at_x), between(y, at_y)
         east, north = (np.asarray(down @ node @ aside.T, np.float64) for node in nodes)
         return east, north
 
@@ -174,7 +174,7 @@ def smoothed_to(image: Image, ratio: float) -> Image:
     return np.asarray(smooth, np.float32).reshape(image.shape)
 
 
-def _between(fine: Floats, nodes: Floats) -> Floats:
+def between(fine: Floats, nodes: Floats) -> Floats:
     """(len(fine), len(nodes)): weights of linear interpolation between evenly spaced nodes."""
     step = (nodes[-1] - nodes[0]) / (len(nodes) - 1) or 1.0
     place = np.clip((fine - nodes[0]) / step, 0, len(nodes) - 1)

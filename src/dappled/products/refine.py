@@ -22,7 +22,7 @@ from dappled.products.basemap import BaseMap
 from dappled.products.earth import Projection
 from dappled.products.eye import Eye
 from dappled.products.ground import Ground
-from dappled.products.maps import footprint, sample, smoothed_to
+from dappled.products.maps import between, footprint, sample, smoothed_to
 from dappled.products.matching import Features
 from dappled.products.photographs import Photograph
 
@@ -32,6 +32,7 @@ LEAST_SHARE = 0.25  # of the matches
 _PLANE_PX = 6.0  # a homography is only a sieve: houses stand above it
 _SIFT_PX = 0.6
 _PATCH_PX = 0.4
+_NODE = 3  # pixels between rays
 _CLICK_PX = 0.5  # of a view: a control point found by eye in the frame
 _REACH = 6  # frames ahead that are tried as neighbours
 _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1.0, math.radians(0.5)  # a base map may overrule telemetry that is too sure
@@ -201,17 +202,18 @@ def _closer(
 
 def _patches(group: Marks, one: Photograph, eye: Eye, base: BaseMap, ground: Ground) -> Marks | None:
     rows, columns = eye.shape
-    pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(np.float64)
-    met = ground.meet(eye, pixels)
+    # Rays at every few pixels, and straight lines between them: the patches' own hits are exact further down.
+    at_x, at_y = (np.linspace(0, side - 1, max(2, side // _NODE)) for side in (columns, rows))
+    met = ground.meet(eye, np.stack(np.meshgrid(at_x, at_y), axis=-1).reshape(-1, 2))
     if not np.isfinite(met).all():
         return None
     window = base.window(met[:, :2], 1.0)
     if window is None:
         return None
     picture, grid = window
-    at = np.stack(
-        [(met[:, 0] - grid.west) / grid.step_x - 0.5, (grid.north - met[:, 1]) / grid.step_y - 0.5], axis=1
-    ).reshape(rows, columns, 2)
+    nodes = (met[:, 0] - grid.west) / grid.step_x - 0.5, (grid.north - met[:, 1]) / grid.step_y - 0.5
+    down, aside = between(np.arange(rows, dtype=float), at_y), between(np.arange(columns, dtype=float), at_x)
+    at = np.stack([down @ node.reshape(len(at_y), len(at_x)) @ aside.T for node in nodes], axis=-1)
     picture = smoothed_to(np.nan_to_num(picture), eye.gsd_m(float(np.median(met[:, 2]))) * eye.scale / grid.step_x)
     seen = sample(picture[..., None], at)[..., 0]
     places, shifts = matching.nudges(one.image, seen)
