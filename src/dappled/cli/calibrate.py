@@ -15,7 +15,8 @@ from dappled.config import profiles
 from dappled.config.schema import ConfigError
 from dappled.decode import calibration_report as report
 from dappled.decode.calibrated import Calibration
-from dappled.decode.calibration import CalibrationFrame, Sight, of_sights, sight_of
+from dappled.decode.calibration import CalibrationFrame, of_sights, sight_of
+from dappled.decode.sighting import Sight
 from dappled.drivers import calibration_files
 from dappled.drivers.darkroom import Darkroom, DarkroomError
 from dappled.errors import DappledError

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.aperture import used_aperture
 from dappled.decode.calibrated import Calibration, at_corner
-from dappled.decode.calibration import origin_of, relative_transfer
+from dappled.decode.calibration import origin_of
 from dappled.decode.carriers import LAWS, Carrier, Lattice, Sensor
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import LightField
@@ -26,6 +26,7 @@ from dappled.decode.ownlattice import STRONG, STRONGER, own_lattice, turn_betwee
 from dappled.decode.peaks import Measured, measure
 from dappled.decode.plan import Plans
 from dappled.decode.report import CarriersFrom, DecodeReport, ViewsFrom, light_field, no_views
+from dappled.decode.sighting import relative_transfer
 from dappled.decode.slices import Slices, default_size, extract
 from dappled.decode.spectrum import Spectrum, padded_shape
 from dappled.decode.threads import each

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.calibrated import at_centre, at_corner
-from dappled.decode.calibration import relative_transfer
 from dappled.decode.carriers import Carrier, Lattice
 from dappled.decode.errors import DecodeError
 from dappled.decode.lattice import FoundLattice, find_lattice
@@ -19,6 +18,7 @@ from dappled.decode.lightfield import LightField
 from dappled.decode.noise import noise_rms
 from dappled.decode.plan import Plan, Plans
 from dappled.decode.report import DecodeReport, light_field, no_views
+from dappled.decode.sighting import relative_transfer
 from dappled.decode.slices import Slices, default_size
 from dappled.decode.spectrum import Spectrum
 from dappled.decode.transform import Source
