@@ -11,12 +11,15 @@ from dappled.daemon import preflight
 from dappled.daemon.preflight import Check
 
 VEHICLE = {"latitude_deg": 41.0, "longitude_deg": 1.0, "yaw_deg": 3.0, "position_sigma_m": 1.24, "age_ms": 40.0}
+LINK = {"urls": 2, "silent": 0, "packets": 500, "positions": 50}
 WELL: dict[str, Any] = {
     "utc_ns": 1_800_000_000 * 10**9,
     "camera": {"state": "ready", "reason": ""},
-    "link": {"urls": 2, "packets": 500, "positions": 50},
+    "link": LINK,
+    "stages": [{"name": "decode", "dropped": 0}],
+    "dead": [],
+    "utc_known": True,
     "disk": {"free_bytes": 50 * 10**9, "folder": "/flights/x"},
-    "problems": [],
     "clock": {"source": "timesync", "sigma_ms": 0.31},
     "vehicle": VEHICLE,
     "decode": {"mask": "mask-2", "calibration": "c.toml", "running": True},
@@ -38,9 +41,6 @@ def test_all_is_well() -> None:
     assert [one.text for one in checks if one.name == "Position"] == ["±1.2 m"]
 
 
-SILENT = "MAVLink link udpin:1: nobody was heard for 5 s"
-
-
 @pytest.mark.parametrize(
     ("name", "state", "words", "changes"),
     [
@@ -52,8 +52,8 @@ SILENT = "MAVLink link udpin:1: nobody was heard for 5 s"
         ("Disk", "no-go", "shots are refused", {"disk": {"free_bytes": 4 * 10**8}}),
         ("Disk", "caution", "room for some 25 frames", {"disk": {"free_bytes": 10**9}}),
         ("Autopilot", "caution", "no link is configured", {"link": {"urls": 0, "packets": 0}}),
-        ("Autopilot", "go", "1 of 2 links silent", {"problems": [SILENT]}),
-        ("Autopilot", "no-go", "silent", {"problems": [SILENT, SILENT], "vehicle": VEHICLE | {"age_ms": 9000.0}}),
+        ("Autopilot", "go", "1 of 2 links silent", {"link": LINK | {"silent": 1}}),
+        ("Autopilot", "no-go", "silent", {"link": LINK | {"silent": 2}, "vehicle": VEHICLE | {"age_ms": 9e3}}),
         ("Autopilot", "caution", "tells no position", {"vehicle": None}),
         ("Position", "caution", "unknown", {"vehicle": None}),
         ("Position", "caution", "±22 m", {"vehicle": VEHICLE | {"position_sigma_m": 22.4}}),
@@ -65,8 +65,9 @@ SILENT = "MAVLink link udpin:1: nobody was heard for 5 s"
         ("Decoding", "caution", "kept, not decoded", {"decode": {"mask": "", "calibration": "", "running": False}}),
         ("Decoding", "caution", "off", {"decode": {"mask": "m", "calibration": "", "running": False}}),
         ("Decoding", "caution", "not calibrated", {"decode": {"mask": "m", "calibration": "", "running": True}}),
-        ("Decoding", "caution", "fell behind", {"problems": ["decode fell behind: 2 frames are only in the record"]}),
-        ("Service", "no-go", "has ended", {"problems": ["the capture thread has ended: restart dappled"]}),
+        ("Decoding", "caution", "fell behind", {"stages": [{"name": "decode", "dropped": 2}]}),
+        ("Service", "no-go", "capture ended: restart dappled", {"dead": ["capture"]}),
+        ("Clock", "caution", "not known yet", {"utc_known": False}),
     ],
 )  # fmt: skip
 def test_each_thing_says_what_it_is(name: str, state: str, words: str, changes: dict[str, Any]) -> None:

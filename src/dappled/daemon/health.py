@@ -41,15 +41,19 @@ def record(
     utc_known: bool = True,
 ) -> dict[str, Any]:
     """The facts of a `health` message; `problems` are sentences, none when all is well."""
-    problems = [f"the {name} thread has ended: restart dappled" for name in street.dead()]
+    dead = street.dead()
+    problems = [f"the {name} thread has ended: restart dappled" for name in dead]
     if street.camera_state not in ("starting", "ready", "busy"):
         problems.append(camera_sentence(street))
     if not settings.mavlink.url:
         problems.append("no MAVLink link is configured: frames are tagged without poses")
+    silent = 0
     for link in links:
         if link.error:
+            silent += 1
             problems.append(link.error)
         elif monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS:
+            silent += 1
             problems.append(f"MAVLink link {link.url}: {_silence(link)}")
     if not utc_known:
         problems.append(
@@ -73,6 +77,7 @@ def record(
         "camera": {"state": street.camera_state, "reason": street.camera_reason},
         "link": {
             "urls": len(links),
+            "silent": silent,
             "packets": telemetry.packets,
             "positions": telemetry.positions,
             "each": [_counters(link) for link in links],
@@ -87,6 +92,8 @@ def record(
         },
         "stages": [*stages, _publish(publisher)],
         "problems": problems,
+        "dead": dead,
+        "utc_known": utc_known,
         "interval_s": shutter.interval_s,
         "clock": None if clock is None else {"source": clock.source, "sigma_ms": clock.sigma_ns / 1e6},
         "vehicle": None if vehicle is None or vehicle.latitude_rad is None else _place(vehicle),

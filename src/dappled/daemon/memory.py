@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import ctypes
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # <malloc.h>
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # <malloc.h>
 _LARGE_BYTES = 1 << 30
 
 
 def reuse_large_blocks() -> bool:
-    """Have this process' malloc keep blocks up to 1 GiB. False where its libc has no such setting.
+    """Have this process' malloc keep blocks up to 1 GiB. False where its libc has no such settings.
 
-    glibc gives every block above 32 MiB back at once, and the next one page by page anew: for slices of that size this
-    takes three times as long as receiving them. For programs, not for libraries: it holds for the whole process.
+    glibc gives every block above 32 MiB back at once, and those of other threads than the first when they outgrow
+    64 MiB together; the next one then comes page by page anew, which for slices of that size takes longer than
+    receiving them. For programs, not for libraries: it holds for the whole process.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:
         return False
-    return bool(mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)) and bool(mallopt(_M_TRIM_THRESHOLD, _LARGE_BYTES))
+    wanted = ((_M_MMAP_THRESHOLD, _LARGE_BYTES), (_M_TRIM_THRESHOLD, _LARGE_BYTES), (_M_ARENA_MAX, 1))
+    taken = [mallopt(*one) for one in wanted]
+    return all(taken)

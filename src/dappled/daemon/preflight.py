@@ -36,7 +36,7 @@ def checks(health: Mapping[str, Any], *, frame_bytes: float | None = None) -> li
         _position(health.get("vehicle")),
         _clock(health),
         _decoding(health),
-        _service(health["problems"]),
+        _service(health.get("dead", [])),
     ]
 
 
@@ -65,7 +65,7 @@ def _link(health: Mapping[str, Any]) -> Check:
     link = health["link"]
     if not link["urls"]:
         return Check("Autopilot", "caution", "no link is configured: frames have no poses")
-    silent = sum("MAVLink" in text for text in health["problems"])
+    silent = link.get("silent", 0)
     age_ms = (health.get("vehicle") or {}).get("age_ms")
     if age_ms is not None and age_ms < _FRESH_MS:
         return Check("Autopilot", "go", f"heard; {silent} of {link['urls']} links silent" if silent else "heard")
@@ -85,6 +85,8 @@ def _position(vehicle: Mapping[str, Any] | None) -> Check:
 
 
 def _clock(health: Mapping[str, Any]) -> Check:
+    if not health.get("utc_known", True):
+        return Check("Clock", "caution", "UTC is not known yet: the autopilot will tell it")
     if health["utc_ns"] < _EARLIEST_UTC_NS:
         return Check("Clock", "no-go", "this machine does not know the date")
     clock = health.get("clock")
@@ -101,18 +103,17 @@ def _decoding(health: Mapping[str, Any]) -> Check:
         return Check("Decoding", "caution", "no mask is named: frames are kept, not decoded")
     if not decode["running"]:
         return Check("Decoding", "caution", "off: frames are kept, not decoded")
-    behind = [text for text in health["problems"] if "fell behind" in text]
-    if behind:
-        return Check("Decoding", "caution", behind[0])
+    left = sum(stage["dropped"] for stage in health["stages"] if stage["name"] == "decode")
+    if left:
+        return Check("Decoding", "caution", f"fell behind: {left} frames are only in the record")
     if not decode["calibration"]:
         return Check("Decoding", "caution", f"{decode['mask']}, not calibrated: carriers by the law alone")
     return Check("Decoding", "go", f"{decode['mask']}, calibrated")
 
 
-def _service(problems: Sequence[str]) -> Check:
-    ended = [text for text in problems if "has ended" in text]
-    if ended:
-        return Check("Service", "no-go", ended[0])
+def _service(dead: Sequence[str]) -> Check:
+    if dead:
+        return Check("Service", "no-go", f"{', '.join(dead)} ended: restart dappled")
     return Check("Service", "go", "all parts at work")
 
 

@@ -37,7 +37,7 @@ POSE = {
 }  # fmt: skip
 HEALTH = {
     "utc_ns": 1_800_000_000_000_000_000, "camera": {"state": "ready", "reason": ""},
-    "link": {"urls": 1, "packets": 5, "positions": 5}, "disk": {"free_bytes": 10**11, "folder": "/x"},
+    "link": {"urls": 1, "silent": 0, "packets": 5, "positions": 5}, "disk": {"free_bytes": 10**11, "folder": "/x"},
     "shots": {"wished": 0, "safe": 0, "failed": 0, "pending": 0, "refused": 0}, "stages": [], "problems": [],
     "interval_s": None, "clock": {"source": "timesync", "sigma_ms": 0.1}, "vehicle": None, "min_free_bytes": 0,
     "decode": {"mask": "m", "calibration": "c", "running": True},
