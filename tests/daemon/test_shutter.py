@@ -220,3 +220,21 @@ def test_the_thread_serves_intervals_on_the_real_clock() -> None:
     finally:
         shutter.stop()
     assert fired == [0, 1, 2]
+
+
+def test_every_refusal_is_told() -> None:
+    told: list[str] = []
+    shutter = Shutter(
+        next_index=0,
+        note=lambda _: None,
+        fire=lambda _: None,
+        clock=RecordedClock(10**18),
+        capacity=1,
+        on_refused=lambda refused: told.append(refused[1]),
+    )
+    shutter.start_interval(Wish(PILOT, "IMAGE_START_CAPTURE", 1), -1.0, 0)
+    for sequence in (2, 3):
+        shutter.wish(Wish(PILOT, "IMAGE_START_CAPTURE", sequence))
+    assert len(told) == shutter.statistics().refused == 2
+    assert "an interval is" in told[0]
+    assert "waiting for the camera" in told[1]

@@ -135,8 +135,7 @@ class Shutter:
         if not (math.isfinite(interval_s) and 0 <= interval_s <= 86400) or count < 0:
             with self._lock:
                 self._wishes += 1
-                self._refused += 1
-            return Verdict("refused", reason="an interval is 0 to 86400 s, and a count 0 or more")
+                return self._refuse(wish, "an interval is 0 to 86400 s, and a count 0 or more")
         with self._lock:
             verdict = self._judge(wish)
             if verdict.outcome == "shot" and count != 1:
@@ -224,10 +223,7 @@ class Shutter:
             except (OSError, FlightError) as error:
                 reason = f"the wish could not be written down: {error}"
         if reason is not None:
-            self._refused += 1
-            self._on_refused((wish, reason))
-            log.warning("A shot was refused (%s, %s): %s", wish.source, wish.kind, reason)
-            return Verdict("refused", reason=reason)
+            return self._refuse(wish, reason)
         self._next_index += 1
         self._shots += 1
         self._pending.add(shot.index)
@@ -241,6 +237,12 @@ class Shutter:
             self._failed += 1
             raise
         return Verdict("shot", index=shot.index)
+
+    def _refuse(self, wish: Wish, reason: str) -> Verdict:
+        self._refused += 1
+        self._on_refused((wish, reason))
+        log.warning("A shot was refused (%s, %s): %s", wish.source, wish.kind, reason)
+        return Verdict("refused", reason=reason)
 
     def _why_not(self) -> str | None:
         if self._stopped:
