@@ -90,6 +90,7 @@ def test_fired_by_a_wire_and_picked_up_after_landing(
         assert [tag.focal_length_mm for tag in ledger.tags().values()] == [6.3, 6.3, 6.3, 12.6]
     assert main(pickup) == 0  # again: nothing is left to do
     assert json.loads(capfd.readouterr().out)["there_already"] == 4
+    assert main(["replay", str(flight), "--verify"]) == 0, capfd.readouterr().err
 
 
 def test_a_missing_file_leaves_doubt_that_a_person_settles(

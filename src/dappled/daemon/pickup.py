@@ -153,7 +153,7 @@ def bring(
             row = ledger.shot(number)
             assert row is not None
             facts_of = _settings(folder.path / frame.name)
-            exposure = tagger.mid_exposure(round(_fired(row).fired_s * 1e9), latency, facts_of.exposure_s)
+            exposure = tagger.mid_exposure(_called_utc_ns(row), latency, facts_of.exposure_s)
             exposure, pose = telemetry.pose(number, exposure)
             camera = camera_name(names.get("camera", "auto"), facts_of.model)
             ledger.add_tag(tagger.tag(frame, exposure, facts_of, camera=camera, mask=names.get("mask", ""), pose=pose))
@@ -172,9 +172,13 @@ def bring(
 
 def _fired(row: ShotRow) -> FiredShot:
     """When a shot's shutter was released, in seconds of UTC."""
+    return FiredShot(row.shot.index, _called_utc_ns(row) / 1e9)
+
+
+def _called_utc_ns(row: ShotRow) -> int:
+    """As the street has it, to the nanosecond: a replay makes the same tag."""
     assert row.fired_called_monotonic_ns is not None
-    utc_ns = row.fired_called_monotonic_ns + row.shot.wished_utc_ns - row.shot.wished_monotonic_ns
-    return FiredShot(row.shot.index, utc_ns / 1e9)
+    return row.fired_called_monotonic_ns + row.shot.wished_utc_ns - row.shot.wished_monotonic_ns
 
 
 def _offset(anchors: list[tuple[float | None, FiredShot]]) -> float | None:
