@@ -27,6 +27,7 @@ class FakeMaker:
         self.gate = threading.Event()
         self.gate.set()
         self.problem = ""
+        self.nearest_m: tuple[float, float] | None = None
         self.asked: list[tuple[str, str]] = []
 
     def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> DepthFound:
@@ -38,7 +39,7 @@ class FakeMaker:
         both = np.zeros((2, 2, 3), dtype=np.float32)
         body.write(both.tobytes())
         arrays = [wire.describe_array(name, both[0], "px") for name in ("disparity", "sigma")]
-        return DepthFound(body, arrays, [-0.5, 0.5], [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]], "geometric")
+        return DepthFound(body, arrays, [-0.5, 0.5], [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]], "geometric", self.nearest_m)
 
 
 def story(index: int, *, decoded: bool = True) -> Story:
@@ -58,12 +59,14 @@ class Bench:
     def __init__(self, interval_s: float = 5.0) -> None:
         self.maker, self.now_s = FakeMaker(), 0.0
         self.published: list[tuple[str, dict[str, Any], Any]] = []
+        self.nearest: list[tuple[float, float]] = []
         self.depth = LiveDepth(
             self.maker,
             method="gradient",
             interval_s=interval_s,
             path=lambda one: one.frame.name if one.frame else "",
             publish=lambda topic, facts, body: self.published.append((topic, dict(facts), body)),
+            tell=self.nearest.append,
             clock=lambda: self.now_s,
         )
 
@@ -119,3 +122,13 @@ def test_what_was_not_decoded_has_no_depth_and_a_failure_is_counted(bench: Bench
     eventually(lambda: bench.depth.statistics().failed == 1, "it failed")
     assert [path for path, _ in bench.maker.asked] == ["frames/1.dng"]
     assert bench.published == []
+
+
+def test_the_nearest_distance_is_told_where_it_is_known(bench: Bench) -> None:
+    bench.depth.offer(story(0))
+    eventually(lambda: len(bench.published) == 1, "without metres")
+    bench.maker.nearest_m = (7.5, 0.2)
+    bench.now_s = 10
+    bench.depth.offer(story(1))
+    eventually(lambda: bench.nearest, "it is told")
+    assert bench.nearest == [(7.5, 0.2)]

@@ -51,9 +51,10 @@ def test_metres_need_a_calibration_or_a_focus(path: Path) -> None:
     assert focused.disparity_of(distance_m=distance) == pytest.approx(DISPARITY, rel=1e-6)
     made = focused.distances(focused.depth())
     assert np.nanmedian(made.distance_m) == pytest.approx(distance, rel=0.03)
-    nearest = made.nearest_m()
+    nearest = made.nearest()
     assert nearest is not None
-    assert nearest == pytest.approx(distance, rel=0.1)
+    assert nearest[0] == pytest.approx(distance, rel=0.1)
+    assert 0 < nearest[1] < 0.2 * distance
 
 
 def test_a_kept_ranging_follows_the_f_number() -> None:

@@ -69,7 +69,8 @@ def summary(found: OpenedLightField, made: DepthMap, distances: DistanceMap | No
         told["distance_known"] = float(np.isfinite(distances.distance_m).mean())
         told["distance_m"] = _quartiles(distances.distance_m)
         told["distance_sigma_m"] = _quartiles(distances.sigma_m)
-        told["nearest_m"] = distances.nearest_m()
+        nearest = distances.nearest()
+        told["nearest_m"] = None if nearest is None else nearest[0]
     return told
 
 

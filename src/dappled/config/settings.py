@@ -110,6 +110,9 @@ class DecodeSettings:
     dark: str = setting("", "Dark frame; empty: none")
     workers: int = setting(1, "Threads of one decode; 1 leaves the other core to capture", low=1, high=64)
     depth: str = setting("", "Depth in flight by this method; empty: none", choices=("", *DEPTH_METHODS))
+    depth_to_autopilot: bool = setting(
+        False, "Send the nearest distance as DISTANCE_SENSOR, where the calibration has targets' distances"
+    )
     depth_interval_s: float = setting(5.0, "At most one frame's depth in this time", unit="s", low=0, high=3600)
     queue: int = setting(4, "Frames that may wait; more stay in the record, to be decoded later", low=1, high=1000)
 

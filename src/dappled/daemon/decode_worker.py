@@ -19,8 +19,9 @@ from PIL import Image
 
 from dappled.daemon import wire
 from dappled.daemon.development import NICENESS, serve
-from dappled.decode import depth, evidence
+from dappled.decode import depth, evidence, viewstack
 from dappled.decode.pictures import slice_mosaic
+from dappled.decode.ranging import RANGING, Ranging
 from dappled.drivers.camera import Blob
 from dappled.drivers.camera_channel import Message
 from dappled.drivers.child import end_with_parent
@@ -101,7 +102,13 @@ def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> Reply:
     found = depth.estimate(evidence.of_light_field(field), asked["method"])
     both = [np.ascontiguousarray(one, dtype=np.float32) for one in (found.disparity, found.sigma)]
     known = found.disparity[found.known]
+    ranging = field.attributes.get(RANGING)
+    nearest = None
+    if ranging:
+        metres = Ranging.from_dict(ranging).at(field.attributes.get("f_number"))
+        nearest = metres.distances(found, viewstack.of(field)).nearest()
     facts = {
+        "nearest_m": nearest,
         "arrays": [
             wire.describe_array(name, one, "pixels of a view, from view to view")
             for name, one in zip(("disparity", "sigma"), both, strict=True)

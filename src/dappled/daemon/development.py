@@ -71,13 +71,15 @@ class Developed:
 @dataclass(frozen=True, slots=True)
 class DepthFound:
     """Depth of one frame. `body` holds disparity and sigma, float32 (h, w) each, as `arrays` says; `range_px` the 2nd
-    and 98th percentile of the known disparities, None where none is known; `grid` as in Developed."""
+    and 98th percentile of the known disparities, None where none is known; `grid` as in Developed. `nearest_m` is the
+    nearest distance and its standard error, None where no calibration leads to metres or too little is known."""
 
     body: mmap.mmap
     arrays: list[dict[str, Any]]
     range_px: list[float] | None
     grid: list[list[float]]
     law: str
+    nearest_m: tuple[float, float] | None = None
 
 
 class Developer(Protocol):
@@ -135,7 +137,9 @@ class WorkerDeveloper:
         finally:
             os.close(body_fd)
         told = answer.body
-        return DepthFound(body, told["arrays"], told["range_px"], told["grid"], told["law"])
+        nearest = told["nearest_m"]
+        pair = None if nearest is None else (float(nearest[0]), float(nearest[1]))
+        return DepthFound(body, told["arrays"], told["range_px"], told["grid"], told["law"], pair)
 
     def close(self) -> None:
         """End the worker, also in the middle of a frame, which then is not decoded."""

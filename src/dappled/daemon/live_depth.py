@@ -33,11 +33,14 @@ class LiveDepth:
         path: Callable[[Story], str],
         publish: Publish,
         give_way: Callable[[], object] = lambda: None,
+        tell: Callable[[tuple[float, float]], object] = lambda _: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`path` says where a frame's file stands; `give_way` waits, bounded, while frames wait to be decoded."""
+        """`path` says where a frame's file stands; `give_way` waits, bounded, while frames wait to be decoded; `tell`
+        is given the nearest distance and its standard error in m, where they are known."""
         self._maker, self._method, self._interval_s = maker, method, interval_s
         self._path, self._publish, self._give_way, self._clock = path, publish, give_way, clock
+        self._tell = tell
         self._last_s = -1e9
         self._stage: Stage[Story] = Stage("depth", self._work, capacity=1, policy="drop oldest")
 
@@ -74,3 +77,5 @@ class LiveDepth:
             "arrays": found.arrays,
         }
         self._publish("depth", header, found.body)
+        if found.nearest_m is not None:
+            self._tell(found.nearest_m)

@@ -17,7 +17,7 @@ from typing import Any
 import dappled
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.daemon import curve, ground_facts, health, inputs, links, utc
+from dappled.daemon import curve, distance_sensor, ground_facts, health, inputs, links, utc
 from dappled.daemon.answers import Answers
 from dappled.daemon.books import LiveBook
 from dappled.daemon.cameras import open_camera
@@ -192,9 +192,16 @@ class Service:
             path=lambda story: self._book.path(story.frame) if story.frame else "",
             publish=self._publisher.publish,
             give_way=self._street.decoding_idle,
+            tell=self._tell_distance if self.settings.decode.depth_to_autopilot else lambda _: None,
         )
         self._depth.start()
         stack.callback(self._depth.stop)
+
+    def _tell_distance(self, nearest_m: tuple[float, float]) -> None:
+        boot_ms = (self._clock.monotonic_ns() // 10**6) % 2**32
+        told = distance_sensor.message(nearest_m, boot_ms, self.settings.pose.mount)
+        if told is not None:
+            self._links.send(told)
 
     def _knobs(self, camera: Camera, names: Names, recipe: Recipe | None) -> Knobs:
         """What a ground station may set: the body's settings; and here, whether frames are decoded in flight."""

@@ -108,12 +108,14 @@ class DistanceMap:
     distance_m: Map
     sigma_m: Map
 
-    def nearest_m(self, share: float = 0.01) -> float | None:
-        """The distance that `share` of the known pixels are nearer than; None where fewer than a tenth are known."""
+    def nearest(self, share: float = 0.01) -> tuple[float, float] | None:
+        """(m, σ in m): the distance that `share` of the known pixels are nearer than, and how well such pixels are
+        known; None where fewer than a tenth are known at all."""
         known = np.isfinite(self.distance_m)
         if known.mean() < 0.1:
             return None
-        return float(np.quantile(self.distance_m[known], share))
+        distance = float(np.quantile(self.distance_m[known], share))
+        return distance, float(np.median(self.sigma_m[known & (self.distance_m <= distance)]))
 
 
 @dataclass(frozen=True, slots=True)
