@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
 
+import jsonschema
+import numpy as np
 import pytest
 
 from dappled.cli import main
+from dappled.daemon import wire
+from dappled.daemon.subscriber import Subscriber
 from dappled.mocks.simulation import free_port
 from tests.system.conftest import dappled
 
@@ -80,6 +85,35 @@ def test_a_subscriber_that_was_killed_and_started_again_ends_with_every_frame(tm
     assert f"{frames} frames received" in said
     kept = sorted(int(path.stem) for path in (tmp_path / "received").glob("*.npy"))
     assert kept == list(range(frames))
+
+
+@pytest.mark.slow
+def test_depth_comes_where_it_is_switched_on(tmp_path: Path, sockets: Path) -> None:
+    """As the schema says, with disparities that are known in most of the picture, and a sigma wherever they are."""
+    endpoint = f"ipc://{sockets}/depth"
+    (tmp_path / "dappled.toml").write_text(
+        f'[record]\ndirectory = "flights"\n[publish]\nslices = "{endpoint}"\n[decode]\ndepth = "combined"\n'
+        "depth_interval_s = 0\n"
+    )
+    run = [sys.executable, "-m", "dappled", "run", "--simulate", "--frames", "500", "--config", "dappled.toml"]
+    daemon = subprocess.Popen(run, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        with Subscriber(endpoint, topics=["depth"]) as subscriber:
+            message = subscriber.receive(90)
+        assert message is not None
+        jsonschema.validate(message.header, wire.schema("depth"))
+        arrays = message.arrays()
+        known = np.isfinite(arrays["disparity"])
+        assert arrays["disparity"].shape == arrays["sigma"].shape
+        assert known.mean() > 0.5
+        assert (arrays["sigma"][known] > 0).all()
+        assert message.header["method"] == "combined"
+    finally:
+        daemon.send_signal(signal.SIGTERM)
+        try:
+            daemon.wait(30)
+        finally:
+            daemon.kill()
 
 
 @pytest.mark.parametrize(
