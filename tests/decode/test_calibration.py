@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +11,7 @@ from dappled.decode.calibrated import Calibration, at_centre, at_corner
 from dappled.decode.calibration import CalibrationFrame, calibrate, origin_of
 from dappled.decode.carriers import Lattice
 from dappled.decode.errors import DecodeError
-from dappled.decode.masks import Mask
+from dappled.decode.masks import Mask, Pattern
 from dappled.decode.views import transfer
 from tests.decode.rays import FOCAL_MM, MASK, SENSOR, STATED_DISTANCE_MM, STOPPED_F, Camera, Texture
 
@@ -116,3 +117,48 @@ def test_a_mask_printed_at_another_size_keeps_the_stated_distance() -> None:
     assert not fit.distance_fitted
     assert fit.mask_distance_mm == STATED_DISTANCE_MM
     assert math.hypot(*fit.lattice.kx) == pytest.approx(math.hypot(*camera.lattice.kx), rel=1e-4)
+
+
+def _of_another_print(pattern: Pattern) -> tuple[Camera, Callable[[], Calibration]]:
+    """A camera whose mask has 12.4 lines a millimetre, and a calibration that was told 15.5."""
+    camera = Camera(0.48, 0.02, (0.004, 0.007), mask=Mask(12.4, 2, pattern))
+    plane = camera.expose([(Texture.random(np.random.default_rng(3)), 1.0)], STOPPED_F)
+    return camera, lambda: calibrate(
+        [CalibrationFrame(plane, FOCAL_MM, STOPPED_F)],
+        sensor=SENSOR,
+        mask=Mask(15.5, 2, pattern),
+        law="geometric",
+        mask_distance_mm=STATED_DISTANCE_MM,
+    )
+
+
+def test_a_lattice_that_no_law_foresaw_is_found_and_called_so() -> None:
+    camera, calibration = _of_another_print("full")
+    found = calibration()
+    (fit,) = found.fits
+    np.testing.assert_allclose(fit.lattice.matrix(), camera.lattice.matrix(), atol=1e-4)
+    assert not fit.distance_fitted
+    assert found.verdict.startswith("neither law explains")
+    assert len(fit.seen) == len(MASK.half_orders()) - 1
+
+
+def test_the_few_carriers_of_a_diagonal_mask_are_not_made_into_a_wrong_lattice() -> None:
+    _, calibration = _of_another_print("diagonal")
+    with pytest.raises(DecodeError, match="check mask, camera and focal length"):
+        calibration()
+
+
+def test_the_other_law_s_frames_are_found_too() -> None:
+    camera = Camera.hidden(4)
+    plane = camera.expose([(Texture.random(np.random.default_rng(3)), 1.0)], STOPPED_F)
+    for choose, law in ((False, "fd"), (True, "geometric")):
+        found = calibrate(
+            [CalibrationFrame(plane, FOCAL_MM, STOPPED_F)],
+            sensor=SENSOR,
+            mask=MASK,
+            law="fd",
+            mask_distance_mm=STATED_DISTANCE_MM,
+            choose_law=choose,
+        )
+        assert found.law == law
+        np.testing.assert_allclose(found.lattice_at(FOCAL_MM).matrix(), camera.lattice.matrix(), atol=2e-5)

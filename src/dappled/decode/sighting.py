@@ -20,6 +20,7 @@ from dappled.decode.slices import default_size, extract
 from dappled.decode.spectrum import Spectrum
 
 _SEARCH = 0.12  # of a carrier's frequency: 2° of rotation and, under the fd law, 10 % of the mask's distance
+_ALIKE_BINS = 0.5  # rms from their lattice: what lies farther off are peaks of the scene
 _ENOUGH = 0.6  # of a mask's carriers: a prediction near which so many stand is the right one
 
 
@@ -141,12 +142,18 @@ def _verified(
         looked = [c for c in lattice.carriers(mask.half_orders()) if c.on_sensor and (c.ky, c.kx) != (0, 0)]
         peaks = measure(spectrum, looked, radius)
         found = [(c, m) for c, m in zip(looked, peaks, strict=True) if m is not None]
-        if len(found) < 2 or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in found]) < 2:
+        if len(found) < min(3, len(looked)) or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in found]) < 2:
             raise DecodeError(
                 f"only {len(found)} of {len(looked)} carriers show: calibrate on a frame at a small aperture "
                 "(an eighth of the widest)"
             )
         lattice = fit(found)
+    carriers = lattice.carriers([(c.ky, c.kx) for c, _ in found])
+    if residual_bins(carriers, [m for _, m in found], spectrum) > _ALIKE_BINS:
+        raise DecodeError(
+            f"{len(found)} peaks stand near the prediction, but on no common lattice: calibrate on a frame at a small "
+            "aperture (an eighth of the widest), and check mask, camera and focal length"
+        )
     return lattice, found, len(found) / len(looked)
 
 
