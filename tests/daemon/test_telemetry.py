@@ -15,12 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dappled.daemon.boot_clock import Answer, from_arrivals, from_timesync
-from dappled.daemon.interpolation import hermite, metres_per_radian, normalised, slerp, turn_rad
+from dappled.daemon.interpolation import from_euler, hermite, metres_per_radian, normalised, slerp, turn_rad
 from dappled.daemon.telemetry import Telemetry, first_position_utc_ns
 from dappled.drivers.mavlink import Decoder, Message, mavlink
 from dappled.flight.records import Pose, digest
 from dappled.mocks.autopilot import BootTime, flight
-from dappled.mocks.path import Path, TruePose, from_euler
+from dappled.mocks.path import Path, TruePose
 
 START_NS = 1_790_000_000 * 10**9
 BOOT = BootTime()

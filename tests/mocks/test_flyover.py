@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dappled.daemon.interpolation import from_euler
 from dappled.mocks import flyover
 from dappled.mocks.flyover import Terrain
 from dappled.mocks.lens import Rays
-from dappled.mocks.path import Path, TruePose, from_euler
+from dappled.mocks.path import Path, TruePose
 
 V_MM = 50.0
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from dappled.config.profiles import Lens
+from dappled.daemon.interpolation import from_euler
 from dappled.decode.carriers import Sensor
-from dappled.mocks.path import from_euler
 from dappled.products import camera_pose
 from dappled.products import eye as eyes
 from dappled.products.camera_pose import NADIR

@@ -14,10 +14,11 @@ import pytest
 import rasterio
 
 from dappled.cli import main
+from dappled.daemon.interpolation import from_euler
 from dappled.errors import DappledError
 from dappled.flight import recording
 from dappled.flight.records import Tag
-from dappled.mocks.path import TruePose, from_euler
+from dappled.mocks.path import TruePose
 from dappled.products import camera_pose, difference, georeference, photographs
 from dappled.products.earth import Projection
 from dappled.products.georeference import Options

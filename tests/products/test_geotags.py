@@ -20,12 +20,12 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from dappled.cli import main
+from dappled.daemon.interpolation import from_euler
 from dappled.drivers import exif
 from dappled.errors import DappledError
 from dappled.flight import recording
 from dappled.flight.check import check
 from dappled.flight.records import Gnss, Pose
-from dappled.mocks.path import from_euler
 from dappled.products import camera_pose, exif_gps, geotags, sidecars
 from dappled.products.camera_pose import FORWARD, NADIR, Angles
 from dappled.products.earth import Geoid

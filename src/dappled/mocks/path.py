@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dappled.daemon.interpolation import metres_per_radian
+from dappled.daemon.interpolation import conjugate, from_euler, metres_per_radian, multiply
 from dappled.flight.records import Quaternion, Vector3
 
 
@@ -50,7 +50,7 @@ class Path:
         step = 1e-3
         before, now, after = (self._place(t_s + dt) for dt in (-step, 0.0, step))
         velocity = (np.array(after[0]) - np.array(before[0])) / (2 * step)
-        turn = _multiply(_conjugate(before[1]), after[1])  # small rotation in body axes over two steps
+        turn = multiply(conjugate(before[1]), after[1])  # small rotation in body axes over two steps
         sign = math.copysign(1.0, turn[0])
         rates = tuple(float(2 * sign * c / (2 * step)) for c in turn[1:])
         north, east, down = now[0]
@@ -79,31 +79,3 @@ class Path:
         pitch = math.radians(-3) + math.radians(2.5) * math.sin(1.1 * t_s + phase[3])
         roll = math.radians(4) + math.radians(3) * math.sin(0.9 * t_s + phase[4])
         return (north, east, down), from_euler(roll, pitch, yaw)
-
-
-def from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
-    """Aerospace angles (yaw, then pitch, then roll) as a quaternion, body to north-east-down."""
-    cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
-    cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
-    cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
-
-
-def _conjugate(q: Quaternion) -> Quaternion:
-    return q[0], -q[1], -q[2], -q[3]
-
-
-def _multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
-    return (
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    )
