@@ -37,6 +37,7 @@ def _score(camera: MaskedCamera, folder: Path, *, least_disparity_px: float) -> 
     darkroom = Darkroom(Recipe(CAMERA, MASK, calibration=str(folder / "calibration.toml"), workers=2))
     found = darkroom.develop(folder / "frame.dng").light_field
     assert found.attributes["carriers_from"] == "calibrated"
+    assert found.attributes["decoded_from"] == ("grey" if camera.sensor.mono else "mosaic")
     return score(found, exposure.truth, least_disparity_px=least_disparity_px, pixel_mm=camera.sensor.pitch_mm)
 
 

@@ -144,6 +144,7 @@ class Darkroom:
             **light_field.attributes,
             "camera": self.camera_name(raw.camera_model),
             "mask": self.recipe.mask,
+            "decoded_from": "grey" if raw.cfa is None else "mosaic",
             **(self._ranging() if views else {}),
         }
         return Development(replace(light_field, attributes=attributes), report, raw, ms)
