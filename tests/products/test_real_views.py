@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy import ndimage
 
+import dappled
 from dappled.products import opened
 
 
@@ -38,3 +40,18 @@ def test_the_head_is_nearer_than_the_fence(shared_data: Path) -> None:
     depth = opened.light_field(shared_data / "views" / "lytro_2067").depth("contrast")
     head, fence = depth.disparity[190:230, 60:140], depth.disparity[60:120, 60:180]
     assert np.nanmedian(head) > np.nanmedian(fence) + 0.8
+
+
+@pytest.mark.slow
+def test_under_lenslets_nearer_is_larger_too(shared_data: Path) -> None:
+    """A lenslet turns the aperture's picture round; the bust of this made raw stands before its wall all the same."""
+    folder = shared_data / "lenslet" / "lytro_like"
+    frame = dappled.open(
+        folder / "raw.png", mask="lenslet", white=str(folder / "white.png"), cfa="BGGR", black=168, white_level=4095
+    )
+    assert isinstance(frame, opened.OpenedFrame)
+    depth = frame.depth("contrast")
+    assert frame.views.shape[:2] == (9, 9)
+    head, wall = depth.disparity[60:120, 180:280], depth.disparity[100:200, 350:430]
+    assert np.nanmedian(head) > 0.5
+    assert np.nanmedian(wall) < -0.5
