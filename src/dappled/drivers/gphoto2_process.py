@@ -58,7 +58,7 @@ from dappled.drivers.gphoto2_settings import GPhoto2Settings, parse_settings
 _WAITING = 64
 _SEND_S = 5.0
 _POLL_BUSY_S = 0.005
-_POLL_IDLE_S = 1.0
+_POLL_IDLE_S = 0.3
 _BUSY_RETRY_S = 0.05
 _REOPEN_S = 0.25
 _TRIES = 3
