@@ -64,7 +64,8 @@ def test_the_autopilot_process_flies_the_path_in_its_own_time(camera: Camera) ->
         while not camera.telemetry.bracketed(utc_ns) and time.monotonic() < deadline:
             time.sleep(0.01)
         pose = camera.telemetry.pose_at(utc_ns, 0)
-        t_s = (utc_ns - camera.clock.utc_minus_monotonic_ns - start_ns) / 1e9
+        offset_ns = camera.clock.utc_ns() - camera.clock.monotonic_ns()
+        t_s = (utc_ns - offset_ns - start_ns) / 1e9
         truth = Path(4).pose(t_s)
         assert pose.source == "interpolated"
         assert pose.attitude is not None
