@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from dappled.daemon.interpolation import metres_per_radian
 from dappled.mocks.path import TruePose
-from dappled.products import georeference, hyperstereo, mosaic, refine, terrain
+from dappled.products import control, georeference, hyperstereo, mosaic, refine, terrain
 from dappled.products.basemap import BaseMap, BaseMapError
+from dappled.products.control import ControlError
 from dappled.products.eye import turn
 from dappled.products.georeference import Options, Survey
 from dappled.products.ground import Flat
 from dappled.products.ground import load as load_ground
 from dappled.products.photographs import Photograph
-from dappled.products.refine import RefineError
 from tests.products import flown
 from tests.products.flown import Flown
 from tests.products.test_eye import eye_at
@@ -143,9 +143,9 @@ def test_control_points_place_a_frame(rough: Case, tmp_path: Path) -> None:
         pixel = f"{truth.grid[1, 1] * column},{truth.grid[0, 0] * row}"
         lines.append(f"p{number},{one.name}.dng,{pixel},{float(latitude):.10f},{float(longitude):.10f},{altitude}")
     (tmp_path / "gcp.csv").write_text("\n".join(lines))
-    control = refine.read_control(tmp_path / "gcp.csv", rough.survey.projection)
+    points = control.read(tmp_path / "gcp.csv", rough.survey.projection)
     better, said = refine.refine(
-        rough.survey.photographs, rough.survey.ground, control=control, sigmas=(2.0, math.radians(1))
+        rough.survey.photographs, rough.survey.ground, control=points, sigmas=(2.0, math.radians(1))
     )
     gsd_m = one.eye.gsd_m(rough.flown.path.home_altitude_msl_m)
     assert said[1].why is None
@@ -203,13 +203,13 @@ def test_bad_control_points_and_base_maps_are_sentences(exact: Case, tmp_path: P
         ("name,frame,column,row,latitude,longitude,altitude\na,0,1,2,141,9,3\n", "no place on Earth"),
     ):
         path.write_text(text)
-        with pytest.raises(RefineError, match=said):
-            refine.read_control(path, projection)
-    with pytest.raises(RefineError, match="can't be read"):
-        refine.read_control(tmp_path / "none.csv", projection)
+        with pytest.raises(ControlError, match=said):
+            control.read(path, projection)
+    with pytest.raises(ControlError, match="can't be read"):
+        control.read(tmp_path / "none.csv", projection)
     path.write_text("name,frame,column,row,latitude,longitude,altitude\na,999,1,2,41,9,3\n")
-    with pytest.raises(RefineError, match="names frame 999"):
-        refine.refine(exact.survey.photographs[:1], exact.survey.ground, control=refine.read_control(path, projection))
+    with pytest.raises(ControlError, match="names frame 999"):
+        refine.refine(exact.survey.photographs[:1], exact.survey.ground, control=control.read(path, projection))
     with rasterio.open(exact.folder / "base.tif") as read:
         profile = {**read.profile, "transform": rasterio.Affine(1e-6, 0, 10.0, 0, -1e-6, 50.0)}
         with rasterio.open(tmp_path / "elsewhere.tif", "w", **profile) as target:

@@ -16,6 +16,7 @@ from dappled.drivers.darkroom import Darkroom, Development, Recipe
 from dappled.errors import DappledError
 from dappled.flight import durable
 from dappled.flight.records import Frame, Tag
+from dappled.products import control as control_points
 from dappled.products import footprints, maps, photographs, refine
 from dappled.products.basemap import BaseMap
 from dappled.products.earth import Geoid, Projection, utm
@@ -159,7 +160,7 @@ def refined(
     raster = None if base is None else BaseMap(base, made.projection, made.gsd_m)
     if raster is not None:
         raster.check(np.concatenate([maps.footprint(one.eye, made.ground)[:, :2] for one in made.photographs]))
-    points = [] if control is None else refine.read_control(control, made.projection)
+    points = [] if control is None else control_points.read(control, made.projection)
     photos, judged = refine.refine(
         made.photographs,
         made.ground,

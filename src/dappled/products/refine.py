@@ -5,21 +5,18 @@ Each frame is judged by itself. Where too little agrees it keeps its recorded po
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.errors import DappledError
 from dappled.products import matching
 from dappled.products.adjust import Marks, Solution, Ties, adjust
 from dappled.products.basemap import BaseMap
-from dappled.products.earth import Projection
+from dappled.products.control import ControlError, ControlPoint
 from dappled.products.eye import Eye
 from dappled.products.ground import Ground
 from dappled.products.maps import between, footprint, sample, smoothed_to
@@ -39,10 +36,6 @@ _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1.0, math.radians(0.5)  # a base map may over
 _FARTHEST = 5.0  # sigmas
 
 
-class RefineError(DappledError):
-    """A refinement that can't begin; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class Refinement:
     """What became of one frame. `why` it kept its recorded pose, or None; sigmas are what is left to doubt."""
@@ -58,16 +51,6 @@ class Refinement:
     def facts(self) -> dict[str, Any]:
         """For reports."""
         return {"refined": self.why is None, **asdict(self)}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ControlPoint:
-    """A measured place (east, north, height on the map) and the sensor pixel (column, row) of a frame that shows it."""
-
-    name: str
-    frame: str
-    pixel: tuple[float, float]
-    place: tuple[float, float, float]
 
 
 def refine(
@@ -119,34 +102,6 @@ def refine(
         for one, eye, said in zip(photographs, solution.eyes, judged, strict=True)
     ]
     return better, judged
-
-
-def read_control(path: Path, projection: Projection) -> list[ControlPoint]:
-    """Control points from CSV with the columns name, frame, column, row, latitude, longitude, altitude: pixels of the
-    frame as the camera made it, degrees, metres above sea level. Raises RefineError naming the line."""
-    wanted = ("name", "frame", "column", "row", "latitude", "longitude", "altitude")
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.DictReader(file, skipinitialspace=True)
-            missing = [name for name in wanted if name not in (rows.fieldnames or ())]
-            if missing:
-                raise RefineError(f"{path} lacks the column {missing[0]}: its first line must name {', '.join(wanted)}")
-            found = []
-            for row in rows:
-                try:
-                    column, line, latitude, longitude, altitude = (float(row[name]) for name in wanted[2:])
-                except (TypeError, ValueError):
-                    raise RefineError(f"{path}, line {rows.line_num}: a number is missing or is none") from None
-                if not (abs(latitude) <= 90 and math.isfinite(longitude + altitude + column + line)):
-                    raise RefineError(f"{path}, line {rows.line_num}: {latitude}, {longitude} is no place on Earth")
-                east, north = projection.to_map(latitude, longitude)
-                place = (float(east), float(north), altitude)
-                found.append(ControlPoint(row["name"], Path(row["frame"]).stem, (column, line), place))
-    except OSError as error:
-        raise RefineError(f"the control points {path} can't be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise RefineError(f"the control points {path} are no text in UTF-8") from None
-    return found
 
 
 def _to_base(
@@ -265,7 +220,7 @@ def _to_control(photographs: Sequence[Photograph], control: Sequence[ControlPoin
     numbers = {one.name: number for number, one in enumerate(photographs)}
     for point in control:
         if point.frame not in numbers:
-            raise RefineError(f"control point {point.name} names frame {point.frame}, which is not among those mapped")
+            raise ControlError(f"control point {point.name} names frame {point.frame}, which is not among those mapped")
     groups: list[Marks | Ties] = []
     for name, number in numbers.items():
         mine = [point for point in control if point.frame == name]
