@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -132,6 +133,7 @@ def _dismiss(worker: _Worker) -> None:
 
 def _work(door: Connection, make: Make) -> None:
     """A worker's life: a job in, an answer out, until nobody is there any more."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a person's Ctrl-C is for the one who hands out the jobs
     single_threaded()
     while True:
         try:
