@@ -121,8 +121,11 @@ class MaskDecoder:
             spectrum = plan.spectrum(plane, workers=self.workers, largest_fx=reach)
             lattice, measured, carriers_from = self.locate(spectrum, focal_length_mm, predicted)
             used = [c for c in lattice.carriers([(c.ky, c.kx) for c in predicted]) if c.on_sensor]
-            looking = Noise(spectrum)
             size = self.slice_size(lattice)
+            needed = max(abs(c.fx) for c in used) + (size[1] / 2 + 1) / spectrum.padded[1]
+            if reach < min(0.5, needed):  # a lattice found at the edge of the search
+                spectrum = plan.spectrum(plane, workers=self.workers, largest_fx=min(0.5, needed))
+            looking = Noise(spectrum)
             slices = plan.cut(spectrum, used, size, workers=self.workers, beside=looking.work)
             noise = looking.rms()
         if views:
@@ -151,10 +154,11 @@ class MaskDecoder:
         """The largest frequency along columns that slices and searches ask for, in cycles/pixel."""
         predicted = self.predict(focal_length_mm)
         wide = padded_shape(self.sensor.shape)[1]
+        turned = 0.0 if self.calibration is not None else _ROTATION
+        longer = self.lattice_at(focal_length_mm + self.focal_sigma_mm).carriers([(c.ky, c.kx) for c in predicted])
+        reach = max(abs(c.fx) * (1 + turned) + abs(c.fx - far.fx) for c, far in zip(predicted, longer, strict=True))
         width = self.slice_size(self.lattice_at(focal_length_mm))[1]
-        radii = self._radii(predicted, focal_length_mm)
-        outermost = max(abs(c.fx) + radius / wide for c, radius in zip(predicted, radii, strict=True))
-        return min(0.5, outermost + max(width / 2 * (1 + _ROTATION), 8) / wide)
+        return min(0.5, reach + (max(width / 2, max(self._radii(predicted, focal_length_mm)) + 8) + 2) / wide)
 
     def slice_size(self, lattice: Lattice) -> tuple[int, int]:
         """(height, width) of the bands in bins of the padded transform."""
