@@ -130,16 +130,23 @@ def confidence(likelihood: Volume, best: Map, samples: float) -> Map:
 
 
 def judged(
-    disparity: Map, curvature: Map, sure: Map, *, spread: float, method: str, most_sigma: float = 0.25
+    disparity: Map,
+    curvature: Map,
+    sure: Map,
+    *,
+    spread: float,
+    method: str,
+    most_sigma: float = 0.25,
+    bias: float = 0.0,
 ) -> DepthMap:
     """The map: standard errors from curvatures of the likelihood, unknown where these or the confidence won't do.
 
-    `spread` is variance over information, from `windowed`.
+    `spread` is variance over information, from `windowed`; `bias` what a method is known to be off by, in px/view.
     """
     with np.errstate(divide="ignore"):
         noise = np.float32(_SCATTER**2 * spread) / curvature
     edge = _EDGE + _EDGE_SHARE * np.abs(disparity)
-    sigma = np.sqrt(noise + edge**2)
+    sigma = np.sqrt(noise + edge**2 + bias**2)
     known = (sure >= _LEAST_CONFIDENCE) & (sigma <= most_sigma)
     unknown = np.float32(np.nan)
     return DepthMap(
