@@ -37,8 +37,13 @@ class Flusher:
         while not self._closing.is_set():
             self._dirty.wait()
             self._closing.wait(self._interval_s)
-            self._dirty.clear()  # before the sync: a write during it is told of again
-            try:
-                os.fdatasync(self._fd)
-            except OSError as error:
-                self.error = error
+            self._sync()
+        if self._dirty.is_set():
+            self._sync()  # written, then closed, while the last one ran
+
+    def _sync(self) -> None:
+        self._dirty.clear()  # before the sync: a write during it is told of again
+        try:
+            os.fdatasync(self._fd)
+        except OSError as error:
+            self.error = error
