@@ -135,6 +135,7 @@ def _play(
         recording.telemetry,
         recording.horizons,
         wait_s=recorded.pose.wait_ms / 1e3,
+        vehicles=recording.vehicles,
         component_id=recorded.mavlink.component_id,
         attitude_sigma_rad=math.radians(recorded.pose.attitude_sigma_deg),
     )

@@ -92,6 +92,11 @@ class Component:
         """The system that the camera belongs to, as far as decided."""
         return self._identity.system_id
 
+    @property
+    def vehicle(self) -> int | None:
+        """The system whose telemetry counts (see `Identity.vehicle`)."""
+        return self._identity.vehicle()
+
     # what comes in
 
     def on_packet(self, packet: Packet) -> None:

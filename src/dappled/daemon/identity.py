@@ -40,6 +40,12 @@ class Identity:
                 self.system_id = next(iter(self.autopilots))
         return self.settled
 
+    def vehicle(self) -> int | None:
+        """Whose telemetry counts: our own system's, once that is decided. None while no autopilot was heard, or only
+        one of another system: its is better than none."""
+        known = self.settled and (len(self.autopilots) > 1 or self.system_id in self.autopilots)
+        return self.system_id if known else None
+
     def autopilot(self) -> tuple[int, int] | None:
         """(system id, link) of our own autopilot; None while it was not heard."""
         link = self.autopilots.get(self.system_id)

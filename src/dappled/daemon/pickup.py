@@ -16,7 +16,7 @@ from statistics import median
 from typing import Any
 
 from dappled.config import settings as configuration
-from dappled.daemon import tagger
+from dappled.daemon import tagger, vehicles
 from dappled.daemon.replay import RecordedTelemetry
 from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency
 from dappled.drivers import rawfile
@@ -128,10 +128,13 @@ def bring(
     settings = configuration.of_tables(facts.get("settings", {}), str(folder.settings))
     names = facts.get("names", {})
     latency = BodyLatency(settings.camera.latency_ms, settings.camera.latency_sigma_ms, LATENCY_SOURCE)
+    with LedgerReader.open(folder.ledger) as reader:
+        turns = vehicles.of_flight(reader)
     telemetry = RecordedTelemetry(
         folder.telemetry if folder.telemetry.is_file() else None,
         {},
         wait_s=settings.pose.wait_ms / 1e3,
+        vehicles=turns,
         component_id=settings.mavlink.component_id,
         attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
     )

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import sleep
 
+from dappled.daemon import vehicles
 from dappled.daemon.books import Expected, ReplayBook
 from dappled.daemon.clock import RecordedClock
 from dappled.daemon.story import Story
@@ -33,7 +34,8 @@ class ReplayError(DappledError):
 @dataclass(frozen=True, slots=True)
 class Recording:
     """What is to be replayed: shots in order with their files, the telemetry beside them, and what was recorded of
-    each. `horizons` says how many telemetry packets a frame's pose was made from."""
+    each. `horizons` says how many telemetry packets a frame's pose was made from; `vehicles` whose they were (see
+    `Telemetry`)."""
 
     root: Path
     shots: Sequence[Shot]
@@ -41,6 +43,7 @@ class Recording:
     expected: Sequence[Expected]
     telemetry: Path | None
     horizons: dict[int, int]
+    vehicles: Sequence[tuple[int, int]] = ()
 
 
 def of_flight(folder: Path, run: str = LIVE) -> Recording:
@@ -53,6 +56,7 @@ def of_flight(folder: Path, run: str = LIVE) -> Recording:
         digests = {table: ledger.digests(table) for table in ("poses", "tags")}
         results = ledger.results(run)
         events = [event for event in ledger.events() if event.index is not None]
+        turns = vehicles.of_flight(ledger)
     told: dict[int | None, dict[str, str]] = defaultdict(dict)
     for event in events:
         told[event.index][event.kind] = event.text
@@ -76,7 +80,7 @@ def of_flight(folder: Path, run: str = LIVE) -> Recording:
         raise ReplayError(f"{folder} holds no frames: there is nothing to replay")
     telemetry = flight.telemetry if flight.telemetry.is_file() else None
     horizons = {index: pose.telemetry_packets for index, pose in poses.items()}
-    return Recording(folder, [row.shot for row in rows], files, expected, telemetry, horizons)
+    return Recording(folder, [row.shot for row in rows], files, expected, telemetry, horizons, turns)
 
 
 def of_folder(
@@ -123,12 +127,13 @@ class RecordedTelemetry:
         horizons: dict[int, int],
         *,
         wait_s: float,
+        vehicles: Sequence[tuple[int, int]] = (),
         component_id: int = 100,
         attitude_sigma_rad: float = 0.0,
     ) -> None:
-        """`component_id` and `attitude_sigma_rad` are those that the recording daemon had."""
+        """`vehicles`, `component_id` and `attitude_sigma_rad` are those that the recording daemon had."""
         self._horizons, self._wait_ns = horizons, round(wait_s * 1e9)
-        self._telemetry = Telemetry(component_id=component_id, attitude_sigma_rad=attitude_sigma_rad)
+        self._telemetry = Telemetry(vehicles=vehicles, component_id=component_id, attitude_sigma_rad=attitude_sigma_rad)
         self._packets = _packets(path) if path else iter(())
         self._fed = 0
 

@@ -37,6 +37,7 @@ from dappled.daemon.street import Street
 from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency, Exposure
 from dappled.daemon.telemetry import Telemetry, UtcCorrection
 from dappled.daemon.utc import UtcLearner
+from dappled.daemon.vehicles import Vehicles
 from dappled.drivers.camera import Camera, Identity, SettingsChanged, StateChanged
 from dappled.drivers.darkroom import Recipe
 from dappled.drivers.mavlink import Packet, mavlink
@@ -115,6 +116,7 @@ class Service:
                 self._facts(names, recipe),
                 utc_known=utc_known,
             )
+            self._vehicles = Vehicles(self._telemetry, self._recording.ledger.set_fact)
             self._utc = UtcLearner(known=utc_known, note=self._learn_utc)
             stack.callback(self._remove_litter)
             stack.callback(self._close_recording)
@@ -241,6 +243,7 @@ class Service:
         """One turn of the working loop."""
         if self._component is not None and self.settings.mavlink.url:
             self._component.tick()
+            self._look_whose()
         self._write_notes()
         now_ns = self._clock.monotonic_ns()
         if now_ns >= self._health_due_ns:
@@ -398,6 +401,13 @@ class Service:
             self._telemetry.feed(packet.number, packet.stamp_us, packet.message)
         if self._component is not None:
             self._component.on_packet(packet)
+
+    def _look_whose(self) -> None:
+        assert self._component is not None
+        try:
+            self._vehicles.look(self._component.vehicle)
+        except DappledError as error:
+            report(log, "vehicle", error)
 
     def _look_for_utc(self) -> None:
         try:

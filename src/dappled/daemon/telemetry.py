@@ -8,7 +8,8 @@ gets the very same floats, also when it has read on already (by less than a minu
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from dappled.daemon import feedback, telemetry_pose, telemetry_samples
@@ -55,36 +56,45 @@ class UtcCorrection:
 
 
 class Telemetry:
-    """History of one vehicle: `system_id`, or the first autopilot (component 1) that sends a position or attitude.
+    """History of one vehicle: the one of `follow`; until that is told, the first autopilot (component 1) heard.
 
+    `vehicles` are (packet number, system id) in order, as `follow` gave them in a flight that is folded again.
     `component_id` is our own (see AutopilotTime). `attitude_sigma_rad` is how well the autopilot knows its attitude,
     where it doesn't tell; 0 is not known. All methods may be called from any thread.
     """
 
     def __init__(
-        self, *, system_id: int | None = None, component_id: int = 100, attitude_sigma_rad: float = 0.0
+        self, *, vehicles: Sequence[tuple[int, int]] = (), component_id: int = 100, attitude_sigma_rad: float = 0.0
     ) -> None:
-        self._system_id, self._attitude_sigma_rad = system_id, attitude_sigma_rad
+        self._system_id: int | None = None
+        self._turns = deque(vehicles)
+        self._component_id, self._attitude_sigma_rad = component_id, attitude_sigma_rad
         self._lock = threading.Lock()
-        self._time = AutopilotTime(component_id)
         self._packets = 0
-        self._positions: list[PositionSample] = []
-        self._attitudes: list[AttitudeSample] = []
-        self._receiver: list[GnssSample] = []
-        self._gimbals = Gimbals()
-        self._feedbacks: list[Feedback] = []
+        self._forget()
         self._positions_seen = self._attitudes_seen = self._feedbacks_seen = 0
         self._out_of_order = 0
 
     def feed(self, number: int, stamp_us: int, message: Message) -> None:
         """Fold in one packet. Numbers must rise. Messages of no interest only count."""
         with self._lock:
+            while self._turns and self._turns[0][0] <= number:
+                self._turn_to(self._turns.popleft()[1])
             self._packets = number + 1
             handler = _HANDLERS.get(message.get_type())
             if handler is not None:
                 handler(self, number, stamp_us * 1000, message)
                 if number % _PRUNE_EVERY == 0:
                     self._prune(stamp_us * 1000 - HISTORY_NS)
+
+    def follow(self, system_id: int) -> int:
+        """Whose history this is from the next packet on; what was known of another vehicle is forgotten then.
+
+        Returns the number of that packet: with it, a replay turns at the same place.
+        """
+        with self._lock:
+            self._turns.append((self._packets, system_id))
+            return self._packets
 
     def boot_clock(self, upto_packet: int | None = None) -> BootClock | None:
         """The autopilot's clock against ours, as known from the packets below the limit; None while unknown."""
@@ -171,6 +181,19 @@ class Telemetry:
                 self._feedbacks_seen,
                 self._gimbals.seen,
             )
+
+    def _turn_to(self, system_id: int) -> None:
+        if system_id != self._system_id:
+            self._system_id = system_id
+            self._forget()
+
+    def _forget(self) -> None:
+        self._time = AutopilotTime(self._component_id)
+        self._positions: list[PositionSample] = []
+        self._attitudes: list[AttitudeSample] = []
+        self._receiver: list[GnssSample] = []
+        self._gimbals = Gimbals()
+        self._feedbacks: list[Feedback] = []
 
     def _feed_position(self, number: int, stamp_ns: int, message: Message) -> None:
         sample = telemetry_samples.position(number, stamp_ns, message)
