@@ -1,7 +1,7 @@
 """One picture of the simulated reference camera as a file, to try the commands on.
 
-    python -m dappled.mocks.shoot frame.dng
-    python -m dappled.mocks.shoot white.dng --scene white --f-number 59.2
+python -m dappled.mocks.shoot frame.dng
+python -m dappled.mocks.shoot white.dng --scene white --f-number 59.2
 """
 
 from __future__ import annotations
