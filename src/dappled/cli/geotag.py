@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from dappled.daemon import late_tags
+from dappled.errors import DappledError
 from dappled.flight import layout
 from dappled.products import camera_pose, earth, geotags
 from dappled.products.earth import EarthError, Geoid
@@ -52,6 +55,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     facts = layout.read_facts(layout.open_folder(arguments.flight))
+    tagged_late = _tag_late(arguments.flight)
     mounting = _mounting(arguments, facts.get("settings", {}).get("pose", {}))
     written = geotags.write(
         arguments.flight,
@@ -71,6 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
                     "placed": written.placed,
                     "without_position": written.without_position,
                     "without_tag": written.without_tag,
+                    "tagged_late": tagged_late,
                     "copies": copied,
                     "without_copy": without_copy,
                     "geoid": mounting.geoid.name if mounting.geoid else None,
@@ -89,6 +94,18 @@ def run(arguments: argparse.Namespace) -> int:
         if name not in (*written.without_position, *written.without_tag):
             print(f"no copy of {name}: {reason}", file=sys.stderr)
     return 0
+
+
+def _tag_late(flight: Path) -> list[int]:
+    """What a crash left untagged is tagged first; where that can't be done, the others are placed all the same."""
+    try:
+        added = late_tags.add_missing(flight, time.time_ns)
+    except DappledError as error:
+        print(f"frames without a tag stay so: {error}", file=sys.stderr)
+        return []
+    if added:
+        print(f"{len(added)} frames that the end of the recording had left untagged are tagged now", file=sys.stderr)
+    return added
 
 
 def _copies(flight: Path, folder: Path, mounting: Mounting) -> Iterable[tuple[str, Path | str]]:
