@@ -184,6 +184,47 @@ def test_an_endless_interval_ends_when_told_and_late_ticks_are_not_bunched() -> 
     assert len(rig.fired()) == 6
 
 
+def start(rig: Rig, interval_s: float, count: int = 0, *, source: str = PILOT, link: int = 0) -> str:
+    """An interval as ground stations start it, who number everything 0."""
+    return rig.shutter.start_interval(Wish(source, "IMAGE_START_CAPTURE", 0, link=link), interval_s, count).outcome
+
+
+@pytest.mark.parametrize("link", [0, 1])
+@pytest.mark.parametrize("gap_s", [0.1, 0.6])
+def test_an_interval_right_after_a_press_runs_and_a_press_right_after_its_start_is_a_shot(
+    gap_s: float, link: int
+) -> None:
+    rig = Rig()
+    assert rig.press() == "shot"
+    rig.clock.advance(gap_s)
+    assert start(rig, 2.0, link=link) == "shot"
+    assert rig.press(gap_s, sequence=3, link=1 - link) == "shot"
+    rig.tick(5)
+    assert rig.shutter.statistics().interval_s == 2.0
+    assert len(rig.fired()) == 5
+
+
+def test_an_interval_that_was_stopped_starts_again_at_once_unless_another_stopped_it() -> None:
+    rig = Rig()
+    for again in ("shot", "shot"):
+        assert start(rig, 2.0) == again
+        rig.clock.advance(0.3)
+        assert rig.shutter.stop_interval(PILOT)
+    assert start(rig, 2.0) == "shot"
+    assert rig.shutter.stop_interval(VEHICLE)
+    assert start(rig, 2.0) == "duplicate"  # a retry that was under way must not undo the stop
+    assert rig.shutter.statistics().interval_s is None
+
+
+def test_a_second_interval_takes_the_place_of_the_first_however_soon_and_the_first_that_of_the_second() -> None:
+    rig = Rig()
+    for interval_s, count in ((2.0, 0), (5.0, 0), (2.0, 0), (2.0, 7)):
+        assert start(rig, interval_s, count) == "shot"
+        assert start(rig, interval_s, count) == "duplicate"
+        assert rig.shutter.statistics().interval_s == interval_s
+        rig.clock.advance(0.2)
+
+
 def test_a_burst_takes_the_next_shot_when_the_last_one_is_settled() -> None:
     rig = Rig()
     rig.shutter.start_interval(Wish(PILOT, "IMAGE_START_CAPTURE", 1), 0.0, 3)

@@ -125,7 +125,6 @@ def test_mavproxys_camera_module(camera: Camera, tmp_path: Path) -> None:
         proxy.until("IMAGE_START_CAPTURE: ACCEPTED")
         proxy.until("Camera 100 image 0 captured at frames/000000.cr2")
         eventually(lambda: camera.shots()["pending"] == 0, "idle")
-        time.sleep(1.3)  # MAVProxy says sequence 0 always: sooner, it would be a retry by the written rules
         proxy.type("camera photo 0.4 0")
         proxy.until("Camera 100 image 3 captured")
         proxy.type("camera stopphotos")

@@ -57,7 +57,7 @@ class CameraCommands:
         return judged(self._shutter.start_interval(wish, command.number(2), count))
 
     def _stop_capture(self, command: Command) -> Answer:
-        self._shutter.stop_interval()
+        self._shutter.stop_interval(command.source)
         return Answer(ACCEPTED)
 
     def _digicam_control(self, command: Command) -> Answer:

@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from dappled.daemon.clock import Clock
@@ -136,21 +136,24 @@ class Shutter:
             with self._lock:
                 self._wishes += 1
                 return self._refuse(wish, "an interval is 0 to 86400 s, and a count 0 or more")
+        wish = replace(wish, series=(interval_s, float(count)))
         with self._lock:
             verdict = self._judge(wish)
             if verdict.outcome == "shot" and count != 1:
                 step_ns = round(max(interval_s, _SHORTEST_S if interval_s > 0 else 0.0) * 1e9)
                 left = None if count == 0 else count - 1
+                self._end_interval(wish.source)
                 self._interval = _Interval(wish.source, step_ns, left, self._clock.monotonic_ns() + step_ns, wish)
                 self._wake.set()
         self._on_change()
         return verdict
 
-    def stop_interval(self) -> bool:
-        """End a running interval, whoever started it. False where none ran."""
+    def stop_interval(self, source: str | None = None) -> bool:
+        """End a running interval, whoever started it; the same command from the same `source` then starts it again.
+        False where none ran."""
         with self._lock:
             ran = self._interval is not None
-            self._interval = None
+            self._end_interval(source)
         self._on_change()
         return ran
 
@@ -206,6 +209,12 @@ class Shutter:
                 self._next_index,
                 None if self._interval is None else self._interval.interval_ns / 1e9,
             )
+
+    def _end_interval(self, source: str | None) -> None:
+        """What a sender ended itself it may start again at once; after another's stop its message is a retry."""
+        if self._interval is not None and self._interval.command.source == source:
+            self._recent.forget(self._interval.command)
+        self._interval = None
 
     def _judge(self, wish: Wish) -> Verdict:
         self._wishes += 1

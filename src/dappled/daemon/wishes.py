@@ -7,6 +7,8 @@
    trigger, and a vehicle on two links says each of them twice. Within 0.3 s of a shot's first message, a message of
    the same source belongs to that shot if the shot has none of this kind from this link yet, and none of this kind
    with another sequence; the oldest such shot takes it.
+3. A series (an interval, a step of the zoom) is another wish than a single shot and than a series with other numbers:
+   only a retry in all its numbers is the same, and nothing else belongs to its first shot.
 
 So a second press with the same sequence (most ground stations: always 0) inside 1.2 s is lost; and triggers from one
 source less than 0.3 s apart may be joined if some of their messages were lost on the way.
@@ -21,6 +23,7 @@ RETRY_LIMIT_NS = 2_400_000_000
 CONFIRMED_RETRY_NS = 10 * 10**9
 TRIGGER_NS = 300_000_000
 _REMEMBERED = 256
+_Key = tuple[str, str, int | None, tuple[float, ...] | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +31,8 @@ class Wish:
     """Somebody wants a shot: one message, or one act.
 
     `source` is "mavlink:255/190", "console" …; `kind` the message or command; `sequence` the sender's own number,
-    None where the kind has none; `acknowledged`: the sender gets an answer, and repeats when it misses it.
+    None where the kind has none; `acknowledged`: the sender gets an answer, and repeats when it misses it. `series`:
+    the numbers of what is more than one shot now (an interval's seconds and count).
     """
 
     source: str
@@ -37,6 +41,7 @@ class Wish:
     confirmation: int = 0
     link: int | None = None
     acknowledged: bool = True
+    series: tuple[float, ...] | None = None
 
 
 @dataclass(slots=True)
@@ -45,9 +50,13 @@ class _Remembered:
     source: str
     kind: str
     sequence: int | None
+    series: tuple[float, ...] | None
     first_ns: int
     last_ns: int
     parts: dict[tuple[str, int | None], int | None]  # (kind, link): sequence; shared by all names of a shot
+
+    def key(self) -> _Key:
+        return self.source, self.kind, self.sequence, self.series
 
 
 class Recent:
@@ -67,21 +76,26 @@ class Recent:
             found.last_ns = max(found.last_ns, now_ns)
         else:  # a part that may itself be retried: remembered under its own name
             self._wishes.append(
-                _Remembered(found.index, wish.source, wish.kind, wish.sequence, now_ns, now_ns, found.parts)
+                _Remembered(found.index, wish.source, wish.kind, wish.sequence, None, now_ns, now_ns, found.parts)
             )
         return found.index
 
     def add(self, wish: Wish, now_ns: int, index: int) -> None:
         """A new wish became shot `index`."""
         parts = {(wish.kind, wish.link): wish.sequence}
-        self._wishes.append(_Remembered(index, wish.source, wish.kind, wish.sequence, now_ns, now_ns, parts))
+        self._wishes.append(
+            _Remembered(index, wish.source, wish.kind, wish.sequence, wish.series, now_ns, now_ns, parts)
+        )
+
+    def forget(self, wish: Wish) -> None:
+        """The next message like it is a new wish."""
+        self._wishes = [known for known in self._wishes if known.key() != _key(wish)]
 
     def _retry(self, wish: Wish, now_ns: int) -> _Remembered | None:
         if not wish.acknowledged and wish.sequence is None:
             return None
-        key = (wish.source, wish.kind, wish.sequence)
         for known in reversed(self._wishes):
-            if (known.source, known.kind, known.sequence) != key:
+            if known.key() != _key(wish):
                 continue
             if wish.confirmation > 0:
                 return known if now_ns - known.last_ns <= CONFIRMED_RETRY_NS else None
@@ -90,11 +104,17 @@ class Recent:
         return None
 
     def _part(self, wish: Wish, now_ns: int) -> _Remembered | None:
+        if wish.series is not None:
+            return None
         for known in self._wishes:
-            if known.source != wish.source or now_ns - known.first_ns > TRIGGER_NS:
+            if known.series is not None or known.source != wish.source or now_ns - known.first_ns > TRIGGER_NS:
                 continue
             if (wish.kind, wish.link) in known.parts:
                 continue
             if all(sequence == wish.sequence for (kind, _), sequence in known.parts.items() if kind == wish.kind):
                 return known
         return None
+
+
+def _key(wish: Wish) -> _Key:
+    return wish.source, wish.kind, wish.sequence, wish.series
