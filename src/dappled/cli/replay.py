@@ -32,6 +32,7 @@ from dappled.drivers.replay import ReplayCamera
 from dappled.flight import check, layout
 from dappled.flight.ledger import LIVE
 
+_OF_FOLDERS = ("telemetry", "match", "start", "interval")
 _GIVEN = ("camera", "mask", "white", "dark", "calibration")
 
 
@@ -66,11 +67,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--white", metavar="FILE", help="white frame")
     parser.add_argument("--dark", metavar="FILE", help="dark frame")
     parser.add_argument("--calibration", metavar="FILE", help="file written by dappled calibrate")
-    parser.add_argument("--match", default="*", metavar="GLOB", help="which files of a folder are frames")
+    parser.add_argument("--match", metavar="GLOB", help="which files of a folder are frames (default: all)")
     parser.add_argument(
-        "--start", type=_utc_ns, metavar="UTC", help="time of the first frame, such as 2026-11-21T10:15:03Z"
+        "--start", type=_utc_ns, metavar="UTC", help="time of a folder's first frame, such as 2026-11-21T10:15:03Z"
     )
-    parser.add_argument("--interval", type=seconds, default=1.0, metavar="S", help="between frames without a time")
+    parser.add_argument("--interval", type=seconds, metavar="S", help="between the frames of a folder (default: 1)")
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings: endpoints, workers")
     parser.add_argument("--json", action="store_true", help="one JSON object a frame")
 
@@ -82,6 +83,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise ReplayError(f"{arguments.flight} is no recorded flight: there are no hashes to verify")
     if arguments.run_name and not is_flight:
         raise ReplayError(f"{arguments.flight} is no recorded flight: --run names results in a flight's ledger")
+    for option in _OF_FOLDERS if is_flight else ():
+        if getattr(arguments, option) is not None:
+            what = "a recorded flight has its own frames, times and telemetry"
+            raise ReplayError(f"--{option} is for a folder of frames: {what}; leave it out, or replay its frames/")
     problems = list(check.check(arguments.flight).problems) if arguments.verify else []
     facts = layout.read_facts(layout.open_folder(arguments.flight)) if is_flight else {}
     recipe = _recipe(arguments, facts, settings)
@@ -195,10 +200,10 @@ def _recording(arguments: argparse.Namespace, is_flight: bool) -> replay.Recordi
         raise ReplayError(f"{arguments.flight} is neither a flight nor a folder of frames")
     return replay.of_folder(
         arguments.flight,
-        arguments.match,
+        arguments.match or "*",
         telemetry=arguments.telemetry,
         start_utc_ns=arguments.start,
-        interval_s=arguments.interval,
+        interval_s=1.0 if arguments.interval is None else arguments.interval,
     )
 
 
