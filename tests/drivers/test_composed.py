@@ -12,7 +12,7 @@ import pytest
 from dappled.drivers import exif, folder, fujifilm
 from dappled.drivers.camera import Arrival, CameraError, Companion, Deferred, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.composed import ComposedCamera, Plan
-from dappled.drivers.pickup import FolderSource, StorageSource
+from dappled.drivers.pickup import FolderSource, Found, StorageSource
 from dappled.drivers.replay import Recorded, ReplayCamera
 from dappled.drivers.shutter_line import GpioLine, OutsideLine
 from dappled.mocks import simulated
@@ -29,6 +29,10 @@ T0 = 1_700_000_000.0
 @pytest.fixture
 def body(tmp_path: Path) -> FinePix:
     return FinePix(tmp_path, write_s=0.0, wall_s=lambda: T0)
+
+
+def utc_ns() -> int:
+    return round(T0 * 1e9)
 
 
 def line(body: FinePix) -> GpioLine:
@@ -52,7 +56,7 @@ class TestContractOfAWireAndMassStorage(CameraContract):
     def rig(self, body: FinePix) -> Iterator[Rig]:
         body.plug()
         plan = Plan(follows="it follows", hold_s=0.01, poll_s=0.02)
-        camera = ComposedCamera(WHO, line(body), StorageSource(body.mounts, body.places), plan)
+        camera = ComposedCamera(WHO, line(body), StorageSource(body.mounts, body.places), plan, utc_ns=utc_ns)
         yield Rig(camera, lambda number: picture(number, 6.3, T0), loose=True, follows=True)
         camera.stop()
 
@@ -192,38 +196,131 @@ def test_no_file_fails_the_shot_and_a_late_one_is_told_by_the_camera_s_clock(tmp
         camera.stop()
 
 
-def test_a_card_that_appears_after_many_shots_brings_them_all_in_order(tmp_path: Path) -> None:
-    now_s = 1000.0
-    body = FinePix(tmp_path, write_s=0.0, wall_s=lambda: T0 + now_s, clock_offset_s=-3600.0)
-    plan = Plan(follows="it follows", hold_s=0.001, poll_s=0.02)
-    source = StorageSource(body.mounts, body.places)
-    camera = ComposedCamera(WHO, line(body), source, plan, lambda: round(now_s * 1e9))
-    camera.start()
-    try:
-        until_state(camera, "ready")
-        for shot, step_s in enumerate((3, 5, 4, 9, 3, 6)):
-            now_s += step_s
-            camera.fire(shot)
-            events = until(camera, lambda event: isinstance(event, Deferred))
-            assert of_shots(events) == [(Fired, shot), (Deferred, shot)]
-            until_state(camera, "ready")
-        missing = body.card / "DCIM" / "100_FUJI" / "DSCF0003.RAF"
-        assert body.made == 6
+class Flight:
+    """A Fujifilm by wire whose card is plugged when the test says so; its clocks are the test's."""
+
+    def __init__(self, folder: Path) -> None:
+        self.now_s = 1000.0
+        self.body = FinePix(folder, write_s=0.0, wall_s=lambda: T0 + self.now_s, clock_offset_s=-3600.0)
+        self.card = self.body.card / "DCIM" / "100_FUJI"
+        self.looks = 0
+        source = StorageSource(self.body.mounts, self.body.places)
+        listed = source.list
+
+        def counted() -> list[Found]:
+            try:
+                return listed()
+            finally:
+                self.looks += 1
+
+        source.list = counted  # type: ignore[method-assign]  # counts only
+        plan = Plan(follows="it follows", hold_s=0.001, poll_s=0.02)
+        self.camera = ComposedCamera(
+            WHO,
+            line(self.body),
+            source,
+            plan,
+            lambda: round(self.now_s * 1e9),
+            utc_ns=lambda: round((T0 + self.now_s) * 1e9),
+        )
+
+    def old(self, count: int, before_s: float = 86_400.0) -> None:
+        """Pictures of another flight, 5 s apart."""
+        for number in range(count):
+            (self.card / f"OLD{number:04d}.RAF").write_bytes(picture(number, 6.3, T0 - before_s + 5 * number))
+
+    def shoot(self, shot: int, after_s: float) -> None:
+        self.now_s += after_s
+        self.camera.fire(shot)
+        events = until(self.camera, lambda event: isinstance(event, Deferred))
+        assert of_shots(events) == [(Fired, shot), (Deferred, shot)]
+        until_state(self.camera, "ready")
+
+    def written(self, count: int) -> None:
         deadline = time.monotonic() + 20
-        while len(list(missing.parent.glob("*.RAF"))) < 6:
+        while len(list(self.card.glob("DSCF*.RAF"))) < count:
             assert time.monotonic() < deadline
             time.sleep(0.005)
-        missing.unlink()
-        body.plug()
+
+    def brought(self, count: int) -> dict[int | None, str]:
+        """The next so many arrivals: shot → name."""
         found: dict[int | None, str] = {}
-        while len(found) < 5:
-            arrival = until(camera, lambda event: isinstance(event, Arrival))[-1]
+        while len(found) < count:
+            arrival = until(self.camera, lambda event: isinstance(event, Arrival))[-1]
             assert isinstance(arrival, Arrival)
             found[arrival.shot] = arrival.name
             arrival.blob.close()
-        assert found == {shot: f"DSCF{shot + 1:04d}.RAF" for shot in (0, 1, 3, 4, 5)}
-    finally:
-        camera.stop()
+        return found
+
+    def brings_nothing(self) -> None:
+        """For a dozen looks."""
+        deadline, until_look = time.monotonic() + 20, self.looks + 12
+        while self.looks < until_look:
+            assert time.monotonic() < deadline
+            event = self.camera.next_event(0.01)
+            assert not isinstance(event, Arrival), event.name
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Iterator[Flight]:
+    made = Flight(tmp_path)
+    yield made
+    made.camera.stop()
+
+
+def test_a_card_that_appears_after_many_shots_brings_them_all_in_order(flight: Flight) -> None:
+    flight.camera.start()
+    until_state(flight.camera, "ready")
+    for shot, step_s in enumerate((3, 5, 4, 9, 3, 6)):
+        flight.shoot(shot, step_s)
+    flight.written(6)
+    flight.old(60)
+    flight.body.plug()
+    assert flight.brought(6) == {shot: f"DSCF{shot + 1:04d}.RAF" for shot in range(6)}
+    flight.brings_nothing()
+
+
+def test_a_card_seen_before_the_flight_brings_what_is_sure_where_one_is_missing(flight: Flight) -> None:
+    flight.old(60)
+    flight.body.plug()
+    flight.camera.start()
+    until_state(flight.camera, "ready")
+    flight.body.unplug()
+    for shot, step_s in enumerate((3, 5, 4, 9, 3, 6)):
+        flight.shoot(shot, step_s)
+    flight.written(6)
+    (flight.card / "DSCF0003.RAF").unlink()
+    flight.body.plug()
+    assert flight.brought(5) == {shot: f"DSCF{shot + 1:04d}.RAF" for shot in (0, 1, 3, 4, 5)}
+
+
+@pytest.mark.parametrize("shots", [1, 2, 5])
+@pytest.mark.parametrize("before_s", [3600.0, 86_400.0, 4 * 365 * 86_400.0])
+def test_an_old_card_s_pictures_are_never_those_of_a_body_that_did_not_fire(
+    flight: Flight, shots: int, before_s: float
+) -> None:
+    flight.old(1 if shots == 1 else 40, before_s)
+    flight.body.misses = frozenset(range(1, 100))
+    flight.camera.start()
+    until_state(flight.camera, "ready")
+    for shot in range(shots):
+        flight.shoot(shot, 5)
+    flight.body.plug()
+    flight.brings_nothing()
+
+
+def test_another_card_than_before_the_flight_is_as_strange_as_any(flight: Flight) -> None:
+    (flight.card / "DSCF9999.RAF").write_bytes(picture(1, 6.3, T0))
+    flight.body.plug()
+    flight.camera.start()
+    until_state(flight.camera, "ready")
+    flight.body.unplug()
+    flight.body.misses = frozenset(range(1, 100))
+    flight.shoot(0, 5)
+    (flight.card / "DSCF9999.RAF").unlink()
+    flight.old(1)
+    flight.body.plug()
+    flight.brings_nothing()
 
 
 def test_a_line_that_another_program_holds_is_named_and_taken_when_it_is_free(body: FinePix) -> None:

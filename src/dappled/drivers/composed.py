@@ -33,6 +33,9 @@ from dappled.drivers.shutter_line import Order, ShutterLine, UsesAutopilot, pres
 
 _LATE = 64
 _WAITING = 64
+_FIRST_LOOK_S = 2.0
+_ENOUGH = 3
+"""So many pairs, and no shot without one, say that a card nobody saw before the flight is this camera's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +62,8 @@ class ComposedCamera:
         source: Source | None,
         plan: Plan,
         clock_ns: Callable[[], int] = time.monotonic_ns,
+        *,
+        utc_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self._identity, self._line, self._plan, self._clock_ns = identity, line, plan, clock_ns
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
@@ -68,7 +73,12 @@ class ComposedCamera:
         self._started = self._stopping = False
         self._ready = threading.Event()
         self._arrived = threading.Event()  # a shot was fired: look for its file
-        self._pickup = None if source is None else _Pickup(source, plan, self._deliver, self._give_up, clock_ns)
+        self._pickup = (
+            None
+            if source is None
+            else _Pickup(source, plan, self._deliver, self._give_up, clock_ns=clock_ns, utc_ns=utc_ns)
+        )
+        self._looked = threading.Event()  # what lay at the source before the first shot was seen, or nothing can be
         self._fire_thread = threading.Thread(target=self._fire_all, name="shutter line", daemon=True)
         self._pick_thread = threading.Thread(target=self._pick_up, name="pickup", daemon=True)
 
@@ -84,6 +94,8 @@ class ComposedCamera:
         self._fire_thread.start()
         if self._pickup is not None:
             self._pick_thread.start()
+        else:
+            self._looked.set()
 
     def fire(self, shot: int) -> None:
         """See Camera: the line is pressed by a thread of its own."""
@@ -128,6 +140,7 @@ class ComposedCamera:
             self._stopping = True
         self._orders.put(-1)
         self._arrived.set()
+        self._looked.set()
         for thread in (self._fire_thread, self._pick_thread):
             if thread.is_alive():
                 thread.join(0.8)
@@ -158,6 +171,7 @@ class ComposedCamera:
                     self._events.put(StateChanged("faulted", said, self._clock_ns()))
                 self._wait(self._plan.retry_s)
             else:
+                self._looked.wait(_FIRST_LOOK_S)
                 self._ready.set()
                 self._events.put(StateChanged("ready", "", self._clock_ns(), self._identity))
                 return True
@@ -207,6 +221,7 @@ class ComposedCamera:
         assert self._pickup is not None
         while not self._stopping:
             self._pickup.look()
+            self._looked.set()
             self._arrived.wait(self._plan.poll_s)
             self._arrived.clear()
             self._wait(self._plan.poll_s / 4)
@@ -232,15 +247,18 @@ class _Pickup:
         plan: Plan,
         deliver: Callable[[Arrival | Companion], None],
         give_up: Callable[[int], None],
+        *,
         clock_ns: Callable[[], int],
+        utc_ns: Callable[[], int],
     ) -> None:
         self._source, self._plan = source, plan
-        self._tell, self._give_up_shot, self._clock_ns = deliver, give_up, clock_ns
+        self._tell, self._give_up_shot, self._clock_ns, self._utc_ns = deliver, give_up, clock_ns, utc_ns
         self._lock = threading.Lock()
         self._claims: list[Claim] = []
         self._late: list[Claim] = []
         self._clock = BodyClock()
         self._done: set[str] | None = None
+        self._old: frozenset[str] | None = None  # what lay there before the first shot, as long as it does
         self._before: dict[str, int] = {}
         self._first_seen: dict[str, int] = {}
         self._stems: dict[str, int] = {}  # delivered frames by stem: for companions that come after
@@ -256,9 +274,13 @@ class _Pickup:
             found = self._source.list()
         except CameraError:
             found = []
+            self._old = self._old or None  # an empty card that went can't be told from another one
         else:
+            names = frozenset(one.name for one in found)
             if self._done is None and not self._claims:
-                self._done = {one.name for one in found}
+                self._done, self._old = set(names), names
+            if self._old is not None and not self._old <= names:
+                self._old = None  # another card
             self._take(found)
         self._before = {one.name: one.size for one in found}
         self._bound()
@@ -306,16 +328,24 @@ class _Pickup:
             self._late = [] if verdict.doubt else [one for one in self._late if one.shot != verdict.shot]
 
     def _match(self, fresh: list[Group]) -> None:
-        """A card that appeared, with all that was taken since: only pairs that are sure are taken now."""
+        """A card with all that was taken since: only pairs that are sure are taken now.
+
+        Where nobody saw what lay on it before the flight, what is there may be of any day and any camera: then all
+        shots must have found their files, and enough of them. The rest is left to `dappled flight pickup`.
+        """
         with self._lock:
             claims = list(self._claims)
         try:
             dated = [matching.DatedFile(group.main.name, self._source.taken_s(group.main)) for group in fresh]
         except CameraError:
             return  # the card is gone again
-        shots = [matching.FiredShot(claim.shot, claim.fired_ns / 1e9) for claim in claims]
+        to_utc_ns = self._utc_ns() - self._clock_ns()
+        shots = [matching.FiredShot(claim.shot, (claim.fired_ns + to_utc_ns) / 1e9) for claim in claims]
         by_name = {group.main.name: group for group in fresh}
-        for shot, name in matching.match(shots, dated, plausible_s=float("inf")).pairs:
+        matched = matching.match(shots, dated)
+        if self._old is None and (matched.shots or len(matched.pairs) < _ENOUGH):
+            return
+        for shot, name in matched.pairs:
             self._bring(shot, by_name[name], {})
 
     def _bring(self, shot: int | None, group: Group, facts: dict[str, str]) -> bool:
