@@ -197,6 +197,10 @@ def _chosen(choice: Choice, fresh: list[Group], rows: Mapping[int, ShotRow]) -> 
             raise PickupError(
                 f"--pair {index}={name}: shot {index} {'has its frame' if row else 'is not in the flight'}"
             )
+        if row.fired_called_monotonic_ns is None:
+            raise PickupError(
+                f"--pair {index}={name}: shot {index} never fired, as far as the flight knows: {row.reason}"
+            )
         fitting = [group for group in fresh if name in (group.main.name, group.main.base)]
         if len(fitting) != 1:
             raise PickupError(f"--pair {index}={name}: {len(fitting)} new files are called so; give its whole name")
