@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import uvicorn
+from starlette.types import ASGIApp
 
 from dappled.daemon import journal
 from dappled.daemon.console import app, background
 from dappled.daemon.console.access import Access
+from dappled.daemon.console.connection import CONNECTIONS, Connection
 from dappled.daemon.console.control import Control
 from dappled.daemon.console.feed import Feed
 from dappled.daemon.console.hub import Hub
@@ -29,7 +31,6 @@ from dappled.drivers.darkroom import Recipe
 from dappled.errors import DappledError, report
 
 NICENESS = 15  # below the decoder's 10: looking comes last
-_CONNECTIONS = 64
 log = logging.getLogger(__name__)
 
 
@@ -66,22 +67,7 @@ async def _serve(channel: Channel, listener: socket.socket, setup: Mapping[str, 
         access=Access(setup["token"], setup["hosts"]),
         background=_background(setup["map"]),
     )
-    server = uvicorn.Server(
-        uvicorn.Config(
-            app.make(parts),
-            log_config=None,
-            access_log=False,
-            lifespan="off",
-            ws="none",
-            http="h11",
-            loop="asyncio",
-            server_header=False,
-            timeout_keep_alive=10,
-            timeout_graceful_shutdown=1,
-            limit_concurrency=_CONNECTIONS,
-            h11_max_incomplete_event_size=16_384,
-        )
-    )
+    server = uvicorn.Server(configuration(app.make(parts)))
     tasks = [asyncio.create_task(parts.feed.run()), asyncio.create_task(app.follow_log(parts))]
     for task in tasks:
         task.add_done_callback(lambda done: _end(done, server))
@@ -90,6 +76,24 @@ async def _serve(channel: Channel, listener: socket.socket, setup: Mapping[str, 
     for task in (*tasks, watcher):
         task.cancel()
     await asyncio.gather(*tasks, watcher, return_exceptions=True)
+
+
+def configuration(served: ASGIApp) -> uvicorn.Config:
+    """How it is served: over connections that are few, and end by themselves when they ask for nothing."""
+    return uvicorn.Config(
+        served,
+        log_config=None,
+        access_log=False,
+        lifespan="off",
+        ws="none",
+        http=Connection,
+        loop="asyncio",
+        server_header=False,
+        timeout_keep_alive=10,
+        timeout_graceful_shutdown=1,
+        limit_concurrency=2 * CONNECTIONS,  # those that ask; and tasks of those that went end a moment later
+        h11_max_incomplete_event_size=16_384,
+    )
 
 
 def _end(task: asyncio.Task[None], server: uvicorn.Server) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
@@ -82,12 +82,12 @@ def _login(parts: Parts) -> Endpoint:
 
 def _events(parts: Parts) -> Endpoint:
     async def events(_: Request) -> Response:
-        if parts.hub.full:
-            return refused(Refusal(503, "too many pages are open: close one"))
         feed = parts.feed
         first = [_about(parts), feed.state(), *(feed.frame_event(index) for index in feed.frames), {"is": "ready"}]
         if log := await _log(parts, 0):
             first.append(log)
+        if parts.hub.full:
+            return refused(Refusal(503, "too many pages are open: close one"))
         return StreamingResponse(_stream(parts.hub.listen(first)), media_type="text/event-stream")
 
     return events
@@ -242,6 +242,8 @@ async def _body(request: Request) -> dict[str, Any]:
         body = json.loads(await request.body() or b"{}")
     except (ValueError, RecursionError):
         body = None
+    except ClientDisconnect:
+        raise StudioError("a request broke off before its end") from None
     if not isinstance(body, dict):
         raise StudioError("a request's body is one JSON object")
     return body

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import weakref
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -15,7 +16,7 @@ class Hub:
     """The pages that listen. All on one event loop."""
 
     def __init__(self) -> None:
-        self._pages: set[asyncio.Queue[str]] = set()
+        self._pages: weakref.WeakSet[asyncio.Queue[str]] = weakref.WeakSet()  # a stream that never began leaves too
         self.dropped = 0
 
     def __len__(self) -> int:
@@ -35,10 +36,16 @@ class Hub:
                 self.dropped += 1
             page.put_nowait(text)
 
-    async def listen(self, first: list[dict[str, Any]]) -> AsyncIterator[str]:
-        """Server-sent events for one page, the first ones at once; a comment where nothing happens."""
+    def listen(self, first: list[dict[str, Any]]) -> AsyncIterator[str]:
+        """Server-sent events for one page, the first ones at once; a comment where nothing happens.
+
+        The page counts from now on.
+        """
         page: asyncio.Queue[str] = asyncio.Queue(WAITING)
         self._pages.add(page)
+        return self._stream(page, first)
+
+    async def _stream(self, page: asyncio.Queue[str], first: list[dict[str, Any]]) -> AsyncIterator[str]:
         try:
             for event in first:
                 yield f"data: {json.dumps(event, separators=(',', ':'))}\n\n"
