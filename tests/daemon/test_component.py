@@ -228,6 +228,38 @@ def test_the_sole_autopilots_system_is_adopted(autopilots: tuple[int, ...], syst
     assert rig.system_id == system
 
 
+def autopilot_heartbeat(rig: Rig, system: int) -> None:
+    rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), (system, 1))
+
+
+def test_an_autopilot_that_boots_after_the_camera_is_taken_and_fires_it() -> None:
+    rig = Rig()
+    assert "HEARTBEAT" in rig.tick(3.1)
+    assert (rig.system_id, rig.component.doubt()) == (1, None)
+    rig.clock.advance(60)
+    autopilot_heartbeat(rig, 7)
+    rig.tick(1.3)
+    assert (rig.system_id, rig.component.vehicle, rig.component.doubt()) == (7, 7, None)
+    rig.hear(mavlink.MAVLink_camera_trigger_message(1, 1), (7, 1))
+    assert rig.fired == [5]
+    autopilot_heartbeat(rig, 8)
+    rig.tick(1.3)
+    assert (rig.system_id, rig.component.doubt()) == (7, None)
+
+
+def test_several_autopilots_that_come_late_leave_the_configured_system_and_it_is_said() -> None:
+    rig = Rig()
+    rig.tick(3.1)
+    for system in (8, 7):
+        autopilot_heartbeat(rig, system)
+        rig.tick(0.5)
+    rig.tick(1)
+    assert rig.system_id == 1
+    assert rig.component.doubt() == ("autopilots 7, 8 are heard, the camera belongs to system 1: set mavlink.system_id")
+    autopilot_heartbeat(rig, 1)
+    assert rig.component.doubt() is None
+
+
 def test_heartbeats_time_requests_and_streams_come_in_time_and_none_while_faulted() -> None:
     rig = Rig()
     rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), AUTOPILOT)

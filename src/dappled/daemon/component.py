@@ -97,6 +97,10 @@ class Component:
         """The system whose telemetry counts (see `Identity.vehicle`)."""
         return self._identity.vehicle()
 
+    def doubt(self) -> str | None:
+        """A sentence where the camera may belong to the wrong system (see `Identity.doubt`)."""
+        return self._identity.doubt()
+
     # what comes in
 
     def on_packet(self, packet: Packet) -> None:

@@ -9,13 +9,15 @@ ALONE_NS = 1_200_000_000  # heartbeats come every second: a second autopilot wou
 
 
 class Identity:
-    """Decides once, three seconds after the start at the latest: the sole autopilot's system id, or, where there are
-    several or none, the configured one. Decides sooner when one autopilot was heard alone for 1.2 s."""
+    """Decides three seconds after the start at the latest: the sole autopilot's system id, or, where there are several
+    or none, the configured one. Decides sooner when one autopilot was heard alone for 1.2 s. Where there was none (it
+    boots more slowly than this machine), the first that is later heard alone for 1.2 s is taken; then it stays."""
 
     def __init__(self, configured_system_id: int, start_ns: int) -> None:
         self.system_id = configured_system_id
         self.settled = False
         self.autopilots: dict[int, int] = {}  # system id: link it was last heard on
+        self._nobody_yet = True
         self._start_ns = start_ns
         self._first_heard_ns: int | None = None
 
@@ -30,15 +32,24 @@ class Identity:
 
     def decide(self, now_ns: int) -> bool:
         """Whether it is known by now who we are."""
-        if self.settled:
-            return True
-        alone = len(self.autopilots) == 1
         waited = self._first_heard_ns is not None and now_ns - self._first_heard_ns >= ALONE_NS
-        if now_ns - self._start_ns >= LISTEN_NS or (alone and waited):
-            self.settled = True
-            if alone:
+        if not self.settled and now_ns - self._start_ns >= LISTEN_NS:
+            self.settled = waited = True
+        if self._nobody_yet and self.autopilots and waited:
+            self._nobody_yet = False
+            if len(self.autopilots) == 1:
+                self.settled = True
                 self.system_id = next(iter(self.autopilots))
         return self.settled
+
+    def doubt(self) -> str | None:
+        """A sentence where autopilots are heard, but not that of the system which the camera belongs to."""
+        heard = sorted(self.autopilots)
+        if not self.settled or self._nobody_yet or not heard or self.system_id in heard:
+            return None
+        ids = ", ".join(map(str, heard))
+        who = f"autopilot {ids} is" if len(heard) == 1 else f"autopilots {ids} are"
+        return f"{who} heard, the camera belongs to system {self.system_id}: set mavlink.system_id"
 
     def vehicle(self) -> int | None:
         """Whose telemetry counts: our own system's, once that is decided. None while no autopilot was heard, or only
