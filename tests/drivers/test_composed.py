@@ -323,6 +323,50 @@ def test_another_card_than_before_the_flight_is_as_strange_as_any(flight: Flight
     flight.brings_nothing()
 
 
+def test_a_source_that_breaks_in_any_way_is_told_and_its_shots_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = FolderSource(tmp_path)
+    camera = ComposedCamera(WHO, OutsideLine(), source, Plan(file_s=0.2, hold_s=0.01, poll_s=0.02))
+    camera.start()
+    try:
+        until_state(camera, "ready")
+
+        def broken() -> list[Found]:
+            raise MemoryError("no more")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(source, "list", broken)
+            assert "no more" in until_state(camera, "faulted").reason
+            camera.fire(1)
+            assert of_shots(until_shot_ends(camera, 1)) == [(Fired, 1), (ShotFailed, 1)]
+        until_state(camera, "ready")
+        camera.fire(2)
+        until(camera, lambda event: isinstance(event, Fired))
+        (tmp_path / "2.dng").write_bytes(b"two")
+        arrival = until(camera, lambda event: isinstance(event, Arrival))[-1]
+        assert isinstance(arrival, Arrival)
+        assert content(arrival) == b"two"
+    finally:
+        camera.stop()
+
+
+def test_a_shot_without_a_file_says_what_was_wrong_with_the_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "card"
+    folder.mkdir()
+    camera = ComposedCamera(WHO, OutsideLine(), FolderSource(folder), Plan(file_s=0.2, hold_s=0.01, poll_s=0.02))
+    camera.start()
+    try:
+        until_state(camera, "ready")
+        folder.rmdir()
+        camera.fire(1)
+        failed = until_shot_ends(camera, 1)[-1]
+        assert isinstance(failed, ShotFailed)
+        assert "card is not there" in failed.reason
+    finally:
+        camera.stop()
+
+
 def test_a_line_that_another_program_holds_is_named_and_taken_when_it_is_free(body: FinePix) -> None:
     body.hold_line(True)
     camera = ComposedCamera(WHO, line(body), None, Plan(follows="later", hold_s=0.01, retry_s=0.02))

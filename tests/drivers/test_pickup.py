@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -62,6 +64,43 @@ def test_mass_storage_is_found_where_it_is_mounted(tmp_path: Path) -> None:
     body.unplug()
     with pytest.raises(CameraError, match="mass storage"):
         source.list()
+
+
+def test_a_mount_that_can_t_be_read_is_a_sentence_and_hides_no_other(tmp_path: Path) -> None:
+    body = FinePix(tmp_path)
+    (body.card / "DCIM" / "100_FUJI" / "DSCF0001.RAF").write_bytes(b"one")
+    source = StorageSource(body.mounts, body.places)
+    bad = f"/dev/sda1 {tmp_path}/media/{'x' * 300} vfat rw 0 0\nno mount\n"  # a name too long: looking raises OSError
+    body.mounts.write_text(bad)
+    with pytest.raises(CameraError, match="can't be read: File name too long"):
+        source.list()
+    body.plug()
+    body.mounts.write_text(bad + body.mounts.read_text())
+    assert [one.name for one in source.list()] == ["100_FUJI/DSCF0001.RAF"]
+    body.mounts.unlink()
+    with pytest.raises(CameraError, match="mounts can't be read: No such file"):
+        source.list()
+
+
+def test_a_card_that_is_pulled_while_it_is_listed_is_not_an_empty_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "1.RAF").write_bytes(b"one")
+    scan = os.scandir
+
+    def pulled(path: str, number: int) -> Any:
+        if str(path).endswith("/a"):
+            raise OSError(number, os.strerror(number), str(path))
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", lambda path: pulled(path, errno.EIO))
+    with pytest.raises(CameraError, match="Input/output error"):
+        FolderSource(tmp_path).list()
+    monkeypatch.setattr(os, "scandir", lambda path: pulled(path, errno.EACCES))
+    assert FolderSource(tmp_path).list() == []  # a folder in it is not ours
+    with pytest.raises(CameraError, match="Permission denied"):
+        FolderSource(tmp_path / "a").list()
 
 
 def test_one_exposure_s_files_are_a_group() -> None:

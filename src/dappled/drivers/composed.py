@@ -71,6 +71,7 @@ class ComposedCamera:
         self._lock = threading.Lock()
         self._open: dict[int, None] = {}  # shots that have not ended
         self._started = self._stopping = False
+        self._files_fault = ""
         self._ready = threading.Event()
         self._arrived = threading.Event()  # a shot was fired: look for its file
         self._pickup = (
@@ -173,7 +174,7 @@ class ComposedCamera:
             else:
                 self._looked.wait(_FIRST_LOOK_S)
                 self._ready.set()
-                self._events.put(StateChanged("ready", "", self._clock_ns(), self._identity))
+                self._rest()
                 return True
         return False
 
@@ -191,7 +192,12 @@ class ComposedCamera:
             if self._plan.follows is not None:
                 self._end(shot, Deferred(shot, self._plan.follows, self._clock_ns()))
             self._let_go()
-        self._events.put(StateChanged("ready", "", self._clock_ns(), self._identity))
+        self._rest()
+
+    def _rest(self) -> None:
+        """Tell the state between shots."""
+        fault = self._files_fault
+        self._events.put(StateChanged("faulted" if fault else "ready", fault, self._clock_ns(), self._identity))
 
     def _let_go(self) -> None:
         self._wait(self._plan.hold_s)
@@ -220,8 +226,16 @@ class ComposedCamera:
     def _pick_up(self) -> None:
         assert self._pickup is not None
         while not self._stopping:
-            self._pickup.look()
+            try:
+                self._pickup.look()
+                fault = ""
+            except Exception as error:  # noqa: BLE001  # whatever a source raises: shots must end, the next look may do
+                fault = f"files can't be picked up: {error!r}"
             self._looked.set()
+            if fault != self._files_fault:
+                self._files_fault = fault
+                if self._ready.is_set():
+                    self._rest()
             self._arrived.wait(self._plan.poll_s)
             self._arrived.clear()
             self._wait(self._plan.poll_s / 4)
@@ -233,8 +247,8 @@ class ComposedCamera:
         else:
             self._events.put(arrival)
 
-    def _give_up(self, shot: int) -> None:
-        reason = f"no file came within {self._plan.file_s:g} s of the release"
+    def _give_up(self, shot: int, trouble: str) -> None:
+        reason = f"no file came within {self._plan.file_s:g} s of the release" + (f": {trouble}" if trouble else "")
         self._end(shot, ShotFailed(shot, reason, self._clock_ns()))
 
 
@@ -246,7 +260,7 @@ class _Pickup:
         source: Source,
         plan: Plan,
         deliver: Callable[[Arrival | Companion], None],
-        give_up: Callable[[int], None],
+        give_up: Callable[[int, str], None],
         *,
         clock_ns: Callable[[], int],
         utc_ns: Callable[[], int],
@@ -260,6 +274,7 @@ class _Pickup:
         self._done: set[str] | None = None
         self._old: frozenset[str] | None = None  # what lay there before the first shot, as long as it does
         self._before: dict[str, int] = {}
+        self._trouble = ""  # why nothing could be listed, at the last look
         self._first_seen: dict[str, int] = {}
         self._stems: dict[str, int] = {}  # delivered frames by stem: for companions that come after
 
@@ -269,10 +284,18 @@ class _Pickup:
             self._claims.append(claim)
 
     def look(self) -> None:
-        """Deliver what is new and whole; give up what was waited for too long."""
+        """Deliver what is new and whole; give up what was waited for too long, whatever the source does."""
+        try:
+            self._look()
+        finally:
+            self._bound()
+
+    def _look(self) -> None:
+        self._trouble = ""
         try:
             found = self._source.list()
-        except CameraError:
+        except CameraError as error:
+            self._trouble = str(error)
             found = []
             self._old = self._old or None  # an empty card that went can't be told from another one
         else:
@@ -283,7 +306,6 @@ class _Pickup:
                 self._old = None  # another card
             self._take(found)
         self._before = {one.name: one.size for one in found}
-        self._bound()
 
     def close(self) -> None:
         """Let go of the source."""
@@ -382,4 +404,4 @@ class _Pickup:
             self._claims = [claim for claim in self._claims if claim.fired_ns >= limit_ns]
         for claim in overdue:
             self._late = [*self._late, claim][-_LATE:]
-            self._give_up_shot(claim.shot)
+            self._give_up_shot(claim.shot, self._trouble)

@@ -90,13 +90,16 @@ class FolderSource:
 
     def list(self) -> list[Found]:
         """See Source."""
-        if not self.folder.is_dir():
-            raise CameraError(f"{self.folder} is not there: check the path, or mount the card")
-        return sorted(self._walk(), key=lambda one: one.name)
+        try:
+            if not self.folder.is_dir():
+                raise CameraError(f"{self.folder} is not there: check the path, or mount the card")
+            return sorted(self._walk(), key=lambda one: one.name)
+        except OSError as error:
+            raise CameraError(f"{self.folder} can't be read: {error.strerror}") from None
 
     def _walk(self) -> Iterator[Found]:
         count = 0
-        for place, folders, names in os.walk(self.folder):
+        for place, folders, names in os.walk(self.folder, onerror=self._unreadable):
             folders[:] = [name for name in folders if not name.startswith(".")]
             for name in names:
                 path = Path(place) / name
@@ -109,6 +112,11 @@ class FolderSource:
                     yield Found(path.relative_to(self.folder).as_posix(), path.stat().st_size)
                 except OSError:
                     continue  # gone again
+
+    def _unreadable(self, error: OSError) -> None:
+        """A card that is pulled must not look like one with fewer files; a folder inside that is not ours may be."""
+        if not isinstance(error, PermissionError) or error.filename == str(self.folder):
+            raise error
 
     def taken_s(self, found: Found) -> float | None:
         """See Source: from EXIF."""
@@ -124,7 +132,11 @@ class FolderSource:
             fd = os.open(self.folder / found.name, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
             raise self._lost(found, error) from None
-        return Blob(fd, os.fstat(fd).st_size)
+        try:
+            return Blob(fd, os.fstat(fd).st_size)
+        except OSError as error:
+            os.close(fd)
+            raise self._lost(found, error) from None
 
     def _lost(self, found: Found, error: OSError) -> CameraError:
         return CameraError(f"{self.folder / found.name} can't be read: {error.strerror}")
@@ -142,13 +154,25 @@ class StorageSource(FolderSource):
 
     def list(self) -> list[Found]:
         """See Source."""
-        for line in self._mounts.read_text().splitlines():
-            words = line.split(" ")
-            where = words[1].replace("\\040", " ") if len(words) > 1 else ""
-            if where.startswith(self._places) and (Path(where) / "DCIM").is_dir():
-                self.folder = Path(where) / "DCIM"
+        unreadable = ""
+        for where in self._mounted():
+            try:
+                there = (where / "DCIM").is_dir()
+            except OSError as error:
+                unreadable = f"; {where} can't be read: {error.strerror}"
+                continue
+            if there:
+                self.folder = where / "DCIM"
                 return super().list()
-        raise CameraError("no card and no camera as mass storage is mounted: connect it, or wait until it is")
+        raise CameraError(f"no card and no camera as mass storage is mounted: connect it{unreadable}")
+
+    def _mounted(self) -> Iterator[Path]:
+        try:
+            lines = self._mounts.read_text(errors="surrogateescape").splitlines()
+        except OSError as error:
+            raise CameraError(f"{self._mounts} can't be read: {error.strerror}") from None
+        places = [line.split(" ")[1].replace("\\040", " ") for line in lines if " " in line]
+        return (Path(place) for place in places if place.startswith(self._places))
 
 
 def parse_source(text: str, ptp: Callable[[str], Source]) -> Source:
