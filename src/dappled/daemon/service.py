@@ -138,6 +138,7 @@ class Service:
         if recipe is None:
             return None
         kept = self._recipe = inputs.keep(recipe, self._recording.folder.path)
+        self._recording.note_inputs(inputs.FOLDER)
         developer = WorkerDeveloper(kept)
         stack.callback(developer.close)
         threading.Thread(target=_warm_up, args=[developer], name="decoder warm-up", daemon=True).start()
@@ -314,7 +315,7 @@ class Service:
             vehicle=self._telemetry.pose_at(self._clock.utc_ns(), 0.0),
             decoding=self._recipe is not None,
             utc_known=self._utc.known,
-            doubt=self._component and self._component.doubt(),
+            doubt=self._component.doubt() if self._component else None,
         )
 
     # wishes
