@@ -12,6 +12,7 @@ from collections.abc import Callable
 import pytest
 
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, Packet, mavlink
+from dappled.drivers.mavlink_stream import over_tcp
 
 
 class Clock:
@@ -108,6 +109,30 @@ def test_a_tcp_link_comes_back_after_its_server_was_gone() -> None:
         with Side(f"tcpin:127.0.0.1:{port}") as again:
             send_until_received(client, again)
             assert client.links.statistics()[0].error is None
+
+
+def test_a_client_that_fell_silent_does_not_keep_the_next_one_waiting() -> None:
+    with Side("tcpin:127.0.0.1:0") as server:
+        address = ("127.0.0.1", server.links.port(0))
+        with socket.create_connection(address) as vanished, socket.create_connection(address) as second:
+            packer = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
+            second.sendall(heartbeat().pack(packer))  # type: ignore[attr-defined]  # as above
+            assert server.received(1)[0].message.get_srcSystem() == 9
+            server.links.send(heartbeat())
+            second.settimeout(10)
+            assert second.recv(300)[0] == 0xFD
+            vanished.settimeout(10)
+            assert vanished.recv(300) == b""  # let go: a machine that is still there comes again
+
+
+def test_a_connection_whose_other_side_vanished_is_given_up_within_seconds() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as client:
+        over_tcp(client)
+        # The kernel's own limits are a quarter of an hour where something was sent, and two hours where nothing was.
+        assert client.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 5000
+        assert client.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
+        assert client.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) == 2
+        assert client.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL) == 1
 
 
 def test_a_serial_device() -> None:

@@ -7,6 +7,8 @@ import select
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import or_
 from typing import Protocol
 
 from dappled.drivers.mavlink_address import Address, LinkError, parse
@@ -225,8 +227,9 @@ class MavlinkLinks:
     def _wait(self, channel: Channel) -> bool:
         """Whether there is something to read; sends what waits. poll knows descriptors above 1023, select does not."""
         poll = select.poll()
-        poll.register(channel, select.POLLIN | (select.POLLOUT if channel.wants_write() else 0))
-        ready = sum(events for _, events in poll.poll(_LOOK_S * 1e3))
+        for descriptor in channel.descriptors():
+            poll.register(descriptor, select.POLLIN | (select.POLLOUT if channel.wants_write() else 0))
+        ready = reduce(or_, (events for _, events in poll.poll(_LOOK_S * 1e3)), 0)
         if ready & select.POLLOUT:
             with self._order:
                 channel.flush()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import socket
+from collections.abc import Sequence
 from typing import Protocol
 
 from dappled.drivers.mavlink_address import Address, LinkError
@@ -16,8 +17,8 @@ class Channel(Protocol):
 
     datagrams: bool  # what `read` gives holds whole packets
 
-    def fileno(self) -> int:
-        """The descriptor to wait on."""
+    def descriptors(self) -> Sequence[int]:
+        """What to wait on: any of them may have something to read."""
 
     def read(self) -> bytes | None:
         """What has come; b"" for nothing yet. None: the other side is gone. Raises OSError likewise."""

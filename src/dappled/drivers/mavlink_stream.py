@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import socket
 import termios
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from dappled.drivers.mavlink_address import Address, LinkError
 
 _CHUNK = 65536
 _OUTBOX_LIMIT = 65536
+_GONE_S = 5
 
 
 class Stream:
@@ -23,8 +24,8 @@ class Stream:
         self._fd, self._close, self._port = fd, close, port
         self._waiting = bytearray()
 
-    def fileno(self) -> int:
-        return self._fd
+    def descriptors(self) -> Sequence[int]:
+        return (self._fd,)
 
     def read(self) -> bytes | None:
         try:
@@ -58,7 +59,8 @@ class Stream:
 
 
 class Listener:
-    """A TCP server for one client at a time; when it has gone the next one is let in."""
+    """A TCP server for one client at a time: the last that came. One whose radio went out of range never says so, and
+    must not keep the next one waiting."""
 
     datagrams = False
 
@@ -66,13 +68,16 @@ class Listener:
         self._sock = sock
         self._client: Stream | None = None
 
-    def fileno(self) -> int:
-        return self._client.fileno() if self._client else self._sock.fileno()
+    def descriptors(self) -> Sequence[int]:
+        return (self._sock.fileno(), *(self._client.descriptors() if self._client else ()))
 
     def read(self) -> bytes | None:
+        with suppress(BlockingIOError):
+            newcomer = over_tcp(self._sock.accept()[0])
+            self._leave()
+            self._client = newcomer
+            return b""
         if self._client is None:
-            with suppress(BlockingIOError):
-                self._client = over_tcp(self._sock.accept()[0])
             return b""
         try:
             data = self._client.read()
@@ -113,8 +118,12 @@ class Listener:
 
 
 def over_tcp(sock: socket.socket) -> Stream:
-    """A connected TCP socket as a stream. Raises OSError."""
+    """A connected TCP socket as a stream; it fails 5 s after the other side vanished. Raises OSError."""
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * _GONE_S)  # what was sent and not acknowledged
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # where nothing was sent
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 2)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
     sock.setblocking(False)
     return Stream(sock.fileno(), sock.close, int(sock.getsockname()[1]))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import socket
 import time
+from collections.abc import Sequence
 
 from dappled.drivers.mavlink_address import Address
 
@@ -23,8 +24,8 @@ class _Udp:
         sock.setblocking(False)
         self._sock = sock
 
-    def fileno(self) -> int:
-        return self._sock.fileno()
+    def descriptors(self) -> Sequence[int]:
+        return (self._sock.fileno(),)
 
     def read(self) -> bytes | None:
         try:
