@@ -355,6 +355,24 @@ def test_an_unsigned_packet_on_a_signed_link_is_heard_and_not_obeyed() -> None:
     assert (rig.fired, rig.decode, rig.of("COMMAND_ACK")) == ([], "on", [])
 
 
+@pytest.mark.parametrize("late_s", [0.0, 60.0])
+def test_an_unsigned_heartbeat_does_not_decide_whose_camera_this_is(late_s: float) -> None:
+    rig = Rig()
+    rig.tick(late_s)
+    rig.trusted = False
+    autopilot_heartbeat(rig, 66)
+    rig.tick(4)
+    assert (rig.system_id, rig.component.vehicle) == (1, None)
+    rig.trusted = True
+    autopilot_heartbeat(rig, 7)
+    rig.trusted = False
+    autopilot_heartbeat(rig, 66)
+    rig.tick(4)
+    assert (rig.system_id, rig.component.vehicle) == (7, 7)
+    assert rig.component.order(2000, (0,)) is None
+    assert rig.of("COMMAND_LONG")[-1].target_system == 7
+
+
 @pytest.mark.parametrize("counts", [True, False])
 def test_feedback_is_a_shot_only_where_the_autopilot_fires(counts: bool) -> None:
     rig = Rig(feedback_is_shot=counts)

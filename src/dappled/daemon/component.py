@@ -114,7 +114,8 @@ class Component:
         if handler is not None and packet.trusted:
             handler(self, packet)
         elif message.get_type() == "HEARTBEAT":
-            self._identity.heard(message, packet.link, self._clock.monotonic_ns())
+            if packet.trusted:  # else anybody could say whose camera this is, and where orders to its autopilot go
+                self._identity.heard(message, packet.link, self._clock.monotonic_ns())
         elif message.get_srcSystem() == self._identity.system_id:
             self._requests.heard(message.get_msgId())
 
