@@ -193,6 +193,27 @@ def test_past_images_are_answered_failures_too_and_without_an_index_one_after_th
     assert rig.command(mavlink.MAV_CMD_REQUEST_CAMERA_IMAGE_CAPTURE, 5) == mavlink.MAV_RESULT_DENIED
 
 
+def test_more_past_images_than_can_wait_are_refused_and_every_accepted_one_is_told() -> None:
+    rig = Rig()
+    rig.tick(4)
+    results = [rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 263, at % 5) for at in range(300)]
+    told = 0
+    for _ in range(300):
+        told += rig.tick().count("CAMERA_IMAGE_CAPTURED")
+    assert results == [mavlink.MAV_RESULT_ACCEPTED] * told + [mavlink.MAV_RESULT_TEMPORARILY_REJECTED] * (300 - told)
+    assert told == 256
+    assert rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 263, 1) == mavlink.MAV_RESULT_ACCEPTED
+
+
+def test_a_past_image_whose_flight_was_moved_away_is_missed_in_words() -> None:
+    rig = Rig()
+    rig.tick(4)
+    assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, 1) == mavlink.MAV_RESULT_ACCEPTED
+    assert rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 263, 5) == mavlink.MAV_RESULT_ACCEPTED
+    rig.tick()
+    assert b"image 5 is in none of the flights" in b"".join(m._text_raw for m in rig.of("STATUSTEXT"))
+
+
 def test_refused_by_name_and_silent_on_broadcasts() -> None:
     rig = Rig()
     for command in (mavlink.MAV_CMD_VIDEO_START_CAPTURE, 206, 214, 2003, 2505):

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 
 from dappled.daemon.clock import Clock
-from dappled.daemon.commands import ACCEPTED, DENIED, UNSUPPORTED, Answer, Command, judged
+from dappled.daemon.commands import ACCEPTED, DENIED, REJECTED, UNSUPPORTED, Answer, Command, judged
 from dappled.daemon.knobs import Knobs
 from dappled.daemon.periodic import MessageIntervals
 from dappled.daemon.shutter import Shutter, Wish
@@ -34,7 +34,7 @@ class CameraCommands:
         self._shutter, self._clock, self._telling, self._knobs = shutter, clock, telling, knobs
         self._intervals = intervals
         self._walks: dict[str, int] = {}  # who asks without an index: the next image for it
-        self.wanted_images: deque[tuple[int, int]] = deque(maxlen=OLD_IMAGES)
+        self.wanted_images: deque[tuple[int, int]] = deque()
 
     def answer(self, command: Command) -> Answer:
         """Do it, or say why not. Never raises for what a command says."""
@@ -94,6 +94,8 @@ class CameraCommands:
         """How a past shot ended. MAVSDK, which lists photographs from before it came, leaves the index out (NaN) each
         time: it is told one after the other, from the first."""
         count = self._shutter.statistics().next_index
+        if len(self.wanted_images) >= OLD_IMAGES:
+            return Answer(REJECTED, words=f"{OLD_IMAGES} past images are being looked up: ask again")
         if math.isfinite(command.parameters[place - 1]):
             index = command.whole(place)
         else:

@@ -290,7 +290,9 @@ class Component:
         for _ in range(min(_OLD_IMAGES_A_TICK, len(wanted))):  # each may open a ledger: heartbeats go on
             index, link = wanted.popleft()
             captured = self._lookup(index)
-            if captured is not None:
+            if captured is None:
+                self.say(f"image {index} is in none of the flights here, or has not ended yet")
+            else:
                 self._links.send(camera_messages.image_captured(captured, self._telling.boot_ms()), link)
 
 
