@@ -192,6 +192,22 @@ def test_a_wrong_call_is_a_sentence(
     assert len(err.strip().splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--focus", "0", "--view", "ground"], "0 is not a distance above 0 m"),
+        (["--focus", "nan"], "nan is not a distance above 0 m"),
+    ],
+)
+def test_a_wrong_word_is_refused_before_anything_is_decoded(
+    short_flight: Flown, tmp_path: Path, more: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(words(short_flight, tmp_path, *more))
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_lever_arm_and_the_mount_reach_the_map(short_flight: Flown) -> None:
     frames, tags = photographs.recorded(short_flight.folder)
     turned = tuple((np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]) @ camera_pose.NADIR).ravel())

@@ -13,6 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from dappled.cli import fields
 from dappled.daemon import inputs
 from dappled.drivers.darkroom import Recipe
 from dappled.errors import DappledError
@@ -78,7 +79,7 @@ def add_placing(parser: argparse.ArgumentParser) -> None:
                         help="antenna to camera, metres forward, right, down (default: the flight's)")  # fmt: skip
     camera.add_argument("--mount", nargs=9, type=float, metavar="R",
                         help="camera axes to body, row by row (default: the flight's)")  # fmt: skip
-    camera.add_argument("--focus", type=float, default=float("inf"), metavar="M",
+    camera.add_argument("--focus", type=fields.metres, default=math.inf, metavar="M",
                         help="distance that the lens was focused at (default: infinity)")  # fmt: skip
     maps = parser.add_argument_group("map")
     maps.add_argument("--crs", metavar="EPSG:N", help="projection in metres (default: the UTM zone)")
