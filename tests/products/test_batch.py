@@ -115,6 +115,20 @@ def test_a_bad_frame_is_noted_and_the_others_are_made(
     }
 
 
+def test_a_bad_flight_is_said_and_the_others_are_made(
+    flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = words(flight, tmp_path / "out", "--as", "npz", "--frames", "0", "--workers", "1")
+    assert main([asked[0], str(tmp_path), str(tmp_path / "none"), *asked[1:]]) == 1
+    said = capsys.readouterr()
+    assert "1 frames made" in said.out
+    lines = said.err.strip().splitlines()
+    assert len(lines) == 2
+    assert all("is not a flight folder" in line for line in lines)
+    assert main([asked[0], str(tmp_path), *asked[2:]]) == 1  # and where none is left
+    assert capsys.readouterr().err.count("is not a flight folder") == 1
+
+
 def test_a_frame_without_a_place_still_becomes_a_light_field(flight: Flown, tmp_path: Path) -> None:
     (first, _) = batch.plan(flight.folder, flight.recipe, Options(), ["npz", "cog"], tmp_path)
     lost = replace(first, station=None, why="no position is known for frames/000000.dng")

@@ -38,13 +38,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     jobs: list[Job] = []
+    refused = 0
     for flight in arguments.flights:
-        folder = layout.open_folder(flight)
-        facts = layout.read_facts(folder)
-        recipe = georeference.recipe(folder.path, facts, arguments)
-        jobs += batch.plan(
-            folder.path, recipe, georeference.options(facts, arguments), arguments.kinds, arguments.output
-        )
+        try:
+            jobs += _planned(flight, arguments)
+        except DappledError as error:  # the other flights are made all the same
+            refused += 1
+            said = str(error) if str(flight) in str(error) else f"{flight}: {error}"
+            print(f"dappled batch: {said}", file=sys.stderr)
+    if refused and not jobs:
+        return 1
     bad = 0
     with Manifest(arguments.output) as manifest:
         todo = [job for job in jobs if not manifest.holds(job.key)]
@@ -67,4 +70,13 @@ def run(arguments: argparse.Namespace) -> int:
         raise DappledError("these flights hold no frames")
     if not arguments.json:
         print(f"{len(todo) - bad} frames made, {len(jobs) - len(todo)} were there already, {bad} could not be made")
-    return 1 if bad else 0
+    return 1 if bad or refused else 0
+
+
+def _planned(flight: Path, arguments: argparse.Namespace) -> list[Job]:
+    """The jobs of one flight. Raises DappledError."""
+    folder = layout.open_folder(flight)
+    facts = layout.read_facts(folder)
+    recipe = georeference.recipe(folder.path, facts, arguments)
+    options = georeference.options(facts, arguments)
+    return batch.plan(folder.path, recipe, options, arguments.kinds, arguments.output)
