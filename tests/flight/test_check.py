@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from dappled.flight import summary
+from dappled.flight import durable, summary
 from dappled.flight.check import check
 from dappled.flight.entries import Result
 from dappled.flight.errors import FlightError
 from dappled.flight.layout import FlightFolder
+from dappled.flight.ledger import LedgerReader
 from dappled.flight.recording import Recording
 from tests.flight.makers import deliver, flip, mavlink_2, shot, tag, wish
 
@@ -28,6 +29,11 @@ def recorded(flight: Recording) -> FlightFolder:
     flight.ledger.failed(2, "no file came")
     for number in range(20):
         flight.telemetry.append(number, mavlink_2(b"payload"))
+    (flight.folder.path / "inputs/masks").mkdir(parents=True)
+    for name in ("white.npy", "masks/mask-1.toml"):
+        (flight.folder.path / "inputs" / name).write_bytes(b"what frames were decoded with")
+    flight.note_inputs("inputs")
+    flight.add_facts({"identity": {"model": "450D"}})
     flight.close()
     return flight.folder
 
@@ -70,6 +76,11 @@ FAULTS = [
         lambda f: f.journal.write_bytes(f.journal.read_bytes().replace(b"mavlink:255/190", b"mavlink:255/191")),
         "told differently",
     ),
+    Fault("a letter of flight.toml", lambda f: flip(f.settings, 2), "flight.toml was changed"),
+    Fault("a byte of the white frame", lambda f: flip(f.path / "inputs/white.npy", 9), "inputs/white.npy was changed"),
+    Fault(
+        "no mask profile", lambda f: (f.path / "inputs/masks/mask-1.toml").unlink(), "mask-1.toml is in the ledger, but"
+    ),
     Fault("no flight.toml", lambda f: f.settings.unlink(), "flight.toml"),
     Fault("no ledger", lambda f: f.ledger.unlink(), "there is no ledger"),
     Fault("garbage for a ledger", lambda f: f.ledger.write_bytes(b"garbage" * 999), "damaged"),
@@ -106,6 +117,26 @@ def test_a_flight_that_is_being_recorded_is_no_fault(flight: Recording) -> None:
     report = check(flight.folder.path)
     assert report.intact
     assert "still recorded" in report.notes[0]
+
+
+def test_a_crash_while_flight_toml_is_written_anew_is_no_fault(
+    flight: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def crash(path: Path, data: bytes) -> None:
+        if written:
+            write(path, data)
+        raise KeyboardInterrupt
+
+    write = durable.write_file
+    for written in (False, True):
+        with monkeypatch.context() as dying:
+            dying.setattr(durable, "write_file", crash)
+            with pytest.raises(KeyboardInterrupt):
+                flight.add_facts({"camera": {"written": written}})
+        assert check(flight.folder.path).problems == ()
+    flight.add_facts({"identity": {"model": "450D"}})
+    with LedgerReader.open(flight.folder.ledger) as ledger:
+        assert len(ledger.facts()["sha256:flight.toml"]) == 1
 
 
 def test_what_is_no_flight_is_told(tmp_path: Path) -> None:

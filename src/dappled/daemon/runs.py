@@ -16,7 +16,7 @@ from dappled.daemon import inputs
 from dappled.daemon.story import Names
 from dappled.drivers.darkroom import Recipe
 from dappled.errors import DappledError
-from dappled.flight import layout, lock
+from dappled.flight import layout, lock, papers
 from dappled.flight.entries import Result
 from dappled.flight.ledger import LIVE, Ledger, LedgerReader
 
@@ -52,6 +52,7 @@ class RunBook:
         kept = inputs.keep(run.recipe, flight, run.name)
         self.run = replace(run, recipe=kept)
         self._ledger = Ledger(folder.ledger, utc_ns)
+        papers.note(folder, self._ledger, f"{inputs.FOLDER}/{run.name}")
         told = {"recipe": _relative(kept, flight), "names": asdict(run.names), "software": inputs.versions()}
         self._ledger.set_fact(_fact(run.name), {**told, "utc_ns": utc_ns()})
 

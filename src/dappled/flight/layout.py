@@ -159,7 +159,12 @@ def write_facts(folder: FlightFolder, facts: Mapping[str, Any]) -> None:
 
     Raises OSError, and TypeError for a value that TOML can't hold.
     """
-    durable.write_file(folder.settings, tomli_w.dumps(_plain(facts)).encode())
+    durable.write_file(folder.settings, facts_as_toml(facts))
+
+
+def facts_as_toml(facts: Mapping[str, Any]) -> bytes:
+    """What flight.toml holds of these facts. Raises TypeError for a value that TOML can't hold."""
+    return tomli_w.dumps(_plain(facts)).encode()
 
 
 def read_facts(folder: FlightFolder) -> dict[str, Any]:

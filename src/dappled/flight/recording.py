@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dappled.flight import durable, layout, recovery
+from dappled.flight import durable, layout, papers, recovery
 from dappled.flight.errors import disk_error
 from dappled.flight.index import Entry, ImageIndex, open_or_rebuild
 from dappled.flight.layout import FlightFolder
@@ -54,10 +54,12 @@ class Recording:
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
         """Add to flight.toml what was learnt since the start, such as the camera's identity. Raises FlightError."""
-        try:
-            layout.write_facts(self.folder, {**layout.read_facts(self.folder), **facts})
-        except OSError as error:
-            raise disk_error("write", self.folder.settings, error) from error
+        papers.write_facts(self.folder, self.ledger, {**layout.read_facts(self.folder), **facts})
+
+    def note_inputs(self, folder: str) -> None:
+        """What stands in this folder of the flight is what frames are decoded with: `flight check` compares it from
+        now on. Raises FlightError."""
+        papers.note(self.folder, self.ledger, folder)
 
     def learn_utc(self, correction_ns: int, sigma_ns: int, source: str) -> None:
         """UTC is known now: this is to be added to every stamp of this flight, those before it too. Nothing is renamed
@@ -110,6 +112,7 @@ def begin(
         stack.callback(ledger.close)
         ledger.set_fact("began_utc_ns", began_utc_ns)
         ledger.set_fact("utc_known", utc_known)
+        papers.note(folder, ledger, folder.settings.name)
         index.add_flight(folder.name, start_utc_ns)
         journal = WishJournal(folder.journal)
         stack.callback(journal.close)
