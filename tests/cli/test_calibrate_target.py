@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from dappled.cli import main
+from dappled.cli.calibrate_target import from_frames
+from dappled.drivers.darkroom import Darkroom, DarkroomError, Development, Recipe
 from dappled.mocks.masked_camera import reference_camera
 from tests.system.test_depth import target
 
@@ -40,6 +44,22 @@ def test_targets_lead_to_metres(folder: Path, capsys: pytest.CaptureFixture[str]
     found = json.loads(capsys.readouterr().out)
     assert found["distance_m"][1] == pytest.approx(6.0, rel=0.01)
     assert found["distances_from"] == "2 targets"
+    assert told["focal_length_mm"] == 50.0
+
+
+def test_frames_of_several_zooms_are_no_targets(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second frame says that the lens was zoomed in between."""
+    recipe = Recipe("reference-36mm", "reference-5x5", calibration=str(folder / "c.toml"))
+    honest = Darkroom.develop
+
+    def zoomed(self: Darkroom, path: Path, **asked: Any) -> Development:
+        done = honest(self, path, **asked)
+        said = {**done.light_field.attributes, "focal_length_mm": 50.0 if path.stem == "2" else 70.0}
+        return replace(done, light_field=replace(done.light_field, attributes=said))
+
+    monkeypatch.setattr(Darkroom, "develop", zoomed)
+    with pytest.raises(DarkroomError, match=r"several focal lengths \(50, 70\)"):
+        from_frames(recipe, [folder / "2.dng", folder / "6.dng"], [2.0, 6.0])
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 from PIL import Image
 
 from dappled.cli import main
-from dappled.products import lightfiles
+from dappled.decode.ranging import Ranging
+from dappled.products import lightfiles, opened
 from tests.products.fields import DISPARITY, light_field
 
 
@@ -87,6 +89,21 @@ def test_depth_in_pixels_and_in_metres(field: str, tmp_path: Path, capsys: pytes
     with np.load(tmp_path / "m.npz") as made:
         assert set(made) == {"disparity", "sigma", "confidence", "distance_m", "distance_sigma_m"}
         assert float(np.nanmedian(made["distance_m"])) == pytest.approx(told["distance_m"][1])
+
+
+def test_a_calibration_of_another_zoom_is_refused_or_told(
+    field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = "[ranging]\ngain_px_m = 40.0\noffset_px = 0.0\nf_number = 7.4\nfocal_length_mm = 12.8\n"
+    (tmp_path / "wide.toml").write_text(table)
+    assert main(["depth", field, "--calibration", str(tmp_path / "wide.toml")]) == 1
+    assert "the frame's is 50 mm" in capsys.readouterr().err
+    kept = opened.with_ranging(light_field(), Ranging.from_dict(tomllib.loads(table)["ranging"]))
+    lightfiles.save(tmp_path / "kept.npz", kept)
+    assert main(["depth", str(tmp_path / "kept.npz"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert "the frame's is 50 mm" in told["no_distances"]
+    assert "distance_m" not in told
 
 
 @pytest.mark.parametrize(

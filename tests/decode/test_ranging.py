@@ -48,8 +48,23 @@ def test_what_cannot_be_told_from_infinity_is_unknown() -> None:
 
 
 def test_stopping_down_shrinks_the_shift() -> None:
-    assert LENS.at(14.8).gain_px_m == pytest.approx(LENS.gain_px_m / 2)
-    assert LENS.at(None) is LENS
+    assert LENS.at(14.8, 50.0).gain_px_m == pytest.approx(LENS.gain_px_m / 2)
+    assert LENS.at(None, 50.0) == LENS
+
+
+def test_a_calibration_is_for_one_focal_length() -> None:
+    """Gain grows as the focal length's square: half a millimetre may be rounding, and is told."""
+    wide = fit_targets([Target(2.0, 9.0), Target(6.0, 3.0)], f_number=2.8, focal_length_mm=12.8)
+    assert Ranging.from_dict(wide.to_dict()) == wide
+    assert wide.at(2.8, 12.8) == wide
+    assert wide.at(2.8, 13.0).gain_sigma_share == pytest.approx(2 * 0.2 / 12.8)
+    for other in (32.7, 13.4, None):
+        with pytest.raises(DecodeError, match=r"calibrated at a focal length of 12\.8 mm"):
+            wide.at(2.8, other)
+    unknown = replace(wide, focal_length_mm=None)
+    assert unknown.at(2.8, None) == unknown
+    with pytest.raises(DecodeError, match=r"an unknown focal length, the frame's is 12\.8"):
+        unknown.at(2.8, 12.8)
 
 
 def test_targets_tell_gain_and_offset() -> None:

@@ -58,10 +58,21 @@ def test_metres_need_a_calibration_or_a_focus(path: Path) -> None:
 
 
 def test_a_kept_ranging_follows_the_f_number() -> None:
-    lens = Ranging(40.0, -1.0, f_number=7.4)
+    lens = Ranging(40.0, -1.0, f_number=7.4, focal_length_mm=50.0)
     found = OpenedLightField(opened.with_ranging(light_field(f_number=14.8), lens))
     assert found.ranging is not None
     assert found.ranging.gain_px_m == pytest.approx(20.0)
+
+
+def test_a_ranging_of_another_zoom_gives_no_metres() -> None:
+    """It would be wrong by the square of the ratio."""
+    lens = Ranging(40.0, -1.0, f_number=7.4, focal_length_mm=12.8)
+    field = opened.with_ranging(light_field(), lens)
+    assert OpenedLightField(field).ranging is None
+    with pytest.raises(DecodeError, match=r"calibrated at a focal length of 12\.8 mm, the frame's is 50 mm"):
+        OpenedLightField(field).refocus(distance_m=5.0)
+    by_focus = OpenedLightField(field, focus_m=float("inf")).metres()
+    assert by_focus.focal_length_mm == 50.0
 
 
 @pytest.mark.parametrize("change", [{"camera": "nobody's"}, {"f_number": None}, {"lenslet_pitch_px": [10, 10]}])

@@ -52,18 +52,23 @@ def from_frames(
     darkroom = Darkroom(recipe)
     targets: list[Target] = []
     stops: set[float | None] = set()
+    lengths: set[float | None] = set()
     lens: Ranging | None = None
     for path, distance in zip(tqdm(frames, unit="frame", disable=not sys.stderr.isatty()), metres, strict=True):
         field = OpenedLightField(darkroom.develop(path, focal_length_mm=focal_length_mm).light_field, path)
         with darkroom.naming(path):
             targets.append(Target(distance, target_shift(field.depth(), field.stack)))
         stops.add(None if recipe.mask == profiles.LENSLET else field.attributes.get("f_number"))
+        lengths.add(field.attributes.get("focal_length_mm"))
         lens = opened.lens_ranging(field.field, float("inf"))
-    if len(stops) > 1:
-        raise DarkroomError(
-            f"the targets were taken at several f-numbers ({sorted(map(str, stops))}): take them at one"
-        )
-    return fit_targets(targets, f_number=stops.pop(), lens=lens), targets
+    for several, name in ((stops, "f-numbers"), (lengths, "focal lengths")):
+        if len(several) > 1:
+            raise DarkroomError(f"the targets were taken at several {name} ({_listed(several)}): take them at one")
+    return fit_targets(targets, f_number=stops.pop(), focal_length_mm=lengths.pop(), lens=lens), targets
+
+
+def _listed(values: set[float | None]) -> str:
+    return ", ".join(sorted("unknown" if value is None else f"{value:g}" for value in values))
 
 
 def _write(recipe: Recipe, output: Path, found: Ranging) -> list[Path]:

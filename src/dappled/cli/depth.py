@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dappled.cli import fields
 from dappled.decode import depth as depths
 from dappled.decode.depthmap import DepthMap
+from dappled.decode.errors import DecodeError
 from dappled.decode.ranging import DistanceMap
 from dappled.products import exports, photographs, pointcloud, prints
 from dappled.products.opened import OpenedLightField, OpenError
@@ -71,7 +72,19 @@ def summary(found: OpenedLightField, made: DepthMap, distances: DistanceMap | No
         told["distance_sigma_m"] = _quartiles(distances.sigma_m)
         nearest = distances.nearest()
         told["nearest_m"] = None if nearest is None else nearest[0]
+    else:
+        told["no_distances"] = _why_not(found)
     return told
+
+
+def _why_not(found: OpenedLightField) -> str:
+    try:
+        found.metres()
+    except DecodeError as error:  # a calibration that is not for this frame
+        return str(error)
+    except OpenError:
+        pass
+    return "metres need --focus, or a calibration with targets (--calibration)"
 
 
 def words(told: dict[str, Any]) -> str:
@@ -90,7 +103,7 @@ def words(told: dict[str, Any]) -> str:
             f"{told['distance_known']:.0%} known; by {told['distances_from']}"
         )
     else:
-        lines.append("relative depth only: metres need --focus, or a calibration with targets (--calibration)")
+        lines.append(f"relative depth only: {told['no_distances']}")
     if "withheld" in told:
         lines.append(f"{told['points']} points, {told['withheld']} withheld for their σ ({told['coordinates']})")
     lines += [f"written: {path}" for path in told.get("written", [])]

@@ -38,9 +38,8 @@ def opened_field(arguments: argparse.Namespace) -> OpenedLightField:
         tables = calibration_files.tables(calibration)
         if RANGING not in tables:
             raise opened.OpenError(f"{calibration} knows no distances: make it anew with dappled calibrate --target")
-        found = OpenedLightField(
-            opened.with_ranging(found.field, Ranging.from_dict(tables[RANGING])), found.path, found.focus_m
-        )
+        found = OpenedLightField(opened.with_ranging(found.field, Ranging.from_dict(tables[RANGING])), found.path)
+        found.metres()  # asked for by name: refused where it is for another focal length
     return found
 
 

@@ -20,6 +20,9 @@ from PIL import Image
 from dappled.daemon import wire
 from dappled.daemon.development import NICENESS, serve
 from dappled.decode import depth, evidence, viewstack
+from dappled.decode.depthmap import DepthMap
+from dappled.decode.errors import DecodeError
+from dappled.decode.lightfield import LightField
 from dappled.decode.pictures import slice_mosaic
 from dappled.decode.ranging import RANGING, Ranging
 from dappled.drivers.camera import Blob
@@ -102,13 +105,8 @@ def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> Reply:
     found = depth.estimate(evidence.of_light_field(field), asked["method"])
     both = [np.ascontiguousarray(one, dtype=np.float32) for one in (found.disparity, found.sigma)]
     known = found.disparity[found.known]
-    ranging = field.attributes.get(RANGING)
-    nearest = None
-    if ranging:
-        metres = Ranging.from_dict(ranging).at(field.attributes.get("f_number"))
-        nearest = metres.distances(found, viewstack.of(field)).nearest()
     facts = {
-        "nearest_m": nearest,
+        "nearest_m": nearest(field, found),
         "arrays": [
             wire.describe_array(name, one, "pixels of a view, from view to view")
             for name, one in zip(("disparity", "sigma"), both, strict=True)
@@ -118,6 +116,18 @@ def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> Reply:
         "law": field.attributes["law"],
     }
     return facts, (Blob.of(np.stack(both).tobytes(), "depth").fd,)
+
+
+def nearest(field: LightField, found: DepthMap) -> tuple[float, float] | None:
+    """The nearest distance and its standard error, m; None where no calibration is for the lens as the frame has it."""
+    ranging = field.attributes.get(RANGING)
+    if not ranging:
+        return None
+    try:
+        metres = Ranging.from_dict(ranging).at(*(field.attributes.get(k) for k in ("f_number", "focal_length_mm")))
+    except DecodeError:
+        return None  # another zoom: the autopilot gets no distance, rather than a wrong one
+    return metres.distances(found, viewstack.of(field)).nearest()
 
 
 def _seen(done: Development) -> dict[str, Any]:

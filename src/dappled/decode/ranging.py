@@ -21,6 +21,7 @@ from dappled.decode.viewstack import ViewStack
 
 RANGING = "ranging"  # the attribute of light fields, and the table of calibrations
 _FARTHEST_SIGMAS = 2.0  # a shift that is not clear of infinity by so many standard errors has no distance
+_ROUNDED_MM = 0.5  # files and bodies may round focal lengths to whole millimetres
 _NOMINAL = 0.02  # f-numbers and focal lengths are rounded, and nominal
 _FRESH_DISTANCES = 1.01  # targets whose distances differ by less tell the offset only
 
@@ -28,14 +29,15 @@ _FRESH_DISTANCES = 1.01  # targets whose distances differ by less tell the offse
 @dataclass(frozen=True, slots=True)
 class Ranging:
     """S = `gain_px_m`/Z + `offset_px`, for a lens at `f_number` (None: the scale doesn't depend on it, as under
-    lenslets). `source` says in words where it is from, `gain_sigma_share` how well the gain is known, as a share of
-    it: all distances are off together by as much."""
+    lenslets) and one focal length (None: unknown). `source` says in words where it is from, `gain_sigma_share` how
+    well the gain is known, as a share of it: all distances are off together by as much."""
 
     gain_px_m: float
     offset_px: float
     f_number: float | None = None
     source: str = "calibration"
     gain_sigma_share: float = 0.0
+    focal_length_mm: float | None = None
 
     def __post_init__(self) -> None:
         """Raises DecodeError for numbers that are no lens."""
@@ -52,14 +54,32 @@ class Ranging:
             )
         sensor_m = 1e-3 / (1 / focal_length_mm - 1e-3 / focus_m)  # Eq 3
         gain = focal_length_mm / f_number * sensor_m / pixel_mm
-        return cls(gain, -gain / focus_m, f_number, "focal length, f-number and focus", _NOMINAL)
+        return cls(gain, -gain / focus_m, f_number, "focal length, f-number and focus", _NOMINAL, focal_length_mm)
 
-    def at(self, f_number: float | None) -> Ranging:
-        """The same lens at another f-number."""
+    def at(self, f_number: float | None, focal_length_mm: float | None) -> Ranging:
+        """The same lens at another f-number.
+
+        Raises DecodeError for another focal length, or where only one of the two is known: a zoom changes gain and
+        offset in ways that Eq 5 alone doesn't tell. What rounding may hide (half a millimetre) goes into the gain's σ.
+        """
+        made = replace(self, gain_sigma_share=math.hypot(self.gain_sigma_share, self._zoom_share(focal_length_mm)))
         if self.f_number is None or f_number is None:
-            return self
+            return made
         scale = self.f_number / f_number
-        return replace(self, gain_px_m=self.gain_px_m * scale, offset_px=self.offset_px * scale, f_number=f_number)
+        return replace(made, gain_px_m=self.gain_px_m * scale, offset_px=self.offset_px * scale, f_number=f_number)
+
+    def _zoom_share(self, focal_length_mm: float | None) -> float:
+        """What a focal length this far from the calibrated one may change of the gain, which grows as its square."""
+        ours = self.focal_length_mm
+        if ours is None and focal_length_mm is None:
+            return 0.0
+        if ours is None or focal_length_mm is None or abs(focal_length_mm - ours) > _ROUNDED_MM + 1e-9:
+            known = "an unknown focal length" if ours is None else f"a focal length of {ours:g} mm"
+            frame = "unknown" if focal_length_mm is None else f"{focal_length_mm:g} mm"
+            raise DecodeError(
+                f"distances were calibrated at {known}, the frame's is {frame}: calibrate with targets at the frame's"
+            )
+        return 2 * abs(focal_length_mm - ours) / ours
 
     def disparity(self, distance_m: float, stack: ViewStack) -> float:
         """The disparity of what is so far away, inf allowed. Raises DecodeError for a distance of 0 or less."""
@@ -86,16 +106,19 @@ class Ranging:
             "f_number": self.f_number,
             "source": self.source,
             "gain_sigma_share": self.gain_sigma_share,
+            "focal_length_mm": self.focal_length_mm,
         }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Ranging:
         """The inverse of `to_dict`. Raises DecodeError."""
         try:
-            f_number = values.get("f_number")
+            f_number, length = (
+                None if values.get(name) is None else float(values[name]) for name in ("f_number", "focal_length_mm")
+            )
             return cls(
-                float(values["gain_px_m"]), float(values["offset_px"]), None if f_number is None else float(f_number),
-                str(values.get("source", "calibration")), float(values.get("gain_sigma_share", 0.0)),
+                float(values["gain_px_m"]), float(values["offset_px"]), f_number,
+                str(values.get("source", "calibration")), float(values.get("gain_sigma_share", 0.0)), length,
             )  # fmt: skip
         except (KeyError, TypeError, ValueError) as error:
             raise DecodeError(f"the ranging is incomplete or wrong ({error}): calibrate with targets anew") from error
@@ -126,7 +149,13 @@ class Target:
     shift_px: float
 
 
-def fit_targets(targets: Sequence[Target], *, f_number: float | None, lens: Ranging | None = None) -> Ranging:
+def fit_targets(
+    targets: Sequence[Target],
+    *,
+    f_number: float | None,
+    focal_length_mm: float | None = None,
+    lens: Ranging | None = None,
+) -> Ranging:
     """The ranging that targets at known distances show, least squares in 1/Z.
 
     One distance alone tells the offset (the focus); the gain is then that of `lens`. Raises DecodeError without it.
@@ -144,12 +173,13 @@ def fit_targets(targets: Sequence[Target], *, f_number: float | None, lens: Rang
             )
         gain = lens.gain_px_m
         offset = float(np.mean(shifts - gain * inverse))
-        return Ranging(gain, offset, f_number, f"{len(targets)} target(s) and the lens", lens.gain_sigma_share)
+        source = f"{len(targets)} target(s) and the lens"
+        return Ranging(gain, offset, f_number, source, lens.gain_sigma_share, focal_length_mm)
     design = np.column_stack([inverse, np.ones_like(inverse)])
     gain, offset = np.linalg.lstsq(design, shifts, rcond=None)[0]
     if gain <= 0:
         raise DecodeError("nearer targets were seen with smaller shifts: are the distances in the order of the frames?")
-    return Ranging(float(gain), float(offset), f_number, f"{len(targets)} targets")
+    return Ranging(float(gain), float(offset), f_number, f"{len(targets)} targets", focal_length_mm=focal_length_mm)
 
 
 def target_shift(depth: DepthMap, stack: ViewStack, share: float = 0.25) -> float:

@@ -9,6 +9,7 @@ for frame in dappled.open("~/flights/20261121T101503Z-0a1b2c3d"): frame.views
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -85,13 +86,21 @@ class OpenedLightField:
 
     @cached_property
     def ranging(self) -> Ranging | None:
-        """From disparity to metres: by a calibration with targets, or by `focus_m`; None: only relative depth."""
+        """From disparity to metres: by a calibration with targets, or by `focus_m`; None: only relative depth.
+
+        A calibration at another focal length is none. `metres` says what is missing."""
+        with contextlib.suppress(DecodeError):
+            kept = self._kept_ranging()
+            if kept is not None:
+                return kept
+        return None if self.focus_m is None else lens_ranging(self.field, self.focus_m)
+
+    def _kept_ranging(self) -> Ranging | None:
+        """That of the attributes, for this frame's lens. Raises DecodeError where it is for another one."""
         kept = self.attributes.get(RANGING)
-        if kept:
-            return Ranging.from_dict(kept).at(self.attributes.get("f_number"))
-        if self.focus_m is None:
+        if not kept:
             return None
-        return lens_ranging(self.field, self.focus_m)
+        return Ranging.from_dict(kept).at(self.attributes.get("f_number"), self.attributes.get("focal_length_mm"))
 
     def disparity_of(
         self, *, alpha: float | None = None, disparity: float | None = None, distance_m: float | None = None
@@ -108,8 +117,9 @@ class OpenedLightField:
         return 0.0 if disparity is None else disparity
 
     def metres(self) -> Ranging:
-        """`ranging`, or OpenError with what to do."""
+        """`ranging`, or DappledError with what to do."""
         if self.ranging is None:
+            self._kept_ranging()
             raise OpenError(
                 f"{self.path or 'the light field'} has no distances: calibrate with targets "
                 "(dappled calibrate --target METRES), or say where the lens was focused (--focus METRES, or inf)"
