@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from tqdm import tqdm
@@ -24,6 +25,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT",
                         help="light field (.zarr, .npz, .h5); with several frames a folder")  # fmt: skip
     parser.add_argument("--colour", action="store_true", help="views in red, green and blue (default: grey)")
+    parser.add_argument("--taper", type=float, default=0.0, metavar="SHARE",
+                        help="share of each band that falls off softly, 0 to 1: less ringing, less detail")  # fmt: skip
     parser.add_argument("--overwrite", action="store_true", help="replace what stands there")
 
 
@@ -32,6 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     darkroom.check()
     single = len(arguments.frames) == 1 and arguments.output.suffix
     if not single:
+        _refuse_same_names(arguments.frames, arguments.output)
         arguments.output.mkdir(parents=True, exist_ok=True)
     bad = 0
     for frame in tqdm(arguments.frames, unit="frame", disable=len(arguments.frames) < 2 or not sys.stderr.isatty()):
@@ -48,6 +52,17 @@ def run(arguments: argparse.Namespace) -> int:
     if bad:
         print(f"{bad} of {len(arguments.frames)} frames could not be decoded", file=sys.stderr)
     return 1 if bad else 0
+
+
+def _refuse_same_names(frames: Sequence[Path], folder: Path) -> None:
+    """Two frames of one name would overwrite each other's light field."""
+    first: dict[str, Path] = {}
+    for frame in frames:
+        other = first.setdefault(frame.stem, frame)
+        if other is not frame:
+            raise DappledError(
+                f"{other} and {frame} would both be written as {folder / frame.stem}.zarr: decode them into two folders"
+            )
 
 
 def summary(made: Development) -> str:
