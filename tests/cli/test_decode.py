@@ -12,6 +12,7 @@ from dappled.cli import main
 from dappled.mocks.dng import Exif, encode
 from dappled.mocks.lens import Installation
 from dappled.mocks.masked_camera import reference_camera
+from dappled.products import lightfiles
 
 MASK = "reference-5x5"
 
@@ -134,3 +135,33 @@ def test_a_batch_goes_on_past_bad_frames_and_says_so(
     assert "bad.dng" in lines[0]
     assert "black.npy" in lines[1]
     assert lines[2] == "2 of 3 frames could not be decoded"
+
+
+def test_two_frames_of_one_name_are_not_written_over_each_other(
+    stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "b" / stopped.name
+    other.parent.mkdir()
+    other.write_bytes(stopped.read_bytes())
+    code, _, err = _told(capsys, stopped.parent, str(stopped), str(other), "-o", str(tmp_path / "out"))
+    assert code == 1
+    assert f"{stopped} and {other} would both be written as" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_bands_fall_off_softly_where_that_is_asked_for(
+    stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = {}
+    for taper in ("0", "1"):
+        out = tmp_path / f"{taper}.npz"
+        code, _, err = _told(capsys, stopped.parent, str(stopped), "--taper", taper, "-o", str(out))
+        assert code == 0, err
+        made[taper] = lightfiles.load(out).slices
+    rough = {taper: float(np.abs(np.diff(slices[0].real)).mean()) for taper, slices in made.items()}
+    assert rough["1"] < 0.95 * rough["0"]
+    for words, said in ((["--taper", "2"], "from 0 to 1"), (["--taper", "0.5"], "printed mask")):
+        mask = MASK if said == "from 0 to 1" else "lenslet"
+        code, _, err = _told(capsys, stopped.parent, str(stopped), *words, "-o", str(tmp_path / "x.npz"), mask=mask)
+        assert code == 1
+        assert said in err

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from dappled.decode.carriers import Carrier, Lattice
 from dappled.decode.errors import DecodeError
-from dappled.decode.slices import _cell_weights, default_size, extract
+from dappled.decode.slices import _cell_weights, default_size, extract, taper_weights
 from dappled.decode.spectrum import Spectrum
 
 SHAPE = (200, 250)
@@ -36,6 +36,23 @@ def test_a_slice_is_the_picture_times_the_carriers_amplitude(fy: float, fx: floa
     np.testing.assert_allclose(found.values[0][inner], expected[inner], atol=0.02)
     np.testing.assert_allclose(found.values[1][inner], (factor * expected)[inner], atol=0.02)
     assert picture.mean() == pytest.approx(found.values[0].real.mean(), abs=0.02)
+
+
+def test_a_tapered_band_keeps_its_middle_and_rings_less() -> None:
+    size = (40, 48)
+    weights = taper_weights(size, 0.5)
+    assert weights[20, 24] == 1.0
+    assert weights[0, 24] == pytest.approx(0.0, abs=1e-6)
+    assert np.all(weights[11:30, 13:36] == 1.0)  # the middle half is left alone
+    plane = np.zeros(SHAPE, dtype=np.float32)
+    plane[:, SHAPE[1] // 2 :] = 1.0
+    mean = [Carrier(0, 0, 0.0, 0.0)]
+    sharp, soft = (extract(Spectrum.of(plane), mean, size, taper=taper) for taper in (0.0, 1.0))
+    inner = (slice(8, -8), slice(8, -8))
+    assert soft.values[0].real[inner].max() < sharp.values[0].real[inner].max() - 0.05  # Gibbs' overshoot is gone
+    assert soft.band == pytest.approx(sharp.band * float(np.mean(taper_weights(size, 1.0) ** 2)))
+    with pytest.raises(DecodeError, match="share of the band"):
+        extract(Spectrum.of(plane), mean, size, taper=1.5)
 
 
 def test_the_largest_boxes_do_not_overlap() -> None:

@@ -56,6 +56,7 @@ def recipe(arguments: argparse.Namespace) -> Recipe:
         black=arguments.black,
         white_level=arguments.white_level,
         colour=getattr(arguments, "colour", False),
+        taper=getattr(arguments, "taper", 0.0),
     )
 
 

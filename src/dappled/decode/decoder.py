@@ -60,7 +60,7 @@ class MaskDecoder:
     known to (half of the EXIF rounding): it widens the search. `size` of the slices in bins of the padded transform;
     None: as large as the spacing allows. Views need a calibration, or a frame that shows its carriers; else only the
     slices are there, and `views` has the shape (0, 0, h, w). `colours` says that the planes are colour mosaics.
-    `plans` keep buffers from frame to frame.
+    `taper` apodises the bands, see `slices.extract`. `plans` keep buffers from frame to frame.
     """
 
     sensor: Sensor
@@ -73,6 +73,7 @@ class MaskDecoder:
     focal_sigma_mm: float = 0.05
     workers: int = 1
     colours: bool = False
+    taper: float = 0.0
     plans: Plans = field(default_factory=Plans, repr=False)
 
     def __post_init__(self) -> None:
@@ -126,7 +127,7 @@ class MaskDecoder:
             if reach < min(0.5, needed):  # a lattice found at the edge of the search
                 spectrum = plan.spectrum(plane, workers=self.workers, largest_fx=min(0.5, needed))
             looking = Noise(spectrum)
-            slices = plan.cut(spectrum, used, size, workers=self.workers, beside=looking.work)
+            slices = plan.cut(spectrum, used, size, workers=self.workers, beside=looking.work, taper=self.taper)
             noise = looking.rms()
         if views:
             made, offsets, views_from, told = self.views(
@@ -192,7 +193,7 @@ class MaskDecoder:
 
     def cut(self, spectrum: Spectrum, lattice: Lattice, carriers: Sequence[Carrier]) -> Slices:
         """The slices at these carriers, cut at Nyquist."""
-        return extract(spectrum, carriers, self.slice_size(lattice), workers=self.workers)
+        return extract(spectrum, carriers, self.slice_size(lattice), taper=self.taper, workers=self.workers)
 
     def _radii(self, carriers: Sequence[Carrier], focal_length_mm: float) -> list[float]:
         """How far from each prediction a carrier may lie, in bins: rotation, rounding of the focal length, 1.5 bins."""

@@ -87,6 +87,7 @@ def extract(
     *,
     lattice: Lattice | None = None,
     window: Window = "box",
+    taper: float = 0.0,
     wrap: bool = False,
     workers: int = 1,
 ) -> Slices:
@@ -94,11 +95,14 @@ def extract(
 
     `size` is (height, width) of the band in bins; by default `default_size` of `lattice`, which is otherwise only
     needed for the window "cell". `wrap` lets a band go on cyclically past the edge of the spectrum (sampled lenslet
-    arrays); else what lies beyond Nyquist is 0. Scaled so that the slice of (0, 0) has the plane's local mean; phases
-    are those at pixel (0, 0), the fraction of a bin compensated exactly. The slices end where the frame ends. The
-    same numbers as `equations.slice_at`, for all carriers at once.
+    arrays); else what lies beyond Nyquist is 0. `taper` is the share of the band, 0 to 1, that falls off to its edges
+    as a raised cosine (Tukey's window; 1 is Hann's): less ringing, less detail. Scaled so that the slice of (0, 0) has
+    the plane's local mean; phases are those at pixel (0, 0), the fraction of a bin compensated exactly. The slices end
+    where the frame ends. The same numbers as `equations.slice_at`, for all carriers at once.
     """
-    plan = plan_slices(spectrum.shape, spectrum.padded, carriers, size, lattice=lattice, window=window, wrap=wrap)
+    plan = plan_slices(
+        spectrum.shape, spectrum.padded, carriers, size, lattice=lattice, window=window, taper=taper, wrap=wrap
+    )
     return plan.apply(spectrum, workers=workers)
 
 
@@ -110,6 +114,7 @@ def plan_slices(
     *,
     lattice: Lattice | None = None,
     window: Window = "box",
+    taper: float = 0.0,
     wrap: bool = False,
 ) -> SlicePlan:
     """`extract` for all frames of `shape`, transformed over `padded`."""
@@ -122,14 +127,32 @@ def plan_slices(
     height, width = size
     if not (2 <= height <= padded[0] and 2 <= width <= padded[1]):
         raise DecodeError(f"a slice of {height}×{width} bins doesn't fit a spectrum of {padded}")
+    if not 0 <= taper <= 1:
+        raise DecodeError(f"the taper is {taper:g}: it must be a share of the band, from 0 to 1")
     share = height * width / (padded[0] * padded[1])
     cell = None
     if window == "cell" and lattice is not None:
         cell = _cell_weights(lattice, padded, size)
+    if taper:
+        cell = taper_weights(size, taper) * (1 if cell is None else cell)
+    if cell is not None:
         share *= float(np.mean(cell**2))
     samples = _samples(shape[0], padded[0], height), _samples(shape[1], padded[1], width)
     bands = lay_out(padded, carriers, size, samples, wrap=wrap, cell=cell)
     return SlicePlan(tuple(carriers), bands, padded, share)
+
+
+def taper_weights(size: tuple[int, int], taper: float) -> NDArray[np.float32]:
+    """Tukey's window over a band, float32 (h, w): 1 at DC (h//2, w//2), to 0 at the edges."""
+    rows, columns = (_tukey(np.abs(np.arange(side) - side // 2) / (side / 2), taper) for side in size)
+    return np.outer(rows, columns).astype(np.float32)
+
+
+def _tukey(out: NDArray[np.float64], taper: float) -> NDArray[np.float64]:
+    """Tukey's window at `out`, 0 in the middle and 1 at the edge."""
+    falling = np.clip((out - (1 - taper)) / taper, 0, 1)
+    weights: NDArray[np.float64] = 0.5 * (1 + np.cos(np.pi * falling))
+    return weights
 
 
 def _samples(side: int, padded: int, size: int) -> int:

@@ -47,7 +47,7 @@ class Recipe:
     `camera` a profile, a TOML file or "auto" (by the frame's model); `mask` a profile, a TOML file or "lenslet";
     `law` "" takes the camera's; the files are "" where there are none.
     `cfa` (as "BGGR", row by row), `black` and `white_level` are for files that don't say so themselves. `colour` asks
-    for views in red, green and blue.
+    for views in red, green and blue; `taper`, 0 to 1, for slices whose bands fall off softly (printed masks).
     """
 
     camera: str
@@ -61,6 +61,7 @@ class Recipe:
     black: float | None = None
     white_level: float | None = None
     colour: bool = False
+    taper: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +105,10 @@ class Darkroom:
             profiles.mask(self.recipe.mask)
         if self.recipe.calibration and self.recipe.mask != profiles.LENSLET:
             self._calibration()
+        if self.recipe.taper and self.recipe.mask == profiles.LENSLET:
+            raise DarkroomError("a taper is for the bands of a printed mask; lenslets' bands tile the spectrum whole")
+        if not 0 <= self.recipe.taper <= 1:
+            raise DarkroomError(f"the taper is {self.recipe.taper:g}: it must be a share of the band, from 0 to 1")
         for path in (self.recipe.white, self.recipe.dark):
             if path:
                 rawfile.read_metadata(Path(path))
@@ -264,6 +269,7 @@ class Darkroom:
             calibration=known,
             workers=recipe.workers,
             colours=colours,
+            taper=recipe.taper,
         )
 
     def _ranging(self) -> dict[str, Any]:
