@@ -452,6 +452,23 @@ def test_a_lens_that_can_be_set_zooms_to_the_nearest_focal_length(kind: int, val
     assert rig.of("CAMERA_INFORMATION")[0].flags & mavlink.CAMERA_CAP_FLAGS_HAS_BASIC_ZOOM
 
 
+def test_a_repeated_zoom_step_is_one_step_and_another_step_is_another() -> None:
+    rig = Rig()
+    rig.tick(4)
+
+    def step(after_s: float, value: float, confirmation: int = 0) -> str:
+        """The focal length that the body has after it."""
+        rig.clock.advance(after_s)
+        result = rig.command(mavlink.MAV_CMD_SET_CAMERA_ZOOM, 0, value, confirmation=confirmation)
+        assert result == mavlink.MAV_RESULT_ACCEPTED
+        rig.body.take("focal_length", rig.body.asked[-1][1])
+        return rig.body.now["focal_length"].value
+
+    rig.body.now["focal_length"] = Setting("focal_length", "18", ("18", "24", "35", "55"))
+    assert [step(0, 1), step(0.5, 1), step(3, 1, confirmation=1)] == ["24", "24", "24"]
+    assert [step(0.1, -1), step(0.1, 1), step(2, 1), step(2, 1)] == ["18", "24", "35", "55"]
+
+
 def test_field_of_view_from_lens_and_sensor() -> None:
     rig = Rig()
     rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 271)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 
 from dappled.daemon.clock import Clock
 from dappled.daemon.commands import ACCEPTED, DENIED, REJECTED, UNSUPPORTED, Answer, Command, judged
@@ -12,6 +13,7 @@ from dappled.daemon.knobs import Knobs
 from dappled.daemon.periodic import MessageIntervals
 from dappled.daemon.shutter import Shutter, Wish
 from dappled.daemon.telling import ZOOM, Telling
+from dappled.daemon.wishes import Recent
 from dappled.drivers.camera import CameraError
 from dappled.drivers.mavlink import mavlink
 
@@ -33,6 +35,7 @@ class CameraCommands:
     ) -> None:
         self._shutter, self._clock, self._telling, self._knobs = shutter, clock, telling, knobs
         self._intervals = intervals
+        self._steps = Recent()
         self._walks: dict[str, int] = {}  # who asks without an index: the next image for it
         self.wanted_images: deque[tuple[int, int]] = deque()
 
@@ -145,6 +148,10 @@ class CameraCommands:
         if not lengths:
             return Answer(DENIED, words="no zoom: this lens is zoomed by hand")
         kind, value = command.whole(1, -1), command.number(2, math.nan)
+        step = Wish(command.source, "SET_CAMERA_ZOOM", None, command.confirmation, command.link, series=(kind, value))
+        now_ns = self._clock.monotonic_ns()
+        if kind == _ZOOM_STEP and self._steps.same(step, now_ns) is not None:
+            return Answer(ACCEPTED)  # its sender missed the answer
         at = self._zoom_target(kind, value, [mm for mm, _ in lengths])
         if at is None:
             return Answer(DENIED, words="zoom goes by step, range, focal length or field of view")
@@ -152,6 +159,9 @@ class CameraCommands:
             self._knobs.turn(ZOOM, lengths[at][1])
         except CameraError as error:
             return Answer(DENIED, words=str(error))
+        self._steps.forget(replace(step, series=(kind, -value)))  # forth, back and forth again is three steps
+        if kind == _ZOOM_STEP:
+            self._steps.add(step, now_ns, at)
         return Answer(ACCEPTED)
 
     def _zoom_target(self, kind: int, value: float, lengths_mm: list[float]) -> int | None:
