@@ -323,6 +323,118 @@ def test_another_card_than_before_the_flight_is_as_strange_as_any(flight: Flight
     flight.brings_nothing()
 
 
+class BadLine:
+    """A shutter line whose calls raise what the test says."""
+
+    def __init__(self) -> None:
+        self.raises: dict[str, Exception] = {}
+        self.calls: list[str] = []
+
+    def _do(self, name: str) -> None:
+        self.calls.append(name)
+        if name in self.raises:
+            raise self.raises[name]
+
+    def open(self) -> None:
+        self._do("open")
+
+    def press(self) -> None:
+        self._do("press")
+
+    def let_go(self) -> None:
+        self._do("let_go")
+
+    def close(self) -> None:
+        self._do("close")
+
+
+@pytest.fixture
+def bad() -> BadLine:
+    return BadLine()
+
+
+@pytest.fixture
+def by_bad_line(bad: BadLine) -> Iterator[ComposedCamera]:
+    camera = ComposedCamera(WHO, bad, None, Plan(follows="later", hold_s=0.01, retry_s=0.02))
+    yield camera
+    camera.stop()
+
+
+@pytest.mark.parametrize(
+    "error", [CameraError("stuck"), OSError("stuck"), TimeoutError("stuck"), AttributeError("stuck")]
+)
+def test_a_line_that_raises_anything_when_pressed_fails_that_shot_only(
+    bad: BadLine, by_bad_line: ComposedCamera, error: Exception
+) -> None:
+    by_bad_line.start()
+    until_state(by_bad_line, "ready")
+    bad.raises["press"] = error
+    by_bad_line.fire(1)
+    failed = until_shot_ends(by_bad_line, 1)[-1]
+    assert isinstance(failed, ShotFailed)
+    assert "stuck" in failed.reason
+    until_state(by_bad_line, "ready")
+    assert bad.calls == ["open", "press", "close", "open"]  # taken anew: it may have been lost
+    del bad.raises["press"]
+    by_bad_line.fire(2)
+    assert of_shots(until(by_bad_line, lambda event: isinstance(event, Deferred))) == [(Fired, 2), (Deferred, 2)]
+
+
+@pytest.mark.parametrize(
+    "error", [CameraError("stuck"), OSError("stuck"), TimeoutError("stuck"), AttributeError("stuck")]
+)
+def test_a_shutter_that_stays_pressed_is_faulted_until_it_is_let_go(
+    bad: BadLine, by_bad_line: ComposedCamera, error: Exception
+) -> None:
+    by_bad_line.start()
+    until_state(by_bad_line, "ready")
+    bad.raises["let_go"] = error
+    by_bad_line.fire(1)
+    until_state(by_bad_line, "faulted")
+    assert by_bad_line.identity == WHO
+    by_bad_line.fire(2)
+    deadline = time.monotonic() + 20
+    while bad.calls.count("let_go") < 4:
+        event = by_bad_line.next_event(0.01)
+        assert time.monotonic() < deadline
+        assert not (isinstance(event, StateChanged) and event.state == "ready")
+        if isinstance(event, ShotFailed):
+            assert "stays pressed" in event.reason
+            assert event.shot == 2
+    assert bad.calls.count("press") == 1
+    assert bad.calls.count("close") >= 1
+    bad.raises.clear()
+    until_state(by_bad_line, "ready")
+    assert bad.calls[-1] == "let_go"
+    by_bad_line.fire(3)
+    assert of_shots(until(by_bad_line, lambda event: isinstance(event, Deferred))) == [(Fired, 3), (Deferred, 3)]
+
+
+def test_a_line_that_is_lost_is_opened_again_and_what_waited_is_not_fired_then(
+    bad: BadLine, by_bad_line: ComposedCamera
+) -> None:
+    by_bad_line.start()
+    until_state(by_bad_line, "ready")
+    bad.raises = {"press": CameraError("the chip is gone"), "open": OSError("no chip")}
+    for shot in (1, 2, 3):
+        by_bad_line.fire(shot)
+    ends = [until_shot_ends(by_bad_line, shot)[-1] for shot in (1, 2, 3)]
+    assert all(isinstance(end, ShotFailed) for end in ends)
+    bad.raises.clear()
+    until_state(by_bad_line, "ready")
+    assert bad.calls.count("press") == 1
+    by_bad_line.fire(4)
+    assert of_shots(until(by_bad_line, lambda event: isinstance(event, Deferred))) == [(Fired, 4), (Deferred, 4)]
+
+
+def test_a_line_that_raises_anything_when_opened_is_tried_again(bad: BadLine, by_bad_line: ComposedCamera) -> None:
+    bad.raises["open"] = RuntimeError("not yet")
+    by_bad_line.start()
+    assert "not yet" in until_state(by_bad_line, "faulted").reason
+    bad.raises.clear()
+    until_state(by_bad_line, "ready")
+
+
 def test_a_source_that_breaks_in_any_way_is_told_and_its_shots_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

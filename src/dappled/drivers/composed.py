@@ -33,6 +33,7 @@ from dappled.drivers.shutter_line import Order, ShutterLine, UsesAutopilot, pres
 
 _LATE = 64
 _WAITING = 64
+_PRESSED = "the shutter stays pressed"
 _FIRST_LOOK_S = 2.0
 _ENOUGH = 3
 """So many pairs, and no shot without one, say that a card nobody saw before the flight is this camera's."""
@@ -71,6 +72,8 @@ class ComposedCamera:
         self._lock = threading.Lock()
         self._open: dict[int, None] = {}  # shots that have not ended
         self._started = self._stopping = False
+        self._opened = False  # the line, once
+        self._line_fault = "the shutter line is not open"
         self._files_fault = ""
         self._ready = threading.Event()
         self._arrived = threading.Event()  # a shot was fired: look for its file
@@ -106,11 +109,11 @@ class ComposedCamera:
             ready = self._ready.is_set() and not self._stopping and len(self._open) < _WAITING
             if ready:
                 self._open[shot] = None
-        if ready:
-            self._orders.put(shot)
-        else:
-            reason = "the camera was stopped" if self._stopping else "the shutter line is not open"
-            self._events.put(ShotFailed(shot, reason, self._clock_ns()))
+                self._orders.put(shot)
+                return
+            line = "too many shots wait for their files" if self._ready.is_set() else self._line_fault
+        reason = "the camera was stopped" if self._stopping else line
+        self._events.put(ShotFailed(shot, reason, self._clock_ns()))
 
     def next_event(self, timeout_s: float) -> Event | None:
         """See Camera."""
@@ -124,8 +127,8 @@ class ComposedCamera:
 
     @property
     def identity(self) -> Identity | None:
-        """See Camera: known once the line is open."""
-        return self._identity if self._ready.is_set() else None
+        """See Camera: known once the line was open."""
+        return self._identity if self._opened else None
 
     def settings(self) -> tuple[Setting, ...]:
         """See Camera: nothing can be read over a wire."""
@@ -153,58 +156,92 @@ class ComposedCamera:
     # the shutter
 
     def _fire_all(self) -> None:
-        if not self._open_line():
-            return
-        while not self._stopping:
+        opened = self._open_line()
+        while opened and not self._stopping:
             shot = self._orders.get()
             if not self._stopping:
-                self._fire_one(shot)
-        self._line.close()
+                opened = self._fire_one(shot)
+        if self._opened:
+            self._tried(self._line.close)
 
-    def _open_line(self) -> bool:
-        said = ""
+    def _tried(self, call: Callable[[], None]) -> str:
+        """Why a call of the line failed; empty where it did not. A line of anybody's making may raise anything."""
+        try:
+            call()
+        except CameraError as error:
+            return str(error)
+        except Exception as error:  # noqa: BLE001  # as the docstring says: the thread must outlive it
+            return f"the shutter line broke: {error!r}"
+        return ""
+
+    def _open_line(self, fault: str = "", *, pressed: bool = False) -> bool:
+        """Until it is open, and, where it was `pressed`, let go. False when stopping."""
+        said = fault
         while not self._stopping:
-            try:
-                self._line.open()
-            except CameraError as error:
-                if str(error) != said:
-                    said = str(error)
-                    self._events.put(StateChanged("faulted", said, self._clock_ns()))
-                self._wait(self._plan.retry_s)
-            else:
+            problem = self._tried(self._line.open)
+            if pressed and not problem:
+                problem = self._tried(self._line.let_go)
+            if not problem:
                 self._looked.wait(_FIRST_LOOK_S)
+                self._opened = True
                 self._ready.set()
                 self._rest()
                 return True
+            problem = f"{_PRESSED}: {problem}" if pressed else problem
+            if problem != said:
+                said = problem
+                self._line_lost(problem)
+            self._wait(self._plan.retry_s)
+            if self._opened:
+                self._tried(self._line.close)
         return False
 
-    def _fire_one(self, shot: int) -> None:
+    def _line_lost(self, problem: str) -> None:
+        """Say so. Shots that wait must not be fired when it is found again: their moment is over."""
+        with self._lock:
+            self._ready.clear()
+            self._line_fault = problem
+            self._events.put(StateChanged("faulted", problem, self._clock_ns()))
+        while True:
+            try:
+                shot = self._orders.get_nowait()
+            except queue.Empty:
+                return
+            self._end(shot, ShotFailed(shot, problem, self._clock_ns()))
+
+    def _fire_one(self, shot: int) -> bool:
+        """False when stopping."""
         self._events.put(StateChanged("busy", "", self._clock_ns(), self._identity))
-        try:
-            called_ns, returned_ns = pressing(self._line, self._clock_ns)
-        except CameraError as error:
-            self._end(shot, ShotFailed(shot, str(error), self._clock_ns()))
-        else:
-            self._events.put(Fired(shot, called_ns, returned_ns))
-            if self._pickup is not None:
-                self._pickup.expect(Claim(shot, called_ns))
-                self._arrived.set()
-            if self._plan.follows is not None:
-                self._end(shot, Deferred(shot, self._plan.follows, self._clock_ns()))
-            self._let_go()
-        self._rest()
+        times: list[tuple[int, int]] = []
+        problem = self._tried(lambda: times.append(pressing(self._line, self._clock_ns)))
+        if problem:
+            self._end(shot, ShotFailed(shot, problem, self._clock_ns()))
+            self._tried(self._line.close)
+            return self._open_line()
+        called_ns, returned_ns = times[0]
+        self._events.put(Fired(shot, called_ns, returned_ns))
+        if self._pickup is not None:
+            self._pickup.expect(Claim(shot, called_ns))
+            self._arrived.set()
+        if self._plan.follows is not None:
+            self._end(shot, Deferred(shot, self._plan.follows, self._clock_ns()))
+        self._wait(self._plan.hold_s)
+        problem = self._tried(self._line.let_go)
+        if not problem:
+            self._rest()
+            return True
+        problem = f"{_PRESSED}: {problem}"
+        self._line_lost(problem)
+        self._wait(self._plan.retry_s)
+        return self._open_line(problem, pressed=True)
 
     def _rest(self) -> None:
-        """Tell the state between shots."""
-        fault = self._files_fault
-        self._events.put(StateChanged("faulted" if fault else "ready", fault, self._clock_ns(), self._identity))
-
-    def _let_go(self) -> None:
-        self._wait(self._plan.hold_s)
-        try:
-            self._line.let_go()
-        except CameraError as error:
-            self._events.put(StateChanged("faulted", f"the shutter stays pressed: {error}", self._clock_ns()))
+        """Tell the state between shots, where the line is not lost."""
+        with self._lock:
+            fault = self._files_fault
+            state = StateChanged("faulted" if fault else "ready", fault, self._clock_ns(), self._identity)
+            if self._ready.is_set():
+                self._events.put(state)
 
     def _wait(self, seconds: float) -> None:
         """Wait, but not when stopping: the end of the orders is a -1."""
@@ -234,8 +271,7 @@ class ComposedCamera:
             self._looked.set()
             if fault != self._files_fault:
                 self._files_fault = fault
-                if self._ready.is_set():
-                    self._rest()
+                self._rest()
             self._arrived.wait(self._plan.poll_s)
             self._arrived.clear()
             self._wait(self._plan.poll_s / 4)
