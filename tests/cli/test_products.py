@@ -55,6 +55,9 @@ def test_metres_focus_where_the_board_is(field: str, tmp_path: Path) -> None:
     ):
         assert main(["refocus", field, *words, "-o", str(tmp_path / f"{name}.npy")]) == 0
     a, b, c = (np.load(tmp_path / f"{name}.npy") for name in ("metres", "disparity", "tilt"))
+    words = ["--disparity", str(DISPARITY), "--tilt", "0.1", "0", "--aperture", "0.3"]
+    assert main(["refocus", field, *words, "-o", str(tmp_path / "narrow.npy")]) == 0
+    assert np.nanmax(np.abs(np.load(tmp_path / "narrow.npy") - c)) > 1e-3
     np.testing.assert_allclose(a, b, atol=1e-5)
     assert np.nanmax(np.abs(b - c)) > 1e-3
 
@@ -131,6 +134,13 @@ def test_a_rerun_recording_is_written_and_can_be_read(field: str, tmp_path: Path
         (["refocus", "{}", "--alpha", "0", "-o", "{out}.png"], "is no image plane"),
         (["refocus", "{}", "--distance", "5", "-o", "{out}.png"], "has no distances"),
         (["refocus", "{}", "--magnify", "-o", "{out}.png"], "goes with --alpha"),
+        (["refocus", "{}", "--eyes", "anaglyph", "--fourier", "-o", "{out}.png"], "--eyes doesn't go with --fourier"),
+        (
+            ["refocus", "{}", "--fourier", "--aperture", "0.3", "-o", "{out}.png"],
+            "--fourier doesn't go with --aperture",
+        ),
+        (["refocus", "{}", "--eyes", "anaglyph", "--tilt", "1", "0", "-o", "{out}.png"], "doesn't go with --tilt"),
+        (["refocus", "{}", "--alpha", "1", "--fourier", "--magnify", "-o", "{out}.png"], "doesn't go with --magnify"),
         (["refocus", "{}", "--all-in-focus", "-o", "{out}.png"], "needs --stack"),
         (["refocus", "{}", "--stack", "0", "1", "0.5", "-o", "{out}.png"], "no number of pictures"),
         (["refocus", "{}", "-o", "{out}.gif"], "name it so"),

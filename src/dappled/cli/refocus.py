@@ -49,6 +49,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    _check_mix(arguments)
     found = fields.opened_field(arguments)
     planes = _planes(found, arguments)
     if arguments.all_in_focus or arguments.index:
@@ -64,11 +65,29 @@ def run(arguments: argparse.Namespace) -> int:
         ]
         captions = [c for c, _ in planes]
         if arguments.magnify:
-            if not arguments.alpha:
-                raise OpenError("--magnify goes with --alpha: it is Eq 29's x/α")
             made = [magnified(picture, alpha) for picture, alpha in zip(made, arguments.alpha, strict=True)]
     _write(arguments.output, made, captions)
     return 0
+
+
+def _check_mix(arguments: argparse.Namespace) -> None:
+    """Refuse words that would be ignored. Raises OpenError."""
+    ways = {
+        "--all-in-focus": arguments.all_in_focus or arguments.index is not None,
+        "--eyes": arguments.eyes is not None,
+        "--fourier": arguments.fourier,
+    }
+    chosen = [name for name, given in ways.items() if given]
+    forms = {
+        "--aperture": arguments.aperture is not None,
+        "--tilt": any(arguments.tilt),
+        "--magnify": arguments.magnify,
+    }
+    unused = chosen[1:] + [name for name, given in forms.items() if given] if chosen else []
+    if unused:
+        raise OpenError(f"{chosen[0]} doesn't go with {', '.join(unused)}: leave one of them out")
+    if arguments.magnify and not arguments.alpha:
+        raise OpenError("--magnify goes with --alpha: it is Eq 29's x/α")
 
 
 def _planes(found: OpenedLightField, arguments: argparse.Namespace) -> list[tuple[str, float]]:

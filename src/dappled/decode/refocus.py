@@ -127,12 +127,14 @@ class FocalPlane:
         return plane
 
 
-def tilted(stack: ViewStack, plane: FocalPlane, *, workers: int = 1) -> Image:
-    """The picture focused on a tilted plane, such as ground that is seen obliquely."""
+def tilted(
+    stack: ViewStack, plane: FocalPlane, *, weights: NDArray[np.floating] | None = None, workers: int = 1
+) -> Image:
+    """The picture focused on a tilted plane, such as ground that is seen obliquely; `weights` as `shift_and_add`."""
     height, width = stack.views.shape[2:4]
     if plane.over_height == 0 and plane.over_width == 0:
-        return shift_and_add(stack, plane.disparity, workers=workers)
-    return along(stack, plane.over((height, width)), workers=workers)
+        return shift_and_add(stack, plane.disparity, weights=weights, workers=workers)
+    return along(stack, plane.over((height, width)), weights=weights, workers=workers)
 
 
 def disc(stack: ViewStack, diameter: float, centre: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:

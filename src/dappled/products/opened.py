@@ -141,10 +141,8 @@ class OpenedLightField:
         disparity over the picture's height and width. float32 (h, w) or (h, w, 3), NaN where no view sees.
         """
         at = self.disparity_of(alpha=alpha, disparity=disparity, distance_m=distance_m)
-        if any(tilt):
-            return refocusing.tilted(self.stack, FocalPlane(at, *tilt), workers=self.workers)
         weights = None if aperture is None else refocusing.disc(self.stack, aperture)
-        return refocusing.shift_and_add(self.stack, at, weights=weights, workers=self.workers)
+        return refocusing.tilted(self.stack, FocalPlane(at, *tilt), weights=weights, workers=self.workers)
 
     def depth(
         self, method: str = "combined", *, between: tuple[float, float] | None = None, window: int = depths.WINDOW
