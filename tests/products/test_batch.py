@@ -20,7 +20,7 @@ from dappled.drivers.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import durable
 from dappled.flight.records import Frame
-from dappled.products import batch, lightfiles, workers
+from dappled.products import batch, lightfiles, photographs, workers
 from dappled.products.batch import Done, Job
 from dappled.products.georeference import Options
 from dappled.products.manifest import Manifest, ManifestError
@@ -127,6 +127,36 @@ def test_a_bad_flight_is_said_and_the_others_are_made(
     assert all("is not a flight folder" in line for line in lines)
     assert main([asked[0], str(tmp_path), *asked[2:]]) == 1  # and where none is left
     assert capsys.readouterr().err.count("is not a flight folder") == 1
+
+
+def test_a_flight_that_is_named_twice_is_made_once(
+    flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = words(flight, tmp_path / "out", "--as", "npz", "--frames", "0", "--workers", "1")
+    again = tmp_path / "link"
+    again.symlink_to(flight.folder)
+    assert main([asked[0], str(flight.folder), str(again), *asked[1:]]) == 0
+    assert "1 frames made" in capsys.readouterr().out
+
+
+def test_two_flights_of_one_name_are_refused(flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    copy = tmp_path / flight.folder.name
+    subprocess.run(["cp", "-r", str(flight.folder), str(copy)], check=True)  # noqa: S607  on PATH
+    asked = words(flight, tmp_path / "out")
+    assert main([asked[0], str(copy), *asked[1:]]) == 1
+    assert "would both be written to" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_frames_with_the_same_bytes_are_jobs_of_their_own(
+    flight: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a still scene without noise makes them, from frames that were never tagged."""
+    frames, _ = photographs.recorded(flight.folder)
+    twins = [replace(frame, sha256=frames[0].sha256) for frame in frames]
+    monkeypatch.setattr(photographs, "recorded", lambda _: (twins, {}))
+    jobs = batch.plan(flight.folder, flight.recipe, Options(), ["npz"], tmp_path)
+    assert len({one.key for one in jobs}) == 2
 
 
 def test_a_frame_without_a_place_still_becomes_a_light_field(flight: Flown, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from tqdm import tqdm
@@ -39,13 +40,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     jobs: list[Job] = []
     refused = 0
-    for flight in arguments.flights:
+    for flight in _different(arguments.flights):
         try:
             jobs += _planned(flight, arguments)
         except DappledError as error:  # the other flights are made all the same
             refused += 1
-            said = str(error) if str(flight) in str(error) else f"{flight}: {error}"
-            print(f"dappled batch: {said}", file=sys.stderr)
+            named = str(error) if str(flight) in str(error) else f"{flight}: {error}"
+            print(f"dappled batch: {named}", file=sys.stderr)
     if refused and not jobs:
         return 1
     bad = 0
@@ -71,6 +72,18 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.json:
         print(f"{len(todo) - bad} frames made, {len(jobs) - len(todo)} were there already, {bad} could not be made")
     return 1 if bad or refused else 0
+
+
+def _different(flights: Sequence[Path]) -> list[Path]:
+    """The folders, each once. Raises DappledError for two of one name: they would share a folder of the output."""
+    named: dict[str, Path] = {}
+    for flight in flights:
+        folder = flight.resolve()
+        if named.setdefault(folder.name, folder) != folder:
+            raise DappledError(
+                f"{named[folder.name]} and {folder} would both be written to {folder.name}: give them separate batches"
+            )
+    return list(named.values())
 
 
 def _planned(flight: Path, arguments: argparse.Namespace) -> list[Job]:

@@ -106,7 +106,8 @@ def plan(flight: Path, recipe: Recipe, options: Options, kinds: Sequence[str], o
     jobs = []
     for frame in frames:
         tag = tags.get(frame.index)
-        said = {**common, "flight": flight.name, "frame": frame.sha256, "tag": None if tag is None else asdict(tag)}
+        said = {**common, "flight": flight.name, "name": frame.name, "frame": frame.sha256,
+                "tag": None if tag is None else asdict(tag)}  # fmt: skip
         key = hashlib.sha256(canonical(said)).hexdigest()
         jobs.append(
             Job(
