@@ -51,7 +51,7 @@ def record(
         publisher=PublisherStatistics({}, {}, 0, 0, 0),
         folder=folder,
         utc_known=more.pop("utc_known", True),
-        doubt=more.pop("doubt", None),
+        doubts=more.pop("doubts", ()),
     )
 
 
@@ -77,7 +77,7 @@ def test_well(tmp_path: Path) -> None:
         ({"settings": replace(WELL, mavlink=MavlinkSettings())}, "no MAVLink link is configured"),
         ({"settings": replace(WELL, mask=MaskSettings())}, "no mask is configured"),
         ({"settings": replace(WELL, record=RecordSettings(min_free_mb=10_000_000))}, "disk nearly full"),
-        ({"doubt": "autopilot 7 is heard"}, "autopilot 7 is heard"),
+        ({"doubts": ["autopilot 7 is heard"]}, "autopilot 7 is heard"),
         ({"utc_known": False}, "UTC is not known yet"),
         ({"settings": replace(WELL, record=RecordSettings(warn_free_mb=10_000_000))}, "the disk is filling up"),
         ({"dead": ["capture"]}, "the capture thread has ended: restart dappled"),

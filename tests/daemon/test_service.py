@@ -15,6 +15,7 @@ from dappled.daemon import service as module
 from dappled.daemon.service import Service
 from dappled.daemon.shutter import Wish
 from dappled.daemon.story import Story, Watchers
+from dappled.daemon.telemetry import UtcCorrection
 from dappled.errors import DappledError
 from dappled.flight import check, layout
 from dappled.flight.errors import FlightError
@@ -116,3 +117,13 @@ def test_stop_twice_and_before_start_is_harmless(camera: FakeCamera, settings: S
     service = started(replace(settings), [])
     service.stop()
     service.stop()
+
+
+def test_a_believed_clock_that_the_satellites_contradict_is_a_problem(camera: FakeCamera, settings: Settings) -> None:
+    service = started(replace(settings, record=replace(settings.record, utc="system")), [])
+    try:
+        assert "clock" not in "".join(service.health()["problems"])
+        service._utc.look(UtcCorrection(-3600 * 10**9, 10**7, "SYSTEM_TIME"))
+        assert "this machine's clock is 3600 s fast" in "".join(service.health()["problems"])
+    finally:
+        service.stop()

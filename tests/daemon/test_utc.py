@@ -85,6 +85,32 @@ def test_a_machine_that_knows_learns_nothing() -> None:
     assert learner.utc_ns(5) == 5
 
 
+S = 10**9
+
+
+@pytest.mark.parametrize(
+    ("correction_ns", "sigma_ns", "said"),
+    [
+        (3600 * S, S // 100, "3600 s slow"),
+        (-3600 * S, S // 100, "3600 s fast"),
+        (2 * S, S // 100, "2 s slow"),
+        (S // 2, 0, None),
+        (3 * S, S, None),  # nobody knows it that well
+    ],
+)
+def test_a_clock_that_is_believed_and_wrong_is_told(correction_ns: int, sigma_ns: int, said: str | None) -> None:
+    learner = UtcLearner(known=True, note=lambda _: pytest.fail("nothing to note"))
+    assert learner.doubt() is None
+    learner.look(UtcCorrection(correction_ns, sigma_ns, "test"))
+    learner.look(None)  # the autopilot was silent for a moment
+    told = learner.doubt()
+    assert (told is None) if said is None else (told is not None and said in told)
+    assert learner.utc_ns(5) == 5
+    unsure = UtcLearner(known=False, note=lambda _: None)
+    unsure.look(UtcCorrection(correction_ns, sigma_ns, "test"))
+    assert unsure.doubt() is None
+
+
 def test_the_autopilots_satellites_tell_what_is_missing() -> None:
     """Our clock began in 1970; the autopilot sends SYSTEM_TIME, first without a time, then with."""
     telemetry, truth_ns = Telemetry(), 1_790_000_000 * 10**9

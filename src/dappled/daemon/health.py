@@ -39,10 +39,10 @@ def record(
     vehicle: Pose | None = None,
     decoding: bool = False,
     utc_known: bool = True,
-    doubt: str | None = None,
+    doubts: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """The facts of a `health` message; `problems` are sentences, none when all is well. `doubt`: one more, from
-    the MAVLink component."""
+    """The facts of a `health` message; `problems` are sentences, none when all is well. `doubts`: more of them,
+    of what is contradictory in the vehicle."""
     dead = street.dead()
     problems = [f"the {name} thread has ended: restart dappled" for name in dead]
     if street.camera_state not in ("starting", "ready", "busy"):
@@ -57,8 +57,7 @@ def record(
         elif monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS:
             silent += 1
             problems.append(f"MAVLink link {link.url}: {_silence(link)}")
-    if doubt:
-        problems.append(doubt)
+    problems += doubts
     if not utc_known:
         problems.append(
             "UTC is not known yet: the autopilot's satellites will tell it, and all stamps are put right then"

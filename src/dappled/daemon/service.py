@@ -315,7 +315,7 @@ class Service:
             vehicle=self._telemetry.pose_at(self._clock.utc_ns(), 0.0),
             decoding=self._recipe is not None,
             utc_known=self._utc.known,
-            doubt=self._component.doubt() if self._component else None,
+            doubts=[text for text in (self._component and self._component.doubt(), self._utc.doubt()) if text],
         )
 
     # wishes

@@ -10,6 +10,7 @@ from dappled.daemon.telemetry import UtcCorrection
 
 FLOOR_NS = 1_735_689_600 * 10**9  # 2025: a clock that shows less has never been set
 _BETTER = 2
+_AGREES_NS = 10**9  # what clocks may differ by before it is told
 _TIMEX_BYTES = 512  # more than any kernel's struct timex
 
 
@@ -41,11 +42,15 @@ def known(setting: str, utc_ns: int) -> bool:
 
 
 class UtcLearner:
-    """Notes the autopilot's word once there is one, and again when it is twice as sure."""
+    """Notes the autopilot's word once there is one, and again when it is twice as sure.
+
+    Where the machine's own clock is believed nothing is noted; that they differ is told.
+    """
 
     def __init__(self, *, known: bool, note: Callable[[UtcCorrection], object]) -> None:
         self._known, self._note = known, note
         self.learnt: UtcCorrection | None = None
+        self._last: UtcCorrection | None = None
 
     @property
     def known(self) -> bool:
@@ -54,11 +59,24 @@ class UtcLearner:
 
     def look(self, found: UtcCorrection | None) -> None:
         """What telemetry says now. Raises DappledError when it can't be noted; the next look tries again."""
+        self._last = found or self._last
         if self._known or found is None:
             return
         if self.learnt is None or found.sigma_ns * _BETTER <= self.learnt.sigma_ns:
             self._note(found)
             self.learnt = found
+
+    def doubt(self) -> str | None:
+        """A sentence where the machine's clock is believed, and the autopilot's satellites say something else."""
+        last = self._last
+        if not self._known or last is None or abs(last.correction_ns) <= 3 * last.sigma_ns + _AGREES_NS:
+            return None
+        way = "slow" if last.correction_ns > 0 else "fast"
+        off_s = abs(last.correction_ns) / 1e9
+        return (
+            f"this machine's clock is {off_s:.0f} s {way}, by the autopilot's satellites, and believed all the same: "
+            'set it, or set record.utc = "autopilot"'
+        )
 
     def utc_ns(self, utc_ns: int) -> int | None:
         """A stamp of this flight as UTC; None while that is not known."""
