@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -574,6 +575,42 @@ def test_after_a_break_the_same_body_is_taken_again_and_not_its_twin() -> None:
             assert camera.identity.serial == "0000000002"
         finally:
             camera.stop()
+
+
+def test_a_process_that_can_t_be_started_now_is_tried_again(body: Body) -> None:
+    problems = [OSError(errno.EMFILE, os.strerror(errno.EMFILE)), OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))]
+
+    def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
+        if problems:
+            raise problems.pop(0)
+        return spawn_process(settings, before)
+
+    camera = GPhoto2Camera(parse_settings({"port": body.port}), spawn=spawn)
+    camera.start()
+    try:
+        assert "Too many open files" in until_state(camera, "faulted").reason
+        camera.fire(1)
+        assert of_shots(until_shot_ends(camera, 1)) == [(ShotFailed, 1)]
+        until_state(camera, "ready")
+        camera.fire(2)
+        _ended(until_shot_ends(camera, 2))
+    finally:
+        camera.stop()
+
+
+def test_a_process_that_was_not_started_leaves_no_descriptor(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+
+    monkeypatch.setattr(subprocess, "Popen", full)
+    before = sorted(os.listdir("/proc/self/fd"))
+    error = None
+    try:
+        spawn_process(parse_settings({}), Before())
+    except OSError as caught:
+        error = caught  # with its traceback, which must hold no open channel
+    assert error is not None
+    assert sorted(os.listdir("/proc/self/fd")) == before
 
 
 def test_a_body_that_comes_back_under_another_address_is_found() -> None:

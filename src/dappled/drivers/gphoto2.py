@@ -42,6 +42,7 @@ from dappled.drivers.gphoto2_settings import GPhoto2Settings, parse_settings
 _PING_S = 1.0
 _STOP_S = 1.2
 _KILL_S = 0.6
+_SPAWN_S = 1.0
 
 Spawn = Callable[[GPhoto2Settings, Before], tuple["subprocess.Popen[bytes]", Channel]]
 
@@ -52,24 +53,28 @@ def open_camera(settings: Mapping[str, Any]) -> GPhoto2Camera:
 
 
 def spawn_process(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
-    """Start the camera's process; it dies with the calling thread."""
+    """Start the camera's process; it dies with the calling thread. Raises OSError."""
     channel, other = Channel.pair()
     with other:
-        process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "dappled.drivers.gphoto2_process",
-                str(other.fileno()),
-                str(os.getpid()),
-                json.dumps(settings.to_json()),
-                json.dumps(before.to_json()),
-            ],
-            pass_fds=(other.fileno(),),
-            stdin=subprocess.DEVNULL,
-            # libgphoto2 keeps settings (capture target, ...) under HOME and would let one run change the next.
-            env={**os.environ, "HOME": "/nonexistent"},
-        )
+        try:
+            process = subprocess.Popen(
+                [
+                    sys.executable,
+                    "-m",
+                    "dappled.drivers.gphoto2_process",
+                    str(other.fileno()),
+                    str(os.getpid()),
+                    json.dumps(settings.to_json()),
+                    json.dumps(before.to_json()),
+                ],
+                pass_fds=(other.fileno(),),
+                stdin=subprocess.DEVNULL,
+                # libgphoto2 keeps settings (capture target, ...) under HOME and would let one run change the next.
+                env={**os.environ, "HOME": "/nonexistent"},
+            )
+        except OSError:
+            channel.close()
+            raise
     return process, channel
 
 
@@ -178,7 +183,13 @@ class GPhoto2Camera:
 
     def _supervise(self) -> None:
         while not self._stopping.is_set():
-            process, channel = self._spawn(self._settings, self._before)
+            try:
+                process, channel = self._spawn(self._settings, self._before)
+            except OSError as error:  # no memory, no descriptors: that may pass
+                reason = f"the camera's process can't be started: {error.strerror}"
+                self._events.put(StateChanged("faulted", reason, self._clock_ns()))
+                self._stopping.wait(_SPAWN_S)
+                continue
             with self._lock:
                 self._process, self._channel = process, channel
             reason = self._serve(process, channel)
