@@ -1,0 +1,25 @@
+"""What tests skip for lack of, the CI's own run gets: a skip must not hide that a promise was never looked at."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+ELSEWHERE = {
+    "cargo",  # Rust comes from rustup, not from Debian
+    "unshare",  # util-linux: part of every Debian
+    "g++",  # looked for by a header of the libraries that it comes with
+}
+
+
+def test_every_program_that_a_test_looks_for_is_had_from_debian_in_ci() -> None:
+    sought = {
+        name
+        for path in (ROOT / "tests").rglob("*.py")
+        if path != Path(__file__)
+        for name in re.findall(r'which\("([^"]+)"\)', path.read_text("utf-8"))
+    }
+    assert "strace" in sought
+    had = set(re.findall(r"command -v (\S+) >/dev/null \|\| wanted", (ROOT / ".ci" / "run").read_text("utf-8")))
+    assert sought - had - ELSEWHERE == set()
