@@ -113,6 +113,43 @@ def test_terrain_and_difference(short_flight: Flown, tmp_path: Path, capsys: pyt
         assert np.nanmax(np.abs(read.read(1))) < 1e-4
 
 
+@pytest.fixture
+def later_flight(short_flight: Flown, tmp_path: Path) -> Path:
+    """The first frame alone, as frame 7 of another flight: numbers go on over flights."""
+    begun = recording.begin(tmp_path / "later", lambda: flown.START_NS)
+    raw = sorted((short_flight.folder / "frames").iterdir())[0].read_bytes()
+    wish(begun, 7)
+    frame = deliver(begun, 7, raw, "IMG_7.DNG")
+    pose_of_it = flown.as_recorded(true_pose(short_flight))
+    begun.ledger.add_tag(replace(tagged(frame.sha256, 7), pose=pose_of_it))
+    begun.close()
+    return begun.folder.path
+
+
+def test_frames_and_control_points_are_the_first_flights_alone(
+    short_flight: Flown, later_flight: Path, tmp_path: Path
+) -> None:
+    place = true_pose(short_flight)
+    sighting = f"target,000000,921.5,693.5,{place.latitude_deg},{place.longitude_deg},203.4"
+    points = tmp_path / "points.csv"
+    points.write_text(f"name,frame,column,row,latitude,longitude,altitude\n{sighting}\n")
+    more = ["--as", "difference", "--against", str(later_flight), "--frames", "0", "--gcp", str(points)]
+    assert main(words(short_flight, tmp_path / "maps", *more, "--gsd", "0.1")) == 0
+    assert (tmp_path / "maps" / "difference.tif").is_file()
+
+
+def test_what_cant_be_compared_leaves_the_maps_and_a_report(
+    short_flight: Flown, later_flight: Path, tmp_path: Path
+) -> None:
+    """The other flight's one frame shows no ground twice."""
+    more = ["--as", "cog", "terrain", "difference", "--against", str(later_flight), "--gsd", "0.1"]
+    assert main(words(short_flight, tmp_path / "maps", *more)) == 1
+    report = json.loads((tmp_path / "maps" / "report.json").read_text())
+    assert report["files"] == ["mosaic.tif", "terrain.tif", "terrain.las", "difference.tif"]
+    (why,) = report["notes"]
+    assert why.startswith(f"no difference to {later_flight}: no two frames")
+
+
 def test_a_change_on_the_ground_stands_out_of_another_hours_light() -> None:
     eye, ground = eye_at(height_m=100.0), Flat(0.0)
     image = painted(eye, ground)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +22,7 @@ from dappled.products import difference, drawings, earth, georeference, terrain
 from dappled.products.georeference import Options, Progress, Survey
 from dappled.products.hyperstereo import HyperstereoError
 from dappled.products.photographs import Mounting
+from dappled.products.terrain import Terrain
 
 KINDS = ("kmz", "cog", "footprints", "terrain", "difference")
 
@@ -39,7 +40,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="what to make (default: kmz cog footprints)")  # fmt: skip
     parser.add_argument("--each", action="store_true", help="a kmz or cog of each frame too, in frames/")
     parser.add_argument("--quad", action="store_true", help="each frame's kmz as a LatLonQuad: the view itself")
-    parser.add_argument("--against", type=Path, metavar="FLIGHT", help="for difference: the other, later flight")
+    parser.add_argument(
+        "--against", type=Path, metavar="FLIGHT", help="for difference: the other, later flight, all its frames"
+    )
     parser.add_argument("--between", nargs=2, type=float, metavar=("LOW", "HIGH"),
                         help="for terrain: heights to search, metres above sea level\n"
                         "(default: 3 m below to 12 m above the ground that is given)")  # fmt: skip
@@ -102,30 +105,28 @@ def run(arguments: argparse.Namespace) -> int:
         raise DappledError("--as difference and --against FLIGHT go together")
     if arguments.between and not arguments.between[0] < arguments.between[1]:
         raise DappledError("--between: the lower height comes first")
+    if arguments.against is not None:
+        layout.open_folder(arguments.against)
     with ExitStack() as stack:
         progress = stack.enter_context(Bar())
         made = _survey(folder.path, arguments, progress, stack)
         files = _draw(made, output, arguments)
-        terrain_of, missing = None, ""
-        low, high = arguments.between or (None, None)
+        missing: list[str] = []  # sentences: what could be made is there all the same
+        terrain_of = None
         if "terrain" in arguments.kinds:
             try:
-                terrain_of = terrain.of(made, progress, lowest_m=low, highest_m=high)
+                terrain_of = _heights(made, arguments, progress)
                 files.append(terrain.write_raster(made, terrain_of, output / "terrain.tif"))
                 files.append(terrain.write_points(made, terrain_of, output / "terrain.las"))
-            except HyperstereoError as error:  # the maps are there all the same
-                missing = str(error)
+            except HyperstereoError as error:
+                missing.append(str(error))
         if arguments.against is not None:
-            arguments.crs = made.projection.name
-            other = _survey(layout.open_folder(arguments.against).path, arguments, progress, stack)
-            changed = difference.of_pictures(made, other)
-            files.append(difference.write(made, other, changed, output / "difference.tif", "share of brightness"))
-            if terrain_of is not None:
-                found = terrain.of(other, progress, lowest_m=low, highest_m=high)
-                raised = difference.of_heights(terrain_of, found)
-                files.append(difference.write(made, other, raised, output / "height-difference.tif", "m"))
-    if missing:
-        made = replace(made, notes=(*made.notes, missing))
+            try:
+                for path in _compare(made, terrain_of, output, arguments=arguments, progress=progress, stack=stack):
+                    files.append(path)
+            except DappledError as error:
+                missing.append(f"no difference to {arguments.against}: {error}")
+    made = replace(made, notes=(*made.notes, *missing))
     report = georeference.write_report(made, output, files)
     if arguments.json:
         print(report.read_text(), end="")
@@ -136,6 +137,34 @@ def run(arguments: argparse.Namespace) -> int:
     for why in (*(why for _, why in made.left), *made.notes):
         print(why, file=sys.stderr)
     return 1 if missing else 0
+
+
+def _heights(made: Survey, arguments: argparse.Namespace, progress: Progress) -> Terrain:
+    low, high = arguments.between or (None, None)
+    return terrain.of(made, progress, lowest_m=low, highest_m=high)
+
+
+def _compare(
+    made: Survey,
+    heights: Terrain | None,
+    output: Path,
+    *,
+    arguments: argparse.Namespace,
+    progress: Progress,
+    stack: ExitStack,
+) -> Iterator[Path]:
+    """The rasters of what has changed until the flight of --against, one by one as they are made."""
+    other = _survey(arguments.against, _for_the_other(arguments, made), progress, stack)
+    changed = difference.of_pictures(made, other)
+    yield difference.write(made, other, changed, output / "difference.tif", "share of brightness")
+    if heights is not None:
+        raised = difference.of_heights(heights, _heights(other, arguments, progress))
+        yield difference.write(made, other, raised, output / "height-difference.tif", "m")
+
+
+def _for_the_other(arguments: argparse.Namespace, made: Survey) -> argparse.Namespace:
+    """The arguments for the flight of --against: what names frames is about the first flight alone."""
+    return argparse.Namespace(**{**vars(arguments), "crs": made.projection.name, "frames": None, "gcp": None})
 
 
 def _survey(flight: Path, arguments: argparse.Namespace, progress: Progress, stack: ExitStack) -> Survey:
