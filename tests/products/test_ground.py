@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 import rasterio.shutil
+from numpy.typing import NDArray
 
 from dappled.products import ground as grounds
 from dappled.products.earth import Geoid, Projection
@@ -98,6 +99,24 @@ def test_dted_is_terrain(tmp_path: Path) -> None:
     east, y = (float(v) for v in PROJECTION.to_map(41.6, -91.5))
     ground = grounds.load(cell, PROJECTION, (east - 500, y - 500, east + 500, y + 500))
     assert float(ground.heights(np.array(east), np.array(y))) == pytest.approx(60.0, abs=0.5)
+
+
+def write_degrees(path: Path, west: float, north: float, step_deg: float, values: NDArray[np.float32]) -> Path:
+    rows, columns = values.shape
+    with rasterio.open(
+        path, "w", driver="GTiff", width=columns, height=rows, count=1, dtype="float32", crs="EPSG:4326",
+        transform=rasterio.Affine(step_deg, 0, west, 0, -step_deg, north),
+    ) as target:  # fmt: skip
+        target.write(values, 1)
+    return path
+
+
+def test_a_raster_of_the_whole_world_is_terrain(tmp_path: Path) -> None:
+    world = write_degrees(tmp_path / "world.tif", -180, 90, 0.5, np.full((360, 720), 12.0, dtype=np.float32))
+    east, north = eye_at().centre[:2]
+    made = grounds.load(world, PROJECTION, (east - 20, north - 20, east + 20, north + 20))
+    assert float(made.heights(np.array(east), np.array(north))) == pytest.approx(12.0)
+    assert 30_000 < made.step_m < 60_000  # half a degree of longitude, there
 
 
 def test_bad_terrain_is_a_sentence(tmp_path: Path) -> None:

@@ -154,7 +154,7 @@ def load(
             if source.crs is None or source.transform.is_identity:
                 raise GroundError(f"the terrain {path} doesn't say where it lies: give one with a coordinate system")
             target = projection.crs.to_wkt()
-            step = _step(source, projection)
+            step = _step(source, projection, bounds)
             margin = 4 * step
             west, south = bounds[0] - margin, bounds[1] - margin
             columns = math.ceil((bounds[2] + margin - west) / step) + 1
@@ -190,11 +190,12 @@ def load(
     return Raster(values, west, north, step, 0.05 * step if sigma_m is None else sigma_m, path.name)
 
 
-def _step(source: Any, projection: Projection) -> float:
-    """A raster's own step in map metres."""
+def _step(source: Any, projection: Projection, bounds: tuple[float, float, float, float]) -> float:
+    """A raster's own step in map metres, under the flight."""
     a, e = abs(source.transform.a), abs(source.transform.e)
     if source.crs.is_geographic:
-        return float(min(a * math.cos(math.radians(source.bounds.bottom)), e)) * math.radians(1) * 6378137.0
+        latitude, _ = projection.to_geodetic((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2)
+        return float(min(a * math.cos(math.radians(float(latitude))), e)) * math.radians(1) * 6378137.0
     factor = source.crs.linear_units_factor[1] if source.crs.is_projected else 1.0
     return float(min(a, e) * factor)
 
