@@ -11,6 +11,7 @@ import rasterio.shutil
 from numpy.typing import NDArray
 
 from dappled.products import ground as grounds
+from dappled.products.basemap import BaseMap
 from dappled.products.earth import Geoid, Projection
 from dappled.products.ground import Flat, GroundError, Raster
 from tests.products.test_eye import eye_at
@@ -117,6 +118,29 @@ def test_a_raster_of_the_whole_world_is_terrain(tmp_path: Path) -> None:
     made = grounds.load(world, PROJECTION, (east - 20, north - 20, east + 20, north + 20))
     assert float(made.heights(np.array(east), np.array(north))) == pytest.approx(12.0)
     assert 30_000 < made.step_m < 60_000  # half a degree of longitude, there
+
+
+@pytest.mark.parametrize("west", [-180.0, 0.0, 170.0])
+def test_terrain_goes_on_over_the_antimeridian(tmp_path: Path, west: float) -> None:
+    """From a raster that ends there, and from two that don't."""
+    columns = 40 if west == 170 else 720
+    longitude = west + 0.5 * (np.arange(columns) + 0.5)
+    values = np.where(longitude % 360 < 180, 10.0, 20.0).astype(np.float32)
+    world = write_degrees(tmp_path / "world.tif", west, 90, 0.5, np.tile(values, (360, 1)))
+    projection = Projection("EPSG:32701")
+    east, north = (float(v) for v in projection.to_map(-17.0, 180.0))
+    made = grounds.load(world, projection, (east - 90e3, north - 9e3, east + 90e3, north + 9e3))
+    met = made.heights(np.array([east - 85e3, east + 85e3]), np.full(2, north))
+    assert met == pytest.approx([10.0, 20.0], abs=0.01)
+    picture = BaseMap(world, projection, 1000.0)
+    box = np.array([[east - 90e3, north - 9e3], [east + 90e3, north + 9e3]])
+    picture.check(box)
+    window = picture.window(box, 0.0)
+    assert window is not None
+    drawn, _ = window
+    assert np.isfinite(drawn).all()
+    assert drawn[:, 0] == pytest.approx(10.0, abs=0.01)
+    assert drawn[:, -1] == pytest.approx(20.0, abs=0.01)
 
 
 def test_bad_terrain_is_a_sentence(tmp_path: Path) -> None:

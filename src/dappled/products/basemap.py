@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.errors import DappledError
-from dappled.products.earth import Projection
+from dappled.products.earth import Projection, touch
 from dappled.products.extras import need
 from dappled.products.maps import MapGrid, around
 
@@ -41,7 +41,7 @@ class BaseMap:
             except rasterio.errors.RasterioError as error:
                 raise BaseMapError(f"the base map {self.path} and the flight have no common system: {error}") from None
             b = source.bounds
-            if not (there[0] <= b.right and b.left <= there[2] and there[1] <= b.top and b.bottom <= there[3]):
+            if not touch(there, b, degrees=source.crs.is_geographic):
                 raise BaseMapError(
                     f"the base map {self.path} lies elsewhere on Earth: it covers {b.left:.6g} … {b.right:.6g} by "
                     f"{b.bottom:.6g} … {b.top:.6g}, the flight is at {there[0]:.6g}, {there[1]:.6g}"

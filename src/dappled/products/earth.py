@@ -102,6 +102,20 @@ def wrapped(longitude_deg: float) -> float:
     return (longitude_deg + 180) % 360 - 180
 
 
+def touch(a: tuple[float, ...], b: tuple[float, ...], *, degrees: bool) -> bool:
+    """Whether two boxes (west, south, east, north) meet. In degrees also around the antimeridian, where a box's west
+    may lie above its east, and whether a raster counts to 180° or to 360°.
+
+    >>> touch((179.9, -17, -179.9, -16), (-180, -90, 180, 90), degrees=True)
+    True
+    """
+    if not (a[1] <= b[3] and b[1] <= a[3]):
+        return False
+    east_a, east_b = (box[2] + 360 * (degrees and box[0] > box[2]) for box in (a, b))
+    turns = (-360, 0, 360) if degrees else (0,)
+    return any(a[0] + turn <= east_b and b[0] <= east_a + turn for turn in turns)
+
+
 def utm(latitude_deg: float, longitude_deg: float) -> str:
     """The UTM zone of a place as an EPSG code, or UPS beyond 84° N and 80° S.
 

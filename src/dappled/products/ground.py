@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.errors import DappledError
-from dappled.products.earth import Geoid, Projection
+from dappled.products.earth import Geoid, Projection, touch
 from dappled.products.extras import need
 from dappled.products.eye import Eye
 
@@ -165,7 +165,7 @@ def load(
                 )
             north = south + (rows - 1) * step
             box = warp.transform_bounds(target, source.crs, west, south, west + (columns - 1) * step, north)
-            if not _touches(box, source.bounds):
+            if not touch(box, source.bounds, degrees=source.crs.is_geographic):
                 raise GroundError(
                     f"the terrain {path} lies elsewhere: it covers {_words(source.bounds)}, the flight {_words(box)}"
                 )
@@ -198,10 +198,6 @@ def _step(source: Any, projection: Projection, bounds: tuple[float, float, float
         return float(min(a * math.cos(math.radians(float(latitude))), e)) * math.radians(1) * 6378137.0
     factor = source.crs.linear_units_factor[1] if source.crs.is_projected else 1.0
     return float(min(a, e) * factor)
-
-
-def _touches(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
-    return a[0] <= b[2] and b[0] <= a[2] and a[1] <= b[3] and b[1] <= a[3]
 
 
 def _words(box: tuple[float, ...]) -> str:
