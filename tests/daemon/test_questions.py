@@ -7,7 +7,7 @@ import json
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.daemon import questions
+from dappled.daemon import questions, wire
 from dappled.daemon.wire import WireError
 
 
@@ -16,7 +16,11 @@ from dappled.daemon.wire import WireError
     | st.builds(
         lambda value: json.dumps(value).encode(),
         st.recursive(
-            st.none() | st.booleans() | st.integers() | st.sampled_from(["start", "frame", "slices", "get"]),
+            st.none()
+            | st.floats()
+            | st.booleans()
+            | st.integers()
+            | st.sampled_from(["start", "frame", "slices", "get"]),
             lambda inner: (
                 st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["get", "frame", "seq"]), inner)
             ),
@@ -29,4 +33,6 @@ def test_any_question_is_understood_or_refused(data: bytes) -> None:
     except WireError:
         return
     assert request["get"] in ("start", "frame", "slices")
-    assert json.loads(data) == request
+    asked = json.loads(data)
+    assert request == {name: asked[name] for name in questions.KEPT if name in asked}
+    wire.encode(request)  # as the answer's header repeats it

@@ -7,11 +7,17 @@ from typing import Any
 
 from dappled.daemon.wire import WireError
 
+KEPT = ("get", "frame", "seq", "flight")
+FLIGHT_CHARACTERS = 200
+
 
 def parse(payload: list[bytes]) -> dict[str, Any]:
-    """One JSON object with `get` and, unless it asks for the start, `frame` or `seq`. Raises WireError."""
+    """One JSON object with `get` and, unless it asks for the start, `frame` or `seq`. Raises WireError.
+
+    Only what a question can hold is kept of it, as the answer's header repeats it.
+    """
     try:
-        request = json.loads(payload[0]) if len(payload) == 1 else None
+        request = json.loads(payload[0], parse_constant=_no_number) if len(payload) == 1 else None
     except (ValueError, RecursionError):
         request = None
     topics = ("start", "frame", "slices")
@@ -23,4 +29,11 @@ def parse(payload: list[bytes]) -> dict[str, Any]:
         number = request.get("frame", request.get("seq"))
         if not isinstance(number, int) or isinstance(number, bool) or number < 0:
             raise WireError("a question names a frame (or, for slices, a seq) by a whole number from 0")
-    return request
+    flight = request.get("flight")
+    if flight is not None and not (isinstance(flight, str) and len(flight) <= FLIGHT_CHARACTERS):
+        raise WireError("a question's flight is a name")
+    return {name: request[name] for name in KEPT if name in request}
+
+
+def _no_number(text: str) -> object:
+    raise ValueError(text)
