@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import mmap
 import socket
 import threading
 import time
-from collections.abc import Iterator, Mapping
+import weakref
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,8 @@ import zmq
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.daemon import wire
+from dappled.config.settings import PublishSettings
+from dappled.daemon import publisher, wire
 from dappled.daemon.publisher import Publisher, Reply
 from dappled.daemon.subscriber import AsyncSubscriber, Subscriber, subscribe, subscribe_async
 from dappled.daemon.wire import Message, WireError
@@ -154,6 +157,8 @@ def test_the_start_can_be_asked_for_later(started: Publisher, endpoint: str) -> 
 @pytest.mark.parametrize(
     "question",
     [b"", b"{", b"[]", b'{"get": "fish"}', b'{"get": "slices"}', b'{"get": "slices", "frame": "4"}', b"[" * 4000,
+     b'{"get": "slices", "frame": 1, "x": NaN}', b'{"get": "slices", "seq": Infinity}',
+     b'{"get": "slices", "frame": 1, "flight": 7}',
      b'{"get": "slices", "frame": -1}', b'{"get": "slices", "seq": 99}', b'{"get": "slices", "frame": true}'],
 )  # fmt: skip
 def test_a_bad_question_gets_one_sentence(started: Publisher, endpoint: str, question: bytes) -> None:
@@ -195,6 +200,125 @@ def test_a_flood_of_questions_disturbs_nobody(started: Publisher, endpoint: str)
             threading.Event().wait(0.01)
     assert started.statistics().refused == 10_000
     context.destroy(linger=0)
+
+
+class Bodies:
+    """Makes bodies of a megabyte, and knows which of them somebody still holds."""
+
+    def __init__(self) -> None:
+        self.alive: set[int] = set()
+        self.made = 0
+
+    def make(self) -> mmap.mmap:
+        body = mmap.mmap(-1, 1 << 20)
+        self.alive.add(self.made)
+        weakref.finalize(body, self.alive.discard, self.made)
+        self.made += 1
+        return body
+
+
+@pytest.mark.parametrize("before", [0, 1])
+def test_a_reader_of_slices_that_stops_keeps_four(endpoint: str, before: int) -> None:
+    """Whatever was read before it stopped: that decides how far ZeroMQ has counted."""
+    bodies = Bodies()
+    mark = PublishSettings().high_water_mark
+    one = Publisher(endpoint, "", flight="f", answer=no_answer, high_water_mark=mark)
+    one.start()
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    deaf = context.socket(zmq.SUB)
+    deaf.setsockopt(zmq.RCVHWM, 1)
+    deaf.setsockopt(zmq.RCVBUF, 4096)
+    deaf.subscribe(b"slices")
+    deaf.connect(endpoint)
+    with Subscriber(endpoint) as subscriber:
+        connected(one, subscriber)
+        until = time.monotonic() + 10
+        while not deaf.poll(50):  # until its subscription has come
+            assert time.monotonic() < until
+            one.publish("slices", {"frame": 0, "arrays": []}, b"")
+        for _ in range(before):
+            one.publish("slices", {"frame": 0, "arrays": []}, b"")
+        for number in range(1, 13):
+            one.publish("slices", {"frame": number, "arrays": []}, bodies.make())
+            while receive(subscriber, "slices").header["frame"] != number:
+                pass
+        eventually(lambda: len(bodies.alive) <= 4, "what nobody waits for is freed")
+        assert bodies.made == 12
+    context.destroy(linger=0)
+    one.stop(0.0)
+
+
+def test_what_follows_a_large_message_at_once_is_not_lost(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("_PATIENCE_S", "_LARGE_PATIENCE_S"):  # a machine may be slow
+        monkeypatch.setattr(publisher, name, 10.0)
+    one = Publisher(endpoint, "", flight="f", answer=no_answer, capacity=100, high_water_mark=1)
+    one.start()
+    rounds, rest = 10, ("preview", "depth", "frame", "health")
+    got: list[str] = []
+    with Subscriber(endpoint) as subscriber:
+        connected(one, subscriber)
+        for _ in range(rounds):
+            one.publish("slices", {"frame": 1, "arrays": []}, mmap.mmap(-1, 1 << 24))
+            for topic in rest:
+                one.publish(topic, {"frame": 1, "arrays": []}, b"x")
+        while len(got) < rounds * 5:
+            message = subscriber.receive(20)
+            assert message is not None, "lost"
+            if "frame" in message.header:
+                got.append(message.topic)
+    assert got == ["slices", *rest] * rounds
+    one.stop(0.0)
+
+
+def test_askers_that_never_read_keep_four_answers_of_all_together(endpoint: str) -> None:
+    bodies = Bodies()
+
+    def answer(request: Mapping[str, Any], reply: Reply) -> None:
+        reply(Message("slices", {"frame": request["frame"], "arrays": []}, bodies.make()))
+
+    one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer)
+    one.start()
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    askers = [context.socket(zmq.DEALER) for _ in range(10)]
+    for asker in askers:
+        asker.setsockopt(zmq.RCVHWM, 1)
+        asker.connect(endpoint + ".ask")
+        for frame in range(10):
+            asker.send_json({"get": "slices", "frame": frame})
+    eventually(lambda: bodies.made == 100 and one.statistics().waiting == 0, "all are answered")
+    eventually(lambda: len(bodies.alive) <= 4, "four answers wait")
+    assert one.statistics().refused >= 50
+    for asker in askers:  # what came is an answer, or says why not
+        while asker.poll(100):
+            message = wire.decode(asker.recv_multipart())
+            assert message.topic == "slices" or "ask again later" in message.header["error"]
+    eventually(lambda: not bodies.alive, "what was read is freed")
+    asker.send_json({"get": "slices", "frame": 3})
+    assert asker.poll(10_000)
+    assert wire.decode(asker.recv_multipart()).topic == "slices"
+    context.destroy(linger=0)
+    one.stop(0.0)
+
+
+def test_an_answer_that_cannot_be_sent_is_no_loss_of_the_stream(endpoint: str) -> None:
+    def answer(_: Mapping[str, Any], reply: Reply) -> None:
+        reply(Message("slices", {"frame": float("nan")}))
+
+    one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer)
+    one.start()
+    with Subscriber(endpoint, endpoint + ".ask", topics=[]) as subscriber:
+        subscriber.ask({"get": "slices", "frame": 1})
+        assert "can't be sent" in receive(subscriber, "error").header["error"]
+    assert not any(one.statistics().dropped.values())
+    assert one.statistics().refused == 1
+    one.stop(0.0)
+
+
+def eventually(condition: Callable[[], object], what: str) -> None:
+    until = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < until, f"never: {what}"
+        threading.Event().wait(0.01)
 
 
 def test_asyncio_recovers_what_was_lost(endpoint: str) -> None:

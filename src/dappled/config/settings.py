@@ -121,7 +121,9 @@ class DecodeSettings:
 class PublishSettings:
     slices: str = setting("", "ZeroMQ endpoint of the stream; empty: ipc in the user's runtime folder")
     ask: str = setting("", "ZeroMQ endpoint that answers questions about recorded frames; empty: beside the stream")
-    high_water_mark: int = setting(6, "Messages that may wait for a slow subscriber; 2 to 4 a frame", low=1, high=1000)
+    high_water_mark: int = setting(
+        3, "Messages, so stacks of slices, that may wait for one slow subscriber", low=1, high=1000
+    )
     preview_interval_s: float = setting(1.0, "At most one preview in this time", unit="s", low=0, high=3600)
     socket_mode: str = setting("0660", "Who may connect to ipc sockets, as chmod says it", choices=SOCKET_MODES)
     keys: str = setting("", "Secret CURVE key for tcp endpoints, made by dappled keys make; empty: none off loopback")

@@ -12,6 +12,8 @@ import logging
 import os
 import select
 import threading
+import time
+import weakref
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -31,6 +33,10 @@ Answer = Callable[[Mapping[str, Any], Reply], None]
 DROP_ORDER = ("preview", "health", "depth", "slices")
 REMEMBERED = 65536  # slices whose frame number is known by sequence
 QUESTION_BYTES = 4096
+UNREAD_ANSWERS = 4  # with a body, of all askers together
+_LARGE_BYTES = 1_000_000
+_PATIENCE_S, _LARGE_PATIENCE_S = 0.02, 0.1  # after a message, while its bytes are on their way to those who read
+_HEARTBEAT_MS, _DEAF_MS = 5_000, 30_000  # a peer that reads nothing for so long is cut off; it may come again
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +81,9 @@ class Publisher:
         self._dropped = dict.fromkeys(wire.TOPICS, 0)
         self._frame_of: dict[int, int] = {}
         self._questions = self._refused = self._open_questions = self._wrong_keys = 0
-        self._grace_s = 0.0
+        self._grace_s = self._patient_until_s = 0.0
         self._start: Message | None = None
+        self._unread: list[weakref.ref[memoryview]] = []  # answers' bodies; ZeroMQ lets go of those that were read
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._stopping = threading.Event()
         self._closed = False
@@ -193,6 +200,9 @@ class Publisher:
                 self._send_reply(peer, message) if peer else self._send(message)
             except Exception as error:  # noqa: BLE001  # one message that can't be sent must not end the stream
                 report(log, f"{message.topic} was not sent", error)
+                if peer:  # the stream itself lost nothing
+                    self._say_so(peer)
+                    continue
                 with self._lock:
                     self._dropped[message.topic] = self._dropped.get(message.topic, 0) + 1
 
@@ -200,18 +210,54 @@ class Publisher:
         header = self._envelope(message, self._sent[message.topic])
         if message.topic == "end":
             header["sent"] = dict(self._sent)  # so that a subscriber can tell what it missed last
-        self._pub.send_multipart(_parts(message, header), copy=False)
+        self._give_out(_parts(message, header))
+        large = message.body is not None and memoryview(message.body).nbytes >= _LARGE_BYTES
+        until_s = time.monotonic() + (_LARGE_PATIENCE_S if large else _PATIENCE_S)
+        self._patient_until_s = max(self._patient_until_s, until_s)
         with self._lock:
             self._sent[message.topic] += 1
             self._remember(message, header)
 
+    def _give_out(self, parts: list[Any]) -> None:
+        """Wait a little for a reader whose queue is full because of what came just before, then go on without it.
+
+        So queues can be short, in stacks of slices, and what follows at once is not lost.
+        """
+        while (left_s := self._patient_until_s - time.monotonic()) > 0:
+            self._pub.setsockopt(zmq.XPUB_NODROP, 1)
+            try:
+                self._pub.send_multipart(parts, flags=zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                time.sleep(min(left_s, 0.002))
+            else:
+                return
+        self._pub.setsockopt(zmq.XPUB_NODROP, 0)
+        self._pub.send_multipart(parts, copy=False)
+
     def _send_reply(self, peer: bytes, message: Message) -> None:
         assert self._router is not None  # a reply can only be to a question
         self._open_questions -= 1
+        header, body = message.header, None if message.body is None else memoryview(message.body)
+        self._unread = [one for one in self._unread if one() is not None]
+        if body is not None and len(self._unread) >= UNREAD_ANSWERS:
+            self._refused += 1
+            text = f"{UNREAD_ANSWERS} answers wait to be read already: ask again later"
+            message, body = Message("error", {}), None
+            header = {**self._envelope(Message("error", {"error": text}), None), "asked": header["asked"]}
+        if body is not None:
+            self._unread.append(weakref.ref(body))
+        parts = [peer, *_parts(Message(message.topic, header, body), header)]
         try:
-            self._router.send_multipart([peer, *_parts(message, message.header)], flags=zmq.NOBLOCK, copy=False)
+            self._router.send_multipart(parts, flags=zmq.NOBLOCK, copy=False)
         except zmq.ZMQError as error:  # the asker is gone or does not read: its loss
             log.info("an answer found nobody: %s", error)
+
+    def _say_so(self, peer: bytes) -> None:
+        assert self._router is not None
+        self._refused += 1
+        header = self._envelope(Message("error", {"error": "the answer can't be sent: see the daemon's log"}), None)
+        with contextlib.suppress(zmq.ZMQError):  # the asker is gone or does not read: its loss
+            self._router.send_multipart([peer, b"error", wire.encode({**header, "asked": None})], flags=zmq.NOBLOCK)
 
     def _envelope(self, message: Message, seq: int | None) -> dict[str, Any]:
         return {
@@ -259,6 +305,8 @@ class Publisher:
         one.setsockopt(zmq.SNDHWM, high_water_mark)
         one.setsockopt(zmq.RCVHWM, 100)
         one.setsockopt(zmq.MAXMSGSIZE, QUESTION_BYTES)
+        one.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
+        one.setsockopt(zmq.HEARTBEAT_TIMEOUT, _DEAF_MS)
         if kind == zmq.ROUTER:
             one.setsockopt(zmq.ROUTER_MANDATORY, 1)
         for endpoint in filter(None, wanted):
