@@ -87,6 +87,21 @@ def test_a_retry_gets_the_same_answer_and_opens_nothing_twice() -> None:
     assert len(client.server._sessions) == 1
 
 
+@pytest.mark.parametrize("end", ["terminate", "idle"])
+def test_the_same_open_after_its_session_ended_opens_another_one(end: str) -> None:
+    client = Client()
+    client.ask(OPEN, b"camera.xml", session=5)
+    request = struct.pack("<HBBBBBxI", 2, 5, OPEN, 10, 0, 0, 0) + b"camera.xml"  # a client may number from 1 again
+    session = client.send(request)[0][2]
+    client.sequence = 50
+    if end == "terminate":
+        client.ask(TERMINATE, session=session)
+    else:
+        client.now_ns = 61 * 10**9
+    again = client.send(request)[0][2]
+    assert client.ask(READ, session=again, size=10) == DATA[:10]
+
+
 def test_listing_and_checksum() -> None:
     client = Client()
     assert client.ask(LIST, b"/") == b"Fcamera.xml\t%d\0" % len(DATA)

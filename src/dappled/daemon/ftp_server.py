@@ -48,13 +48,22 @@ class _Session:
     used_ns: int
 
 
+@dataclass(frozen=True, slots=True)
+class _Answered:
+    """The last request of a client, its answer, and the session that it opened."""
+
+    request: _Request
+    messages: list[Message]
+    opened: _Session | None
+
+
 class FtpServer:
     """Serves what `files()` gives: names without folders to bytes. Eight files may be open, each for a minute idle."""
 
     def __init__(self, files: Callable[[], Mapping[str, bytes]]) -> None:
         self._files = files
         self._sessions: dict[int, _Session] = {}
-        self._last: dict[tuple[_Client, int], tuple[_Request, list[Message]]] = {}  # a retry gets the same answer
+        self._last: dict[tuple[_Client, int], _Answered] = {}  # a retry gets the same answer
 
     def answer(self, message: Message, now_ns: int) -> list[Message]:
         """What to send back for a FILE_TRANSFER_PROTOCOL message. Time is monotonic."""
@@ -62,20 +71,25 @@ class FtpServer:
         request = _parse(bytes(message.payload))
         if request is None or request.opcode >= _ACK:  # an answer is nothing to be answered
             return []
-        known = self._last.get((client, request.session))
-        if known is not None and known[0] == request:
-            return known[1]
         self._sessions = {at: one for at, one in self._sessions.items() if now_ns - one.used_ns < IDLE_NS}
+        known = self._last.get((client, request.session))
+        if known is not None and known.request == request and self._lives(known.opened):
+            return known.messages
         replies = self._act(request, client, now_ns)
         messages = [
             mavlink.MAVLink_file_transfer_protocol_message(message.target_network, *client, _bytes(request, at, reply))
             for at, reply in enumerate(replies)
         ]
         self._last.pop((client, request.session), None)
-        self._last[client, request.session] = (request, messages)
+        opened = next((self._sessions[reply.session] for reply in replies if reply.session is not None), None)
+        self._last[client, request.session] = _Answered(request, messages, opened)
         if len(self._last) > SESSIONS:
             self._last.pop(next(iter(self._last)))
         return messages
+
+    def _lives(self, session: _Session | None) -> bool:
+        """Whether an answer that opened this session is still true. An answer that opened none is."""
+        return session is None or any(session is one for one in self._sessions.values())
 
     def _act(self, request: _Request, client: _Client, now_ns: int) -> list[_Reply]:
         handler = _OPERATIONS.get(request.opcode)
