@@ -135,6 +135,29 @@ def test_a_connection_whose_other_side_vanished_is_given_up_within_seconds() -> 
         assert client.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL) == 1
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # what it provokes
+def test_a_receiving_thread_that_ended_is_named() -> None:
+    class Broken:
+        def descriptors(self) -> list[int]:
+            raise SystemExit  # a bug that no handler foresaw
+
+        def close(self) -> None:
+            return
+
+    side = Side("udpin:127.0.0.1:0")
+    with side:
+        assert side.links.dead() == []
+        open_one = side.links._links[0].channel
+        assert open_one is not None
+        side.links._links[0].channel = Broken()  # type: ignore[assignment]  # all that the thread asks
+        deadline = time.monotonic() + 10
+        while side.links.dead() != ["mavlink 0"]:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        open_one.close()
+    assert side.links.dead() == []  # it was asked to end
+
+
 def test_a_serial_device() -> None:
     near, far = pty.openpty()
     try:

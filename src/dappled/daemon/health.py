@@ -39,11 +39,12 @@ def record(
     vehicle: Pose | None = None,
     decoding: bool = False,
     utc_known: bool = True,
+    dead: Sequence[str] = (),
     doubts: Sequence[str] = (),
 ) -> dict[str, Any]:
     """The facts of a `health` message; `problems` are sentences, none when all is well. `doubts`: more of them,
-    of what is contradictory in the vehicle."""
-    dead = street.dead()
+    of what is contradictory in the vehicle. `dead`: threads that have ended, beside the street's."""
+    dead = [*street.dead(), *dead]
     problems = [f"the {name} thread has ended: restart dappled" for name in dead]
     if street.camera_state not in ("starting", "ready", "busy"):
         problems.append(camera_sentence(street))

@@ -227,7 +227,7 @@ class Service:
             facts=lambda: ground_facts.camera(self._street.identity, self._focal_length_mm, self._chip),
             storage=lambda: ground_facts.storage(self.folder),
             lookup=self._lookup,
-            healthy=lambda: not self._street.dead(),
+            healthy=lambda: not (self._street.dead() or self._links.dead()),
             pose=lambda: self._telemetry.pose_at(self._clock.utc_ns(), 0.0),
             mount=self.settings.pose.mount,
             feedback_is_shot=self.settings.mavlink.feedback_is_shot,
@@ -280,7 +280,7 @@ class Service:
 
     def whole(self) -> bool:
         """Whether every part of the street still works."""
-        return not self._street.dead()
+        return not (self._street.dead() or self._links.dead())
 
     @property
     def folder(self) -> Path:
@@ -315,6 +315,7 @@ class Service:
             vehicle=self._telemetry.pose_at(self._clock.utc_ns(), 0.0),
             decoding=self._recipe is not None,
             utc_known=self._utc.known,
+            dead=self._links.dead(),
             doubts=[text for text in (self._component and self._component.doubt(), self._utc.doubt()) if text],
         )
 

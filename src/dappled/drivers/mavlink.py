@@ -158,6 +158,12 @@ class MavlinkLinks:
         """Counters of every link, in the order of the urls."""
         return tuple(link.statistics() for link in self._links)
 
+    def dead(self) -> list[str]:
+        """Which receiving threads have ended without being asked to: none, unless there is a bug."""
+        if self._stop.is_set():
+            return []
+        return [thread.name for thread in self._threads if not thread.is_alive()]
+
     def _send_on(self, link: _Link, message: Message) -> bool:
         channel = link.channel
         if channel is None:
