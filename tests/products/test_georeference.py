@@ -14,7 +14,10 @@ import pytest
 import rasterio
 
 from dappled.cli import main
+from dappled.config.profiles import CameraProfile
 from dappled.daemon.interpolation import from_euler
+from dappled.decode.lightfield import LightField
+from dappled.drivers.darkroom import Darkroom
 from dappled.errors import DappledError
 from dappled.flight import recording
 from dappled.flight.records import Tag
@@ -23,12 +26,14 @@ from dappled.products import camera_pose, difference, georeference, photographs
 from dappled.products.earth import Projection
 from dappled.products.georeference import Options
 from dappled.products.ground import Flat
-from dappled.products.photographs import Mounting, PhotographError
+from dappled.products.photographs import Mounting, PhotographError, Station
 from tests.flight.makers import deliver, pose, wish
 from tests.products import flown
 from tests.products.flown import Flown
 from tests.products.test_eye import eye_at
 from tests.products.test_maps import painted, photograph, survey
+
+PROJECTION = Projection("EPSG:32615")
 
 
 def words(flight: Flown, output: Path, *more: str) -> list[str]:
@@ -264,6 +269,42 @@ def test_a_camera_on_a_gimbal_looks_where_the_gimbal_does(short_flight: Flown) -
     assert found.camera_to_ned == pytest.approx(camera_pose.matrix_of(aside) @ camera_pose.NADIR)
     with pytest.raises(PhotographError, match="no attitude of the gimbal"):
         photographs.station(frames[0], tags[0], Mounting(on_gimbal=True))
+
+
+@pytest.fixture(scope="module")
+def decoded(short_flight: Flown) -> tuple[Station, LightField, CameraProfile]:
+    """The first frame of the flight."""
+    (frame, *_), tags = photographs.recorded(short_flight.folder)
+    darkroom = Darkroom(short_flight.recipe)
+    made = darkroom.develop(short_flight.folder / frame.name)
+    station = photographs.station(frame, tags[frame.index], Mounting())
+    return station, made.light_field, darkroom.camera(made.raw.camera_model or "")
+
+
+def test_a_lens_that_is_focused_near_stands_farther_from_the_sensor(
+    decoded: tuple[Station, LightField, CameraProfile],
+) -> None:
+    station, field, profile = decoded
+    far, near = (
+        photographs.eye_of(station, field, profile, PROJECTION, focus_m=focus_m) for focus_m in (math.inf, 5.0)
+    )
+    assert near.matrix[0, 0] / far.matrix[0, 0] == pytest.approx(1 / (1 - 0.05 / 5.0))
+    assert near.gsd_m(0.0) / far.gsd_m(0.0) == pytest.approx(1 - 0.05 / 5.0, rel=1e-4)  # it is tilted a little
+    with pytest.raises(PhotographError, match=r"a lens of 50 mm can't be focused at 0\.05 m"):
+        photographs.eye_of(station, field, profile, PROJECTION, focus_m=0.05)
+
+
+def test_views_need_an_f_number(decoded: tuple[Station, LightField, CameraProfile]) -> None:
+    station, field, profile = decoded
+    silent = replace(field, attributes={**field.attributes, "f_number": None, "focal_length_mm": None})
+    assert photographs.photograph(station, silent, profile, PROJECTION, view="ground").apertures_m == pytest.approx(
+        photographs.photograph(station, field, profile, PROJECTION, view="ground").apertures_m
+    )  # the tag knows both
+    unknown = replace(station, tag=replace(station.tag, f_number=None))
+    for view in ("ground", "0,4"):
+        with pytest.raises(PhotographError, match=r"the f-number of frames/000000\.dng is unknown"):
+            photographs.photograph(unknown, silent, profile, PROJECTION, view=view)
+    photographs.photograph(unknown, silent, profile, PROJECTION)
 
 
 def test_one_view_is_seen_from_aside(short_flight: Flown, tmp_path: Path) -> None:

@@ -120,7 +120,7 @@ def recorded(flight: Path) -> tuple[list[Frame], dict[int, Tag]]:
 def station(frame: Frame, tag: Tag | None, mounting: Mounting) -> Station:
     """Where a frame was taken. Raises PhotographError where that isn't known."""
     if tag is None:
-        raise PhotographError(f"{frame.name} was never tagged: nobody knows where it was taken")
+        raise PhotographError(f"{frame.name} was never tagged: `dappled geotag` tags what a crash left so")
     camera = camera_pose.of(tag.pose, mounting.lever_m, mounting.matrix, on_gimbal=mounting.on_gimbal)
     if camera is None:
         raise PhotographError(f"no position is known for {frame.name}: there was no telemetry at its exposure")
@@ -131,19 +131,24 @@ def station(frame: Frame, tag: Tag | None, mounting: Mounting) -> Station:
     return Station(frame, tag, camera, camera_pose.matrix_of(attitude) @ mounting.matrix)
 
 
-def lens_of(profile: CameraProfile, focal_length_mm: float) -> Lens:
-    """The calibrated lens, or a plain one focused at infinity."""
-    return profile.lens(focal_length_mm) or Lens(focal_length_mm, focal_length_mm)
+def lens_of(profile: CameraProfile, focal_length_mm: float, focus_m: float = math.inf) -> Lens:
+    """The calibrated lens, or a plain one focused at a distance: v = f / (1 − f/F). Raises PhotographError for a
+    distance within the focal length."""
+    share = focal_length_mm * 1e-3 / focus_m
+    if share >= 1:
+        raise PhotographError(f"a lens of {focal_length_mm:g} mm can't be focused at {focus_m:g} m: see --focus")
+    return profile.lens(focal_length_mm) or Lens(focal_length_mm, focal_length_mm / (1 - share))
 
 
-def eye_of(station: Station, field: LightField, profile: CameraProfile, projection: Projection) -> Eye:
-    """The eye of a light field's mean view on the map. Raises PhotographError, ConfigError, EarthError."""
-    attributes = field.attributes
-    focal_length_mm = attributes.get("focal_length_mm") or station.tag.focal_length_mm
-    if focal_length_mm is None:
-        raise PhotographError(f"the focal length of {station.frame.name} is unknown: give it with --focal-length")
-    rows, columns = attributes["shape"]
-    lens = lens_of(profile, float(focal_length_mm))
+def eye_of(
+    station: Station, field: LightField, profile: CameraProfile, projection: Projection, *, focus_m: float = math.inf
+) -> Eye:
+    """The eye of a light field's mean view on the map, its lens focused at a distance.
+
+    Raises PhotographError, ConfigError, EarthError.
+    """
+    rows, columns = field.attributes["shape"]
+    lens = lens_of(profile, _focal_length_mm(station, field), focus_m)
     camera = station.camera
     return look(
         intrinsics(profile.sensor((int(rows), int(columns))), lens, field.grid),
@@ -153,6 +158,13 @@ def eye_of(station: Station, field: LightField, profile: CameraProfile, projecti
         height_m=camera.altitude_msl_m,
         camera_to_ned=station.camera_to_ned,
     )
+
+
+def _focal_length_mm(station: Station, field: LightField) -> float:
+    known = field.attributes.get("focal_length_mm") or station.tag.focal_length_mm
+    if known is None:
+        raise PhotographError(f"the focal length of {station.frame.name} is unknown: give it with --focal-length")
+    return float(known)
 
 
 def photograph(
@@ -166,24 +178,29 @@ def photograph(
 ) -> Photograph:
     """A decoded frame's photograph; `view` is "mean", "ground" (all views, to be laid over each other on the ground),
     or "v,u", the row and column of one view. Raises PhotographError where there is no such view, and as `eye_of`."""
-    eye = eye_of(station, field, profile, projection)
+    eye = eye_of(station, field, profile, projection, focus_m=focus_m)
     image, views, apertures = mean_view(field), None, None
     if view == "ground" and field.views.shape[0]:
         views = field.views.reshape(-1, *field.views.shape[2:])
-        apertures = field.view_offsets.reshape(-1, 2) * _aperture_m(field)
+        apertures = field.view_offsets.reshape(-1, 2) * _aperture_m(station, field)
     elif view not in ("mean", "ground"):
         v, u = _which(view, field)
         image = np.ascontiguousarray(field.views[v, u])
-        y, x = field.view_offsets[v, u] * _aperture_m(field)
+        y, x = field.view_offsets[v, u] * _aperture_m(station, field)
         eye = through(eye, (float(y), float(x)), focus_m)
     return Photograph(
         station.name, station.tag.utc_ns, image, eye, *_sigmas(station.tag.pose), field.grid, views, apertures
     )
 
 
-def _aperture_m(field: LightField) -> float:
-    """The full aperture's diameter: v / f-number."""
-    return float(field.attributes["focal_length_mm"]) / float(field.attributes["f_number"]) * 1e-3
+def _aperture_m(station: Station, field: LightField) -> float:
+    """The full aperture's diameter: focal length / f-number. Raises PhotographError where one is unknown."""
+    f_number = field.attributes.get("f_number") or station.tag.f_number
+    if f_number is None:
+        raise PhotographError(
+            f"the f-number of {station.frame.name} is unknown: give it with --f-number, or map its mean"
+        )
+    return _focal_length_mm(station, field) / float(f_number) * 1e-3
 
 
 def true_colours(raw: RawFile) -> NDArray[np.float64] | None:
