@@ -2,7 +2,7 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check test-fast test-slow soak bench lock arm64 install uninstall clean
+.PHONY: help setup demo test check test-fast test-slow soak faults bench lock arm64 install uninstall clean
 PREFIX ?= /usr/local
 
 help: ## show this list
@@ -25,13 +25,17 @@ check: setup ## lint, format, types, layers
 
 test-fast: setup
 	@$(BIN)/coverage erase
-	@$(BIN)/pytest -m "not slow" --cov --cov-report=term
+	@$(BIN)/pytest -m "not slow" --durations=25 --cov --cov-report=term
 
 test-slow: setup ## the tests that take longer
 	@$(BIN)/pytest -m slow
 
 soak: setup ## half an hour in which something goes wrong every few seconds; MINUTES=n for another time
 	@$(BIN)/python -m dappled.mocks.soak --minutes $(or $(MINUTES),30)
+
+faults: setup ## every camera fault against the daemon, again and again; ROUNDS=n for another number
+	@for round in $$(seq $(or $(ROUNDS),20)); do echo "== round $$round"; \
+	  $(BIN)/pytest -q -p no:cacheprovider -m "" tests/system/test_camera_faults.py || exit 1; done
 
 bench: setup ## what the performance claims are measured with
 	@for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
