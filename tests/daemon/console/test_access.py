@@ -96,14 +96,45 @@ def test_a_globe_brings_the_token_in_its_address(rules: Access) -> None:
 def test_guesses_are_few() -> None:
     now = [0.0]
     rules = Access(TOKEN, clock=lambda: now[0])
-    codes = [refusal.status if (refusal := rules.try_token(f"guess {n}")) else 200 for n in range(access.GUESSES + 2)]
+    codes = [
+        refusal.status if (refusal := rules.try_token(f"guess {n}", "10.0.0.9")) else 200
+        for n in range(access.GUESSES + 2)
+    ]
     assert codes == [403] * access.GUESSES + [429, 429]
-    refusal = rules.try_token(TOKEN)  # the right one waits too: else guesses went on
+    refusal = rules.try_token(TOKEN, "10.0.0.9")  # the right one waits too: else guesses went on
     assert refusal is not None
     assert refusal.status == 429
     now[0] = access.GUESS_WINDOW_S + 1
-    assert rules.try_token(TOKEN) is None
+    assert rules.try_token(TOKEN, "10.0.0.9") is None
     assert rules.refused == access.GUESSES + 3
+
+
+@pytest.mark.parametrize(
+    ("stranger", "operator", "code"),
+    [("10.0.0.9", "10.0.0.8", 200), ("2001:db8::1", "2001:db8:1::1", 200), ("2001:db8::1", "2001:db8::2", 429)],
+)
+def test_a_strangers_guesses_keep_nobody_else_out(stranger: str, operator: str, code: int) -> None:
+    rules = Access(TOKEN)
+    for guess in range(access.GUESSES + 1):
+        rules.try_token(f"guess {guess}", stranger)
+    refusal = rules.judge(Request("GET", "/metrics", {**HOST, "authorization": f"Bearer {TOKEN}"}, "", operator))
+    assert (200 if refusal is None else refusal.status) == code
+
+
+def test_addresses_that_guess_are_not_remembered_without_end() -> None:
+    rules = Access(TOKEN)
+    for number in range(access.GUESSERS + 100):
+        rules.try_token("guess", f"10.0.{number // 256}.{number % 256}")
+    assert len(rules._guesses) == access.GUESSERS
+
+
+@given(st.text(st.characters()))  # lone surrogates too: JSON can hold them
+def test_any_text_is_judged_as_a_token(text: str) -> None:
+    rules = Access(TOKEN)
+    for token in (text, text + "\ud800", "é€"):
+        refusal = rules.try_token(token, "10.0.0.9")
+        assert refusal is not None
+        assert refusal.status == 403
 
 
 def test_without_a_token_loopback_is_open() -> None:

@@ -344,3 +344,13 @@ def test_messages_that_are_none_are_passed_over(rig: Rig) -> None:
     rig.publisher.publish("frame", {"frame": 1})
     rig.publisher.publish("health", {"camera": None})
     seen(rig, 4)
+
+
+@pytest.mark.parametrize("token", ['"\\ud800"', '"é€"', '""', "7", "null"])
+def test_any_token_is_well_where_none_is_asked_for(rig: Rig, token: str) -> None:
+    with rig.client(origin=rig.url) as client:
+        answer = client.post(
+            "/api/login", content=f'{{"token": {token}}}'.encode(), headers={"content-type": "application/json"}
+        )
+    assert answer.status_code == 200
+    assert "set-cookie" not in answer.headers

@@ -6,14 +6,15 @@ import hmac
 import ipaddress
 import socket
 import time
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs
 
 COOKIE = "dappled"
-GUESSES, GUESS_WINDOW_S = 10, 60.0
+GUESSES, GUESS_WINDOW_S = 10, 60.0  # from one address
+GUESSERS = 1024  # addresses that are remembered
 BODY_BYTES = 4096
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -33,6 +34,7 @@ class Request:
     path: str
     headers: Mapping[str, str]
     query: str = ""
+    client: str = ""  # the address it comes from
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +59,7 @@ class Access:
         self._token = token
         self._names = {name.lower() for name in (*names, "localhost", own, f"{own}.local")}
         self._clock = clock
-        self._guesses: deque[float] = deque(maxlen=GUESSES)
+        self._guesses: OrderedDict[str, deque[float]] = OrderedDict()
         self.refused = 0
 
     @property
@@ -72,15 +74,19 @@ class Access:
             self.refused += 1
         return refusal
 
-    def try_token(self, token: str) -> Refusal | None:
-        """None for the right token; guesses are few."""
-        now = self._clock()
-        if len(self._guesses) == GUESSES and now - self._guesses[0] < GUESS_WINDOW_S:
+    def try_token(self, token: str, client: str) -> Refusal | None:
+        """None for the right token; guesses are few from one address, and keep nobody out who comes from another."""
+        now, client = self._clock(), _network(client)
+        guesses = self._guesses.get(client, deque())
+        if len(guesses) == GUESSES and now - guesses[0] < GUESS_WINDOW_S:
             self.refused += 1
             return Refusal(429, "too many wrong tokens: wait a minute")
         if not self._token or self._right(token):
             return None
-        self._guesses.append(now)
+        self._guesses.setdefault(client, deque(maxlen=GUESSES)).append(now)
+        self._guesses.move_to_end(client)
+        if len(self._guesses) > GUESSERS:
+            self._guesses.popitem(last=False)
         self.refused += 1
         return Refusal(403, "this is not the token")
 
@@ -118,10 +124,10 @@ class Access:
         given = bearer[2] if bearer[0].lower() == "bearer" else ""
         if request.path.startswith("/kml") and not given:  # a virtual globe has no cookies of ours
             given = (parse_qs(request.query).get("token") or [""])[0]
-        return self.try_token(given) if given else Refusal(401, "the console asks for its token")
+        return self.try_token(given, request.client) if given else Refusal(401, "the console asks for its token")
 
     def _right(self, token: str) -> bool:
-        return hmac.compare_digest(token.encode(), self._token.encode())
+        return hmac.compare_digest(token.encode("utf-8", "surrogatepass"), self._token.encode())
 
 
 def _cookie(header: str) -> str:
@@ -130,3 +136,14 @@ def _cookie(header: str) -> str:
     except CookieError:
         return ""
     return found.value if found is not None else ""
+
+
+def _network(client: str) -> str:
+    """The address, of IPv6 the network: one machine has as many addresses there as it likes."""
+    try:
+        address = ipaddress.ip_address(client)
+    except ValueError:
+        return client
+    if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is None:
+        return str(ipaddress.ip_network((int(address) >> 64 << 64, 64)))
+    return client

@@ -29,7 +29,8 @@ class Guard:
                 message = {**message, "headers": [*message["headers"], *more]}
             await send(message)
 
-        refusal = self._rules.judge(access.Request(scope["method"], scope["path"], headers, query))
+        client = (scope.get("client") or ("",))[0]
+        refusal = self._rules.judge(access.Request(scope["method"], scope["path"], headers, query, client))
         if refusal is not None:
             await refused(refusal)(scope, receive, strictly)
         else:
