@@ -6,10 +6,11 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from dappled.drivers import exif, folder, fujifilm
+from dappled.drivers import exif, folder, fujifilm, matching
 from dappled.drivers.camera import Arrival, CameraError, Companion, Deferred, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.composed import ComposedCamera, Plan
 from dappled.drivers.pickup import FolderSource, Found, StorageSource
@@ -213,7 +214,14 @@ class Flight:
             finally:
                 self.looks += 1
 
-        source.list = counted  # type: ignore[method-assign]  # counts only
+        dated = source.taken_s
+        self.read: list[str] = []
+
+        def taken_s(found: Found) -> float | None:
+            self.read.append(found.base)
+            return dated(found)
+
+        source.list, source.taken_s = counted, taken_s  # type: ignore[method-assign]  # count only
         plan = Plan(follows="it follows", hold_s=0.001, poll_s=0.02)
         self.camera = ComposedCamera(
             WHO,
@@ -307,6 +315,32 @@ def test_an_old_card_s_pictures_are_never_those_of_a_body_that_did_not_fire(
         flight.shoot(shot, 5)
     flight.body.plug()
     flight.brings_nothing()
+
+
+def test_what_is_in_doubt_is_read_and_weighed_once(flight: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
+    weighed = 0
+    match = matching.match
+
+    def counted(*arguments: Any) -> matching.Matching:
+        nonlocal weighed
+        weighed += 1
+        return match(*arguments)
+
+    monkeypatch.setattr(matching, "match", counted)
+    flight.old(5)
+    flight.body.misses = frozenset({1})
+    flight.camera.start()
+    until_state(flight.camera, "ready")
+    flight.shoot(0, 5)
+    flight.body.plug()
+    flight.brings_nothing()
+    assert weighed == 1
+    assert len(flight.read) == 5
+    flight.shoot(1, 5)
+    flight.written(1)
+    flight.brings_nothing()
+    assert weighed <= 3  # a shot more, a file more
+    assert sorted(flight.read) == ["DSCF0001.RAF", *(f"OLD{number:04d}.RAF" for number in range(5))]
 
 
 def test_another_card_than_before_the_flight_is_as_strange_as_any(flight: Flight) -> None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 import random
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dappled.drivers import matching
 from dappled.drivers.matching import DatedFile, FiredShot, in_order, match, seconds
 
 
@@ -112,6 +115,24 @@ def test_files_without_a_time_are_in_doubt_and_may_be_taken_by_order() -> None:
     assert (found.pairs, len(found.doubts)) == ((), 2)
     assert in_order(shots, bare) == truth(files)
     assert in_order(shots, bare[1:]) is None
+
+
+def test_windows_that_can_t_hold_as_many_pairs_are_not_looked_into(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = random.Random(3)  # noqa: S311  # a simulation
+    shots, files = flown([rng.uniform(2, 9) for _ in range(60)], 3600.0)
+    old, _ = flown([rng.uniform(2, 9) for _ in range(200)], 0.0)
+    others = [DatedFile(f"OLD{one.index}.RAF", float(math.floor(one.fired_s - 40_000))) for one in old]
+    chains, looked = matching._chains, []
+
+    def counted(fits: Any) -> Any:
+        looked.append(1)
+        return chains(fits)
+
+    monkeypatch.setattr(matching, "_chains", counted)
+    assert match(shots, [*others, *files]).pairs == truth(files)
+    assert len(looked) < 30
+    bounds, dozen = matching._bounds, np.array([0.0, 0.1, 1.6])
+    assert list(bounds(np.array([[0.0, 1.0], [1.65, -2.0]]), dozen)) == [1, 2, 1]
 
 
 def test_nothing_to_match() -> None:

@@ -310,6 +310,8 @@ class _Pickup:
         self._done: set[str] | None = None
         self._old: frozenset[str] | None = None  # what lay there before the first shot, as long as it does
         self._before: dict[str, int] = {}
+        self._dates: dict[Found, float | None] = {}
+        self._weighed: tuple[list[Claim], list[Group]] | None = None  # what was matched last: again brings no more
         self._trouble = ""  # why nothing could be listed, at the last look
         self._first_seen: dict[str, int] = {}
         self._stems: dict[str, int] = {}  # delivered frames by stem: for companions that come after
@@ -393,18 +395,23 @@ class _Pickup:
         """
         with self._lock:
             claims = list(self._claims)
+        if not claims or self._weighed == (claims, fresh):
+            return
         try:
-            dated = [matching.DatedFile(group.main.name, self._source.taken_s(group.main)) for group in fresh]
+            for group in fresh:
+                if group.main not in self._dates:
+                    self._dates[group.main] = self._source.taken_s(group.main)
         except CameraError:
             return  # the card is gone again
+        dated = [matching.DatedFile(group.main.name, self._dates[group.main]) for group in fresh]
         to_utc_ns = self._utc_ns() - self._clock_ns()
         shots = [matching.FiredShot(claim.shot, (claim.fired_ns + to_utc_ns) / 1e9) for claim in claims]
         by_name = {group.main.name: group for group in fresh}
         matched = matching.match(shots, dated)
-        if self._old is None and (matched.shots or len(matched.pairs) < _ENOUGH):
-            return
-        for shot, name in matched.pairs:
-            self._bring(shot, by_name[name], {})
+        sure = self._old is not None or (not matched.shots and len(matched.pairs) >= _ENOUGH)
+        brought = [self._bring(shot, by_name[name], {}) for shot, name in matched.pairs] if sure else []
+        if all(brought):
+            self._weighed = claims, fresh
 
     def _bring(self, shot: int | None, group: Group, facts: dict[str, str]) -> bool:
         try:

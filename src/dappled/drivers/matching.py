@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 WINDOW_S = 1.6
 """How far offsets of true pairs lie apart: the whole second that the camera shows, and the spread of its latency."""
 _GRID_S = 0.1
+_HAIR_S = 1e-5
 PLAUSIBLE_S = 26 * 3600.0
 """A camera's clock is off by a time zone, a summer time, a forgotten minute; by more it was never set."""
 
@@ -102,23 +103,42 @@ def seconds(taken: str | None) -> float | None:
 
 
 def _starts(offsets: NDArray[np.float64], known_s: float | None, plausible_s: float) -> NDArray[np.float64]:
-    """Where a window of offsets may begin, on a grid, the most crowded window first."""
+    """Where a window of offsets may begin, on a grid, ascending."""
     flat = np.sort(offsets.ravel())
     near = flat[np.abs(flat - known_s) <= WINDOW_S] if known_s is not None else flat[np.abs(flat) <= plausible_s]
-    starts = np.unique(np.floor(near / _GRID_S) * _GRID_S)
-    crowd = np.searchsorted(flat, starts + WINDOW_S, "right") - np.searchsorted(flat, starts, "left")
-    return starts[np.argsort(-crowd, kind="stable")]
+    return np.unique(np.floor(near / _GRID_S) * _GRID_S)
+
+
+def _bounds(offsets: NDArray[np.float64], starts: NDArray[np.float64]) -> NDArray[np.int64]:
+    """For each window the most pairs that it can hold: the fewer of the shots and the files with an offset in it."""
+    return np.minimum(_touched(offsets, starts), _touched(offsets.T, starts))
+
+
+def _touched(offsets: NDArray[np.float64], starts: NDArray[np.float64]) -> NDArray[np.int64]:
+    """How many rows have an offset in each window; a hair too many where one lies on its edge."""
+    ordered = np.sort(offsets, axis=1)
+    first = np.searchsorted(starts, ordered - WINDOW_S - _HAIR_S, "left")
+    last = np.searchsorted(starts, ordered + _HAIR_S, "right")
+    first[:, 1:] = np.maximum(first[:, 1:], last[:, :-1])  # each window once for a row
+    some = first < last
+    size = len(starts) + 1
+    return np.cumsum(np.bincount(first[some], minlength=size) - np.bincount(last[some], minlength=size))[:-1]
 
 
 def _best(offsets: NDArray[np.float64], starts: NDArray[np.float64]) -> tuple[list[tuple[int, int]], NDArray[np.bool_]]:
     """(pairs that all best matchings share, pairs that some have)."""
     best = 0
+    bounds = _bounds(offsets, starts)
+    seen: set[bytes] = set()
     found: list[tuple[set[tuple[int, int]], NDArray[np.bool_]]] = []
-    for start_s in starts:
-        fits = (offsets >= start_s) & (offsets <= start_s + WINDOW_S)
-        bound = min(int(fits.any(axis=1).sum()), int(fits.any(axis=0).sum()))
-        if bound < best or bound == 0:
+    for which in np.argsort(-bounds, kind="stable"):
+        if bounds[which] < max(best, 1):
+            break  # this window can't hold as many pairs, nor can any after it
+        fits = (offsets >= starts[which]) & (offsets <= starts[which] + WINDOW_S)
+        key = np.flatnonzero(fits).tobytes()
+        if not key or key in seen:
             continue
+        seen.add(key)
         length, forced, possible = _chains(fits)
         if length > best:
             best, found = length, []
