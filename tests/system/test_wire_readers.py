@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.needs import without
 from tests.system.conftest import dappled
 
 ROOT = Path(__file__).parents[2]
@@ -50,7 +51,7 @@ def python(folder: Path) -> list[str]:
 def cpp(folder: Path) -> list[str]:
     compiler = shutil.which("g++")
     if compiler is None or not Path("/usr/include/zmq.h").exists():
-        pytest.skip("no g++ with libzmq: apt install g++ libzmq3-dev nlohmann-json3-dev")
+        without("no g++ with libzmq: apt install g++ libzmq3-dev nlohmann-json3-dev")
     (folder / "reader.cpp").write_text(block("cpp"), encoding="utf-8")
     subprocess.run(
         [compiler, "-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "reader.cpp", "-o", "reader", "-lzmq"],
@@ -64,7 +65,7 @@ def cpp(folder: Path) -> list[str]:
 def rust(folder: Path) -> list[str]:
     cargo = shutil.which("cargo")
     if cargo is None:
-        pytest.skip("no Rust: see rustup.rs")
+        without("no Rust: apt install cargo")
     (folder / "src").mkdir()
     (folder / "src" / "main.rs").write_text(block("rust"), encoding="utf-8")
     for name in ("Cargo.toml", "Cargo.lock"):
