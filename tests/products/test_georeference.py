@@ -143,6 +143,21 @@ def test_frames_and_control_points_are_the_first_flights_alone(
     assert (tmp_path / "maps" / "difference.tif").is_file()
 
 
+def test_a_control_point_of_a_frame_that_is_left_out_is_noted(
+    short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = true_pose(short_flight)
+    rows = [f"p{k},{k:06d},921.5,693.5,{place.latitude_deg},{place.longitude_deg},203.4" for k in (0, 1)]
+    points = tmp_path / "points.csv"
+    points.write_text("\n".join(["name,frame,column,row,latitude,longitude,altitude", *rows]) + "\n")
+    more = ["--as", "footprints", "--gcp", str(points), "--frames"]
+    assert main(words(short_flight, tmp_path / "maps", *more, "0")) == 0
+    assert "control point p1 is left out: frame 000001 is not on the map" in capsys.readouterr().err
+    points.write_text("\n".join(["name,frame,column,row,latitude,longitude,altitude", rows[1]]) + "\n")
+    assert main(words(short_flight, tmp_path / "none", *more, "0")) == 1
+    assert "no control point is on a frame that is mapped: the first, p1" in capsys.readouterr().err
+
+
 def test_what_cant_be_compared_leaves_the_maps_and_a_report(
     short_flight: Flown, later_flight: Path, tmp_path: Path
 ) -> None:

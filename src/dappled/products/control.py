@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,3 +52,14 @@ def read(path: Path, projection: Projection) -> list[ControlPoint]:
     except UnicodeDecodeError:
         raise ControlError(f"the control points {path} are no text in UTF-8") from None
     return found
+
+
+def sighted(points: Sequence[ControlPoint], frames: Collection[str]) -> tuple[list[ControlPoint], list[str]]:
+    """The points that these frames show, and a sentence for each other. Raises ControlError where none is left."""
+    kept = [point for point in points if point.frame in frames]
+    if points and not kept:
+        raise ControlError(
+            f"no control point is on a frame that is mapped: the first, {points[0].name}, names frame {points[0].frame}"
+        )
+    others = [point for point in points if point.frame not in frames]
+    return kept, [f"control point {one.name} is left out: frame {one.frame} is not on the map" for one in others]

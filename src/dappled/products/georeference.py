@@ -161,6 +161,7 @@ def refined(
     if raster is not None:
         raster.check(np.concatenate([maps.footprint(one.eye, made.ground)[:, :2] for one in made.photographs]))
     points = [] if control is None else control_points.read(control, made.projection)
+    points, unseen = control_points.sighted(points, {one.name for one in made.photographs})
     photos, judged = refine.refine(
         made.photographs,
         made.ground,
@@ -176,7 +177,7 @@ def refined(
     }
     kept = [f"frame {one.name} keeps its recorded pose: {said.why}" for one, said in zip(photos, judged, strict=True)
             if said.why is not None]  # fmt: skip
-    return replace(made, photographs=tuple(photos), facts=facts, notes=(*made.notes, *kept))
+    return replace(made, photographs=tuple(photos), facts=facts, notes=(*made.notes, *unseen, *kept))
 
 
 def develop(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, options: Options) -> Development:
