@@ -11,8 +11,9 @@ import dappled
 from dappled.decode.errors import DecodeError
 from dappled.decode.ranging import Ranging
 from dappled.errors import DappledError
+from dappled.mocks.masked_camera import reference_camera
 from dappled.products import lightfiles, opened
-from dappled.products.opened import OpenedLightField, OpenError
+from dappled.products.opened import OpenedFrame, OpenedLightField, OpenError
 from tests.products.fields import DISPARITY, light_field
 
 
@@ -104,6 +105,7 @@ def test_what_cannot_be_opened_is_told(tmp_path: Path, path: Path) -> None:
         (lambda: dappled.open(tmp_path / "gone"), "there is no"),
         (lambda: dappled.open(tmp_path / "frame.cr2"), "say how to decode it"),
         (lambda: dappled.open(tmp_path / "frame.cr2", mesh="mask-2"), "can't be opened so"),
+        (lambda: dappled.open(path, mask="nonsense"), "is decoded already: leave mask out"),
         (lambda: dappled.open(tmp_path / "empty"), "holds 0 pictures"),
         (lambda: opened.light_field(path).refocus(alpha=1, disparity=2), "give one of"),
     ):
@@ -119,6 +121,15 @@ def _frame(folder: Path) -> Path:
     """A file that is opened as a raw frame by a light field's door."""
     (folder / "b.dng").write_bytes(b"raw")
     return folder / "b.dng"
+
+
+def test_a_raw_frame_keeps_where_its_lens_was_focused(tmp_path: Path) -> None:
+    camera = reference_camera(1, scale=0.5, scene="bench")
+    (tmp_path / "frame.dng").write_bytes(camera.expose(0.0, 0).file)
+    frame = dappled.open(tmp_path / "frame.dng", mask="reference-5x5", focus_m=20.0)
+    assert isinstance(frame, OpenedFrame)
+    metres = frame.light_field.metres()
+    assert -metres.gain_px_m / metres.offset_px == pytest.approx(20.0)
 
 
 def test_one_view_has_no_depth() -> None:

@@ -171,13 +171,14 @@ class OpenedFrame:
     darkroom: Darkroom
     tag: Tag | None = None
     index: int | None = None
+    focus_m: float | None = None
 
     @cached_property
     def light_field(self) -> OpenedLightField:
         """The decoded frame. Raises DappledError."""
         length, stop = (None, None) if self.tag is None else (self.tag.focal_length_mm, self.tag.f_number)
         made = self.darkroom.develop(self.path, focal_length_mm=length, f_number=stop)
-        return OpenedLightField(made.light_field, self.path)
+        return OpenedLightField(made.light_field, self.path, self.focus_m)
 
     @property
     def views(self) -> NDArray[np.float32]:
@@ -200,6 +201,7 @@ class OpenedFlight:
     path: Path
     record: summary.Flight
     darkroom: Darkroom | None
+    focus_m: float | None = None
 
     def __len__(self) -> int:
         return sum(line.frame is not None for line in self.record.lines)
@@ -218,7 +220,7 @@ class OpenedFlight:
         if self.darkroom is None:
             raise OpenError(f"{self.path} was recorded without a mask: name one, as in dappled.open(path, mask=…)")
         assert line.frame is not None
-        return OpenedFrame(self.path / line.frame.name, self.darkroom, line.tag, line.frame.index)
+        return OpenedFrame(self.path / line.frame.name, self.darkroom, line.tag, line.frame.index, self.focus_m)
 
 
 Opened = OpenedLightField | OpenedFrame | OpenedFlight
@@ -227,21 +229,24 @@ Opened = OpenedLightField | OpenedFrame | OpenedFlight
 def open(path: str | Path, *, focus_m: float | None = None, **recipe: Any) -> Opened:
     """What a path holds: a light field (.zarr, .npz, .h5, or a folder of n × n pictures), a flight, or a raw frame.
 
-    `focus_m` is where a light field's lens was focused. `recipe` says how frames are decoded: `camera`, `mask`, `law`,
-    `calibration`, `white`, `dark`, `colour` … as `Recipe`; a flight has its own, on top of which these are laid.
-    Raises DappledError.
+    `focus_m` is where the lens was focused (inf: infinity). `recipe` says how frames are decoded: `camera`, `mask`,
+    `law`, `calibration`, `white`, `dark`, `colour` … as `Recipe`; a flight has its own, on top of which these are laid.
+    Raises DappledError, also for a recipe where nothing is left to decode.
     """
     found = Path(path).expanduser()
     if not found.exists():
         raise OpenError(f"there is no {found}; check the path")
     if found.suffix in _LIGHT_FIELDS:
+        _refuse(recipe, found)
         return OpenedLightField(lightfiles.load(found), found, focus_m)
     if not found.is_dir():
-        return OpenedFrame(found, Darkroom(_recipe(Recipe("auto", "", workers=2), recipe, found)))
+        darkroom = Darkroom(_recipe(Recipe("auto", "", workers=2), recipe, found))
+        return OpenedFrame(found, darkroom, focus_m=focus_m)
     if layout.FlightFolder(found).ledger.exists():
         record = summary.show(found)
         own = kept_recipe.of_flight(found, record.settings, recipe)
-        return OpenedFlight(found, record, None if own is None else Darkroom(own))
+        return OpenedFlight(found, record, None if own is None else Darkroom(own), focus_m)
+    _refuse(recipe, found)
     return OpenedLightField(viewfolders.read(found), found, focus_m)
 
 
@@ -273,6 +278,11 @@ def lens_ranging(field: LightField, focus_m: float) -> Ranging | None:
 def with_ranging(field: LightField, ranging: Ranging) -> LightField:
     """The light field with its way to metres among its attributes."""
     return replace(field, attributes={**field.attributes, RANGING: ranging.to_dict()})
+
+
+def _refuse(recipe: Mapping[str, Any], path: Path) -> None:
+    if recipe:
+        raise OpenError(f"{path} is decoded already: leave {', '.join(recipe)} out")
 
 
 def _recipe(plain: Recipe, given: Mapping[str, Any], path: Path) -> Recipe:
