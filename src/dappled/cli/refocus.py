@@ -16,6 +16,7 @@ from dappled.decode.stereo_pair import anaglyph, side_by_side
 from dappled.products import prints
 from dappled.products.opened import OpenedLightField, OpenError
 
+_MOST_PICTURES = 500  # of a stack, all held in memory at once
 Picture = NDArray[np.float32]
 
 
@@ -98,8 +99,10 @@ def _planes(found: OpenedLightField, arguments: argparse.Namespace) -> list[tupl
         return [(f"{z:g} m", found.disparity_of(distance_m=z)) for z in arguments.distance]
     if arguments.stack:
         low, high, count = arguments.stack
-        if count < 1 or count != round(count):
+        if not count >= 1 or count % 1:
             raise OpenError(f"--stack: {count:g} is no number of pictures")
+        if count > _MOST_PICTURES:
+            raise OpenError(f"--stack: {count:g} pictures are too many: at most {_MOST_PICTURES}")
         return [(f"{d:.3g} px/view", float(d)) for d in np.linspace(low, high, round(count))]
     if arguments.disparity:
         return [(f"{d:g} px/view", d) for d in arguments.disparity]
