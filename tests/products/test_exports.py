@@ -116,3 +116,10 @@ def test_nothing_is_overwritten_and_misfits_are_told(tmp_path: Path, monkeypatch
     with pytest.raises(ExportError, match="can't be written"):
         exports.hci(tmp_path / "gone" / "hci", field)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mat"]
+
+
+def test_an_eslf_picture_leaves_a_text_of_its_name_alone(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("of a day in the field")
+    with pytest.raises(ExportError, match=r"notes\.txt exists already"):
+        exports.eslf(tmp_path / "notes.png", light_field())
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("notes.txt", "of a day in the field")]

@@ -72,7 +72,7 @@ def eslf(path: Path, field: LightField, lenslet_px: int = 0) -> None:
     """An ESLF image: 16-bit PNG in which each pixel of the views is a lenslet of `lenslet_px`² pixels, one a view.
 
     0 takes the number of views an axis; more leave black pixels around them. The size and the white are written beside
-    it, in a .txt of the same name. Raises ExportError.
+    it, in a .txt of the same name. Raises ExportError, also where either of them stands already.
     """
     views = as_cameras(viewstack.of(field))
     side = lenslet_px or max(views.shape[:2])
@@ -90,9 +90,12 @@ def eslf(path: Path, field: LightField, lenslet_px: int = 0) -> None:
     def write(part: Path) -> None:
         _png16(part, flat)
 
+    beside = path.with_suffix(".txt")
+    if beside.exists():
+        raise ExportError(f"{beside} exists already; choose another name")
     _whole(path, write)
     note = f"lenslet_px = {side}\nviews = {count_v} x {count_u}\nwhite = {white:.6g}\n"
-    path.with_suffix(".txt").write_text(note, encoding="utf-8")
+    _whole(beside, lambda part: part.write_text(note, encoding="utf-8"))
 
 
 def mat(path: Path, field: LightField) -> None:
