@@ -78,10 +78,28 @@ def test_targets_tell_gain_and_offset() -> None:
     assert Ranging.from_dict(found.to_dict()) == found
 
 
+def test_the_gain_is_as_sure_as_the_targets() -> None:
+    """Against many draws of the targets' errors."""
+    true, sigma = Ranging(33.8, -2.0, 7.4), 0.1
+    rng = np.random.default_rng(1)
+
+    def seen(metres: tuple[float, ...]) -> Ranging:
+        shifts = [true.gain_px_m / z + true.offset_px + sigma * rng.standard_normal() for z in metres]
+        return fit_targets([Target(z, s, sigma) for z, s in zip(metres, shifts, strict=True)], f_number=7.4)
+
+    fits = [seen((3.0, 12.0)) for _ in range(500)]
+    scatter = float(np.std([f.gain_px_m for f in fits])) / true.gain_px_m
+    assert np.median([f.gain_sigma_share for f in fits]) == pytest.approx(scatter, rel=0.1)
+    bent = fit_targets([Target(2.0, 10.0), Target(4.0, 6.0), Target(8.0, 2.5)], f_number=7.4)
+    assert bent.gain_sigma_share > 0.05  # no line goes through these
+
+
 def test_the_target_is_what_fills_the_middle() -> None:
     made = depth_map(0.2, shape=(40, 40))
     made.disparity[:8] = 3.0
-    assert target_shift(made, STACK) == pytest.approx(0.2 * 32)
+    shift, sigma = target_shift(made, STACK, window=5)
+    assert shift == pytest.approx(0.2 * 32)
+    assert sigma == pytest.approx(math.sqrt(math.pi / 2 / 4) * 0.01 * 32)  # four windows of 5 px in 10 × 10 px
     with pytest.raises(DecodeError, match="too little texture"):
         target_shift(depth_map(float("nan")), STACK)
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.depth import WINDOW
 from dappled.decode.depthmap import DepthMap, Map
 from dappled.decode.errors import DecodeError
 from dappled.decode.viewstack import ViewStack
@@ -143,10 +144,11 @@ class DistanceMap:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A target at a known distance and the shift S that it was seen at, both with their errors' part left out."""
+    """A target at a known distance and the shift S that it was seen at, with its standard error."""
 
     distance_m: float
     shift_px: float
+    sigma_px: float = 0.0
 
 
 def fit_targets(
@@ -158,7 +160,8 @@ def fit_targets(
 ) -> Ranging:
     """The ranging that targets at known distances show, least squares in 1/Z.
 
-    One distance alone tells the offset (the focus); the gain is then that of `lens`. Raises DecodeError without it.
+    The gain's σ is what the targets' own leave of it, or what their misfit shows where that is more. One distance
+    alone tells the offset (the focus); the gain is then that of `lens`. Raises DecodeError without it.
     """
     if not targets:
         raise DecodeError("no target was seen")
@@ -179,12 +182,21 @@ def fit_targets(
     gain, offset = np.linalg.lstsq(design, shifts, rcond=None)[0]
     if gain <= 0:
         raise DecodeError("nearer targets were seen with smaller shifts: are the distances in the order of the frames?")
-    return Ranging(float(gain), float(offset), f_number, f"{len(targets)} targets", focal_length_mm=focal_length_mm)
+    by_target = np.linalg.pinv(design)[0]  # how each shift moves the gain
+    sigma = float(np.hypot.reduce(by_target * [t.sigma_px for t in targets]))
+    if len(targets) > 2:
+        misfit = shifts - design @ [gain, offset]
+        sigma = max(sigma, float(np.sqrt(misfit @ misfit / (len(targets) - 2) * (by_target @ by_target))))
+    source = f"{len(targets)} targets"
+    return Ranging(float(gain), float(offset), f_number, source, sigma / float(gain), focal_length_mm)
 
 
-def target_shift(depth: DepthMap, stack: ViewStack, share: float = 0.25) -> float:
-    """The shift S of what fills the picture's middle (`share` of its height and width): the median, each pixel counting
-    by its variance. Raises DecodeError where less than a tenth of it is known."""
+def target_shift(depth: DepthMap, stack: ViewStack, share: float = 0.25, window: int = WINDOW) -> tuple[float, float]:
+    """The shift S of what fills the picture's middle (`share` of its height and width), and its standard error.
+
+    The median, each pixel counting by its variance, with one free measurement a `window`. Raises DecodeError where less
+    than a tenth of it is known.
+    """
     height, width = depth.disparity.shape
     cut = tuple(slice(round(n * (1 - share) / 2), max(round(n * (1 + share) / 2), 1)) for n in (height, width))
     values, sigma = depth.disparity[cut].ravel(), depth.sigma[cut].ravel()
@@ -194,7 +206,9 @@ def target_shift(depth: DepthMap, stack: ViewStack, share: float = 0.25) -> floa
     order = np.argsort(values[known])
     weight: NDArray[np.float64] = np.cumsum(1 / sigma[known][order].astype(np.float64) ** 2)
     middle = values[known][order][int(np.searchsorted(weight, weight[-1] / 2))]
-    return float(middle) * _scale(stack)
+    free = max(float(known.sum()) / window**2, 1.0)
+    error = math.sqrt(math.pi / 2 / free) * float(np.median(sigma[known]))  # a median's, of normal errors
+    return float(middle) * _scale(stack), error * _scale(stack)
 
 
 def _scale(stack: ViewStack) -> float:
