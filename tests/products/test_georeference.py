@@ -158,6 +158,22 @@ def test_a_control_point_of_a_frame_that_is_left_out_is_noted(
     assert "no control point is on a frame that is mapped: the first, p1" in capsys.readouterr().err
 
 
+def test_a_base_map_elsewhere_leaves_the_recorded_poses(short_flight: Flown, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere.tif"
+    with rasterio.open(
+        elsewhere, "w", driver="GTiff", width=8, height=8, count=1, dtype="uint8", crs="EPSG:4326",
+        transform=rasterio.Affine(1e-6, 0, 10.0, 0, -1e-6, 50.0),
+    ):  # fmt: skip
+        pass
+    more = ["--as", "footprints", "--frames", "0", "--refine", str(elsewhere)]
+    assert main(words(short_flight, tmp_path / "maps", *more)) == 1
+    report = json.loads((tmp_path / "maps" / "report.json").read_text())
+    (why,) = report["notes"]
+    assert why.startswith(f"not refined against a base map: the base map {elsewhere} lies elsewhere")
+    assert report["frames"] == [{"name": "000000"}]
+    assert report["files"] == ["footprints.geojson"]
+
+
 def test_what_cant_be_compared_leaves_the_maps_and_a_report(
     short_flight: Flown, later_flight: Path, tmp_path: Path
 ) -> None:

@@ -19,6 +19,7 @@ from dappled.drivers.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import layout
 from dappled.products import difference, drawings, earth, georeference, terrain
+from dappled.products.basemap import BaseMapError
 from dappled.products.georeference import Options, Progress, Survey
 from dappled.products.hyperstereo import HyperstereoError
 from dappled.products.photographs import Mounting
@@ -109,9 +110,9 @@ def run(arguments: argparse.Namespace) -> int:
         layout.open_folder(arguments.against)
     with ExitStack() as stack:
         progress = stack.enter_context(Bar())
-        made = _survey(folder.path, arguments, progress, stack)
-        files = _draw(made, output, arguments)
         missing: list[str] = []  # sentences: what could be made is there all the same
+        made = _survey(folder.path, arguments, progress, stack, missing)
+        files = _draw(made, output, arguments)
         terrain_of = None
         if "terrain" in arguments.kinds:
             try:
@@ -122,7 +123,8 @@ def run(arguments: argparse.Namespace) -> int:
                 missing.append(str(error))
         if arguments.against is not None:
             try:
-                for path in _compare(made, terrain_of, output, arguments=arguments, progress=progress, stack=stack):
+                other = _survey(arguments.against, _for_the_other(arguments, made), progress, stack, missing)
+                for path in _compare(made, other, terrain_of, output, arguments=arguments, progress=progress):
                     files.append(path)
             except DappledError as error:
                 missing.append(f"no difference to {arguments.against}: {error}")
@@ -146,15 +148,14 @@ def _heights(made: Survey, arguments: argparse.Namespace, progress: Progress) ->
 
 def _compare(
     made: Survey,
+    other: Survey,
     heights: Terrain | None,
     output: Path,
     *,
     arguments: argparse.Namespace,
     progress: Progress,
-    stack: ExitStack,
 ) -> Iterator[Path]:
     """The rasters of what has changed until the flight of --against, one by one as they are made."""
-    other = _survey(arguments.against, _for_the_other(arguments, made), progress, stack)
     changed = difference.of_pictures(made, other)
     yield difference.write(made, other, changed, output / "difference.tif", "share of brightness")
     if heights is not None:
@@ -167,23 +168,30 @@ def _for_the_other(arguments: argparse.Namespace, made: Survey) -> argparse.Name
     return argparse.Namespace(**{**vars(arguments), "crs": made.projection.name, "frames": None, "gcp": None})
 
 
-def _survey(flight: Path, arguments: argparse.Namespace, progress: Progress, stack: ExitStack) -> Survey:
-    """A flight decoded, placed, and refined as the arguments say."""
+def _survey(
+    flight: Path, arguments: argparse.Namespace, progress: Progress, stack: ExitStack, missing: list[str]
+) -> Survey:
+    """A flight decoded, placed, and refined as the arguments say; what could not be done is added to `missing`."""
     facts = layout.read_facts(layout.open_folder(flight))
     made = georeference.survey(flight, recipe(flight, facts, arguments), options(facts, arguments), progress, stack)
-    return _refined(made, arguments, progress)
-
-
-def _refined(made: Survey, arguments: argparse.Namespace, progress: Progress) -> Survey:
     rasters = [Path(word) for word in arguments.refine if word != "neighbours"]
     if len(rasters) > 1:
         raise DappledError(f"--refine takes one base map, not {len(rasters)}")
-    if not arguments.refine and arguments.gcp is None:
-        return made
+    if rasters:
+        try:
+            return _refined(made, rasters[0], arguments, progress)
+        except BaseMapError as error:
+            missing.append(f"not refined against a base map: {error}")
+    if "neighbours" in arguments.refine or arguments.gcp is not None:
+        return _refined(made, None, arguments, progress)
+    return made
+
+
+def _refined(made: Survey, base: Path | None, arguments: argparse.Namespace, progress: Progress) -> Survey:
     sigmas = arguments.pose_sigma
     return georeference.refined(
         made,
-        base=rasters[0] if rasters else None,
+        base=base,
         neighbours="neighbours" in arguments.refine,
         control=arguments.gcp,
         search_m=arguments.search,
