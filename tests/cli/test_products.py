@@ -94,6 +94,22 @@ def test_depth_in_pixels_and_in_metres(field: str, tmp_path: Path, capsys: pytes
         assert float(np.nanmedian(made["distance_m"])) == pytest.approx(told["distance_m"][1])
 
 
+@pytest.mark.parametrize("name", ["d.pfm", "d.npz"])
+def test_a_full_disk_leaves_the_depth_map_of_before(
+    field: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def torn(path: Path, *_: object, **__: object) -> None:
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / name).write_bytes(b"of before")
+    monkeypatch.setattr("dappled.products.exports.write_pfm", torn)
+    monkeypatch.setattr("numpy.savez_compressed", torn)
+    assert main(["depth", field, "--between", "0", "1", "-o", str(tmp_path / name)]) == 1
+    assert "can't be written: No space left on device" in capsys.readouterr().err
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [(name, b"of before")]
+
+
 def test_a_calibration_of_another_zoom_is_refused_or_told(
     field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

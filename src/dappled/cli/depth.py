@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import secrets
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -124,9 +126,9 @@ def _write(
         }  # fmt: skip
         if distances is not None:
             arrays |= {"distance_m": distances.distance_m, "distance_sigma_m": distances.sigma_m}
-        np.savez_compressed(path, allow_pickle=False, **arrays)
+        _whole(path, lambda part: np.savez_compressed(part, allow_pickle=False, **arrays))
     elif kind == ".pfm":
-        exports.write_pfm(path, made.disparity)
+        _whole(path, lambda part: exports.write_pfm(part, made.disparity))
     elif kind in _POINTS:
         return _points(path, found, distances, arguments)
     elif distances is not None:
@@ -134,6 +136,18 @@ def _write(
     else:
         prints.save(path, _picture(made.disparity, "px/view"))
     return {}
+
+
+def _whole(path: Path, write: Callable[[Path], None]) -> None:
+    """Under another name, then renamed: a file is there whole, or not at all. Raises OpenError."""
+    part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
+    try:
+        write(part)
+        part.replace(path)
+    except OSError as error:
+        raise OpenError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _points(
