@@ -60,6 +60,8 @@ def answer(one: Job) -> Done:
     if name.startswith("dies-once:") and not Path(name.removeprefix("dies-once:")).exists():
         Path(name.removeprefix("dies-once:")).touch()
         os.kill(os.getpid(), signal.SIGKILL)
+    if name == "hangs":
+        signal.pause()
     if name == "dies":
         os.kill(os.getpid(), signal.SIGKILL)
     return Done(one.key, "flight", name, (), None, 0.0, 0.0, 0.0)
@@ -179,7 +181,12 @@ def test_a_frame_that_kills_every_worker_is_given_up(tmp_path: Path) -> None:
     done = {one.frame: one.error for one in workers.in_processes([job("dies"), job("1"), job("2")], answer, 1)}
     assert done["1"] is None
     assert done["2"] is None
-    assert "ended 3 workers" in str(done["dies"])
+    assert "ended or held up 3 workers" in str(done["dies"])
+
+
+def test_a_frame_that_hangs_every_worker_is_given_up() -> None:
+    (last,) = workers.in_processes([job("hangs")], answer, 1, job_s=0.05)
+    assert "ended or held up 3 workers" in str(last.error)
 
 
 def test_workers_end_with_the_one_who_asked(tmp_path: Path) -> None:
@@ -221,17 +228,18 @@ def test_no_scheduler_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 class Cluster:
-    """A scheduler and two workers, each a process of its own, as `dask scheduler` and `dask worker` start them."""
+    """A scheduler and its workers, each a process of its own, as `dask scheduler` and `dask worker` start them."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, crew: int = 2) -> None:
         self.folder = folder
+        self.crew = crew
         self.processes: list[subprocess.Popen[bytes]] = []
         self.url = ""
 
     def __enter__(self) -> Cluster:
         facts = self.folder / "scheduler.json"
         self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(facts))
-        for _ in range(2):
+        for _ in range(self.crew):
             self.worker()
         return self
 
@@ -257,7 +265,7 @@ class Cluster:
             process.wait()
 
     def address(self) -> str:
-        """The scheduler's address, once two workers are there."""
+        """The scheduler's address, once its workers are there."""
         return str(asyncio.run(asyncio.wait_for(self._address(), 60)))
 
     async def _address(self) -> str:
@@ -268,7 +276,8 @@ class Cluster:
         from distributed import Client  # noqa: PLC0415  slow to import, and only here
 
         async with Client(url, asynchronous=True, set_as_default=False) as client:  # type: ignore[no-untyped-call]  # untyped
-            await client.wait_for_workers(2, timeout=50)
+            if self.crew:
+                await client.wait_for_workers(self.crew, timeout=50)
         return url
 
 
@@ -277,6 +286,14 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     pytest.importorskip("distributed")
     with Cluster(tmp_path_factory.mktemp("dask")) as made:
         yield made
+
+
+@pytest.mark.slow
+def test_a_scheduler_without_workers_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(workers, "_WORKERS_S", 0.2)
+    with Cluster(tmp_path, crew=0) as alone, pytest.raises(workers.ClusterError, match="has no workers"):
+        list(workers.on_cluster([job("1")], answer, alone.address()))
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,6 +25,8 @@ from dappled.products.extras import need
 ATTEMPTS = 3  # a frame that kills so many workers is given up
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "GDAL_NUM_THREADS"), "1")
 _PATIENCE_S = 10.0  # for the scheduler to answer
+_WORKERS_S = 60.0  # for its first worker to be there
+JOB_S = 900.0  # a frame takes seconds: a worker that is silent so long hangs
 
 Make = Callable[[Job], Done]
 
@@ -37,12 +40,15 @@ class _Worker:
     process: BaseProcess
     door: Connection
     job: Job | None = None
+    until_s: float = 0.0  # when its job is overdue
 
 
-def in_processes(jobs: Sequence[Job], make: Make, workers: int) -> Iterator[Done]:
+def in_processes(
+    jobs: Sequence[Job], make: Make, workers: int, *, job_s: float = JOB_S, now_s: Callable[[], float] = time.monotonic
+) -> Iterator[Done]:
     """Answers of jobs done by so many processes, each with one thread.
 
-    A process that dies is replaced, and its job done again, three times in all.
+    A process that dies, or is silent for `job_s`, is replaced, and its job done again, three times in all.
     """
     waiting = deque(jobs)
     deaths: dict[str, int] = {}
@@ -53,14 +59,15 @@ def in_processes(jobs: Sequence[Job], make: Make, workers: int) -> Iterator[Done
                 crew.append(_hired(make))
             for worker in crew:
                 if worker.job is None and waiting:
-                    worker.job = waiting.popleft()
+                    worker.job, worker.until_s = waiting.popleft(), now_s() + job_s
                     _hand(worker, worker.job)
-            ready = wait([w.door for w in crew if w.job is not None])
-            for worker in [w for w in crew if w.door in ready]:
+            busy = [w for w in crew if w.job is not None]
+            ready = wait([w.door for w in busy], max(0.0, min(w.until_s for w in busy) - now_s()))
+            for worker in [w for w in busy if w.door in ready or now_s() >= w.until_s]:
                 job = worker.job
                 assert job is not None
                 try:
-                    answer: Done = worker.door.recv()
+                    answer = _answer(worker)
                 except (EOFError, OSError):
                     crew.remove(worker)
                     _dismiss(worker)
@@ -68,7 +75,9 @@ def in_processes(jobs: Sequence[Job], make: Make, workers: int) -> Iterator[Done
                     if deaths[job.key] < ATTEMPTS:
                         waiting.appendleft(job)
                         continue
-                    answer = given_up(job, f"{job.frame.name} ended {ATTEMPTS} workers: out of memory, or damaged?")
+                    answer = given_up(
+                        job, f"{job.frame.name} ended or held up {ATTEMPTS} workers: out of memory, or damaged?"
+                    )
                 worker.job = None
                 yield answer
     finally:
@@ -79,7 +88,7 @@ def in_processes(jobs: Sequence[Job], make: Make, workers: int) -> Iterator[Done
 def on_cluster(jobs: Sequence[Job], make: Make, scheduler: str) -> Iterator[Done]:
     """Answers of jobs done by the workers of a Dask scheduler, which must see the same folders under the same names.
 
-    Raises ClusterError where nobody answers.
+    Raises ClusterError where nobody answers, or where no worker is there within a minute.
     """
     distributed = need("distributed")
     try:
@@ -89,6 +98,12 @@ def on_cluster(jobs: Sequence[Job], make: Make, scheduler: str) -> Iterator[Done
             f"no Dask scheduler answers at {scheduler} ({error}): start one with dask scheduler"
         ) from None
     with client:
+        try:
+            client.wait_for_workers(1, timeout=_WORKERS_S)
+        except TimeoutError:
+            raise ClusterError(
+                f"the Dask scheduler at {scheduler} has no workers: start some with dask worker {scheduler}"
+            ) from None
         named = {job.key: job for job in jobs}
         futures = [client.submit(make, job, key=f"dappled-{job.key}", pure=False) for job in named.values()]
         for future in distributed.as_completed(futures, loop=client.loop):
@@ -120,6 +135,14 @@ def _hand(worker: _Worker, job: Job) -> None:
         worker.door.send(job)
     except OSError:
         return  # it died at once: reading from it will say so
+
+
+def _answer(worker: _Worker) -> Done:
+    """What a worker has to say. Raises EOFError or OSError where it never will."""
+    if not worker.door.poll():
+        raise TimeoutError("overdue")
+    answer: Done = worker.door.recv()
+    return answer
 
 
 def _dismiss(worker: _Worker) -> None:
