@@ -9,16 +9,19 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import tomli_w
+from PIL import Image
 
 from dappled.config import settings as configuration
 from dappled.daemon.ground_client import GroundClient
 from dappled.drivers.mavlink import mavlink
+from dappled.mocks import lytro
 from dappled.mocks.masked_camera import reference_camera
 from dappled.mocks.simulation import Simulation, World
 
@@ -43,8 +46,23 @@ def commands(document: Path) -> list[str]:
     return lines
 
 
-SUBSTITUTES = {"white-f22.cr2 --mask mask-2": "white.dng --camera reference-36mm --mask reference-5x5"}
-"""What a real camera would have made, and what stands for it here."""
+SUBSTITUTES = {
+    "white-f22.cr2 --mask mask-2": "white.dng --camera reference-36mm --mask reference-5x5",
+    "/media/$USER/FINEPIX/DCIM": "DCIM",
+    "~/flights/20261121T*": "flights/*Z-*",
+    "127.0.0.1:8042": "127.0.0.1:0",
+}
+"""What a real camera, card or day would have made, and what stands for it here."""
+
+ELSEWHERE = {
+    "calibrate --lens": "tests/products/test_chessboard.py",  # pictures of a chessboard
+    "--camera my-450d.toml": "tests/products/test_chessboard.py",  # what comes of them
+    "--refine orthophoto.tif": "tests/products/test_georeference.py",  # a map of the place
+    "--gcp points.csv": "tests/products/test_georeference.py",  # control points of the place
+    "--refine neighbours": "tests/products/test_georeference.py",  # frames that overlap
+    "--scheduler tcp:": "tests/products/test_batch.py",  # a Dask cluster
+}
+"""Commands that need more than this stage has, and the tests that give it to them."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +73,24 @@ class Stage:
     environment: dict[str, str]
     port: str
 
-    def run(self, command: str) -> str | None:
+    def all_fail(self, commands: Iterable[str]) -> list[str]:
+        """Run a document's commands in order, `cd` and all; what those said that did not end well."""
+        said, where = [], self.folder
+        for command in commands:
+            failure = self.run(command, where)
+            if failure:
+                said.append(failure)
+            if into := re.search(r"&& cd (\S+)$", command):
+                where = where / into[1]
+        return said
+
+    def run(self, command: str, where: Path) -> str | None:
         """Run it; None when it went well, else what it said."""
         if command.startswith("make "):
             return self._make(command)
+        for words, test in ELSEWHERE.items():
+            if words in command:
+                return None if (ROOT / test).is_file() else f"{command}: {test} is gone"
         words = command.replace("127.0.0.1:14550", f"127.0.0.1:{self.port}").removeprefix("sudo ")
         for printed, ours in SUBSTITUTES.items():
             words = words.replace(printed, ours)
@@ -69,7 +101,7 @@ class Stage:
         try:
             done = subprocess.run(
                 ["/bin/bash", "-c", words],
-                cwd=self.folder,
+                cwd=where,
                 env=environment,
                 capture_output=True,
                 text=True,
@@ -107,6 +139,8 @@ def stage(folder: Path, short: Path) -> Iterator[Stage]:
     subprocess.run(flown, cwd=folder, env=environment, check=True, capture_output=True)
     flight = next((folder / "flights").glob("*Z-*"))
     (folder / "FLIGHT").symlink_to(flight)
+    (folder / "build/demo/flights").mkdir(parents=True)
+    (folder / "build/demo/flights" / flight.name).symlink_to(flight)
     frame = sorted((flight / "frames").glob("*.dng"))[-1]
     for name in ("frame.dng", "FRAME"):
         shutil.copy(frame, folder / name)
@@ -160,6 +194,20 @@ def _files(folder: Path) -> None:
     white = reference_camera(1, scale=0.5, scene="white").bench_frame().file
     for name in ("white.dng", "white-f22.dng", "bench.dng"):
         (folder / name).write_bytes(white)
+    (folder / "DCIM").mkdir()
+    (folder / "examples").symlink_to(ROOT / "examples")
+    _lenslets(folder)
     (folder / "density.csv").write_text(
         "level,density\n" + "".join(f"{i * 17},{i * 0.2:.2f}\n" for i in range(16)), encoding="utf-8"
     )
+
+
+def _lenslets(folder: Path) -> None:
+    """A small plenoptic camera's frame and its white frame, as PNG and in Lytro's container."""
+    y, x = np.mgrid[0:492, 0:492].astype(np.float64)
+    light = sum(np.cos(2 * np.pi * 0.1 * (np.cos(a) * y + np.sin(a) * x)) for a in (0.001, np.pi / 3, 2 * np.pi / 3))
+    white = 168 + 3000 * np.exp(0.8 * (light - 3) / 3)
+    frame = 168 + (white - 168) * (0.7 + 0.2 * np.sin(x / 57) * np.cos(y / 43))
+    for name, values in (("white.png", white), ("raw.png", frame)):
+        Image.fromarray(values.astype(np.uint16)).save(folder / name)
+    (folder / "frame.lfp").write_bytes(lytro.container(frame.astype(np.uint16), lytro.metadata(frame.shape)))

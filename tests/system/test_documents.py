@@ -32,5 +32,5 @@ def test_commands_are_found(tmp_path: Path) -> None:
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_the_documents_commands_run(document: Path, on_stage: Stage) -> None:
-    failures = [failure for command in commands(document) if (failure := on_stage.run(command))]
+    failures = on_stage.all_fail(commands(document))
     assert not failures, "\n".join(failures)
