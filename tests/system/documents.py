@@ -49,7 +49,7 @@ def commands(document: Path) -> list[str]:
 SUBSTITUTES = {
     "white-f22.cr2 --mask mask-2": "white.dng --camera reference-36mm --mask reference-5x5",
     "/media/$USER/FINEPIX/DCIM": "DCIM",
-    "~/flights/20261121T*": "flights/*Z-*",
+    "~/flights/20261121T*": "build/demo/flights/*Z-*",
     "127.0.0.1:8042": "127.0.0.1:0",
 }
 """What a real camera, card or day would have made, and what stands for it here."""
