@@ -52,7 +52,7 @@ class Connection(H11Protocol):
     def pause_writing(self) -> None:
         super().pause_writing()
         if self._unread is None:
-            self._unread = self.loop.call_later(self.unread_s, self._end)
+            self._unread = self.loop.call_later(self.unread_s, self._cut)
 
     def resume_writing(self) -> None:
         super().resume_writing()
@@ -75,8 +75,14 @@ class Connection(H11Protocol):
             self._end()
 
     def _end(self) -> None:
+        """Close it in order: a browser that kept it for later sees that, and opens another."""
         self._forget()
         self.connections.discard(self)
+        self.transport.close()
+
+    def _cut(self) -> None:
+        """End it at once, with what was not read."""
+        self._end()
         self.transport.abort()
 
     def _forget(self) -> None:
