@@ -67,7 +67,7 @@ def test_systemd_hears_of_a_whole_life(manager: socket.socket, served: subproces
     until(manager, "READY=1".__eq__)
     served.send_signal(signal.SIGTERM)
     until(manager, "STOPPING=1".__eq__)
-    assert served.wait(10) == 0
+    assert served.wait(60) == 0
     said = served.communicate()[1]
     assert "reload: record.min_free_mb is 2 now (was 1)" in said
     assert "takes a restart" in said
