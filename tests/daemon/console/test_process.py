@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import subprocess
@@ -90,6 +91,11 @@ def test_a_stream_over_tcp_gets_a_door_of_the_daemon_s_own(slices: str, private:
         assert door.private.startswith("ipc://") is private
 
 
+def setup(folder: Path) -> dict[str, Any]:
+    return {"token": "", "hosts": [], "map": "", "endpoint": f"ipc://{folder}/s", "ask": "", "recipe": None,
+            "mount": [1, 0, 0, 0, 1, 0, 0, 0, 1]}  # fmt: skip
+
+
 def running(console: Console) -> subprocess.Popen[bytes] | None:
     return console._process
 
@@ -103,9 +109,7 @@ def test_a_console_that_dies_is_started_again_and_the_socket_stays(tmp_path: Pat
 
     listener, _ = process.listen(ConsoleSettings(bind="127.0.0.1:0"))
     url = process.url(listener)
-    setup = {"token": "", "hosts": [], "map": "", "endpoint": f"ipc://{tmp_path}/s", "ask": "", "recipe": None,
-             "mount": [1, 0, 0, 0, 1, 0, 0, 0, 1]}  # fmt: skip
-    console = Console(listener, setup, act)
+    console = Console(listener, setup(tmp_path), act)
     console.start()
     try:
         with httpx.Client(base_url=url, timeout=30, headers={"origin": url.rstrip("/")}, trust_env=False) as client:
@@ -126,6 +130,34 @@ def test_a_console_that_dies_is_started_again_and_the_socket_stays(tmp_path: Pat
     assert running(console) is None
     with pytest.raises(httpx.ConnectError):
         httpx.get(url, trust_env=False)
+
+
+def test_an_answer_that_fails_ends_one_process_and_not_the_console(tmp_path: Path) -> None:
+    begun: list[int] = []
+
+    def act(request: Mapping[str, Any]) -> Mapping[str, Any]:
+        begun.append(1)
+        if len(begun) == 1:
+            raise RuntimeError("a fault of the daemon's own")
+        return {"ok": True, "text": "shot 1"}
+
+    listener, _ = process.listen(ConsoleSettings(bind="127.0.0.1:0"))
+    url = process.url(listener)
+    console = Console(listener, setup(tmp_path), act)
+    console.start()
+    try:
+        until, answer = time.monotonic() + 30, None
+        while answer != {"ok": True, "text": "shot 1"}:
+            assert time.monotonic() < until
+            with (  # the process that was asked first may still be ending: a new connection each time
+                contextlib.suppress(httpx.HTTPError),
+                httpx.Client(base_url=url, timeout=30, headers={"origin": url.rstrip("/")}, trust_env=False) as client,
+            ):
+                answer = client.post("/api/shoot", json={"sequence": 1}).json()
+                answer = {key: answer.get(key) for key in ("ok", "text")}
+        assert running(console) is not None
+    finally:
+        console.stop()
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from dappled.daemon.endpoints import is_loopback
 from dappled.daemon.logbook import Logbook
 from dappled.drivers.camera_channel import Channel, ChannelError
 from dappled.drivers.darkroom import Recipe
-from dappled.errors import DappledError
+from dappled.errors import DappledError, report
 
 log = logging.getLogger(__name__)
 RESTARTS, RESTART_WINDOW_S = 5, 60.0
@@ -119,8 +119,8 @@ class Console:
             self._begun.append(time.monotonic())
             try:
                 self._serve()
-            except OSError as error:
-                log.warning("the console's process can't be started: %s", error.strerror)
+            except Exception as error:  # noqa: BLE001  # whatever it was, it is started again, within the budget
+                report(log, "the console ended", error)
 
     def _serve(self) -> None:
         channel, there = Channel.pair()
