@@ -25,10 +25,11 @@ check: setup ## lint, format, types, layers
 
 test-fast: setup
 	@$(BIN)/coverage erase
-	@$(BIN)/pytest -m "not slow" --durations=25 --cov --cov-report=term
+	@$(BIN)/pytest -q --no-header -m "not slow" --durations=25 --cov --cov-report=
+	@echo "coverage: $$($(BIN)/coverage report --format=total) % of lines and branches (by file: $(BIN)/coverage report)"
 
 test-slow: setup ## the tests that take longer
-	@$(BIN)/pytest -m slow
+	@$(BIN)/pytest -q --no-header -m slow --durations=25
 
 soak: setup ## half an hour in which something goes wrong every few seconds; MINUTES=n for another time
 	@$(BIN)/python -m dappled.mocks.soak --minutes $(or $(MINUTES),30)
