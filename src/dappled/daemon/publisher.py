@@ -15,7 +15,7 @@ import threading
 import time
 import weakref
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +36,7 @@ QUESTION_BYTES = 4096
 UNREAD_ANSWERS = 4  # with a body, of all askers together
 _LARGE_BYTES = 1_000_000
 _PATIENCE_S, _LARGE_PATIENCE_S = 0.02, 0.1  # after a message, while its bytes are on their way to those who read
+_GIVE_WAY_S = 0.25  # how long a large message waits while a frame is made safe
 _HEARTBEAT_MS, _DEAF_MS = 5_000, 30_000  # a peer that reads nothing for so long is cut off; it may come again
 
 
@@ -86,6 +87,8 @@ class Publisher:
         self._unread: list[weakref.ref[memoryview]] = []  # answers' bodies; ZeroMQ lets go of those that were read
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._stopping = threading.Event()
+        self._way_is_free = threading.Event()
+        self._way_is_free.set()
         self._closed = False
         self._context = endpoints.niced_context()
         self._allowed = keys.allowed if keys else {}
@@ -122,6 +125,15 @@ class Publisher:
             if sum(not peer for peer, _ in self._waiting) > self._capacity:
                 self._drop_one()
         self._ring()
+
+    @contextlib.contextmanager
+    def giving_way(self) -> Iterator[None]:
+        """While a frame is made safe: large messages wait, each at most a quarter of a second. One thread calls it."""
+        self._way_is_free.clear()
+        try:
+            yield
+        finally:
+            self._way_is_free.set()
 
     def statistics(self) -> PublisherStatistics:
         """Counters, taken together."""
@@ -210,8 +222,10 @@ class Publisher:
         header = self._envelope(message, self._sent[message.topic])
         if message.topic == "end":
             header["sent"] = dict(self._sent)  # so that a subscriber can tell what it missed last
-        self._give_out(_parts(message, header))
         large = message.body is not None and memoryview(message.body).nbytes >= _LARGE_BYTES
+        if large:
+            self._way_is_free.wait(_GIVE_WAY_S)
+        self._give_out(_parts(message, header))
         until_s = time.monotonic() + (_LARGE_PATIENCE_S if large else _PATIENCE_S)
         self._patient_until_s = max(self._patient_until_s, until_s)
         with self._lock:

@@ -11,6 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -214,7 +215,8 @@ class Street:
         index = arrival.shot
         story = None if index is None else self._story(index)
         try:
-            frame = self._book.record(index, arrival.name, arrival.blob)
+            with self._publisher.giving_way() if self._publisher else nullcontext():
+                frame = self._book.record(index, arrival.name, arrival.blob)
         except Exception as error:
             # The recorder has noted it as far as the disk lets it. A second file doesn't undo the first one.
             if story is not None and story.frame is None and not story.over:
