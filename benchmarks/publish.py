@@ -6,6 +6,7 @@ python benchmarks/publish.py [--json] [--rounds 25] [--frames 8] [--directory DI
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import multiprocessing
 import os
@@ -35,9 +36,19 @@ from dappled.daemon.subscriber import Subscriber
 from dappled.daemon.wire import Message
 
 SHAPE = (13, 572, 566)
+HUNG = 3
 RAW_BYTES = 17_000_000
 DEADLINE_S = 60.0
 SPAWN = multiprocessing.get_context("spawn")
+LIMITS = {  # what is wanted of those figures that are a promise
+    "ipc_over_memcpy": "at least 0.4",
+    "record_crowd_over_alone": "at most 1.05",
+    "wish_note_crowd_over_alone": "at most 1.05",
+    "most_frames_kept_for_the_hung": "at most 4",
+    "safe_to_received_less_decode_median_ms": "at most 15",
+    "frames_of_a_subscriber_started_again": "1",
+}
+UNIT_NICENESS = -5  # systemd/dappled.service
 
 
 def main() -> None:
@@ -58,7 +69,7 @@ def main() -> None:
         print(json.dumps(figures))
     else:
         for name, value in figures.items():
-            print(f"{name:44} {value:10.3f}")
+            print(f"{name:44} {value:10.3f}{f'   wanted: {LIMITS[name]}' if name in LIMITS else ''}")
 
 
 def stack(seed: int) -> NDArray[np.complex64]:
@@ -124,8 +135,13 @@ def _through_a_socket(source: NDArray[np.complex64], target: NDArray[np.complex6
 def hung(root: Path, rounds: int) -> dict[str, float]:
     """Durable frames of 17 MB recorded while slices go out: to nobody, and to ten subscribers of which three hang.
 
-    The two take turns. Also how many stacks of slices the publisher keeps alive at the most.
+    The two take turns, with the niceness that the service's unit gives where this may be had. A frame comes at any
+    time after the slices of the one before. Also how many stacks of slices the publisher keeps alive at the most; the
+    hung ones subscribed to slices alone, which is the worst case.
     """
+    with contextlib.suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, 0, UNIT_NICENESS)
+    when = np.random.default_rng(1)
     from dappled.drivers.camera import Blob  # noqa: PLC0415  # the subscribers' processes load none of it
     from dappled.flight import recording  # noqa: PLC0415  # as above
     from dappled.flight.records import Cause, Shot  # noqa: PLC0415  # as above
@@ -139,7 +155,7 @@ def hung(root: Path, rounds: int) -> dict[str, float]:
     lone = Publisher(f"ipc://{root}/lone", "", answer=_no_answer, flight="lone")
     lone.start()
     with publisher(root) as one, crowd(root, one) as readers:
-        for sleeper in readers[:3]:
+        for sleeper in readers[:HUNG]:
             os.kill(sleeper.pid or 0, signal.SIGSTOP)
         for turn in range(2 * rounds):
             name, through = ("crowd", one) if turn % 2 else ("alone", lone)
@@ -147,25 +163,27 @@ def hung(root: Path, rounds: int) -> dict[str, float]:
             if name == "crowd":
                 alive.add(index)
                 weakref.finalize(body, alive.discard, index)
+            if turn % 8 < 2:  # once a second
+                through.publish("health", {})
+            through.publish("frame", {"frame": index})
+            through.publish("slices", header(index, body), body.data.cast("B"))
+            del body
+            time.sleep(when.uniform(0.0, 0.25))
             shot = Shot(index, Cause("benchmark", "frame"), time.time_ns(), time.monotonic_ns())
             blob = Blob.of(data)
             began = time.perf_counter()
             flight.journal.note(shot)
             wishes[name].append(time.perf_counter() - began)
             flight.ledger.add_shot(shot)
-            if turn % 8 < 2:  # once a second
-                through.publish("health", {})
-            through.publish("frame", {"frame": index})
-            through.publish("slices", header(index, body), body.data.cast("B"))
-            del body
             began = time.perf_counter()
-            flight.recorder.record(index, "IMG.CR2", blob, arrived_utc_ns=time.time_ns())
+            with through.giving_way():  # as the street does
+                flight.recorder.record(index, "IMG.CR2", blob, arrived_utc_ns=time.time_ns())
             times[name].append(time.perf_counter() - began)
             blob.close()
-            time.sleep(0.25)  # four frames a second
+            time.sleep(0.3)  # until all have read what they want
             most = max(most, len(alive))
             index += 1
-        for sleeper in readers[:3]:
+        for sleeper in readers[:HUNG]:
             os.kill(sleeper.pid or 0, signal.SIGCONT)
     lone.stop(0.0)
     flight.close()
@@ -287,7 +305,7 @@ def publisher(root: Path) -> Iterator[Publisher]:
 def reader(root: Path) -> Iterator[Connection]:
     """A subscriber in a process of its own, that says through the pipe when a message has come."""
     here, there = SPAWN.Pipe()
-    process = SPAWN.Process(target=_read, args=[f"ipc://{root}/s", there], daemon=True)
+    process = SPAWN.Process(target=_read, args=[f"ipc://{root}/s", there, list(wire.TOPICS)], daemon=True)
     process.start()
     try:
         yield here
@@ -300,9 +318,10 @@ def reader(root: Path) -> Iterator[Connection]:
 def crowd(root: Path, one: Publisher) -> Iterator[list[BaseProcess]]:
     """Ten subscribers, each in a process of its own, all of them connected."""
     pipes, processes = [], []
-    for _ in range(10):
+    for number in range(10):
         here, there = SPAWN.Pipe()
-        process = SPAWN.Process(target=_read, args=[f"ipc://{root}/s", there, True], daemon=True)
+        topics = ["slices"] if number < HUNG else list(wire.TOPICS)
+        process = SPAWN.Process(target=_read, args=[f"ipc://{root}/s", there, topics, True], daemon=True)
         process.start()
         pipes.append(here)
         processes.append(process)
@@ -322,15 +341,17 @@ def greet(one: Publisher, pipe: Connection) -> None:
     while not pipe.poll(0.05):
         if time.monotonic() > until:
             raise TimeoutError("a subscriber never came")
-        one.publish("health", {})
+        one.publish("slices", {"frame": 0, "arrays": []}, b"")
     while pipe.poll(0.2):
         pipe.recv()
 
 
-def _read(endpoint: str, pipe: Connection, once: bool = False) -> None:
+def _read(endpoint: str, pipe: Connection, topics: list[str], once: bool = False) -> None:
     said = False
     reuse_large_blocks()
-    with Subscriber(endpoint) as subscriber:
+    if os.getpriority(os.PRIO_PROCESS, 0) < 0:
+        os.setpriority(os.PRIO_PROCESS, 0, 0)  # a reader is no part of the service
+    with Subscriber(endpoint, topics=topics) as subscriber:
         while True:
             message = subscriber.receive(60.0)
             if message is not None and not (once and said):
