@@ -26,8 +26,9 @@ from scipy import fft
 
 from dappled.config import profiles
 from dappled.decode import plane as planes
+from dappled.decode.colours import coloured, local_colours
 from dappled.decode.decoder import MaskDecoder
-from dappled.decode.exposure import Developer, developer
+from dappled.decode.developer import Developer, developer
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.noise import Noise
 from dappled.decode.plan import Plan
@@ -201,9 +202,9 @@ def lenslet_colour_views(rounds: int, workers: int) -> float:
     decoder = LensletDecoder.with_white(plane(white), workers=workers, rolloff=MOSAIC_ROLLOFF)
 
     def to_views() -> Any:
-        chroma = planes.local_colours(plane(frame), BAYER, [0, 1, 2], [0, 1, 2])
+        chroma = local_colours(plane(frame), BAYER, [0, 1, 2], [0, 1, 2])
         field = decoder.decode(develop.expose(frame, workers=workers))
-        return replace(field, views=planes.coloured(field.views, field.grid, chroma, LENSLETS))
+        return replace(field, views=coloured(field.views, field.grid, chroma, LENSLETS))
 
     return min(timed(to_views) for _ in range(min(rounds, 3)))
 

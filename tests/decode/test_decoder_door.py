@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from dappled.decode.decoder import MaskDecoder
+from dappled.decode.developer import developer
 from dappled.decode.errors import DecodeError
-from dappled.decode.exposure import Exposure, developer
+from dappled.decode.exposure import Exposure
 from dappled.decode.lenslets import LensletDecoder
 from tests.decode.rays import FOCAL_MM, MASK, SENSOR, STATED_DISTANCE_MM
 

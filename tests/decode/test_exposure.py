@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dappled.decode import colours
 from dappled.decode import plane as planes
+from dappled.decode.developer import developer
 from dappled.decode.errors import DecodeError
-from dappled.decode.exposure import Laid, developer
+from dappled.decode.exposure import Laid
 
 BAYER = np.array([[0, 1], [1, 2]])
 SUPER_CCD = np.array([[0, 1, 2, 1], [1, 1, 1, 1], [2, 1, 0, 1], [1, 1, 1, 1]])
@@ -38,7 +40,7 @@ def test_an_exposure_is_the_plane_with_its_colours_evened(
     levels: dict[str, Any] = {"black": (100, 90, 110), "white": 4095, "cfa": cfa, "balance": balance}
     expected = planes.to_plane(mosaic, **levels)
     if reference:
-        planes.even_colours(expected, cfa, reference)
+        colours.even_colours(expected, cfa, reference)
     exposure = developer(shape, **levels, reference=reference).expose(mosaic)
     np.testing.assert_allclose(exposure.plane(), expected, rtol=2e-5, atol=1e-6)
     assert exposure.level == pytest.approx(float(expected.mean()), rel=0.1)
@@ -50,7 +52,7 @@ def test_dark_and_white_frames_are_taken_off_while_it_is_read() -> None:
     dark = rng.integers(80, 120, mosaic.shape, dtype=np.uint16)
     flat = rng.uniform(1, 2, mosaic.shape).astype(np.float32)
     levels: dict[str, Any] = {"black": 0, "white": 4095, "cfa": BAYER, "balance": (1.0, 1.0, 1.0)}
-    expected = planes.divide(planes.to_plane(mosaic, dark=dark, **levels), flat)
+    expected = planes.to_plane(mosaic, dark=dark, **levels) * flat
     found = developer(mosaic.shape, **levels).expose(mosaic, dark=dark, flat=flat).plane()
     np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-6)
 

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dappled.decode.developer import developer
 from dappled.decode.equations import padded_plane
 from dappled.decode.errors import DecodeError
-from dappled.decode.exposure import developer
 from dappled.decode.transform import Transform
 
 MOSAIC = np.random.default_rng(7).integers(200, 3500, (197, 251), dtype=np.uint16)

@@ -17,10 +17,12 @@ from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode import plane as planes
 from dappled.decode.calibrated import Calibration
+from dappled.decode.colours import coloured, local_colours
 from dappled.decode.decoder import Decoder, MaskDecoder
 from dappled.decode.defects import Places, find_defects, mended
+from dappled.decode.developer import Developer, developer
 from dappled.decode.errors import DecodeError
-from dappled.decode.exposure import Developer, Exposure, developer
+from dappled.decode.exposure import Exposure
 from dappled.decode.latest import Latest
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
@@ -143,7 +145,7 @@ class Darkroom:
                 )
                 if chroma is not None:
                     light_field = replace(
-                        light_field, views=planes.coloured(light_field.views, light_field.grid, chroma, plane.shape)
+                        light_field, views=coloured(light_field.views, light_field.grid, chroma, plane.shape)
                     )
         attributes = {
             **light_field.attributes,
@@ -197,7 +199,7 @@ class Darkroom:
                 even = planes.to_plane(
                     raw.mosaic, black=black, white=raw.white, cfa=cfa, balance=balance, dark=dark, workers=workers
                 )
-                chroma = planes.local_colours(even, cfa, [names.index(name) for name in "RGB"], reference)
+                chroma = local_colours(even, cfa, [names.index(name) for name in "RGB"], reference)
         elif colour:
             raise DecodeError("the frame has no colour pattern: decode it without --colour, or name it with --cfa")
         planes.check_shape(raw.mosaic)
