@@ -8,6 +8,7 @@ import json
 import math
 import struct
 import xml.etree.ElementTree as ET
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -195,6 +196,18 @@ def raf() -> bytes:
     return bytes(header) + preview + b"sensor data"
 
 
+def png(mode: str = "I;16", *, exif: bool = False, late: bool = False) -> bytes:
+    """A grey PNG of 16 bits, or another; `late` puts its EXIF behind the pixels, where it may stand too."""
+    data, told = io.BytesIO(), Image.Exif()
+    told[0x0110] = "Model"
+    Image.new(mode, (8, 8), 77).save(data, "PNG", **({"exif": told} if exif and not late else {}))
+    made = data.getvalue()
+    if not late:
+        return made
+    chunk = b"eXIf" + told.tobytes().removeprefix(b"Exif\0\0")
+    return made[:-12] + struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) + made[-12:]
+
+
 def gps(data: bytes) -> dict[int, Any]:
     """The GPS directory, as Pillow reads it."""
     if data.startswith(b"FUJIFILM"):
@@ -216,6 +229,9 @@ FILES = {
     "IMG.JPG": jpeg(exif=True),
     "BARE.JPG": jpeg(exif=False),
     "DSCF0001.RAF": raf(),
+    "BARE.PNG": png(),
+    "IMG.PNG": png("RGB", exif=True),
+    "LATE.PNG": png("L", exif=True, late=True),
 }
 
 
@@ -252,9 +268,37 @@ def test_copies_of_raws_open_as_before(shared_data: Path, file: str) -> None:
         assert degrees(told.get_ifd(0x8825)[2]) == pytest.approx(41.6, abs=1e-9)
 
 
+@pytest.mark.parametrize("name", [name for name in FILES if name.endswith("PNG")])
+def test_a_copy_of_a_png_has_the_same_pixels_and_whole_chunks(name: str) -> None:
+    """Pillow's own check reads every chunk's CRC; nothing but eXIf is new."""
+    copy = exif_gps.tagged(FILES[name], exif_gps.Place(41.6, -91.5, 215.0, START_NS))
+    with Image.open(io.BytesIO(copy)) as image:
+        image.verify()
+    with Image.open(io.BytesIO(copy)) as image, Image.open(io.BytesIO(FILES[name])) as original:
+        assert image.mode == original.mode
+        assert image.tobytes() == original.tobytes()
+    assert [chunk for chunk in chunks(copy) if chunk[0] != b"eXIf"] == [
+        chunk for chunk in chunks(FILES[name]) if chunk[0] != b"eXIf"
+    ]
+    assert [kind for kind, _ in chunks(copy)].count(b"eXIf") == 1
+    for cut in (9, 40, len(FILES[name]) - 13):
+        with pytest.raises(ExifError, match="cut short"):
+            exif_gps.tagged(FILES[name][:cut], exif_gps.Place(1.0, 2.0, 3.0))
+
+
+def chunks(data: bytes) -> list[tuple[bytes, bytes]]:
+    """A PNG's (kind, content and CRC)."""
+    found, at = [], 8
+    while at < len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        found.append((data[at + 4 : at + 8], data[at + 8 : at + 12 + length]))
+        at += 12 + length
+    return found
+
+
 @given(st.binary(max_size=200))
 def test_any_bytes_are_refused_in_a_sentence_or_tagged(data: bytes) -> None:
-    for start in (b"", b"II*\0\x08\0\0\0", b"MM\0*", b"\xff\xd8\xff\xe1", b"FUJIFILMCCD-RAW"):
+    for start in (b"", b"II*\0\x08\0\0\0", b"MM\0*", b"\xff\xd8\xff\xe1", b"\x89PNG\r\n\x1a\n", b"FUJIFILMCCD-RAW"):
         try:
             made = exif_gps.tagged(start + data, exif_gps.Place(1.0, 2.0, 3.0))
             assert len(made) > len(data)

@@ -1,12 +1,14 @@
-"""EXIF GPS in copies of frames: TIFF-like raws (CR2, DNG, NEF, ARW), TIFF, JPEG, and Fujifilm's RAF.
+"""EXIF GPS in copies of frames: TIFF-like raws (CR2, DNG, NEF, ARW), TIFF, JPEG, PNG, and Fujifilm's RAF.
 
 A TIFF gets its GPS directory, and a new first directory that points to it, behind its end: nothing else moves, so
-every offset in it, a maker note's too, stays right. A JPEG's EXIF is such a TIFF; a RAF shows EXIF in its JPEG preview.
+every offset in it, a maker note's too, stays right. A JPEG's EXIF is such a TIFF, and so is a PNG's eXIf chunk; a RAF
+shows EXIF in its JPEG preview.
 """
 
 from __future__ import annotations
 
 import struct
+import zlib
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -18,8 +20,10 @@ _BYTE, _ASCII, _LONG, _RATIONAL = 1, 2, 4, 5
 _RAF = b"FUJIFILMCCD-RAW"
 _RAF_JPEG = 84
 _EXIF = b"Exif\0\0"
+_PNG = b"\x89PNG\r\n\x1a\n"
 _SOI, _APP0, _APP1, _SOS = 0xD8, 0xE0, 0xE1, 0xDA
 _SEGMENT = 0xFFFF
+_EMPTY = b"II*\0" + struct.pack("<IHI", 8, 0, 0)
 
 
 class ExifError(DappledError):
@@ -53,6 +57,8 @@ def tagged(data: bytes, where: Place) -> bytes:
             return _tiff(data, where)
         if data[:2] == bytes((0xFF, _SOI)):
             return _jpeg(data, where)
+        if data.startswith(_PNG):
+            return _png(data, where)
         if data.startswith(_RAF):
             offset, length = struct.unpack_from(">II", data, _RAF_JPEG)
             preview = _jpeg(data[offset : offset + length], where)
@@ -60,7 +66,7 @@ def tagged(data: bytes, where: Place) -> bytes:
             return header + data[_RAF_JPEG + 8 :] + preview
     except (struct.error, IndexError) as error:
         raise ExifError(f"its EXIF is damaged ({error}): no place can be written into a copy") from None
-    raise ExifError("it is no TIFF-like raw, TIFF, JPEG or RAF: its place stands in the sidecar only")
+    raise ExifError("it is no TIFF-like raw, TIFF, JPEG, PNG or RAF: its place stands in the sidecar only")
 
 
 def _tiff(data: bytes, where: Place) -> bytes:
@@ -91,8 +97,26 @@ def _jpeg(data: bytes, where: Place) -> bytes:
         at += 2 + length
         if insert == 2 and data[3] == _APP0:
             insert = at
-    empty = b"II*\0" + struct.pack("<IHI", 8, 0, 0)
-    return data[:insert] + _segment(_tiff(empty, where)) + data[insert:]
+    return data[:insert] + _segment(_tiff(_EMPTY, where)) + data[insert:]
+
+
+def _png(data: bytes, where: Place) -> bytes:
+    """The eXIf chunk (PNG 1.5 extensions) stands where it stood, else before the pixels; no other byte changes."""
+    at, first = len(_PNG), dict[bytes, tuple[int, int]]()
+    while b"IEND" not in first and at + 12 <= len(data):
+        end = at + 12 + int(struct.unpack_from(">I", data, at)[0])
+        first.setdefault(data[at + 4 : at + 8], (at, end))
+        at = end
+    if at > len(data) or not {b"IDAT", b"IEND"} <= first.keys():
+        raise ExifError("the PNG is cut short: no place can be written into a copy")
+    pixels, _ = first[b"IDAT"]
+    start, end = first.get(b"eXIf", (pixels, pixels))
+    told = data[start + 8 : end - 4] if start < end else _EMPTY
+    return data[:start] + _chunk(_tiff(told, where)) + data[end:]
+
+
+def _chunk(tiff: bytes) -> bytes:
+    return struct.pack(">I", len(tiff)) + b"eXIf" + tiff + struct.pack(">I", zlib.crc32(b"eXIf" + tiff))
 
 
 def _segment(tiff: bytes) -> bytes:
