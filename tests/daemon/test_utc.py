@@ -37,6 +37,15 @@ def test_a_board_without_a_clock_knows_utc_only_from_the_network(
     assert utc.system_knows(NOW_NS, synchronised=lambda: synchronised, root=root) is knows
 
 
+def test_where_the_kernel_may_not_be_asked_timesyncd_s_mark_tells(tmp_path: Path) -> None:
+    root = machine(tmp_path, board=True, clock=False)
+    mark = root / "run/systemd/timesync/synchronized"
+    mark.parent.mkdir(parents=True)
+    assert not utc.system_knows(NOW_NS, synchronised=lambda: False, root=root)
+    mark.touch()
+    assert utc.system_knows(NOW_NS, synchronised=lambda: False, root=root)
+
+
 def test_a_clock_that_was_never_set_is_not_believed(tmp_path: Path) -> None:
     assert not utc.system_knows(FLOOR_NS - 1, synchronised=lambda: True, root=tmp_path)
     assert not utc.known("auto", 10**18)

@@ -31,6 +31,15 @@ def test_without_a_clock_the_flight_is_named_by_boot(flights: Path) -> None:
     assert layout.flights(flights) == [folder]
 
 
+def test_a_flight_has_a_name_where_proc_is_hidden(
+    flights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(layout, "_BOOT_ID", tmp_path / "hidden")
+    folder = layout.create(flights, None)
+    assert re.fullmatch(r"boot[0-9a-f]{8}-[0-9a-f]{8}", folder.name)
+    assert layout.flights(flights) == [folder]
+
+
 def test_other_folders_are_no_flights(flights: Path) -> None:
     flights.mkdir()
     (flights / "notes").mkdir()

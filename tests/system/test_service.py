@@ -100,6 +100,13 @@ def test_the_unit_exposes_little() -> None:
     assert judged.returncode == 0, judged.stdout[-300:]
 
 
+def test_the_unit_leaves_the_daemon_what_tells_whether_its_clock_can_be_believed() -> None:
+    """/proc/sys (the boot's id) and /proc/device-tree (a board without a clock); ProtectClock= takes adjtimex away."""
+    directives = UNIT.read_text(encoding="utf-8").splitlines()
+    assert "ProcSubset=pid" not in directives
+    assert "ProtectClock=yes" in directives
+
+
 def test_the_service_s_settings_are_good() -> None:
     words = [sys.executable, "-m", "dappled", "config", "check", str(ROOT / "systemd/dappled.toml")]
     assert subprocess.run(words, capture_output=True, check=False).returncode == 0

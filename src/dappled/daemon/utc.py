@@ -17,10 +17,11 @@ _TIMEX_BYTES = 512  # more than any kernel's struct timex
 def system_knows(utc_ns: int, *, synchronised: Callable[[], bool] | None = None, root: Path = Path("/")) -> bool:
     """Whether the machine's time of day is to be believed: set at all; and kept by the network, by a clock of its own
     that runs while it is off, or by a host. A single-board computer without either shows when it was last switched off.
+    A service may not ask the kernel (`ProtectClock=`): systemd-timesyncd's mark is looked for as well.
     """
     if utc_ns < FLOOR_NS:
         return False
-    if (synchronised or kernel_synchronised)():
+    if (synchronised or kernel_synchronised)() or (root / "run/systemd/timesync/synchronized").exists():
         return True
     board = (root / "proc/device-tree/model").exists()
     return not board or any((root / "sys/class/rtc").glob("rtc*"))

@@ -88,13 +88,21 @@ def index_of(file_name: str) -> int | None:
     return int(match[1]) if match else None
 
 
+def _boot() -> str:
+    """Eight hex digits of this boot's id; random ones where /proc is hidden: a flight needs a name."""
+    try:
+        return _BOOT_ID.read_text(encoding="ascii").strip().replace("-", "")[:8]
+    except OSError:
+        return secrets.token_hex(4)
+
+
 def create(root: Path, utc_ns: int | None, facts: Mapping[str, Any] | None = None) -> FlightFolder:
     """A new, empty flight under `root` (made if missing), durable with its flight.toml when this returns.
 
     `utc_ns` is the start, or None when UTC is not known. `facts` goes to flight.toml. Raises FlightError.
     """
     if utc_ns is None:
-        start = "boot" + _BOOT_ID.read_text().strip().replace("-", "")[:8]
+        start = f"boot{_boot()}"
     else:
         start = datetime.fromtimestamp(utc_ns // 1_000_000_000, UTC).strftime("%Y%m%dT%H%M%SZ")
     folder = FlightFolder(root / f"{start}-{secrets.token_hex(4)}")
