@@ -147,6 +147,13 @@ def test_flight_verbs_read_it(flown: Flown) -> None:
     assert flown.flight.name in listed.stdout
 
 
+def test_flights_are_found_by_the_daemon_s_settings(flown: Flown, tmp_path: Path) -> None:
+    config = tmp_path / "dappled.toml"
+    config.write_text(f'[record]\ndirectory = "{flown.flight.parent}"\n', encoding="utf-8")
+    assert flown.flight.name in dappled("flight", "list", "--config", str(config)).stdout
+    assert "the books balance" in dappled("flight", "report", "--config", str(config)).stdout
+
+
 def test_the_flight_decodes_again_on_the_ground(flown: Flown, tmp_path: Path) -> None:
     frame = sorted((flown.flight / "frames").glob("*.dng"))[0]
     calibration = flown.flight / "inputs" / "calibration.toml"

@@ -4,9 +4,44 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
+import socket
 from pathlib import Path
 
+from dappled.config import settings
+from dappled.daemon.wire import WireError
 from dappled.drivers.darkroom import Recipe
+
+SERVICE_FOLDER = Path("/run/dappled")  # RuntimeDirectory= of systemd/dappled.service
+
+
+def stream(config: Path | None, service: Path = SERVICE_FOLDER) -> str:
+    """Endpoint of the daemon on this machine: as the settings name it, else this user's own, else the service's.
+
+    Raises ConfigError; WireError where this user may not look into the service's folder.
+    """
+    endpoint = settings.load(config).publish.slices
+    ours = settings.runtime_folder() / "slices"
+    if endpoint != f"ipc://{ours}" or ours.parent == service or not service.is_dir() or answers(endpoint):
+        return endpoint
+    if not os.access(service, os.X_OK):
+        raise WireError(
+            f"{service}: only members of its group may ask the service: sudo usermod -aG dappled $USER, and log in anew"
+        )
+    return f"ipc://{service}/slices"
+
+
+def answers(endpoint: str) -> bool:
+    """Whether somebody listens on an ipc endpoint; of others nothing is known, and they don't."""
+    if not endpoint.startswith("ipc://"):
+        return False
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(endpoint.removeprefix("ipc://"))
+        except OSError:
+            return False
+    return True
 
 
 def whole(text: str) -> int:

@@ -24,7 +24,10 @@ from dappled.flight.ledger import LIVE
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "examples:\n  dappled flight list\n  dappled flight check ~/flights/20261121T101503Z-0a1b2c3d"
+    parser.epilog = (
+        "examples:\n  dappled flight list\n  dappled flight report --config /etc/dappled/dappled.toml\n"
+        "  dappled flight check ~/flights/20261121T101503Z-0a1b2c3d"
+    )
     actions = parser.add_subparsers(dest="action", required=True)
     listing = actions.add_parser("list", help="all flights in a folder")
     listing.add_argument("folder", nargs="?", type=Path, help="flights folder (default: record.directory)")
@@ -41,13 +44,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     away.add_argument("--prune", action="store_true", help="afterwards remove the frames here; the ledger stays")
     flight_pickup.configure(actions.add_parser("pickup", help=flight_pickup.HELP))
     for one in actions.choices.values():
+        one.add_argument("--config", type=Path, metavar="FILE", help="settings that say where flights are")
         one.add_argument("--json", action="store_true", help="as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     if arguments.action == "list":
-        return _list(arguments.folder or _flights(), arguments.json)
-    flight = arguments.flight or last_flight()
+        return _list(arguments.folder or _flights(arguments.config), arguments.json)
+    flight = arguments.flight or _last_flight(_flights(arguments.config))
     if arguments.action == "pickup":
         return flight_pickup.run(flight, arguments)
     if arguments.action == "offload":
@@ -55,16 +59,16 @@ def run(arguments: argparse.Namespace) -> int:
     return {"show": _show, "check": _check, "report": _report}[arguments.action](flight, arguments.json)
 
 
-def last_flight() -> Path:
-    """The newest flight in the configured folder. Raises FlightError when there is none."""
-    found = index.in_order(_flights())
+def _last_flight(flights: Path) -> Path:
+    """The newest flight in a folder. Raises FlightError when there is none."""
+    found = index.in_order(flights)
     if not found:
-        raise FlightError(f"there is no flight in {_flights()} yet; name one, or record one with `dappled run`")
+        raise FlightError(f"there is no flight in {flights} yet; name one, or record one with `dappled run`")
     return found[-1].path
 
 
-def _flights() -> Path:
-    return Path(settings.load(None).record.directory)
+def _flights(config: Path | None) -> Path:
+    return Path(settings.load(config).record.directory)
 
 
 def _list(folder: Path, as_json: bool) -> int:

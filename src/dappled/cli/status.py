@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dappled.cli.common import seconds
-from dappled.config import settings
+from dappled.cli.common import seconds, stream
 from dappled.daemon.subscriber import Subscriber
 from dappled.errors import DappledError
 
@@ -28,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    endpoint = arguments.endpoint or settings.load(arguments.config).publish.slices
+    endpoint = arguments.endpoint or stream(arguments.config)
     told = health(endpoint, arguments.timeout)
     if arguments.json:
         print(json.dumps(told))

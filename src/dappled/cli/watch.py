@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from dappled.cli.common import seconds, whole
-from dappled.config import settings
+from dappled.cli.common import seconds, stream, whole
 from dappled.daemon.curve import ClientKeys, KeyFileError, load_own, load_public
 from dappled.daemon.memory import reuse_large_blocks
 from dappled.daemon.subscriber import Subscriber
@@ -35,8 +34,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    ours = settings.load(None).publish
-    endpoint = arguments.endpoint or ours.slices
+    endpoint = arguments.endpoint or stream(None)
     ask = arguments.ask or (f"{endpoint}.ask" if endpoint.startswith("ipc://") else "")
     if arguments.save:
         arguments.save.mkdir(parents=True, exist_ok=True)
