@@ -5,7 +5,6 @@ Trigger calls, telemetry and frames are all in the record, so the tag is what a 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -17,7 +16,7 @@ from dappled.daemon.books import ReplayBook
 from dappled.daemon.replay import Progress, RecordedTelemetry, Recording
 from dappled.daemon.story import Names, Watchers
 from dappled.daemon.street import Street
-from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency
+from dappled.daemon.tagger import BodyLatency
 from dappled.drivers.camera import Blob, Identity
 from dappled.drivers.replay import ReplayCamera
 from dappled.errors import DappledError
@@ -86,17 +85,10 @@ def add_missing(flight: Path, utc_ns: Callable[[], int]) -> list[int]:
         street = Street(
             camera=ReplayCamera(recording.files, Identity("dappled", "recording", "", str(flight)), time.monotonic_ns),
             book=book,
-            poses=RecordedTelemetry(
-                recording.telemetry,
-                recording.horizons,
-                wait_s=settings.pose.wait_ms / 1e3,
-                vehicles=recording.vehicles,
-                component_id=settings.mavlink.component_id,
-                attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
-            ).pose,
+            poses=RecordedTelemetry.flown(settings, recording.telemetry, recording.horizons, recording.vehicles).pose,
             developer=None,
             publisher=None,
-            latency=BodyLatency(settings.camera.latency_ms, settings.camera.latency_sigma_ms, LATENCY_SOURCE),
+            latency=BodyLatency.of(settings.camera),
             names=Names(**facts["names"]),
             watchers=Watchers(finished=progress.note),
             decode_queue=1,

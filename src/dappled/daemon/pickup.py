@@ -18,7 +18,7 @@ from typing import Any
 from dappled.config import settings as configuration
 from dappled.daemon import tagger, vehicles
 from dappled.daemon.replay import RecordedTelemetry
-from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency
+from dappled.daemon.tagger import BodyLatency, Zoom
 from dappled.drivers import rawfile
 from dappled.drivers.darkroom import camera_name
 from dappled.drivers.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching, in_order, match
@@ -127,21 +127,15 @@ def bring(
     facts = layout.read_facts(folder)
     settings = configuration.of_tables(facts.get("settings", {}), str(folder.settings))
     names = facts.get("names", {})
-    latency = BodyLatency(settings.camera.latency_ms, settings.camera.latency_sigma_ms, LATENCY_SOURCE)
+    latency = BodyLatency.of(settings.camera)
     with LedgerReader.open(folder.ledger) as reader:
         turns = vehicles.of_flight(reader)
-    telemetry = RecordedTelemetry(
-        folder.telemetry if folder.telemetry.is_file() else None,
-        {},
-        wait_s=settings.pose.wait_ms / 1e3,
-        vehicles=turns,
-        component_id=settings.mavlink.component_id,
-        attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
-    )
+    log = folder.telemetry if folder.telemetry.is_file() else None
+    telemetry = RecordedTelemetry.flown(settings, log, {}, turns)
     frames: list[Frame] = []
     zooms: list[str] = []
     companions = 0
-    focal: tuple[int, float] | None = None
+    zoom = Zoom()
     with ExitStack() as stack:
         stack.enter_context(FlightsLock(flight.parent))
         index = stack.enter_context(ImageIndex(flight.parent))
@@ -161,13 +155,9 @@ def bring(
             camera = camera_name(names.get("camera", "auto"), facts_of.model)
             ledger.add_tag(tagger.tag(frame, exposure, facts_of, camera=camera, mask=names.get("mask", ""), pose=pose))
             index.put(Entry(number, folder.name, frame.name, "safe"))
-            if facts_of.focal_length_mm is not None:
-                if focal is not None and focal[1] != facts_of.focal_length_mm:
-                    now = f"the focal length is {facts_of.focal_length_mm:g} mm"
-                    text = f"{now}; it was {focal[1]:g} mm at frame {focal[0]}"
-                    zooms.append(f"frame {number}: {text}")
-                    ledger.add_event("zoom", text, number)
-                focal = number, facts_of.focal_length_mm
+            if zoomed := zoom.look(number, facts_of.focal_length_mm):
+                zooms.append(f"frame {number}: {zoomed}")
+                ledger.add_event("zoom", zoomed, number)
             frames.append(frame)
             progress(frame.size)
     return Picked(tuple(frames), companions, tuple(zooms))
@@ -179,9 +169,8 @@ def _fired(row: ShotRow) -> FiredShot:
 
 
 def _called_utc_ns(row: ShotRow) -> int:
-    """As the street has it, to the nanosecond: a replay makes the same tag."""
     assert row.fired_called_monotonic_ns is not None
-    return row.fired_called_monotonic_ns + row.shot.wished_utc_ns - row.shot.wished_monotonic_ns
+    return tagger.called_utc_ns(row.shot, row.fired_called_monotonic_ns)
 
 
 def _offset(anchors: list[tuple[float | None, FiredShot]]) -> float | None:
@@ -244,9 +233,6 @@ def _accompany(recorder: Recorder, source: Source, index: int, found: Found, utc
 
 def _settings(path: Path) -> tagger.Settings:
     try:
-        facts = rawfile.read_metadata(path)
+        return tagger.Settings.of(rawfile.read_metadata(path))
     except DappledError:
         return tagger.Settings()  # a frame that nobody can read is a frame all the same
-    return tagger.Settings(
-        facts.focal_length_mm, facts.f_number, facts.exposure_s, facts.iso, facts.model or "", facts.taken
-    )

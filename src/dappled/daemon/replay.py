@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import sleep
+from typing import Self
 
+from dappled.config.settings import Settings
 from dappled.daemon import vehicles
 from dappled.daemon.books import Expected, ReplayBook
 from dappled.daemon.clock import RecordedClock
@@ -136,6 +139,20 @@ class RecordedTelemetry:
         self._telemetry = Telemetry(vehicles=vehicles, component_id=component_id, attitude_sigma_rad=attitude_sigma_rad)
         self._packets = _packets(path) if path else iter(())
         self._fed = 0
+
+    @classmethod
+    def flown(
+        cls, settings: Settings, path: Path | None, horizons: dict[int, int], vehicles: Sequence[tuple[int, int]]
+    ) -> Self:
+        """As the daemon of these settings had it."""
+        return cls(
+            path,
+            horizons,
+            wait_s=settings.pose.wait_ms / 1e3,
+            vehicles=vehicles,
+            component_id=settings.mavlink.component_id,
+            attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
+        )
 
     def pose(self, index: int, exposure: Exposure) -> tuple[Exposure, Pose]:
         """When and where a frame was exposed (see `Street`); frames come in the order of their exposure."""

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
-from dappled.flight.records import Frame, Pose, Tag
+from dappled.config.settings import CameraSettings
+from dappled.drivers import exif
+from dappled.flight.records import Frame, Pose, Shot, Tag
 
 LATENCY_SOURCE = "trigger call + body latency"
 WISH_SOURCE = "wish + body latency"
@@ -19,6 +22,11 @@ class BodyLatency:
     mean_ms: float
     sigma_ms: float
     source: str
+
+    @classmethod
+    def of(cls, settings: CameraSettings) -> Self:
+        """As it is configured."""
+        return cls(settings.latency_ms, settings.latency_sigma_ms, LATENCY_SOURCE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +54,32 @@ class Settings:
     iso: float | None = None
     model: str = ""
     taken: str | None = None
+
+    @classmethod
+    def of(cls, facts: exif.Exposure) -> Self:
+        """From a file's metadata."""
+        return cls(facts.focal_length_mm, facts.f_number, facts.exposure_s, facts.iso, facts.model or "", facts.taken)
+
+
+class Zoom:
+    """The focal length from frame to frame: one that is changed in mid-flight moves every carrier."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, float] | None = None
+
+    def look(self, index: int, focal_length_mm: float | None) -> str | None:
+        """A sentence where a frame's focal length is another than that of the last frame that told one."""
+        if focal_length_mm is None:
+            return None
+        before, self._last = self._last, (index, focal_length_mm)
+        if before is None or before[1] == focal_length_mm:
+            return None
+        return f"the focal length is {focal_length_mm:g} mm; it was {before[1]:g} mm at frame {before[0]}"
+
+
+def called_utc_ns(shot: Shot, called_monotonic_ns: int) -> int:
+    """When the trigger call was made, on the clock of the wish: to the nanosecond the same in a replay."""
+    return called_monotonic_ns + shot.wished_utc_ns - shot.wished_monotonic_ns
 
 
 def mid_exposure(fired_utc_ns: int, latency: BodyLatency, exposure_s: float | None) -> Exposure:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dappled.config.settings import Settings
+from dappled.daemon import tagger
 from dappled.daemon.service import Service
 from dappled.daemon.shutter import Wish
 from dappled.daemon.story import Story, Watchers
@@ -110,7 +111,7 @@ def latency(story: Story) -> Latency:
     """What one shot took."""
     to_exposure = to_file = None
     if story.fired is not None and story.tag is not None and story.tag.time_source.startswith("hot shoe"):
-        called_utc_ns = story.fired.called_monotonic_ns + story.shot.wished_utc_ns - story.shot.wished_monotonic_ns
+        called_utc_ns = tagger.called_utc_ns(story.shot, story.fired.called_monotonic_ns)
         opened_utc_ns = story.tag.utc_ns - round((story.tag.exposure_s or 0.0) / 2 * 1e9)
         to_exposure = (opened_utc_ns - called_utc_ns) / 1e6
     if "trigger to file" in story.ms and "trigger call" in story.ms:
