@@ -17,9 +17,9 @@ from dappled.drivers.pickup import FolderSource, Found, StorageSource
 from dappled.drivers.replay import Recorded, ReplayCamera
 from dappled.drivers.shutter_line import GpioLine, OutsideLine
 from dappled.mocks import simulated
-from dappled.mocks.body import pattern
 from dappled.mocks.eos450d import thumbnail
 from dappled.mocks.finepix import FinePix, picture
+from dappled.mocks.pictures import pattern
 from tests.drivers.contract import CameraContract, Rig, content, of_shots, until, until_shot_ends, until_state
 
 WHO = Identity("FUJIFILM", "FinePix S5200", "", "gpio")

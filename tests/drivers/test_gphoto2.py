@@ -23,8 +23,9 @@ from dappled.drivers.camera_channel import Channel
 from dappled.drivers.gphoto2 import GPhoto2Camera, Spawn, open_camera, spawn_process
 from dappled.drivers.gphoto2_before import Before
 from dappled.drivers.gphoto2_settings import GPhoto2Settings, parse_settings
-from dappled.mocks.body import Body, BodyOptions, pattern
+from dappled.mocks.body import Body, BodyOptions
 from dappled.mocks.eos450d import thumbnail
+from dappled.mocks.pictures import pattern
 from tests.drivers.contract import CameraContract, Rig, content, of_shots, until, until_shot_ends, until_state
 
 SIZE = 3_000_001

@@ -13,8 +13,9 @@ from dappled.drivers.camera import CameraError
 from dappled.drivers.gphoto2 import open_camera
 from dappled.drivers.pickup import FolderSource, Found, Source, StorageSource, groups, parse_source
 from dappled.drivers.ptp_source import PtpSource
-from dappled.mocks.body import Body, BodyOptions, pattern
+from dappled.mocks.body import Body, BodyOptions
 from dappled.mocks.finepix import FinePix, picture
+from dappled.mocks.pictures import pattern
 from tests.drivers.contract import content, until_shot_ends, until_state
 
 

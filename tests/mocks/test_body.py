@@ -9,7 +9,8 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from dappled.mocks.body import Body, BodyError, BodyOptions, exposer, pattern
+from dappled.mocks.body import Body, BodyError, BodyOptions
+from dappled.mocks.pictures import exposer, pattern
 
 
 def test_a_body_listens_obeys_and_ends() -> None:
@@ -25,7 +26,7 @@ def test_a_body_listens_obeys_and_ends() -> None:
 
 
 def test_a_body_ends_with_its_input() -> None:
-    command = [sys.executable, "-m", "dappled.mocks.body", "--picture", "pattern:1000:jpg"]
+    command = [sys.executable, "-m", "dappled.mocks.body_process", "--picture", "pattern:1000:jpg"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdin is not None

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from dappled.daemon.shutter import Wish
 from dappled.flight.ledger import LedgerReader
-from dappled.mocks.body import Body, BodyOptions, pattern
+from dappled.mocks.body import Body, BodyOptions
+from dappled.mocks.pictures import pattern
 from tests.system.flying import eventually, flying, settings_of
 
 SIZE, SHOTS = 1_000_001, 5

@@ -19,8 +19,9 @@ import pytest
 
 from dappled.daemon.story import Story
 from dappled.flight.ledger import LedgerReader
-from dappled.mocks.body import Body, BodyOptions, pattern
+from dappled.mocks.body import Body, BodyOptions
 from dappled.mocks.eos450d import thumbnail
+from dappled.mocks.pictures import pattern
 from tests.system.flying import Flying, eventually, flying, settings_of, told
 
 SIZE = 2_000_001

@@ -17,8 +17,9 @@ from dappled.drivers import gphoto2, shutter_line
 from dappled.drivers.mavlink import mavlink
 from dappled.flight import check, summary
 from dappled.flight.ledger import LedgerReader
-from dappled.mocks.body import Body, BodyOptions, pattern
+from dappled.mocks.body import Body, BodyOptions
 from dappled.mocks.finepix import FinePix
+from dappled.mocks.pictures import pattern
 from dappled.mocks.simulation import free_port
 from tests.drivers.contract import content, until_shot_ends, until_state
 from tests.system.flying import Flying, eventually, flying, settings_of

@@ -12,9 +12,9 @@ import threading
 from typing import Protocol
 
 from dappled.mocks import ptp
-from dappled.mocks.eos450d import MODEL, Answer
+from dappled.mocks.eos450d import MODEL
 from dappled.mocks.faults import Faults
-from dappled.mocks.ptp import Packet
+from dappled.mocks.ptp import Answer, Packet
 
 _SILENCE_STEP_S = 0.02
 _SLOW_BYTES = 40_000  # at a time, 50 times a second

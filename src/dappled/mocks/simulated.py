@@ -20,7 +20,8 @@ from dappled.drivers.camera import CameraError, Identity
 from dappled.drivers.composed import ComposedCamera, Plan
 from dappled.drivers.options import only, seconds_of
 from dappled.drivers.pickup import FolderSource
-from dappled.mocks.body import BodyOptions, exposer
+from dappled.mocks.body import BodyOptions
+from dappled.mocks.pictures import exposer
 
 _KNOWN = ("timeouts", "seed", "scale", "scene", "law", "f_number", "folder", "picture")
 _HOLD_S = 0.02
