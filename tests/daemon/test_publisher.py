@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from dappled.config.settings import PublishSettings
 from dappled.daemon import publisher, wire
-from dappled.daemon.publisher import Publisher, Reply
+from dappled.daemon.publisher import UNREAD_STACKS, Publisher, Reply
 from dappled.daemon.subscriber import AsyncSubscriber, Subscriber, subscribe, subscribe_async
 from dappled.daemon.wire import Message, WireError
 
@@ -243,6 +243,51 @@ def test_a_reader_of_slices_that_stops_keeps_four(endpoint: str, before: int) ->
         eventually(lambda: len(bodies.alive) <= 4, "what nobody waits for is freed")
         assert bodies.made == 12
     context.destroy(linger=0)
+    one.stop(0.0)
+
+
+def test_readers_that_stop_at_different_times_keep_eight_of_all_together(endpoint: str) -> None:
+    """Then slices are dropped, and counted, until somebody reads or is gone; what is small goes on."""
+    bodies = Bodies()
+    one = Publisher(endpoint, "", flight="f", answer=no_answer, high_water_mark=PublishSettings().high_water_mark)
+    one.start()
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    readers = [context.socket(zmq.SUB) for _ in range(4)]
+    with Subscriber(endpoint) as subscriber:
+        connected(one, subscriber)
+        number = 0
+
+        def publish() -> None:
+            nonlocal number
+            number += 1
+            one.publish("slices", {"frame": number, "arrays": []}, bodies.make())
+            one.publish("frame", {"frame": number})
+            while receive(subscriber, "frame").header["frame"] != number:
+                pass
+
+        for deaf in readers:
+            deaf.setsockopt(zmq.RCVHWM, 1)
+            deaf.setsockopt(zmq.RCVBUF, 4096)
+            deaf.subscribe(b"slices")
+            deaf.connect(endpoint)
+            until = time.monotonic() + 20
+            while not deaf.poll(50):
+                assert time.monotonic() < until
+                one.publish("slices", {"frame": 0, "arrays": []}, b"")
+            for _ in range(6):
+                publish()
+        assert one.statistics().dropped["slices"] > 0
+        assert len(bodies.alive) <= UNREAD_STACKS + 1  # and the one that is just being sent
+        context.destroy(linger=0)
+
+        def none_kept() -> bool:  # ZeroMQ lets go of what a lost peer had when the socket is used again
+            one.publish("health", {"utc_ns": 0})
+            return not bodies.alive
+
+        eventually(none_kept, "what they kept is freed")
+        seen = one.statistics().sent["slices"]
+        publish()
+        assert one.statistics().sent["slices"] == seen + 1
     one.stop(0.0)
 
 

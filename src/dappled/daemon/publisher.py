@@ -13,7 +13,6 @@ import os
 import select
 import threading
 import time
-import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -21,8 +20,10 @@ from typing import Any
 
 import zmq
 
-from dappled.daemon import curve, endpoints, questions, wire
+from dappled.daemon import questions, wire
 from dappled.daemon.curve import ServerKeys
+from dappled.daemon.doors import Doors
+from dappled.daemon.kept import Kept
 from dappled.daemon.wire import Message, WireError
 from dappled.errors import report
 
@@ -32,12 +33,11 @@ Reply = Callable[[Message], None]
 Answer = Callable[[Mapping[str, Any], Reply], None]
 DROP_ORDER = ("preview", "health", "depth", "slices")
 REMEMBERED = 65536  # slices whose frame number is known by sequence
-QUESTION_BYTES = 4096
 UNREAD_ANSWERS = 4  # with a body, of all askers together
+UNREAD_STACKS = 8  # of all subscribers together: those who hang at different times hold different ones
 _LARGE_BYTES = 1_000_000
 _PATIENCE_S, _LARGE_PATIENCE_S = 0.02, 0.1  # after a message, while its bytes are on their way to those who read
 _GIVE_WAY_S = 0.25  # how long a large message waits while a frame is made safe
-_HEARTBEAT_MS, _DEAF_MS = 5_000, 30_000  # a peer that reads nothing for so long is cut off; it may come again
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,31 +81,21 @@ class Publisher:
         self._sent = dict.fromkeys(wire.TOPICS, 0)
         self._dropped = dict.fromkeys(wire.TOPICS, 0)
         self._frame_of: dict[int, int] = {}
-        self._questions = self._refused = self._open_questions = self._wrong_keys = 0
+        self._questions = self._refused = self._open_questions = 0
         self._grace_s = self._patient_until_s = 0.0
         self._start: Message | None = None
-        self._unread: list[weakref.ref[memoryview]] = []  # answers' bodies; ZeroMQ lets go of those that were read
+        self._unread_stacks, self._unread_answers = Kept(UNREAD_STACKS), Kept(UNREAD_ANSWERS)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._stopping = threading.Event()
         self._way_is_free = threading.Event()
         self._way_is_free.set()
         self._closed = False
-        self._context = endpoints.niced_context()
-        self._allowed = keys.allowed if keys else {}
-        self._bound: list[str] = []
+        self._doors = Doors(keys, mode)
         try:
-            # Whoever judges keys is there before the first door is opened.
-            self._zap = self._judge() if keys else None
-            self._pub = self._socket(zmq.PUB, high_water_mark, [private, slices], keys, mode)
-            self._router = (
-                self._socket(zmq.ROUTER, high_water_mark, [private and f"{private}.ask", ask], keys, mode)
-                if ask or private
-                else None
-            )
+            self._pub = self._doors.open(zmq.PUB, [private, slices], high_water_mark)
+            asked_at = [private and f"{private}.ask", ask]
+            self._router = self._doors.open(zmq.ROUTER, asked_at, high_water_mark) if any(asked_at) else None
         except WireError:
-            for endpoint in self._bound:
-                endpoints.unlink(endpoint)
-            self._context.destroy(linger=0)
             os.close(self._wake)
             raise
         self._thread = threading.Thread(target=self._run, name="publisher", daemon=True)
@@ -144,7 +134,7 @@ class Publisher:
                 len(self._waiting),
                 self._questions,
                 self._refused,
-                self._wrong_keys,
+                self._doors.wrong_keys,
             )
 
     def stop(self, grace_s: float = 2.0) -> None:
@@ -156,14 +146,7 @@ class Publisher:
         self._ring()
         if self._thread.is_alive():
             self._thread.join(grace_s + 3)
-        for endpoint in self._bound:
-            endpoints.unlink(endpoint)
-        for one in (self._pub, self._router):
-            if one is not None:
-                one.close(linger=round(grace_s * 1000))
-        if self._zap is not None:
-            self._zap.close(linger=0)
-        self._context.term()
+        self._doors.close(grace_s)
         with self._lock:
             self._closed = True  # an answer may still be on its way: it must not ring a descriptor that is another's
             os.close(self._wake)
@@ -186,11 +169,11 @@ class Publisher:
         poller.register(self._wake, select.POLLIN)
         if self._router is not None:
             poller.register(self._router.FD, select.POLLIN)
-        if self._zap is not None:
-            poller.register(self._zap.FD, select.POLLIN)
+        if (judge := self._doors.judge_fd) is not None:
+            poller.register(judge, select.POLLIN)
         quiet_rounds = 0
         while True:
-            self._let_in()
+            self._doors.let_in()
             self._send_waiting()
             self._hear_questions()
             if self._stopping.is_set():
@@ -222,12 +205,17 @@ class Publisher:
         header = self._envelope(message, self._sent[message.topic])
         if message.topic == "end":
             header["sent"] = dict(self._sent)  # so that a subscriber can tell what it missed last
-        large = message.body is not None and memoryview(message.body).nbytes >= _LARGE_BYTES
-        if large:
+        body = None if message.body is None else memoryview(message.body)
+        patience_s = _PATIENCE_S
+        if body is not None and body.nbytes >= _LARGE_BYTES:
+            patience_s = _LARGE_PATIENCE_S
             self._way_is_free.wait(_GIVE_WAY_S)
-        self._give_out(_parts(message, header))
-        until_s = time.monotonic() + (_LARGE_PATIENCE_S if large else _PATIENCE_S)
-        self._patient_until_s = max(self._patient_until_s, until_s)
+            if not self._unread_stacks.take(body):
+                with self._lock:
+                    self._dropped[message.topic] += 1
+                return
+        self._give_out(_parts(message.topic, header, body))
+        self._patient_until_s = max(self._patient_until_s, time.monotonic() + patience_s)
         with self._lock:
             self._sent[message.topic] += 1
             self._remember(message, header)
@@ -252,15 +240,12 @@ class Publisher:
         assert self._router is not None  # a reply can only be to a question
         self._open_questions -= 1
         header, body = message.header, None if message.body is None else memoryview(message.body)
-        self._unread = [one for one in self._unread if one() is not None]
-        if body is not None and len(self._unread) >= UNREAD_ANSWERS:
+        if body is not None and not self._unread_answers.take(body):
             self._refused += 1
             text = f"{UNREAD_ANSWERS} answers wait to be read already: ask again later"
             message, body = Message("error", {}), None
             header = {**self._envelope(Message("error", {"error": text}), None), "asked": header["asked"]}
-        if body is not None:
-            self._unread.append(weakref.ref(body))
-        parts = [peer, *_parts(Message(message.topic, header, body), header)]
+        parts = [peer, *_parts(message.topic, header, body)]
         try:
             self._router.send_multipart(parts, flags=zmq.NOBLOCK, copy=False)
         except zmq.ZMQError as error:  # the asker is gone or does not read: its loss
@@ -289,45 +274,6 @@ class Publisher:
             self._frame_of.pop(header["seq"] - REMEMBERED, None)
         elif message.topic == "start":
             self._start = Message("start", header)
-
-    def _let_in(self) -> None:
-        """Judge the keys of those who connect."""
-        while self._zap is not None:
-            try:
-                request = self._zap.recv_multipart(flags=zmq.NOBLOCK)
-            except zmq.Again:
-                return
-            answer, name = curve.judge(request, self._allowed)
-            self._zap.send_multipart(answer)
-            if name is None:
-                self._wrong_keys += 1
-                if self._wrong_keys == 1 or self._wrong_keys % 100 == 0:  # such a peer tries again and again
-                    log.warning("a peer whose key is not on the list was turned away (%d times)", self._wrong_keys)
-            else:
-                log.info("%s came with its key", name)
-
-    def _judge(self) -> zmq.Socket[Any]:
-        one: zmq.Socket[Any] = self._context.socket(zmq.REP)
-        one.bind(curve.ZAP_ENDPOINT)
-        return one
-
-    def _socket(
-        self, kind: int, high_water_mark: int, wanted: list[str], keys: ServerKeys | None, mode: int
-    ) -> zmq.Socket[Any]:
-        one: zmq.Socket[Any] = self._context.socket(kind)
-        one.setsockopt(zmq.LINGER, 0)
-        one.setsockopt(zmq.SNDHWM, high_water_mark)
-        one.setsockopt(zmq.RCVHWM, 100)
-        one.setsockopt(zmq.MAXMSGSIZE, QUESTION_BYTES)
-        one.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
-        one.setsockopt(zmq.HEARTBEAT_TIMEOUT, _DEAF_MS)
-        if kind == zmq.ROUTER:
-            one.setsockopt(zmq.ROUTER_MANDATORY, 1)
-        for endpoint in filter(None, wanted):
-            endpoints.prepare(endpoint, keyed=keys is not None)
-            endpoints.bind(one, endpoint, keys=keys, mode=mode)
-            self._bound.append(endpoint)
-        return one
 
     def _hear_questions(self) -> None:
         if self._router is None:
@@ -377,6 +323,5 @@ class Publisher:
         return reply
 
 
-def _parts(message: Message, header: Mapping[str, Any]) -> list[Any]:
-    body = [] if message.body is None else [message.body]
-    return [message.topic.encode(), wire.encode(header), *body]
+def _parts(topic: str, header: Mapping[str, Any], body: memoryview | None) -> list[Any]:
+    return [topic.encode(), wire.encode(header), *([] if body is None else [body])]
