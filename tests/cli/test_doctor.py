@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from dappled.cli import main
+from dappled.daemon.publisher import Publisher
 from dappled.drivers import usb_bus
 from dappled.drivers.usb_bus import CANON, UsbBody
+from tests.daemon.test_preflight import WELL
 from tests.system.conftest import dappled
 
 
@@ -84,6 +89,59 @@ def test_bodies_that_come_and_go_are_told(monkeypatch: pytest.MonkeyPatch, capfd
     monkeypatch.setattr("dappled.cli.doctor.time.sleep", lambda seconds: None)
     assert main(["doctor", "--watch"]) == 130
     assert [line.split("  ")[0] for line in capfd.readouterr().out.splitlines()] == ["here", "gone"]
+
+
+@pytest.fixture
+def running(tmp_path: Path) -> Iterator[Callable[[dict[str, Any]], Path]]:
+    """A daemon as far as its health is heard; gives settings that lead to it."""
+    endpoint = f"ipc://{tmp_path}/s"
+    publisher = Publisher(endpoint, f"ipc://{tmp_path}/a", answer=lambda _request, _reply: None, high_water_mark=8)
+    publisher.start("20261121T101503Z-1a2b3c4d")
+    ended = threading.Event()
+    speakers: list[threading.Thread] = []
+
+    def say(health: dict[str, Any]) -> None:
+        while not ended.wait(0.02):
+            publisher.publish("health", health)
+
+    def begin(health: dict[str, Any]) -> Path:
+        speakers.append(threading.Thread(target=say, args=[health]))
+        speakers[-1].start()
+        config = tmp_path / "dappled.toml"
+        config.write_text(f'[publish]\nslices = "{endpoint}"\n', encoding="utf-8")
+        return config
+
+    yield begin
+    ended.set()
+    for speaker in speakers:
+        speaker.join()
+    publisher.stop()
+
+
+def test_beside_a_running_daemon_it_asks_that_one(
+    running: Callable[[dict[str, Any]], Path], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dappled.cli.doctor.HEAR_S", 60.0)
+    config = str(running(WELL))
+    assert main(["doctor", "--config", config]) == 0
+    out = capfd.readouterr().out.splitlines()
+    assert out[0] == "a daemon runs here, flight 20261121T101503Z-1a2b3c4d; it says"
+    assert out[1] == "go       Camera      ready"
+    assert out[-1] == "GO"
+    assert main(["doctor", "--config", config, "--test-shot"]) == 1
+    assert "holds the camera: end it first" in capfd.readouterr().err
+
+
+def test_a_running_daemon_without_a_camera_is_no_go(
+    running: Callable[[dict[str, Any]], Path], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dappled.cli.doctor.HEAR_S", 60.0)
+    config = str(running(WELL | {"camera": {"state": "absent", "reason": "no body"}}))
+    assert main(["doctor", "--config", config, "--json"]) == 1
+    told = json.loads(capfd.readouterr().out)
+    assert told["verdict"] == "no-go"
+    assert told["checks"][0] == {"name": "Camera", "state": "no-go", "text": "absent: no body"}
+    assert told["next"]
 
 
 @pytest.mark.slow

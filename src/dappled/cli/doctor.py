@@ -16,16 +16,23 @@ from typing import Any
 
 from tqdm import tqdm
 
-from dappled.cli.common import whole
+from dappled.cli import status
+from dappled.cli.common import answers, stream, whole
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.daemon import checkup, examination, inputs, trial
+from dappled.daemon import checkup, examination, inputs, preflight, trial
 from dappled.daemon.checkup import Finding
 from dappled.daemon.trial import Latency
 from dappled.drivers import usb_bus
 from dappled.errors import DappledError
 
 _WORDS = {"ok": "ok", "note": "note", "wrong": "WRONG", "go": "go", "caution": "caution", "no-go": "NO GO"}
+_VERDICTS = {"go": "GO", "caution": "GO, with the cautions above", "no-go": "NO GO"}
+HEAR_S = 5.0  # a daemon says how it is every second
+
+
+class DaemonRunsError(DappledError):
+    """What was asked needs the camera, and a daemon has it."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -47,6 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
     settings = configuration.load(arguments.config)
     if arguments.watch:
         return _watch()
+    if not arguments.simulate and answers(endpoint := stream(arguments.config)):
+        return _beside(endpoint, settings, arguments)
     with tempfile.TemporaryDirectory(prefix="dpl-") as place, ExitStack() as stack:
         folder = Path(place)
         truth = None
@@ -68,6 +77,30 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if good else 1
 
 
+def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) -> int:
+    """A daemon runs here and holds the camera: go or no-go by what it says of itself, as on the console."""
+    if arguments.test_shot or arguments.latency:
+        raise DaemonRunsError(
+            f"a daemon runs at {endpoint} and holds the camera: end it first (sudo systemctl stop dappled), or ask it "
+            "for a photograph (dappled trigger, the ground station, the console)"
+        )
+    told = status.health(endpoint, HEAR_S)
+    checks = preflight.checks(told)
+    looked: list[Finding] = []
+    if told["camera"]["state"] not in ("ready", "busy", "starting"):  # then nobody but a stranger holds it
+        looked = [one for check in (checkup.bodies, checkup.grabbers) for one in check(settings, checkup.Machine())]
+    verdict = preflight.verdict(checks)
+    todo = checkup.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
+    if arguments.json:
+        facts = [*map(asdict, checks), *map(asdict, looked)]
+        print(json.dumps({"flight": told["flight"], "checks": facts, "verdict": verdict, "next": todo}, indent=2))
+    else:
+        print(f"a daemon runs here, flight {told['flight']}; it says")
+        print("\n".join([f"{_WORDS[one.state]:8} {one.name:11} {one.text}" for one in checks] + _findings(looked)))
+        print(f"{_VERDICTS[verdict]}{f'; next: {todo}' if todo else ''}")
+    return 1 if verdict == "no-go" else 0
+
+
 def _findings(findings: Sequence[Finding]) -> list[str]:
     return [f"{_WORDS[one.state]:8} {one.name:11} {one.text}" for one in findings]
 
@@ -77,7 +110,7 @@ def _last(findings: Sequence[Finding], verdict: str | None) -> str:
     if todo:
         return f"next: {todo}"
     if verdict is not None:
-        return {"go": "GO", "caution": "GO, with the cautions above", "no-go": "NO GO"}[verdict]
+        return _VERDICTS[verdict]
     return "nothing stands in the way; next: dappled doctor --test-shot"
 
 
