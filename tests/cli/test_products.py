@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,10 @@ from PIL import Image
 
 from dappled.cli import main
 from dappled.decode.ranging import Ranging
-from dappled.products import lightfiles, opened
+from dappled.flight import recording
+from dappled.products import camera_pose, lightfiles, opened
+from dappled.products.earth import Projection
+from tests.flight.makers import deliver, pose, tag, wish
 from tests.products.fields import DISPARITY, light_field
 
 
@@ -108,6 +112,30 @@ def test_a_full_disk_leaves_the_depth_map_of_before(
     assert main(["depth", field, "--between", "0", "1", "-o", str(tmp_path / name)]) == 1
     assert "can't be written: No space left on device" in capsys.readouterr().err
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [(name, b"of before")]
+
+
+@pytest.mark.parametrize("mount", [camera_pose.NADIR, camera_pose.FORWARD], ids=["down", "ahead"])
+def test_points_lie_where_the_flights_own_mount_looks(
+    field: str, mount: camera_pose.Matrix, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    laspy = pytest.importorskip("laspy", reason="LAS is an extra")
+    facts = {"settings": {"pose": {"mount": mount.ravel().tolist(), "lever_arm_m": [0.0, 0.0, 2.0]}}}
+    level = replace(pose(), latitude_rad=0.72, longitude_rad=-1.6, altitude_msl_m=215.0, attitude=(1.0, 0.0, 0.0, 0.0))
+    begun = recording.begin(tmp_path / "flights", lambda: 1_795_256_103_000_000_000, facts)
+    wish(begun, 0)
+    begun.ledger.add_tag(replace(tag(deliver(begun, 0, b"a frame")), pose=level))
+    begun.close()
+    given = ["--focus", "inf", "--flight", str(begun.folder.path), "--frame", "0"]
+    path = tmp_path / "points.las"
+    assert main(["depth", field, *given, "-o", str(path), "--json"]) == 0
+    crs = json.loads(capsys.readouterr().out)["coordinates"]
+    found = laspy.read(path)
+    east, north = Projection(crs).to_map(np.degrees(0.72), np.degrees(-1.6))
+    metres = 50.0 / 7.4 / 5 * 50e-3 / (DISPARITY * 0.1)
+    ahead = mount is camera_pose.FORWARD  # to the north, from 2 m below the antenna
+    away = [np.median(found.y) - float(north), np.median(found.z) - 213.0]
+    assert away == pytest.approx([metres, 0.0] if ahead else [0.0, -metres], abs=0.05)
+    assert np.median(found.x) == pytest.approx(float(east), abs=0.05)
 
 
 def test_a_calibration_of_another_zoom_is_refused_or_told(

@@ -17,6 +17,7 @@ from dappled.decode import depth as depths
 from dappled.decode.depthmap import DepthMap
 from dappled.decode.errors import DecodeError
 from dappled.decode.ranging import DistanceMap
+from dappled.flight import layout
 from dappled.products import exports, photographs, pointcloud, prints
 from dappled.products.opened import OpenedLightField, OpenError
 from dappled.products.photographs import Mounting
@@ -164,7 +165,8 @@ def _points(
         chosen = next((f for f in frames if f.index == arguments.frame), None)
         if chosen is None:
             raise OpenError(f"{arguments.flight} has no frame {arguments.frame}")
-        station = photographs.station(chosen, tags.get(chosen.index), Mounting())
+        mounting = Mounting.of(layout.read_facts(layout.open_folder(arguments.flight)))
+        station = photographs.station(chosen, tags.get(chosen.index), mounting)
     cloud = pointcloud.of(
         found.field, found.refocus(), distances, most_sigma=arguments.most_sigma, station=station, crs=arguments.crs
     )

@@ -230,17 +230,14 @@ def recipe(flight: Path, facts: Mapping[str, Any], arguments: argparse.Namespace
 
 def options(facts: Mapping[str, Any], arguments: argparse.Namespace) -> Options:
     """The arguments of `add_placing`, with the flight's own mounting where they don't give one."""
-    recorded = facts.get("settings", {}).get("pose", {})
-    plain = Mounting()
-    lever = arguments.lever_arm or recorded.get("lever_arm_m") or plain.lever_m
-    mount = arguments.mount or recorded.get("mount") or plain.mount
+    mounting = Mounting.of(facts)
+    if arguments.lever_arm is not None:
+        mounting = replace(mounting, lever_m=tuple(arguments.lever_arm))
+    if arguments.mount is not None:
+        mounting = replace(mounting, mount=tuple(arguments.mount))
     ellipsoidal = arguments.terrain_heights == "ellipsoid"
     return Options(
-        mounting=Mounting(
-            (float(lever[0]), float(lever[1]), float(lever[2])),
-            tuple(map(float, mount)),
-            bool(recorded.get("on_gimbal", False)),
-        ),
+        mounting=mounting,
         ground_m=arguments.ground,
         terrain=arguments.terrain,
         terrain_geoid=earth.geoid(arguments.geoid) if ellipsoidal else None,

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +90,17 @@ class Mounting:
     lever_m: Vector3 = (0.0, 0.0, 0.0)
     mount: tuple[float, ...] = tuple(camera_pose.NADIR.ravel().tolist())
     on_gimbal: bool = False
+
+    @classmethod
+    def of(cls, facts: Mapping[str, Any]) -> Mounting:
+        """As a flight's facts have it: its settings `pose.lever_arm_m`, `pose.mount` and `pose.on_gimbal`."""
+        said, plain = facts.get("settings", {}).get("pose", {}), cls()
+        forward, right, down = said.get("lever_arm_m") or plain.lever_m
+        return cls(
+            (float(forward), float(right), float(down)),
+            tuple(map(float, said.get("mount") or plain.mount)),
+            bool(said.get("on_gimbal", False)),
+        )
 
     @property
     def matrix(self) -> Matrix:
