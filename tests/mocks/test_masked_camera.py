@@ -12,13 +12,9 @@ import pytest
 import rawpy
 from numpy.typing import NDArray
 
-from dappled.mocks.masked_camera import (
-    Exposure,
-    MaskedCamera,
-    SensorModel,
-    Truth,
-    reference_camera,
-)
+from dappled.mocks.chip import SensorModel
+from dappled.mocks.masked_camera import Exposure, MaskedCamera, reference_camera
+from dappled.mocks.truth import Truth
 
 
 def quiet(sensor: SensorModel) -> SensorModel:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from dappled.decode.carriers import Lattice
 from dappled.decode.masks import Mask
 from dappled.mocks import lens
+from dappled.mocks.chip import SensorModel
 from dappled.mocks.lens import Installation, Optics, Rays, Rendering
-from dappled.mocks.masked_camera import MaskedCamera, SensorModel
+from dappled.mocks.masked_camera import MaskedCamera
 from dappled.mocks.path import TruePose
 from dappled.mocks.synthesis import MARGIN, SITES, Grid, band_limited
 

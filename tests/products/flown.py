@@ -9,30 +9,26 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
-import tomli_w
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from dappled.config import profiles
 from dappled.daemon.interpolation import metres_per_radian
-from dappled.decode.calibration import CalibrationFrame, calibrate
-from dappled.decode.plane import to_plane
-from dappled.drivers import rawfile
 from dappled.drivers.darkroom import Recipe
 from dappled.flight import recording
 from dappled.flight.records import Pose, Quaternion, Tag
-from dappled.mocks import terrain
+from dappled.mocks import bench_calibration, terrain
+from dappled.mocks.bench_calibration import CAMERA, MASK
 from dappled.mocks.flyover import Terrain
-from dappled.mocks.masked_camera import MaskedCamera, SensorModel, Truth, reference_camera
+from dappled.mocks.masked_camera import MaskedCamera, reference_camera
 from dappled.mocks.path import Path as FlightPath
 from dappled.mocks.path import TruePose
 from dappled.mocks.terrain import DETAIL_TEXEL_M, EXTENT_M, TEXEL_M
+from dappled.mocks.truth import Truth
 from dappled.products import camera_pose
 from tests.flight.makers import deliver, wish
 
 START_NS = 1_795_256_103_000_000_000
-CAMERA, MASK = "reference-36mm", "reference-5x5"
 F_NUMBER = 14.8
 
 
@@ -97,7 +93,7 @@ def fly(
             Tag(index, pose.utc_ns, 10_000, "hot shoe", 50.0, F_NUMBER, 0.001, 100, CAMERA, MASK, frame.sha256, pose)
         )
     begun.close()
-    calibration = calibration_file(folder, camera.sensor, seed)
+    calibration = bench_calibration.write(camera, folder)
     recipe = Recipe(camera=CAMERA, mask=MASK, calibration=str(calibration))
     return Flown(begun.folder.path, recipe, path, tuple(truths), scene.ground)
 
@@ -126,26 +122,6 @@ def turned(attitude: Quaternion, by: NDArray[np.float64]) -> Quaternion:
     """An attitude turned by a small rotation matrix about body axes."""
     x, y, z, w = (float(v) for v in Rotation.from_matrix(camera_pose.matrix_of(attitude) @ by).as_quat())
     return w, x, y, z
-
-
-def calibration_file(folder: Path, sensor: SensorModel, seed: int) -> Path:
-    """What `dappled calibrate` makes of a bench frame of the same body."""
-    bench = reference_camera(seed, scale=0.5, scene="white")
-    raw = rawfile.read(replace(bench, sensor=sensor).bench_frame().file, "bench frame")
-    profile = profiles.camera(CAMERA)
-    plane = to_plane(raw.mosaic, black=raw.black, white=raw.white, cfa=raw.cfa)
-    assert raw.focal_length_mm is not None
-    assert raw.f_number is not None
-    found = calibrate(
-        [CalibrationFrame(plane, raw.focal_length_mm, raw.f_number)],
-        sensor=profile.sensor((plane.shape[0], plane.shape[1])),
-        mask=profiles.mask(MASK).mask,
-        law=profile.law,
-        mask_distance_mm=profile.mask_distance_mm,
-    )
-    path = folder / "calibration.toml"
-    path.write_text(tomli_w.dumps(found.to_dict()), encoding="utf-8")
-    return path
 
 
 def true_ground(truth: Truth, row: int, column: int) -> NDArray[np.float64]:

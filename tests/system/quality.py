@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from dappled.decode.lightfield import LightField
-from dappled.mocks.masked_camera import Truth
+from dappled.mocks.truth import Truth
 
 GREEN = 1  # what a mosaic is balanced to
 BORDER = 12  # px of a view left out: the lens' blur of the truth wraps around there

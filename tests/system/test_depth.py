@@ -24,8 +24,9 @@ from dappled.cli.calibrate import from_frames
 from dappled.decode.depthmap import DepthMap
 from dappled.drivers.darkroom import Darkroom, Recipe
 from dappled.mocks.bench import Bench, Plane
-from dappled.mocks.masked_camera import LEVEL, MaskedCamera, Truth, reference_camera
+from dappled.mocks.masked_camera import LEVEL, MaskedCamera, reference_camera
 from dappled.mocks.synthesis import PASS, Grid
+from dappled.mocks.truth import Truth
 from dappled.products.opened import OpenedFrame, OpenedLightField, with_ranging
 
 CAMERA, MASK = "reference-36mm", "reference-5x5"

@@ -12,19 +12,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import tomli_w
-
-from dappled.config import profiles
 from dappled.config.settings import Settings
-from dappled.decode.calibration import CalibrationFrame, calibrate
-from dappled.decode.plane import to_plane
-from dappled.drivers import rawfile
+from dappled.mocks import bench_calibration
 from dappled.mocks.autopilot import Autopilot
+from dappled.mocks.bench_calibration import CAMERA, MASK
 from dappled.mocks.body import Body, BodyOptions
 from dappled.mocks.ground import GroundStation
 from dappled.mocks.masked_camera import reference_camera
 
-CAMERA, MASK = "reference-36mm", "reference-5x5"
 LATENCY_MS, LATENCY_SIGMA_MS = 60.0, 15.0 / 3**0.5  # the body's is spread evenly over 60 ± 15 ms
 
 
@@ -53,7 +48,8 @@ class Simulation:
     def __enter__(self) -> Settings:
         """Start camera body and autopilot; the settings that make a daemon use them."""
         world = self.world
-        calibration = self._calibrate()
+        camera = reference_camera(world.seed, scale=world.scale, scene="white")
+        calibration = bench_calibration.write(camera, self._folder)
         with ExitStack() as stack:
             self.body = body = Body.start(
                 BodyOptions(
@@ -123,25 +119,6 @@ class Simulation:
         station = GroundStation.start(self.ground_url, frames, interval_s)
         self._stack.callback(station.stop)
         return station
-
-    def _calibrate(self) -> Path:
-        """What `dappled calibrate` makes of the simulated camera's stopped-down bench frame."""
-        camera = reference_camera(self.world.seed, scale=self.world.scale, scene="white")
-        raw = rawfile.read(camera.bench_frame().file, "bench frame")
-        profile = profiles.camera(CAMERA)
-        plane = to_plane(raw.mosaic, black=raw.black, white=raw.white, cfa=raw.cfa)
-        assert raw.focal_length_mm is not None
-        assert raw.f_number is not None
-        found = calibrate(
-            [CalibrationFrame(plane, raw.focal_length_mm, raw.f_number)],
-            sensor=profile.sensor((plane.shape[0], plane.shape[1])),
-            mask=profiles.mask(MASK).mask,
-            law=profile.law,
-            mask_distance_mm=profile.mask_distance_mm,
-        )
-        path = self._folder / "calibration.toml"
-        path.write_text(tomli_w.dumps(found.to_dict()), encoding="utf-8")
-        return path
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
