@@ -7,6 +7,7 @@ import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +16,28 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dappled.decode.film import DensityCurve, density_curve
+from dappled.decode.threads import spans
 from dappled.errors import DappledError
 
 Levels = NDArray[np.unsignedinteger]
 Tile = Callable[[slice, slice], Levels]
-_TILE = 512
+_TILE = 512  # of a TIFF, in pixels a side
+_STRIP = 64  # rows of a PNG at a time
 
 
 class MaskFileError(DappledError):
     """A mask file can't be written or read; one sentence: what, where, what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """What is written: rows and columns, bits, (vertical, horizontal) pixels a mm, and who makes the levels."""
+
+    shape: tuple[int, int]
+    bits: int
+    px_per_mm: tuple[float, float]
+    tile: Tile
+    progress: Callable[[int], object]
 
 
 def write(
@@ -46,24 +60,16 @@ def write(
         raise MaskFileError(f"{path}: a mask is written as .png or .tif; name it so")
     part = path.with_name(path.name + ".part")
     try:
-        writer(part, shape, bits, px_per_mm, tile, progress=progress)
+        writer(part, _Picture(shape, bits, px_per_mm, tile, progress))
         os.replace(part, path)
     except OSError as error:
-        raise MaskFileError(f"{path} can't be written: {error}; choose another place") from None
+        raise MaskFileError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
     finally:
         part.unlink(missing_ok=True)
 
 
-def _write_png(
-    path: Path,
-    shape: tuple[int, int],
-    bits: int,
-    px_per_mm: tuple[float, float],
-    tile: Tile,
-    *,
-    progress: Callable[[int], object],
-) -> None:
-    rows, columns = shape
+def _write_png(path: Path, picture: _Picture) -> None:
+    rows, columns = picture.shape
     packer = zlib.compressobj(1)
     with path.open("wb") as file:
 
@@ -71,51 +77,40 @@ def _write_png(
             file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
 
         file.write(b"\x89PNG\r\n\x1a\n")
-        chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, bits, 0, 0, 0, 0))
-        chunk(b"pHYs", struct.pack(">IIB", round(px_per_mm[1] * 1000), round(px_per_mm[0] * 1000), 1))
-        for start in range(0, rows, _TILE):
-            stop = min(start + _TILE, rows)
-            for top in range(start, stop, 64):
-                end = min(top + 64, stop)
-                strip = tile(slice(top, end), slice(0, columns))
-                raw = strip.astype(">u2").view(np.uint8) if bits == 16 else strip
-                lines = np.zeros((end - top, 1 + columns * bits // 8), dtype=np.uint8)  # filter 0 before each line
-                lines[:, 1:] = raw.reshape(end - top, -1)
-                if packed := packer.compress(lines.tobytes()):
-                    chunk(b"IDAT", packed)
-            progress(stop - start)
+        chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, picture.bits, 0, 0, 0, 0))
+        per_m = (round(density * 1000) for density in reversed(picture.px_per_mm))
+        chunk(b"pHYs", struct.pack(">IIB", *per_m, 1))
+        for these in spans(rows, _STRIP):
+            strip = picture.tile(these, slice(0, columns))
+            raw = strip.astype(">u2").view(np.uint8) if picture.bits == 16 else strip
+            lines = np.zeros((len(strip), 1 + columns * picture.bits // 8), dtype=np.uint8)  # filter 0 before each line
+            lines[:, 1:] = raw.reshape(len(strip), -1)
+            if packed := packer.compress(lines.tobytes()):
+                chunk(b"IDAT", packed)
+            picture.progress(len(strip))
         chunk(b"IDAT", packer.flush())
         chunk(b"IEND", b"")
 
 
-def _write_tiff(
-    path: Path,
-    shape: tuple[int, int],
-    bits: int,
-    px_per_mm: tuple[float, float],
-    tile: Tile,
-    *,
-    progress: Callable[[int], object],
-) -> None:
-    rows, columns = shape
+def _write_tiff(path: Path, picture: _Picture) -> None:
+    rows, columns = picture.shape
 
     def tiles() -> Iterator[Levels]:
-        for top in range(0, rows, _TILE):
-            bottom = min(top + _TILE, rows)
-            progress(bottom - top)  # before the last tile: the writer asks for no more after it
-            for left in range(0, columns, _TILE):
-                yield np.ascontiguousarray(tile(slice(top, bottom), slice(left, min(left + _TILE, columns))))
+        for these in spans(rows, _TILE):
+            picture.progress(these.stop - these.start)  # before the last tile: the writer asks for no more after it
+            for across in spans(columns, _TILE):
+                yield np.ascontiguousarray(picture.tile(these, across))
 
     with tifffile.TiffWriter(path) as writer:
         writer.write(
             tiles(),
-            shape=shape,
-            dtype=np.uint8 if bits == 8 else np.uint16,
+            shape=picture.shape,
+            dtype=np.uint8 if picture.bits == 8 else np.uint16,
             tile=(_TILE, _TILE),
             photometric="minisblack",
             compression="zlib",
             compressionargs={"level": 1},
-            resolution=(px_per_mm[1] * 10, px_per_mm[0] * 10),
+            resolution=(picture.px_per_mm[1] * 10, picture.px_per_mm[0] * 10),
             resolutionunit="CENTIMETER",
             metadata=None,
         )
