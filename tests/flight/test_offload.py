@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
@@ -53,6 +54,30 @@ def test_pruning_leaves_ledger_and_numbering(closed: Path, tmp_path: Path) -> No
     later.close()
     with pytest.raises(FlightError, match="pruned already"):
         go(closed, tmp_path / "disk")
+
+
+def test_a_prune_that_was_cut_short_is_finished(closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = tmp_path / "disk"
+
+    def cut(path: Path, missing_ok: bool = False) -> None:
+        raise OSError(errno.EIO, "the disk went away")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "unlink", cut)
+        with pytest.raises(FlightError, match="cannot prune"):
+            go(closed, there, prune=True)
+    assert len(os.listdir(closed / "frames")) == 2
+    with pytest.raises(FlightError, match="--prune removes the 2 files that are left"):
+        go(closed, there)
+    flip(there / closed.name / "frames" / "000001.cr2", 3)
+    with pytest.raises(FlightError, match="nothing more was removed"):
+        go(closed, there, prune=True)
+    assert len(os.listdir(closed / "frames")) == 2
+    flip(there / closed.name / "frames" / "000001.cr2", 3)
+    assert go(closed, there, prune=True).pruned == 2
+    assert os.listdir(closed / "frames") == []
+    with pytest.raises(FlightError, match="pruned already"):
+        go(closed, there, prune=True)
 
 
 def test_a_flight_that_is_recorded_is_refused(flight: Recording, tmp_path: Path) -> None:

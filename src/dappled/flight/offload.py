@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,10 +44,12 @@ def offload(
     removed then. `progress` is told the bytes done.
     """
     folder = layout.open_folder(flight)
-    _refuse_what_is_open(folder)
+    gone = _offloaded_before(folder)
     target = destination / flight.resolve().name
     if target.resolve().is_relative_to(flight.resolve()):
         raise FlightError(f"cannot offload {flight} into itself: {target}; give a folder on another disk")
+    if gone is not None:
+        return _finish(folder, target, gone, prune=prune)
     copied = there = size = 0
     for source in _files(flight):
         goal = target / source.relative_to(flight)
@@ -65,15 +67,33 @@ def offload(
     return Offloaded(folder.path.name, target, copied, there, size, pruned)
 
 
-def _refuse_what_is_open(folder: FlightFolder) -> None:
+def _offloaded_before(folder: FlightFolder) -> str | None:
+    """Where a closed flight's frames were copied to before they were pruned; None where they weren't."""
     with LedgerReader.open(folder.ledger) as ledger:
         facts = ledger.facts()
     if "closed_utc_ns" not in facts:
         raise FlightError(
             f"{folder.path} is still recorded, or was never closed: stop the daemon, or start it once to close it"
         )
-    if FACT in facts:
-        raise FlightError(f"{folder.path} was offloaded to {facts[FACT]['destination']} and pruned already")
+    return facts[FACT]["destination"] if FACT in facts else None
+
+
+def _finish(folder: FlightFolder, target: Path, gone: str, *, prune: bool) -> Offloaded:
+    """Remove what a prune that was cut short left here, where the copy still holds it."""
+    with LedgerReader.open(folder.ledger) as ledger:
+        left = [row for row in ledger.files() if (folder.path / row.name).exists()]
+    if not (left and prune):
+        rest = f"; --prune removes the {len(left)} files that are left" if left else ""
+        raise FlightError(f"{folder.path} was offloaded to {gone} and pruned already{rest}")
+    for row in left:
+        try:
+            whole = _hash_on_disk(target / row.name) == row.sha256
+        except OSError as error:
+            raise disk_error("read the copy", target / row.name, error) from error
+        if not whole:
+            raise FlightError(f"{target / row.name} differs from what the ledger says: nothing more was removed")
+    _remove(folder, [row.name for row in left])
+    return Offloaded(folder.path.name, target, 0, len(left), sum(row.size for row in left), len(left))
 
 
 def _files(flight: Path) -> Iterator[Path]:
@@ -119,10 +139,14 @@ def _prune(folder: FlightFolder, target: Path, utc_ns: Callable[[], int]) -> int
         names = [row.name for row in ledger.files()]
         ledger.set_fact(FACT, {"destination": str(target.absolute()), "utc_ns": utc_ns(), "files": len(names)})
         ledger.add_event(FACT, f"{len(names)} files were copied to {target}, verified, and removed here")
+    _remove(folder, names)
+    return len(names)
+
+
+def _remove(folder: FlightFolder, names: Sequence[str]) -> None:
     try:
         for name in names:
             (folder.path / name).unlink(missing_ok=True)
         durable.sync_folder(folder.frames)
     except OSError as error:
         raise disk_error("prune", folder.frames, error) from error
-    return len(names)
