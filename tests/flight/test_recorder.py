@@ -15,6 +15,7 @@ import pytest
 
 from dappled.flight import durable
 from dappled.flight.check import check
+from dappled.flight.entries import Stray
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import Ledger
 from dappled.flight.recorder import StrayFileError
@@ -77,6 +78,21 @@ def test_a_second_file_for_a_shot_is_kept_as_a_stray(flight: Recording) -> None:
         deliver(flight, 0, b"other", "IMG_0001.JPG")
     assert files(flight) == ["000000.cr2", "stray-000000.jpg", "stray-000001.jpg"]
     assert flight.ledger.frame(0) == first
+
+
+def test_a_stray_that_lost_its_row_does_not_keep_the_next_one_out(
+    flight: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: Ledger, stray: Stray) -> None:
+        raise FlightError(f"no room for {stray.name}")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Ledger, "add_stray", full)
+        with pytest.raises(FlightError, match="no room"):
+            deliver(flight, 7, DATA)
+    with pytest.raises(StrayFileError):
+        deliver(flight, 7, DATA)
+    assert files(flight) == ["stray-000000.cr2", "stray-000001.cr2"]
 
 
 def test_a_file_for_an_unknown_shot_is_kept_as_a_stray(flight: Recording) -> None:

@@ -80,6 +80,7 @@ class Recorder:
     def record_stray(self, camera_name: str, blob: Bytes, reason: str, *, arrived_utc_ns: int) -> Stray:
         """Make a file safe that belongs to no shot. `reason` is a sentence. Raises FlightError."""
         taken = {PurePosixPath(stray.name).stem for stray in self._ledger.strays()}
+        taken |= {path.stem for path in self._folder.frames.glob("stray-*")}  # one may have lost its row to a full disk
         number = next(n for n in range(len(taken) + 1) if f"stray-{n:06d}" not in taken)
         name = f"frames/stray-{number:06d}.{layout.extension(camera_name)}"
         sha256 = self._write(name, camera_name, blob)
