@@ -19,7 +19,7 @@ from dappled.flight.index import Entry, ImageIndex, in_order
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.recording import Recording
 from tests.flight.conftest import START_UTC_NS
-from tests.flight.makers import deliver, logged, mavlink_1, mavlink_2, shot, wish
+from tests.flight.makers import deliver, held, logged, mavlink_1, mavlink_2, shot, wish
 
 LATER_UTC_NS = START_UTC_NS + 60_000_000_000
 
@@ -155,6 +155,24 @@ def test_a_damaged_ledger_does_not_keep_the_next_flight_down(flights: Path, flig
     assert "the ledger was damaged" in second.recovered[0]
     assert (flight.folder.path / "frames/000004.cr2").read_bytes() == b"raw"
     second.close()
+
+
+@pytest.mark.parametrize("raw", ["DSCF0001.RAF", "IMG_0001.CR2"])
+def test_a_ledger_made_anew_tells_raw_frames_from_the_jpegs_beside_them(
+    flights: Path, flight: Recording, raw: str
+) -> None:
+    wish(flight, 4)
+    frame = deliver(flight, 4, b"raw", raw)
+    with held(b"jpeg") as blob:
+        flight.recorder.record_companion(4, "DSCF0001.JPG", blob, arrived_utc_ns=6)
+    flight.close()
+    (flights / "index.sqlite").unlink()
+    flight.folder.ledger.write_bytes(b"damage" * 1000)
+    begin_later(flights).close()
+    with LedgerReader.open(flight.folder.ledger) as ledger:
+        assert [one.name for one in ledger.frames()] == [frame.name]
+        assert [one.name for one in ledger.companions()] == ["frames/000004.jpg"]
+        assert ledger.strays() == []
 
 
 @pytest.mark.parametrize("harm", ["garbage", "foreign", "gone"])

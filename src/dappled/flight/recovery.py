@@ -21,6 +21,7 @@ from dappled.flight.records import Frame
 from dappled.flight.wishes import WishJournal
 
 SIDECAR = ".xmp"
+_JPEG = (".jpg", ".jpeg")
 LOST = "the recording ended before its file came"
 
 
@@ -136,7 +137,8 @@ def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
         return []
     known = {row.name for row in ledger.files()}
     report = []
-    for file_name in sorted(os.listdir(folder.frames)):
+    # JPEGs last: beside a raw frame they go with it
+    for file_name in sorted(os.listdir(folder.frames), key=lambda one: (one.endswith(_JPEG), one)):
         name = f"frames/{file_name}"
         if name in known or file_name.endswith(SIDECAR):
             continue
@@ -151,8 +153,16 @@ def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
         if number is not None and row is not None and row.state != "safe":
             ledger.safe(Frame(number, name, file_name, stat.st_size, sha256, stat.st_mtime_ns))
             report.append(f"{name} was whole but without a row; it is adopted as the frame of shot {number}")
+        elif number is not None and file_name.endswith(_JPEG) and _has_raw_frame(ledger, number):
+            ledger.add_companion(Frame(number, name, file_name, stat.st_size, sha256, stat.st_mtime_ns))
+            report.append(f"{name} was whole but without a row; it is adopted beside the frame of shot {number}")
         else:
             reason = f"{name} belongs to no shot that waits for a file; it is kept as a stray"
             ledger.add_stray(Stray(name, file_name, stat.st_size, sha256, stat.st_mtime_ns, reason))
             report.append(reason)
     return report
+
+
+def _has_raw_frame(ledger: Ledger, index: int) -> bool:
+    frame = ledger.frame(index)
+    return frame is not None and not frame.name.endswith(_JPEG)
