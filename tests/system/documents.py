@@ -51,6 +51,8 @@ SUBSTITUTES = {
     "/media/$USER/FINEPIX/DCIM": "DCIM",
     "~/flights/20261121T*": "build/demo/flights/*Z-*",
     "127.0.0.1:8042": "127.0.0.1:0",
+    "/etc/dappled/dappled.toml": "dappled.toml",
+    "COPY/FLIGHT": "FLIGHT",
 }
 """What a real camera, card or day would have made, and what stands for it here."""
 
