@@ -54,7 +54,7 @@ class Rig:
         self.sent: list[Message] = []
         self.fired: list[int] = []
         self.obstacle: str | None = None
-        self.well = True
+        self.well, self.troubled = True, False
         self.clock = RecordedClock(10**18, 10**18 - 10**9)
         self.shutter = Shutter(
             next_index=5,
@@ -75,6 +75,7 @@ class Rig:
             storage=lambda: Storage(2**34, 2**33, 2**33),
             lookup=lambda index: Captured(index, ok=index != 3) if index < 5 else None,
             healthy=lambda: self.well,
+            troubled=lambda: self.troubled,
         )
 
     def _decode(self, value: str) -> None:
@@ -290,6 +291,11 @@ def test_heartbeats_time_requests_and_streams_come_in_time_and_none_while_faulte
     seen = [kind for _ in range(100) for kind in rig.tick(0.02)]
     assert seen.count("HEARTBEAT") == 2
     assert seen.count("TIMESYNC") == 10
+    assert {m.system_status for m in rig.of("HEARTBEAT")} == {mavlink.MAV_STATE_ACTIVE}
+    rig.troubled = True
+    rig.sent.clear()
+    rig.tick(1.5)
+    assert {m.system_status for m in rig.of("HEARTBEAT")} == {mavlink.MAV_STATE_CRITICAL}
     rig.well = False
     assert "HEARTBEAT" not in rig.tick(1.5)
 
@@ -321,6 +327,36 @@ def test_a_setting_of_ours_takes_effect_at_once() -> None:
     assert extended(rig, b"LF_DECODE", 12345) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
     assert extended(rig, b"LF_DECODE", code("on"), 1) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
     assert extended(rig, b"NO_SUCH", 1) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
+
+
+def test_a_refused_setting_is_acknowledged_with_its_value_of_now() -> None:
+    rig = Rig()
+    for value, kind in ((200, mavlink.MAV_PARAM_EXT_TYPE_UINT8), (200, mavlink.MAV_PARAM_EXT_TYPE_REAL32), (7, 5)):
+        assert extended(rig, b"CAM_ISO", value, kind) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
+        (ack,) = rig.of("PARAM_EXT_ACK")
+        assert struct.unpack("<I", ack._param_value_raw[:4].ljust(4, b"\0")) == (100,)
+    assert rig.body.asked == []
+
+
+@pytest.mark.parametrize("kind", [kind for kind in range(1, 12) if kind != mavlink.MAV_PARAM_EXT_TYPE_UINT32])
+def test_a_setting_in_a_type_that_is_not_its_own_changes_nothing(kind: int) -> None:
+    rig = Rig()
+    assert extended(rig, b"LF_DECODE", code("off"), kind) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
+    assert rig.decode == "on"
+
+
+def test_what_one_ground_station_sets_the_others_see_too() -> None:
+    rig = Rig()
+    rig.tick(4)
+    assert extended(rig, b"LF_DECODE", code("off")) == [mavlink.PARAM_ACK_ACCEPTED]
+    assert [m.param_id for m in rig.of("PARAM_EXT_VALUE")] == ["LF_DECODE"]
+    assert extended(rig, b"LF_DECODE", code("off")) == [mavlink.PARAM_ACK_ACCEPTED]
+    assert rig.of("PARAM_EXT_VALUE") == []
+    rig.body.take("iso", "400")  # somebody turns the dial
+    rig.sent.clear()
+    rig.component.settings_changed()
+    (value,) = rig.of("PARAM_EXT_VALUE")
+    assert (value.param_id, struct.unpack("<I", value._param_value_raw[:4])) == ("CAM_ISO", (400,))
 
 
 def test_a_bodys_setting_is_in_progress_until_the_body_has_it_and_a_retry_asks_it_once() -> None:

@@ -50,8 +50,8 @@ class Component:
     """One camera on all links. Give the shutter `on_change=component.state_changed`, so that 262 follows each change.
 
     `facts()`, `storage()`, `pose()` and `healthy()` answer from memory; `lookup(index)` may read a disk and tells how
-    an old shot ended, None for one that never was. `healthy()` False: no heartbeat. `feedback_is_shot`: the autopilot
-    fires the camera, and each of its CAMERA_FEEDBACK is a shot.
+    an old shot ended, None for one that never was. `healthy()` False: no heartbeat; `troubled()` True: one with
+    MAV_STATE_CRITICAL. `feedback_is_shot`: the autopilot fires the camera, and each of its CAMERA_FEEDBACK is a shot.
     """
 
     def __init__(
@@ -65,12 +65,14 @@ class Component:
         storage: Callable[[], Storage | None],
         lookup: Callable[[int], Captured | None],
         healthy: Callable[[], bool] = lambda: True,
+        troubled: Callable[[], bool] = lambda: False,
         pose: Callable[[], Pose | None] = lambda: None,
         mount: tuple[float, ...] = DOWN,
         feedback_is_shot: bool = False,
     ) -> None:
         self._links, self._shutter, self._clock = links, shutter, clock
-        self._lookup, self._healthy, self._feedback_is_shot = lookup, healthy, feedback_is_shot
+        self._lookup, self._feedback_is_shot = lookup, feedback_is_shot
+        self._healthy, self._troubled = healthy, troubled
         self._telling = Telling(
             shutter, clock, knobs, links.component_id, facts=facts, storage=storage, pose=pose, mount=mount
         )
@@ -181,6 +183,7 @@ class Component:
         else:
             reply = self._parameters.set(message, packet.link, self._clock.monotonic_ns())
         self._send_reply(reply, packet.link)
+        self._send_news()
 
     def _file(self, packet: Packet) -> None:
         if packet.message.target_component == self._links.component_id and self._is_for_us(packet.message):
@@ -244,6 +247,7 @@ class Component:
         """The body told its settings, with its sentence where it would not have a change."""
         for link, reply in self._parameters.settled(self._clock.monotonic_ns(), refused):
             self._send_reply(reply, link)
+        self._send_news()
         self._links.send(self._telling.settings())
 
     def say(self, text: str, severity: int = mavlink.MAV_SEVERITY_WARNING) -> None:
@@ -260,9 +264,10 @@ class Component:
         if now_ns >= self._heartbeat_due_ns and self._healthy():
             on_time_ns = self._heartbeat_due_ns + HEARTBEAT_NS
             self._heartbeat_due_ns = on_time_ns if on_time_ns > now_ns else now_ns + HEARTBEAT_NS
+            state = mavlink.MAV_STATE_CRITICAL if self._troubled() else mavlink.MAV_STATE_ACTIVE
             self._links.send(
                 mavlink.MAVLink_heartbeat_message(
-                    mavlink.MAV_TYPE_CAMERA, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
+                    mavlink.MAV_TYPE_CAMERA, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, state, 3
                 )
             )
         autopilot = self._identity.autopilot()
@@ -284,6 +289,10 @@ class Component:
             self._links.send(message, link)
         if reply.words is not None:
             self.say(reply.words)
+
+    def _send_news(self) -> None:
+        for message in self._parameters.news():
+            self._links.send(message)
 
     def _send_old_images(self) -> None:
         wanted = self._commands.wanted_images

@@ -42,6 +42,7 @@ class Parameters:
         self._knobs = knobs
         self._lock = threading.Lock()
         self._asked: dict[str, _Asked] = {}
+        self._told = {knob.name: knob.value for knob in knobs.all()}
 
     def listing(self) -> Reply:
         """PARAM_EXT_REQUEST_LIST (321)."""
@@ -59,6 +60,19 @@ class Parameters:
         ]
         return Reply(tuple(found))
 
+    def news(self) -> tuple[Message, ...]:
+        """PARAM_EXT_VALUE of each setting that is another than when this was last asked, whoever changed it: other
+        ground stations and other links show it too."""
+        knobs = self._knobs.all()
+        now = {knob.name: knob.value for knob in knobs}
+        with self._lock:
+            before, self._told = self._told, now
+        return tuple(
+            _value(knob, at, len(knobs))
+            for at, knob in enumerate(knobs)
+            if knob.value != before.get(knob.name, knob.value)
+        )
+
     def set(self, message: Message, link: int, now_ns: int) -> Reply:
         """PARAM_EXT_SET (323). Time is monotonic."""
         name = str(message.param_id)
@@ -66,7 +80,8 @@ class Parameters:
         wanted = _number(message)
         if knob is None or wanted is None:
             words = f"there is no setting {name}" if knob is None else f"{name} takes whole numbers"
-            return Reply((_ack(name, wanted or 0, _UNSUPPORTED),), words)
+            now = (wanted or 0) if knob is None else code(knob.value)
+            return Reply((_ack(name, now, _UNSUPPORTED),), words)
         value = next((one for one in (*knob.choices, knob.value) if code(one) == wanted), None)
         if value is None:
             return Reply((_ack(name, code(knob.value), _UNSUPPORTED),), f"{name} has no choice {wanted}")
