@@ -10,16 +10,19 @@ from pathlib import Path
 import pytest
 
 from dappled.config import settings as configuration
-from dappled.config.settings import PoseSettings, PublishSettings, RecordSettings, Settings
+from dappled.config.settings import MaskSettings, PoseSettings, PublishSettings, RecordSettings, Settings
 from dappled.daemon import service as module
 from dappled.daemon.service import Service
 from dappled.daemon.shutter import Wish
 from dappled.daemon.story import Story, Watchers
+from dappled.daemon.succession import Succession
 from dappled.daemon.telemetry import UtcCorrection
+from dappled.drivers.camera import CameraError, Setting, SettingsChanged
 from dappled.errors import DappledError
 from dappled.flight import check, layout
 from dappled.flight.errors import FlightError
-from tests.daemon.fakes import FakeCamera, eventually
+from dappled.flight.ledger import LedgerReader
+from tests.daemon.fakes import FakeCamera, eventually, good
 
 
 @pytest.fixture
@@ -47,6 +50,12 @@ def started(settings: Settings, stories: list[Story]) -> Service:
     service.start()
     eventually(lambda: service.health()["camera"]["state"] == "ready", "the camera is ready")
     return service
+
+
+def told(flight: Path) -> list[str]:
+    """The ledger's events, as "kind: text"."""
+    with LedgerReader.open(flight / "flight.sqlite") as ledger:
+        return [f"{event.kind}: {event.text}" for event in ledger.events()]
 
 
 def test_a_wish_goes_to_the_end_and_can_be_looked_up_in_the_next_flight(camera: FakeCamera, settings: Settings) -> None:
@@ -127,3 +136,67 @@ def test_a_believed_clock_that_the_satellites_contradict_is_a_problem(camera: Fa
         assert "this machine's clock is 3600 s fast" in "".join(service.health()["problems"])
     finally:
         service.stop()
+
+
+def test_a_lens_that_was_zoomed_between_two_frames_is_told(
+    camera: FakeCamera, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stories: list[Story] = []
+    service = started(settings, stories)
+    try:
+        service.wish(Wish("test", "console", 1))
+        eventually(lambda: stories, "the shot's end")
+        (story,) = stories
+        component, said = service._component, list[str]()
+        assert component is not None
+        assert story.tag is not None
+        monkeypatch.setattr(component, "say", lambda text, *_: said.append(text))
+        for length_mm in (35.0, None, 35.0, 55.0):
+            story.tag = replace(story.tag, focal_length_mm=length_mm)
+            service._story_tagged(story)
+        assert said == ["image 0 was zoomed from 35 to 55 mm: is it calibrated?"]
+    finally:
+        service.stop()
+
+
+def test_a_battery_that_runs_empty_is_told_until_there_is_another(camera: FakeCamera, settings: Settings) -> None:
+    service = started(settings, [])
+    try:
+        camera.say(SettingsChanged((Setting("battery", "Low"),), 1))
+        eventually(lambda: "battery is nearly empty: Low" in "".join(service.health()["problems"]), "the battery")
+        camera.say(SettingsChanged((Setting("battery", "100%"),), 2))
+        eventually(lambda: "battery" not in "".join(service.health()["problems"]), "another battery")
+    finally:
+        service.stop()
+
+
+def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, settings: Settings) -> None:
+    after, stories = Succession(settings), list[Story]()
+    service = Service(settings, watchers=Watchers(finished=stories.append), after=after)
+    service.start()
+    eventually(lambda: service.health()["camera"]["state"] == "ready", "the camera is ready")
+    assert service._component is not None
+    knobs = service._component._parameters._knobs
+    camera.script = lambda _: []
+    assert service.wish(Wish("test", "console", 1)).index == 0
+    with pytest.raises(CameraError, match="1 shots are under way"):
+        knobs.turn("LF_MASK", "mask-3")
+    for event in good(0):
+        assert not isinstance(event, Exception)
+        camera.say(event)
+    eventually(lambda: stories, "the shot's end")
+    service._shutter.start_interval(Wish("test", "console", 2), 3600, 0)
+    camera.script = good
+    with pytest.raises(CameraError, match="stop the interval first"):
+        knobs.turn("LF_MASK", "mask-3")
+    service._shutter.stop_interval()
+    for event in good(1):
+        assert not isinstance(event, Exception)
+        camera.say(event)
+    eventually(lambda: service._shutter.statistics().pending == 0, "the interval's shot's end")
+    assert knobs.turn("LF_MASK", "mask-3")
+    assert "next flight begins" in str(service.wish(Wish("test", "console", 3)).reason)
+    service.run()  # ends by itself
+    service.stop()
+    assert after.next == replace(settings, mask=MaskSettings("mask-3"))
+    assert "next flight: mask mask-3 from there on, by the ground station" in told(service.folder)

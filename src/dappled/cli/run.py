@@ -13,7 +13,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 from typing import Protocol
 
 from dappled.cli import story
@@ -25,6 +24,7 @@ from dappled.daemon.notify import Notifier
 from dappled.daemon.service import Service
 from dappled.daemon.stages import Stage
 from dappled.daemon.story import Story, Watchers
+from dappled.daemon.succession import Succession, flights
 from dappled.drivers.camera import StateChanged
 from dappled.errors import DappledError
 
@@ -77,25 +77,14 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], Asker] | None) -> int:
-    """Run the daemon until it is told to end, or has had its frames or its time."""
-    told = _Told(arguments.json)
-    service = Service(settings, watchers=Watchers(finished=told.finished, camera=told.camera))
+    """Run the daemon, flight after flight, until it is told to end, or has had its frames or its time."""
+    told, manager = _Told(arguments.json), Notifier()
     asked, hung_up = threading.Event(), threading.Event()
-    manager = Notifier()
-    with ExitStack() as stack:
-        stack.callback(signal.signal, signal.SIGHUP, signal.signal(signal.SIGHUP, lambda *_: hung_up.set()))
-        for number in (signal.SIGINT, signal.SIGTERM):  # until all is closed: a second ^C must not cut that short
-            stack.callback(signal.signal, number, signal.signal(number, _stopper(service, asked)))
-        stack.callback(told.close)
-        service.start()
-        stack.callback(service.stop)
-        stack.callback(manager.stopping)
-        manager.ready(time.monotonic_ns())
-        print(f"flight {service.folder}", file=sys.stderr)
-        print(f"stream {settings.publish.slices}", file=sys.stderr)
-        if service.console_url:
-            print(f"console {service.console_url}", file=sys.stderr)
-        goal = _Goal(service, told, arguments.frames, arguments.seconds, ask)
+    goal = _Goal(told, arguments.frames, arguments.seconds, ask)
+
+    def fly(flown: Settings, after: Succession) -> bool:
+        """One flight; whether another may follow."""
+        service = Service(flown, watchers=Watchers(finished=told.finished, camera=told.camera), after=after)
         problems = _Problems(service, manager)
 
         def turn() -> bool:
@@ -106,10 +95,30 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
             if service.whole():
                 manager.working(time.monotonic_ns())
             problems.tell()
-            return goal.reached()
+            return asked.is_set() or goal.reached()
 
-        service.run(turn)
-        problems.tell(now=True)
+        with ExitStack() as stack:
+            service.start()
+            stack.callback(service.stop)
+            stack.callback(lambda: None if after.next and not asked.is_set() else manager.stopping())
+            after.began = True
+            manager.ready(time.monotonic_ns())
+            print(f"flight {service.folder}", file=sys.stderr)
+            print(f"stream {flown.publish.slices}", file=sys.stderr)
+            if service.console_url:
+                print(f"console {service.console_url}", file=sys.stderr)
+            goal.begin(service)
+            service.run(turn)
+            problems.tell(now=True)
+            manager.working(time.monotonic_ns(), now=True)  # closing one flight and opening the next takes a while
+        return not asked.is_set()
+
+    with ExitStack() as stack:
+        stack.callback(signal.signal, signal.SIGHUP, signal.signal(signal.SIGHUP, lambda *_: hung_up.set()))
+        for number in (signal.SIGINT, signal.SIGTERM):  # until all is closed: a second ^C must not cut that short
+            stack.callback(signal.signal, number, signal.signal(number, lambda *_: asked.set()))
+        stack.callback(told.close)
+        flights(settings, fly)
     print(told.summary(), file=sys.stderr)
     short = bool(arguments.frames) and told.good < arguments.frames
     return 1 if short and not asked.is_set() else 0  # who ends it by a signal has had enough
@@ -118,17 +127,18 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
 class _Goal:
     """When the daemon has had its frames or its time. The ground station asks once the camera is ready."""
 
-    def __init__(
-        self,
-        service: Service,
-        told: _Told,
-        frames: int | None,
-        seconds: float | None,
-        ask: Callable[[], Asker] | None,
-    ) -> None:
-        self._service, self._told, self._frames, self._ask = service, told, frames, ask
-        self._until = None if seconds is None else time.monotonic() + seconds
+    def __init__(self, told: _Told, frames: int | None, seconds: float | None, ask: Callable[[], Asker] | None) -> None:
+        self._told, self._frames, self._seconds, self._ask = told, frames, seconds, ask
+        self._until: float | None = None
         self._asker: Asker | None = None
+        self._wished: Callable[[], int] = lambda: 0
+
+    def begin(self, service: Service) -> None:
+        """A flight has begun: its shots come on top of those of the ones before, which have all ended."""
+        if self._until is None and self._seconds is not None:
+            self._until = time.monotonic() + self._seconds
+        earlier = self._told.count
+        self._wished = lambda: earlier + service.wished
 
     def reached(self) -> bool:
         if self._until is not None and time.monotonic() >= self._until:
@@ -139,7 +149,7 @@ class _Goal:
             self._asker = self._ask()
         if self._told.count >= self._frames:
             return True
-        return self._asker is not None and not self._asker.running() and self._told.count >= self._service.wished
+        return self._asker is not None and not self._asker.running() and self._told.count >= self._wished()
 
 
 class _Told:
@@ -213,11 +223,3 @@ def _reload(service: Service, arguments: argparse.Namespace, manager: Notifier) 
     for text in told or ["nothing has changed"]:
         print(f"reload: {text}", file=sys.stderr)
     manager.ready(time.monotonic_ns())
-
-
-def _stopper(service: Service, asked: threading.Event) -> Callable[[int, FrameType | None], None]:
-    def stop(_number: int, _frame: FrameType | None) -> None:
-        asked.set()
-        service.ask_to_stop()
-
-    return stop

@@ -20,7 +20,7 @@ from dappled.drivers.kept_recipe import FILES, FOLDER, of_flight
 from dappled.errors import DappledError
 from dappled.flight import durable
 
-__all__ = ["FOLDER", "keep", "names", "of_flight", "recipe", "versions"]
+__all__ = ["FOLDER", "called", "keep", "names", "of_flight", "recipe", "versions"]
 _LIBRARIES = ("numpy", "scipy", "rawpy", "pyzmq", "pymavlink", "gphoto2", "pillow", "tifffile")
 
 
@@ -29,13 +29,7 @@ def recipe(settings: Settings) -> tuple[Names, Recipe | None]:
 
     Raises DappledError when a named profile or file isn't right.
     """
-    names = Names(
-        camera=settings.camera.profile
-        if settings.camera.profile == "auto"
-        else camera_name(settings.camera.profile, None),
-        mask=Path(settings.mask.profile).stem if settings.mask.profile else "",
-        law=_law(settings),
-    )
+    names = called(settings)
     if not settings.decode.enabled or not settings.mask.profile:
         return names, None
     made = Recipe(
@@ -49,6 +43,17 @@ def recipe(settings: Settings) -> tuple[Names, Recipe | None]:
     )
     Darkroom(made).check()
     return names, made
+
+
+def called(settings: Settings) -> Names:
+    """What frames will be called. Raises DappledError when the named camera profile isn't right."""
+    return Names(
+        camera=settings.camera.profile
+        if settings.camera.profile == "auto"
+        else camera_name(settings.camera.profile, None),
+        mask=Path(settings.mask.profile).stem if settings.mask.profile else "",
+        law=_law(settings),
+    )
 
 
 def keep(made: Recipe, flight: Path, run: str = "") -> Recipe:

@@ -37,9 +37,9 @@ class Notifier:
         """The daemon is ending."""
         self._tell("STOPPING=1")
 
-    def working(self, monotonic_ns: int) -> None:
-        """The loop has turned once more."""
-        if self._watchdog_ns and monotonic_ns - self._fed_ns >= self._watchdog_ns // 2:
+    def working(self, monotonic_ns: int, *, now: bool = False) -> None:
+        """The loop has turned once more. `now`: feed in any case, as something longer follows."""
+        if self._watchdog_ns and (now or monotonic_ns - self._fed_ns >= self._watchdog_ns // 2):
             self._fed_ns = monotonic_ns
             self._tell("WATCHDOG=1")
 

@@ -17,7 +17,7 @@ from typing import Any
 import dappled
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.daemon import curve, distance_sensor, ground_facts, health, inputs, links, utc
+from dappled.daemon import battery, curve, distance_sensor, ground_facts, health, inputs, links, succession, utc
 from dappled.daemon.answers import Answers
 from dappled.daemon.books import LiveBook
 from dappled.daemon.cameras import open_camera
@@ -34,11 +34,12 @@ from dappled.daemon.reload import merge
 from dappled.daemon.shutter import Shutter, Verdict, Wish
 from dappled.daemon.story import Names, Story, Watchers
 from dappled.daemon.street import Street
+from dappled.daemon.succession import Succession
 from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency, Exposure
 from dappled.daemon.telemetry import Telemetry, UtcCorrection
 from dappled.daemon.utc import UtcLearner
 from dappled.daemon.vehicles import Vehicles
-from dappled.drivers.camera import Camera, Identity, SettingsChanged, StateChanged
+from dappled.drivers.camera import Camera, CameraError, Identity, SettingsChanged, StateChanged
 from dappled.drivers.darkroom import Recipe
 from dappled.drivers.mavlink import Packet, mavlink
 from dappled.drivers.shutter_line import UsesAutopilot
@@ -56,13 +57,22 @@ LOOK_S = 0.02
 class Service:
     """One flight, from `start` to `stop`. `run` does both, with the working loop between.
 
-    `watchers` are told what the street does. Raises DappledError from `start` when a part can't be had; what was
-    opened is closed again. A camera that isn't there, a link without an autopilot and a recipe without a mask are no
-    such failures: the daemon says so and goes on.
+    `watchers` are told what the street does; `after` takes what the next flight is to be flown with, where there may be
+    one. Raises DappledError from `start` when a part can't be had; what was opened is closed again. A camera that
+    isn't there, a link without an autopilot and a recipe without a mask are no such failures: the daemon says so and
+    goes on.
     """
 
-    def __init__(self, settings: Settings, *, watchers: Watchers | None = None, clock: Clock | None = None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        watchers: Watchers | None = None,
+        clock: Clock | None = None,
+        after: Succession | None = None,
+    ) -> None:
         self.settings = settings
+        self._after = after
         self._outside = watchers or Watchers()
         self._clock = clock or SystemClock()
         self._stack = ExitStack()
@@ -79,6 +89,7 @@ class Service:
         self._notes: deque[tuple[str, str]] = deque(maxlen=1000)
         self._said: set[str] = set()
         self._focal_length_mm: float | None = None
+        self._battery_doubt: str | None = None
         self._chip = ground_facts.chip(settings, "")
         self._began_monotonic_ns = self._clock.monotonic_ns()
         self._logbook = Logbook(self._clock.utc_ns)
@@ -215,8 +226,7 @@ class Service:
             ("on", "off"),
             self._decode_in_flight if recipe else None,
         )
-        mask = OwnKnob("LF_MASK", "Mask", lambda: names.mask or "none")
-        return Knobs(camera, (decoding, mask, OwnKnob("LF_LAW", "Carrier law", lambda: names.law or "none")))
+        return Knobs(camera, (decoding, *succession.knobs(names, self._after, lambda: self.settings, self._hand_over)))
 
     def _begin_component(self, knobs: Knobs) -> None:
         self._component = Component(
@@ -228,6 +238,7 @@ class Service:
             storage=lambda: ground_facts.storage(self.folder),
             lookup=self._lookup,
             healthy=lambda: not (self._street.dead() or self._links.dead()),
+            troubled=lambda: bool(self._said),
             pose=lambda: self._telemetry.pose_at(self._clock.utc_ns(), 0.0),
             mount=self.settings.pose.mount,
             feedback_is_shot=self.settings.mavlink.feedback_is_shot,
@@ -316,7 +327,11 @@ class Service:
             decoding=self._recipe is not None,
             utc_known=self._utc.known,
             dead=self._links.dead(),
-            doubts=[text for text in (self._component and self._component.doubt(), self._utc.doubt()) if text],
+            doubts=[
+                text
+                for text in (self._component and self._component.doubt(), self._utc.doubt(), self._battery_doubt)
+                if text
+            ],
         )
 
     # wishes
@@ -328,6 +343,8 @@ class Service:
         self._street.expect(shot)
 
     def _obstacle(self) -> str | None:
+        if self._after is not None and self._after.next is not None:
+            return "the next flight begins in a moment, with what the ground station has set"
         if self._street.camera_state not in ("ready", "busy"):
             return health.camera_sentence(self._street)
         try:
@@ -345,6 +362,19 @@ class Service:
     def _decode_in_flight(self, value: str) -> None:
         self._street.decoding = value == "on"
         self._notes.append(("decoding", f"{value} from now on, by the ground station"))
+
+    def _hand_over(self, following: Settings, text: str) -> None:
+        """The ground station has set what belongs to a flight: this one ends between two frames, and the next follows.
+        Raises CameraError where that would cut something short."""
+        assert self._after is not None
+        now = self._shutter.statistics()
+        if now.interval_s is not None:
+            raise CameraError(f"{text} would begin another flight: stop the interval first")
+        if now.pending:
+            raise CameraError(f"{text} would begin another flight: {now.pending} shots are under way, ask again")
+        self._after.next = following
+        self._notes.append(("next flight", f"{text} from there on, by the ground station"))
+        self.ask_to_stop()
 
     def _write_notes(self) -> None:
         """Refused wishes and the like stand in the flight too, as events; written here, where nobody waits for an
@@ -385,6 +415,7 @@ class Service:
         self._outside.camera(change)
 
     def _settings_changed(self, change: SettingsChanged) -> None:
+        self._battery_doubt = battery.doubt(change.settings)
         if self._component is not None:
             self._component.settings_changed(change.refused)
         self._outside.settings(change)
@@ -443,7 +474,10 @@ class Service:
             if not captured.ok:
                 self._component.say(f"image {index} failed: {story.problem}", mavlink.MAV_SEVERITY_ERROR)
         if story.tag is not None:
-            self._focal_length_mm = story.tag.focal_length_mm or self._focal_length_mm
+            before_mm, now_mm = self._focal_length_mm, story.tag.focal_length_mm
+            if self._component is not None and before_mm and now_mm and before_mm != now_mm:
+                self._component.say(f"image {index} was zoomed from {before_mm:g} to {now_mm:g} mm: is it calibrated?")
+            self._focal_length_mm = now_mm or before_mm
         self._outside.tagged(story)
 
     def _tell_pilot(self, problems: list[str]) -> None:
