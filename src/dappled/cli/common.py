@@ -10,6 +10,7 @@ from pathlib import Path
 
 from dappled.config import settings
 from dappled.daemon.wire import WireError
+from dappled.decode.carriers import LAWS
 from dappled.drivers.darkroom import Recipe
 
 SERVICE_FOLDER = Path("/run/dappled")  # RuntimeDirectory= of systemd/dappled.service
@@ -46,18 +47,37 @@ def answers(endpoint: str) -> bool:
 
 def whole(text: str) -> int:
     """An argument that is a whole number from 1."""
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 1")
-    return number
+    if not (text.isdecimal() and int(text) >= 1):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1")
+    return int(text)
 
 
 def seconds(text: str) -> float:
     """An argument that is a time of 0 s or more."""
-    number = float(text)
-    if not (math.isfinite(number) and number >= 0):
-        raise argparse.ArgumentTypeError(f"{text} is not a time of 0 s or more")
+    number = _number(text)
+    if number is None or not (math.isfinite(number) and number >= 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time of 0 s or more")
     return number
+
+
+def positive(text: str) -> float:
+    """An argument that is a number above 0."""
+    number = _number(text)
+    if number is None or not (math.isfinite(number) and number > 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return number
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def add_law(parser: argparse.ArgumentParser) -> None:
+    """--law; empty where it isn't given."""
+    parser.add_argument("--law", default="", choices=tuple(LAWS), help="carrier law (default: the camera's)")
 
 
 def add_recipe(parser: argparse.ArgumentParser, *, mask_needed: bool = True) -> None:
@@ -66,7 +86,7 @@ def add_recipe(parser: argparse.ArgumentParser, *, mask_needed: bool = True) -> 
         "--camera", default="auto", metavar="P", help="camera profile or TOML file (default: by the frame)"
     )
     parser.add_argument("--mask", required=mask_needed, metavar="P", help="mask profile or TOML file, or lenslet")
-    parser.add_argument("--law", default="", choices=("fd", "geometric"), help="carrier law (default: the camera's)")
+    add_law(parser)
     parser.add_argument("--calibration", default="", metavar="FILE", help="file written by dappled calibrate")
     parser.add_argument("--white", default="", metavar="FILE", help="white frame")
     parser.add_argument("--dark", default="", metavar="FILE", help="dark frame")

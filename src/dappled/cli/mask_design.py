@@ -1,4 +1,4 @@
-"""`dappled mask design` and `dappled mask plan`: from an altitude to a mask, and to a flight."""
+"""`dappled mask design`: from an altitude to a mask, its distance and its film."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from dappled.config import profiles
-from dappled.config.schema import ConfigError
-from dappled.decode import optics, prediction, spectrum_pictures, survey
-from dappled.decode.carriers import LAWS, Sensor
+from dappled.cli import mask_arguments
+from dappled.decode import prediction, spectrum_pictures
 from dappled.decode.design import DESIGNS, Design, Wish
 from dappled.decode.film import FILMS
 
+HELP = "mask, distance and film for an altitude"
+EXAMPLE = "dappled mask design --altitude 40 --camera fujifilm-s5200 --focal-length 13 --f-number 3.5 --film 16k"
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    _configure_camera(parser)
+    mask_arguments.add_altitude(parser)
     parser.add_argument("--f-number", type=float, default=5.6, metavar="N", help="of the lens (default 5.6)")
     parser.add_argument("--views", type=int, default=5, metavar="N", help="views an axis, odd (default 5)")
     parser.add_argument("--film", default="4k", choices=tuple(FILMS))
-    parser.add_argument("--law", default="", choices=("", *LAWS), help="carrier law (default: the camera's)")
-    parser.add_argument("--mask-distance", type=float, metavar="MM", help="fixed by the camera (default: free)")
+    mask_arguments.add_installation(parser, free=True)
     parser.add_argument("--room", type=float, metavar="MM", help="the most that the mask may stand off (default 10)")
     parser.add_argument("--wavelength", type=float, default=550.0, metavar="NM")
     parser.add_argument("--shift-error", type=float, default=0.02, metavar="PX", help="of a shift between views")
@@ -34,44 +34,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="as JSON")
 
 
-def _configure_camera(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--altitude", type=float, required=True, metavar="M", help="above ground")
-    parser.add_argument("--camera", required=True, metavar="P", help="camera profile or TOML file")
-    parser.add_argument("--focal-length", type=float, metavar="MM", help="default: the camera's, if it has one only")
-    parser.add_argument(
-        "--shape", type=int, nargs=2, metavar=("H", "W"), help="raw shape (default: the camera's first)"
-    )
-
-
-def configure_plan(parser: argparse.ArgumentParser) -> None:
-    _configure_camera(parser)
-    parser.add_argument("--speed", type=float, required=True, metavar="M/S", help="over ground")
-    parser.add_argument("--overlap", type=float, default=0.8, metavar="SHARE", help="along the line (default 0.8)")
-    parser.add_argument("--sidelap", type=float, default=0.6, metavar="SHARE", help="between lines (default 0.6)")
-    parser.add_argument("--exposure", type=float, default=0.001, metavar="S", help="default 0.001")
-    parser.add_argument("--hours", type=float, default=1.0, metavar="H", help="flight time (default 1)")
-    parser.add_argument("--frame-mb", type=float, default=18.0, metavar="MB", help="size of a raw file (default 18)")
-    parser.add_argument("--mask", metavar="P", help="mask profile, for the views' own ground sample")
-    parser.add_argument("--sideways", action="store_true", help="the frame's columns lie along the flight")
-    parser.add_argument("--json", action="store_true", help="as JSON")
-
-
-def _camera(arguments: argparse.Namespace) -> tuple[profiles.CameraProfile, Sensor, float]:
-    camera = profiles.camera(arguments.camera)
-    shape = arguments.shape
-    sensor = camera.sensor((shape[0], shape[1])) if shape else camera.raw[0].sensor
-    length, known = arguments.focal_length, camera.focal_length_mm
-    if length is None and known is not None and known[0] == known[1]:
-        length = known[0]
-    if length is None:
-        raise ConfigError(f"--focal-length says, in mm, how {camera.name} is set: it has no single one")
-    return camera, sensor, optics.focal_length(length)
-
-
 def run(arguments: argparse.Namespace) -> int:
     if arguments.mask:
         return _best(arguments)
-    camera, sensor, length = _camera(arguments)
+    camera, sensor, length = mask_arguments.camera_set(arguments)
     law = arguments.law or camera.law
     wish = Wish(
         sensor=sensor,
@@ -96,22 +62,19 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _best(arguments: argparse.Namespace) -> int:
-    camera = profiles.camera(arguments.camera)
-    sensor = camera.sensor(tuple(arguments.shape)) if arguments.shape else camera.raw[0].sensor
-    mask, law = profiles.mask(arguments.mask).mask, arguments.law or camera.law
-    distance = camera.mask_distance_mm if arguments.mask_distance is None else arguments.mask_distance
-    best = prediction.best_focal_length(mask, sensor, distance, law=law)
+    one = mask_arguments.installed(arguments)
+    best = prediction.best_focal_length(one.mask, one.sensor, one.distance_mm, law=one.law)
     if arguments.json:
-        print(json.dumps({"law": law, "mask_distance_mm": distance, **asdict(best)}, indent=2))
+        print(json.dumps({"law": one.law, "mask_distance_mm": one.distance_mm, **asdict(best)}, indent=2))
         return 0
     if best.slices_mm is None or best.carriers_mm is None:
-        print(f"law {law}: no focal length brings the outer slices of {arguments.mask} to the edge of the spectrum")
+        print(f"law {one.law}: no focal length brings the outer slices of {arguments.mask} to the edge of the spectrum")
     else:
         print(
-            f"law {law}: {arguments.mask} at {distance:g} mm fills the spectrum at {best.slices_mm:.1f} mm "
+            f"law {one.law}: {arguments.mask} at {one.distance_mm:g} mm fills the spectrum at {best.slices_mm:.1f} mm "
             f"(carriers alone at {best.carriers_mm:.1f} mm)"
         )
-    ideal = mask.frequency_per_mm * distance
+    ideal = one.mask.frequency_per_mm * one.distance_mm
     print(f"by geometry its views are separated at f/{ideal:.3g}, whatever the lens")
     return 0
 
@@ -165,37 +128,3 @@ def _as_text(made: Design) -> str:
     elif made.depth_sigma_m > wish.altitude_m / 2:
         lines.append("this depth is no measurement: fly lower, or take a longer lens with a wider aperture")
     return "\n".join(lines)
-
-
-def run_plan(arguments: argparse.Namespace) -> int:
-    camera, sensor, length = _camera(arguments)
-    columns = None
-    if arguments.mask:
-        mask = profiles.mask(arguments.mask).mask
-        lattice = prediction.lattice_of(camera.law, mask, sensor, camera.mask_distance_mm, length)
-        size = prediction.slice_size(lattice, sensor.shape)
-        columns = size[1] if size else None
-    made = survey.plan(
-        sensor,
-        focal_length_mm=length,
-        altitude_m=arguments.altitude,
-        speed_m_s=arguments.speed,
-        overlap=arguments.overlap,
-        sidelap=arguments.sidelap,
-        exposure_s=arguments.exposure,
-        hours=arguments.hours,
-        frame_bytes=round(optics.within("size of a frame", arguments.frame_mb, "MB", 1e-3, 10_000) * 1e6),
-        view_columns=columns,
-        sideways=arguments.sideways,
-    )
-    if arguments.json:
-        print(json.dumps(asdict(made), indent=2))
-        return 0
-    views = "" if made.view_sample_m is None else f", {made.view_sample_m * 100:.1f} cm a pixel of a view"
-    print(f"footprint  {made.footprint_m[1]:.1f} m across, {made.footprint_m[0]:.1f} m along the flight")
-    print(f"ground     {made.ground_sample_m * 100:.2f} cm a pixel{views}")
-    print(f"interval   {made.interval_s:.2f} s, {made.spacing_m:.2f} m; lines {made.line_m:.1f} m apart")
-    print(f"body       must sustain {made.frames_per_minute:.1f} frames a minute")
-    print(f"blur       {made.blur_px:.2f} px; one pixel at {made.longest_exposure_s * 1e3:.2f} ms")
-    print(f"disk       {made.frames} frames, {made.disk_bytes / 1e9:.1f} GB; card and disk alike, without previews")
-    return 0
