@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import os
 import signal
-import sys
 import tempfile
 import threading
 import time
@@ -13,27 +11,19 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 from dappled.cli import story
 from dappled.cli.common import seconds, whole
+from dappled.cli.terminal import CameraRemarks, Frames, ProblemRemarks, remark
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
 from dappled.daemon import health
+from dappled.daemon.goal import Asker, Goal, Tally
 from dappled.daemon.notify import Notifier
 from dappled.daemon.service import Service
-from dappled.daemon.stages import Stage
 from dappled.daemon.story import Story, Watchers
 from dappled.daemon.succession import Succession, flights
-from dappled.drivers.camera import StateChanged
 from dappled.errors import DappledError
-
-
-class Asker(Protocol):
-    """A ground station that asks for frames."""
-
-    def running(self) -> bool:
-        """Whether it still asks, or waits for an answer."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -70,7 +60,7 @@ def _run(arguments: argparse.Namespace) -> int:
         settings = replace(settings, record=replace(settings.record, directory=str(here)))
     with tempfile.TemporaryDirectory(prefix="dappled-") as folder:
         simulation = Simulation(World(seed=arguments.seed), settings, Path(folder))
-        print("simulating a masked camera, an autopilot and a ground station", file=sys.stderr)
+        remark("simulating a masked camera, an autopilot and a ground station")
         with simulation as simulated:
             ask = (lambda: simulation.ground_station(arguments.frames)) if arguments.frames else None
             return _serve(simulated, arguments, ask)
@@ -78,14 +68,19 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], Asker] | None) -> int:
     """Run the daemon, flight after flight, until it is told to end, or has had its frames or its time."""
-    told, manager = _Told(arguments.json), Notifier()
+    manager, camera, tally = Notifier(), CameraRemarks(), Tally()
+    frames = Frames(story.as_json if arguments.json else story.line)
     asked, hung_up = threading.Event(), threading.Event()
-    goal = _Goal(told, arguments.frames, arguments.seconds, ask)
+    goal = Goal(tally, arguments.frames, arguments.seconds, ask=ask, ready=lambda: camera.state == "ready")
+
+    def finished(one: Story) -> None:
+        tally.add(one)
+        frames.finished(one)
 
     def fly(flown: Settings, after: Succession) -> bool:
         """One flight; whether another may follow."""
-        service = Service(flown, watchers=Watchers(finished=told.finished, camera=told.camera), after=after)
-        problems = _Problems(service, manager)
+        service = Service(flown, watchers=Watchers(finished=finished, camera=camera.changed), after=after)
+        problems = ProblemRemarks(service.health, lambda record: manager.status(health.line(record)))
 
         def turn() -> bool:
             """After each turn of the working loop: whether to end."""
@@ -103,11 +98,11 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
             stack.callback(lambda: None if after.next and not asked.is_set() else manager.stopping())
             after.began = True
             manager.ready(time.monotonic_ns())
-            print(f"flight {service.folder}", file=sys.stderr)
-            print(f"stream {flown.publish.slices}", file=sys.stderr)
+            remark(f"flight {service.folder}")
+            remark(f"stream {flown.publish.slices}")
             if service.console_url:
-                print(f"console {service.console_url}", file=sys.stderr)
-            goal.begin(service)
+                remark(f"console {service.console_url}")
+            goal.begin(lambda: service.wished)
             service.run(turn)
             problems.tell(now=True)
             manager.working(time.monotonic_ns(), now=True)  # closing one flight and opening the next takes a while
@@ -117,100 +112,10 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
         stack.callback(signal.signal, signal.SIGHUP, signal.signal(signal.SIGHUP, lambda *_: hung_up.set()))
         for number in (signal.SIGINT, signal.SIGTERM):  # until all is closed: a second ^C must not cut that short
             stack.callback(signal.signal, number, signal.signal(number, lambda *_: asked.set()))
-        stack.callback(told.close)
+        stack.callback(frames.close)
         flights(settings, fly)
-    print(told.summary(), file=sys.stderr)
-    short = bool(arguments.frames) and told.good < arguments.frames
-    return 1 if short and not asked.is_set() else 0  # who ends it by a signal has had enough
-
-
-class _Goal:
-    """When the daemon has had its frames or its time. The ground station asks once the camera is ready."""
-
-    def __init__(self, told: _Told, frames: int | None, seconds: float | None, ask: Callable[[], Asker] | None) -> None:
-        self._told, self._frames, self._seconds, self._ask = told, frames, seconds, ask
-        self._until: float | None = None
-        self._asker: Asker | None = None
-        self._wished: Callable[[], int] = lambda: 0
-
-    def begin(self, service: Service) -> None:
-        """A flight has begun: its shots come on top of those of the ones before, which have all ended."""
-        if self._until is None and self._seconds is not None:
-            self._until = time.monotonic() + self._seconds
-        earlier = self._told.count
-        self._wished = lambda: earlier + service.wished
-
-    def reached(self) -> bool:
-        if self._until is not None and time.monotonic() >= self._until:
-            return True
-        if self._frames is None:
-            return False
-        if self._ask is not None and self._asker is None and self._told.camera_state == "ready":
-            self._asker = self._ask()
-        if self._told.count >= self._frames:
-            return True
-        return self._asker is not None and not self._asker.running() and self._told.count >= self._wished()
-
-
-class _Told:
-    """Prints a line a frame, and what becomes of the camera; counts. A terminal that stands still holds up nobody."""
-
-    def __init__(self, as_json: bool) -> None:
-        self.count = self.safe = self.decoded = self.good = 0
-        self.camera_state = "starting"
-        self._as_json = as_json
-        self._lock = threading.Lock()
-        self._lines: Stage[str] = Stage("print", _print, capacity=1000, policy="drop oldest")
-        self._lines.start()
-
-    def finished(self, one: Story) -> None:
-        with self._lock:
-            self.count += 1
-            self.safe += one.frame is not None
-            self.decoded += one.developed is not None
-            self.good += not one.problem
-        self._lines.put(story.as_json(one) if self._as_json else story.line(one))
-
-    def close(self) -> None:
-        """Print what waits, for a second at most."""
-        self._lines.stop(1.0)
-
-    def camera(self, change: StateChanged) -> None:
-        if change.state in ("busy", self.camera_state):
-            return
-        self.camera_state = change.state
-        reason = f": {change.reason}" if change.reason else ""
-        print(f"camera {change.state}{reason}", file=sys.stderr)
-
-    def summary(self) -> str:
-        bad = self.count - self.good
-        return f"{self.count} shots: {self.safe} frames safe, {self.decoded} decoded, {bad} with a problem"
-
-
-def _print(line: str) -> None:
-    try:
-        print(line, flush=True)
-    except OSError:  # nobody reads any more; the record is what counts
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # for as long as we live
-
-
-class _Problems:
-    """Says each problem once, when it comes up; the service manager's status line has all of them."""
-
-    def __init__(self, service: Service, manager: Notifier) -> None:
-        self._service, self._manager = service, manager
-        self._said: set[str] = set()
-        self._due = time.monotonic() + 1.0
-
-    def tell(self, *, now: bool = False) -> None:
-        if now or time.monotonic() >= self._due:
-            self._due = time.monotonic() + 1.0
-            told = self._service.health()
-            problems = set(told["problems"])
-            for text in sorted(problems - self._said):
-                print(f"problem: {text}", file=sys.stderr)
-            self._said = problems
-            self._manager.status(health.line(told))
+    remark(tally.summary())
+    return 1 if goal.short and not asked.is_set() else 0  # who ends it by a signal has had enough
 
 
 def _reload(service: Service, arguments: argparse.Namespace, manager: Notifier) -> None:
@@ -221,5 +126,5 @@ def _reload(service: Service, arguments: argparse.Namespace, manager: Notifier) 
     except DappledError as error:
         told = [f"the settings stay as they are: {error}"]
     for text in told or ["nothing has changed"]:
-        print(f"reload: {text}", file=sys.stderr)
+        remark(f"reload: {text}")
     manager.ready(time.monotonic_ns())

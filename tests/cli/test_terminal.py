@@ -1,0 +1,77 @@
+"""What the person who started a daemon reads."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from dappled.cli.terminal import CameraRemarks, Frames, ProblemRemarks
+from dappled.daemon.story import Story
+from dappled.drivers.camera import State, StateChanged
+from tests.flight.makers import shot
+
+
+def test_a_line_for_each_frame(capsys: pytest.CaptureFixture[str]) -> None:
+    frames = Frames(lambda story: f"shot {story.shot.index}")
+    for index in range(20):
+        frames.finished(Story(shot(index)))
+    frames.close()
+    assert capsys.readouterr().out.splitlines() == [f"shot {index}" for index in range(20)]
+
+
+def test_a_terminal_that_is_gone_stops_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Gone:
+        def write(self, _text: str) -> int:
+            raise BrokenPipeError
+
+        def flush(self) -> None:
+            raise BrokenPipeError
+
+    monkeypatch.setattr(sys, "stdout", Gone())
+    frames = Frames(lambda story: f"shot {story.shot.index}")
+    frames.finished(Story(shot(0)))
+    frames.close()
+    with sys.stdout as nowhere:
+        assert nowhere.name == "/dev/null"
+
+
+def test_the_camera_is_told_of_when_it_changes() -> None:
+    said: list[str] = []
+    camera = CameraRemarks(said.append)
+    states: list[tuple[State, str]] = [
+        ("ready", ""),
+        ("busy", ""),
+        ("ready", ""),
+        ("faulted", "it hangs"),
+        ("ready", ""),
+    ]
+    for state, reason in states:
+        camera.changed(StateChanged(state, reason, 0))
+    assert said == ["camera ready", "camera faulted: it hangs", "camera ready"]
+    assert camera.state == "ready"
+
+
+def test_a_problem_is_said_once_each_time_it_comes_up() -> None:
+    said: list[str] = []
+    records: list[Mapping[str, Any]] = []
+    problems: list[str] = []
+    now_s = 10.0
+
+    remarks = ProblemRemarks(
+        lambda: {"problems": list(problems)}, records.append, say=said.append, clock_s=lambda: now_s
+    )
+    remarks.tell()
+    assert records == []  # not yet a second old
+    for here in (["b", "a"], ["a"], ["a", "b"]):
+        problems[:] = here
+        now_s += 1.0
+        remarks.tell()
+        remarks.tell()
+    assert said == ["problem: a", "problem: b", "problem: b"]
+    assert len(records) == 3
+    problems[:] = ["the end"]
+    remarks.tell(now=True)
+    assert said[-1] == "problem: the end"
