@@ -181,6 +181,7 @@ class Component:
         elif name == "PARAM_EXT_REQUEST_READ":
             reply = self._parameters.read(message)
         else:
+            self._send_news()  # what changed before is told apart from what this changes
             reply = self._parameters.set(message, packet.link, self._clock.monotonic_ns())
         self._send_reply(reply, packet.link)
         self._send_news()

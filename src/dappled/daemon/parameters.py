@@ -42,7 +42,7 @@ class Parameters:
         self._knobs = knobs
         self._lock = threading.Lock()
         self._asked: dict[str, _Asked] = {}
-        self._told = {knob.name: knob.value for knob in knobs.all()}
+        self._told: dict[str, str] | None = None  # what each was when that was asked last; None: never yet
 
     def listing(self) -> Reply:
         """PARAM_EXT_REQUEST_LIST (321)."""
@@ -62,11 +62,11 @@ class Parameters:
 
     def news(self) -> tuple[Message, ...]:
         """PARAM_EXT_VALUE of each setting that is another than when this was last asked, whoever changed it: other
-        ground stations and other links show it too."""
+        ground stations and other links show it too. Nothing the first time."""
         knobs = self._knobs.all()
         now = {knob.name: knob.value for knob in knobs}
         with self._lock:
-            before, self._told = self._told, now
+            before, self._told = self._told or now, now
         return tuple(
             _value(knob, at, len(knobs))
             for at, knob in enumerate(knobs)
