@@ -142,6 +142,20 @@ def test_another_or_a_missing_hash_is_a_difference(tmp_path: Path, what: str) ->
     assert play(book, frame) == [f"frame 0: the record holds no hash of its {what}"]
 
 
+def test_a_frame_that_the_flight_left_undecoded_has_no_slices_to_differ(tmp_path: Path) -> None:
+    left = {"slices_sha256": None, "told": frozenset({"not decoded"})}
+    book, frame = replay(tmp_path, **left)
+    assert play(book, frame) == []  # the replay could decode it
+    book, frame = replay(tmp_path, **left)
+    recorded_again = Blob.of(DATA)
+    book.record(0, "IMG_0001.DNG", recorded_again)
+    book.tagged(tag(frame))
+    assert book.verdict() == []  # nor can the replay
+    book, frame = replay(tmp_path, told=frozenset({"not decoded"}))
+    book.tagged(tag(frame))
+    assert book.verdict() == ["frame 0: its slices did not come out of the replay"]  # somebody decoded it after all
+
+
 def test_what_did_not_come_is_a_difference(tmp_path: Path) -> None:
     book, _ = replay(tmp_path)
     book.failed(0, "can't be read")

@@ -119,7 +119,9 @@ def run(arguments: argparse.Namespace) -> int:
     for text in problems:
         print(f"different: {text}", file=sys.stderr)
     count = sum(one.frame is not None for one in recording.expected)
-    print(f"verified {count} frames: " + (f"{len(problems)} differences" if problems else "all hashes the same"))
+    undecoded = sum(one.frame is not None and one.left_undecoded for one in recording.expected)
+    left = f" ({undecoded} were left undecoded in flight)" if undecoded else ""
+    print(f"verified {count} frames: " + (f"{len(problems)} differences" if problems else "all hashes the same") + left)
     return 1 if problems else 0
 
 
