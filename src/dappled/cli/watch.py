@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from pathlib import Path
 
-import numpy as np
-from PIL import Image
-
 from dappled.cli.common import seconds, stream, whole
+from dappled.daemon import watching
 from dappled.daemon.curve import ClientKeys, KeyFileError, load_own, load_public
 from dappled.daemon.memory import reuse_large_blocks
 from dappled.daemon.subscriber import Subscriber
 from dappled.daemon.wire import Message
-from dappled.decode.pictures import slice_mosaic
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -36,48 +32,24 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     endpoint = arguments.endpoint or stream(None)
     ask = arguments.ask or (f"{endpoint}.ask" if endpoint.startswith("ipc://") else "")
-    if arguments.save:
-        arguments.save.mkdir(parents=True, exist_ok=True)
-    reuse_large_blocks()
-    frames: set[tuple[str, int]] = set()
-    ended = False
     if bool(arguments.keys) != bool(arguments.server_key):
         raise KeyFileError("--keys and --server-key go together: your own secret key, and the vehicle's public one")
     keys = ClientKeys(load_own(arguments.keys), load_public(arguments.server_key)) if arguments.keys else None
+    if arguments.save:
+        arguments.save.mkdir(parents=True, exist_ok=True)
+    reuse_large_blocks()
     with Subscriber(endpoint, ask, from_start=arguments.from_start, keys=keys) as subscriber:
-        heard = time.monotonic()
-        while not (ended and not subscriber.waiting_for) and (arguments.count is None or len(frames) < arguments.count):
-            message = subscriber.receive(0.5)
-            if message is None:
-                if arguments.timeout and time.monotonic() - heard > arguments.timeout:
-                    break
-                continue
-            heard = time.monotonic()
-            ended = ended or message.topic == "end"
-            _show(message, arguments.json)
-            if message.topic == "slices":
-                key = (message.header["flight"], message.header["frame"])
-                if key not in frames:
-                    frames.add(key)
-                    if arguments.save:
-                        save(message, arguments.save)
+        seen = watching.watch(
+            subscriber,
+            heard=lambda message: _show(message, arguments.json),
+            new_frame=lambda message: watching.keep(message, arguments.save) if arguments.save else None,
+            count=arguments.count,
+            silence_s=arguments.timeout,
+        )
         if not arguments.json:
-            print(
-                f"{len(frames)} frames received, {subscriber.recovered} of them asked for again, {subscriber.lost} lost"
-            )
-        wanted = 1 if arguments.count is None and not ended else arguments.count or 0
-        short = len(frames) < wanted
-        return 1 if short or subscriber.lost else 0
-
-
-def save(message: Message, folder: Path) -> None:
-    """Header as JSON, slices as NPY, and the mosaic of the slices as PNG (Fig 43), named by the frame."""
-    stem = folder / f"{message.header['frame']:06d}"
-    slices = message.arrays()["slices"]
-    carriers = np.array(message.header["carriers"])
-    stem.with_suffix(".json").write_text(json.dumps(message.header, indent=2))
-    np.save(stem.with_suffix(".npy"), slices)
-    Image.fromarray(slice_mosaic(slices, carriers)).save(stem.with_suffix(".png"))
+            asked_again = f"{subscriber.recovered} of them asked for again"
+            print(f"{seen.frames} frames received, {asked_again}, {subscriber.lost} lost")
+        return 1 if seen.short_of(arguments.count) or subscriber.lost else 0
 
 
 def _show(message: Message, as_json: bool) -> None:
