@@ -26,8 +26,9 @@ from dappled.daemon import telemetry_pose
 from dappled.daemon.camera_clock import CameraClock, exposure_from_camera
 from dappled.daemon.interpolation import metres_per_radian, turn_rad
 from dappled.daemon.tagger import BodyLatency, Exposure, mid_exposure
-from dappled.daemon.telemetry import ATTITUDE_GAP_NS, POSITION_GAP_NS, Telemetry
+from dappled.daemon.telemetry import Telemetry
 from dappled.daemon.telemetry_samples import AttitudeSample, PositionSample, attitude, position
+from dappled.daemon.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
 from dappled.drivers.mavlink import Decoder, Message, mavlink
 from dappled.flight import telemetry_log
 from dappled.flight.records import Pose

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from dappled.daemon.boot_clock import Answer, from_arrivals, from_timesync
 from dappled.daemon.interpolation import from_euler, hermite, metres_per_radian, normalised, slerp, turn_rad
-from dappled.daemon.telemetry import Telemetry, first_position_utc_ns
+from dappled.daemon.telemetry import HISTORY_NS, Telemetry, first_position_utc_ns
+from dappled.daemon.telemetry_history import MOST
 from dappled.drivers.mavlink import Decoder, Message, mavlink
 from dappled.flight.records import Pose, digest
 from dappled.mocks.autopilot import BootTime, flight
@@ -285,3 +286,29 @@ def test_a_real_flight_predicts_each_of_its_samples_from_the_neighbours(shared_d
 
 def test_a_real_flights_reboot_is_seen_once(shared_data: File) -> None:
     assert fed(list(real_flight(shared_data))).statistics().reboots == 1
+
+
+def test_history_is_bounded_in_time_whatever_stands_between_its_packets() -> None:
+    """Every second packet says nothing: no place in the numbering may keep the others from being forgotten."""
+    telemetry, beat = Telemetry(), made(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
+    for step in range(3000):
+        stamp_us = START_NS // 1000 + step * 100_000
+        at_ms = 1000 + step * 100
+        telemetry.feed(2 * step, stamp_us, beat)
+        place = mavlink.MAVLink_global_position_int_message(at_ms, 10**7, 10**7, 0, 0, 0, 0, 0, 0)
+        telemetry.feed(2 * step + 1, stamp_us, made(place))
+    assert telemetry.statistics().positions == 3000
+    assert len(telemetry._history._positions) <= HISTORY_NS / 1e8 + 256
+
+
+def test_a_flood_of_one_kind_keeps_the_newest_and_the_rest_of_the_history() -> None:
+    packets = recording(Path(3), 5)
+    telemetry = fed(packets)
+    number, stamp_us = packets[-1][0], packets[-1][1]
+    flood = made(mavlink.MAVLink_gps_raw_int_message(0, 3, 10**7, 10**7, 0, 100, 100, 0, 0, 9))
+    for _ in range(MOST + 1000):
+        number += 1
+        telemetry.feed(number, stamp_us, flood)
+    assert len(telemetry._history._receiver) <= MOST
+    assert telemetry._history._receiver[-1].number == number
+    assert telemetry.pose_at(START_NS + 4 * 10**9, 0).source == "interpolated"

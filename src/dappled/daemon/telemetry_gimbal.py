@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dappled.daemon.boot_clock import from_arrivals
 from dappled.daemon.telemetry_clock import ARRIVAL_WINDOW_NS
-from dappled.daemon.telemetry_history import around, between, last, prune
+from dappled.daemon.telemetry_history import around, between, keep, last, prune
 from dappled.daemon.telemetry_pose import NEAREST_NS
 from dappled.daemon.telemetry_samples import GIMBAL_COMPONENTS, GimbalSample, gimbal
 from dappled.drivers.mavlink import Message
@@ -38,7 +38,7 @@ class Gimbals:
                 sample = gimbal(number, stamp_ns, message, before.epoch + 1)
                 assert sample is not None
         self.seen += 1
-        self._samples.append(sample)
+        keep(self._samples, sample)
 
     def around(self, utc_ns: int, boot_ns: int, first: int, limit: int) -> tuple[tuple[GimbalSample, ...], int]:
         """The samples of the packets below `limit` around an instant (see `telemetry_history.around`), and the instant

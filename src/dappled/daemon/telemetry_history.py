@@ -6,6 +6,8 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from typing import Protocol, TypeVar
 
+MOST = 2**16  # of one kind: three minutes at 360 Hz, more than any autopilot sends
+
 
 class Numbered(Protocol):
     """Something from one packet of the telemetry log: its running number, and when it came."""
@@ -57,6 +59,13 @@ def around(history: Sequence[S], boot_ns: int, *, gap_ns: int, nearest_ns: int) 
     if nearest is None or abs(nearest.boot_ns - boot_ns) > nearest_ns:
         return ()
     return (nearest,)
+
+
+def keep(history: list[N], sample: N) -> None:
+    """Append. `prune` bounds a history by time; of a flood only the newest are kept as well."""
+    history.append(sample)
+    if len(history) > MOST:
+        del history[: MOST // 4]
 
 
 def prune(history: list[N], before_ns: int) -> None:
