@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import logging
+import socket
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from dappled.cli.terminal import CameraRemarks, Frames, ProblemRemarks
+from dappled.daemon import journal
 from dappled.daemon.story import Story
 from dappled.drivers.camera import State, StateChanged
+from tests.daemon.test_journal import read
 from tests.flight.makers import shot
 
 
@@ -40,7 +45,7 @@ def test_a_terminal_that_is_gone_stops_nobody(monkeypatch: pytest.MonkeyPatch) -
 
 def test_the_camera_is_told_of_when_it_changes() -> None:
     said: list[str] = []
-    camera = CameraRemarks(said.append)
+    camera = CameraRemarks(lambda text, *_, **__: said.append(text))
     states: list[tuple[State, str]] = [
         ("ready", ""),
         ("busy", ""),
@@ -61,7 +66,10 @@ def test_a_problem_is_said_once_each_time_it_comes_up() -> None:
     now_s = 10.0
 
     remarks = ProblemRemarks(
-        lambda: {"problems": list(problems)}, records.append, say=said.append, clock_s=lambda: now_s
+        lambda: {"problems": list(problems)},
+        records.append,
+        say=lambda text, *_, **__: said.append(text),
+        clock_s=lambda: now_s,
     )
     remarks.tell()
     assert records == []  # not yet a second old
@@ -72,6 +80,37 @@ def test_a_problem_is_said_once_each_time_it_comes_up() -> None:
         remarks.tell()
     assert said == ["problem: a", "problem: b", "problem: b"]
     assert len(records) == 3
+    for here in (["disk: 12 MB left"], ["disk: 11 MB left"]):
+        problems[:] = here
+        now_s += 1.0
+        remarks.tell()
+    assert said[3:] == ["problem: disk: 12 MB left"]  # numbers that change are no news
     problems[:] = ["the end"]
     remarks.tell(now=True)
     assert said[-1] == "problem: the end"
+
+
+def test_in_the_journal_a_frame_can_be_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(tmp_path / "j"))
+        listener.settimeout(30)
+        root = logging.getLogger()
+        handler, before = journal.JournalHandler(str(tmp_path / "j")), root.level
+        root.addHandler(handler)
+        root.setLevel(logging.INFO)
+        try:
+            frames = Frames(lambda story: f"shot {story.shot.index}")
+            frames.finished(Story(shot(42), problem="it hangs"))
+            CameraRemarks().changed(StateChanged("ready", "", 0))
+            frames.close()
+            told = {entry["MESSAGE"]: entry for entry in (read(listener.recv(10_000)), read(listener.recv(10_000)))}
+        finally:
+            root.removeHandler(handler)
+            root.setLevel(before)
+            handler.close()
+    assert capsys.readouterr() == ("", "")
+    frame = told["shot 42"]
+    asked = {name: frame[f"DAPPLED_{name}"] for name in ("FRAME", "STATE", "PROBLEM")}
+    assert asked == {"FRAME": "42", "STATE": "failed", "PROBLEM": "it hangs"}
+    assert frame["PRIORITY"] == "4"
+    assert told["camera ready"]["DAPPLED_CAMERA"] == "ready"

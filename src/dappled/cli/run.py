@@ -69,7 +69,7 @@ def _run(arguments: argparse.Namespace) -> int:
 def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], Asker] | None) -> int:
     """Run the daemon, flight after flight, until it is told to end, or has had its frames or its time."""
     manager, camera, tally = Notifier(), CameraRemarks(), Tally()
-    frames = Frames(story.as_json if arguments.json else story.line)
+    frames = Frames(story.as_json if arguments.json else story.line, for_programs=arguments.json)
     asked, hung_up = threading.Event(), threading.Event()
     goal = Goal(tally, arguments.frames, arguments.seconds, ask=ask, ready=lambda: camera.state == "ready")
 
