@@ -24,6 +24,7 @@ from dappled.products import batch, lightfiles, photographs, workers
 from dappled.products.batch import Done, Job
 from dappled.products.georeference import Options
 from dappled.products.manifest import Manifest, ManifestError
+from tests import globe
 from tests.products.flown import Flown
 
 
@@ -109,7 +110,7 @@ def test_a_bad_frame_is_noted_and_the_others_are_made(
     said = capsys.readouterr()
     assert "1 frames made, 0 were there already, 1 could not be made" in said.out
     assert "000000.dng" in said.err
-    assert (output / copy.name / "000001.kmz").is_file()
+    globe.check_archive(output / copy.name / "000001.kmz")
     noted = [json.loads(line) for line in (output / "manifest.jsonl").read_text().splitlines()]
     assert {row["frame"]: row["error"] is None for row in noted} == {
         "frames/000000.dng": False,

@@ -27,6 +27,7 @@ from dappled.products.earth import Projection
 from dappled.products.georeference import Options
 from dappled.products.ground import Flat
 from dappled.products.photographs import Mounting, PhotographError, Station
+from tests import globe
 from tests.flight.makers import deliver, pose, wish
 from tests.products import flown
 from tests.products.flown import Flown
@@ -58,6 +59,8 @@ def test_a_flight_becomes_maps(short_flight: Flown, tmp_path: Path, capsys: pyte
         "mosaic.tif",
         "report.json",
     ]
+    for kmz in ("mosaic.kmz", "frames/000000.kmz", "frames/000001.kmz"):
+        globe.check_archive(tmp_path / kmz)
     report = json.loads((tmp_path / "report.json").read_text())
     assert [frame["refined"] for frame in report["frames"]] == [True, True]
     assert all(frame["shift_m"] < 0.1 for frame in report["frames"])
@@ -341,6 +344,7 @@ def test_views_need_an_f_number(decoded: tuple[Station, LightField, CameraProfil
 def test_one_view_is_seen_from_aside(short_flight: Flown, tmp_path: Path) -> None:
     more = ["--view", "0,4", "--as", "kmz", "--frames", "0", "--each", "--quad"]
     assert main(words(short_flight, tmp_path / "v", *more)) == 0
+    globe.check_archive(tmp_path / "v" / "frames" / "000000.kmz")
     with zipfile.ZipFile(tmp_path / "v" / "frames" / "000000.kmz") as archive:
         assert b"LatLonQuad" in archive.read("doc.kml")
 

@@ -29,6 +29,7 @@ from dappled.products.ground import Flat, Ground
 from dappled.products.kmz import Overlay
 from dappled.products.maps import MapError, MapGrid
 from dappled.products.photographs import Photograph
+from tests import globe
 from tests.products.test_eye import GRID, SHAPE, eye_at
 from tests.products.test_ground import hill
 
@@ -182,6 +183,7 @@ def test_gdals_own_command_reads_the_kmz(tmp_path: Path) -> None:
 
 
 def overlays(path: Path) -> tuple[ET.Element, dict[str, NDArray[np.uint8]]]:
+    globe.check_archive(path)
     with zipfile.ZipFile(path) as archive:
         assert archive.testzip() is None
         assert archive.namelist()[0] == "doc.kml"
@@ -204,7 +206,7 @@ def test_a_kmz_is_north_up_and_lies_where_the_frame_looked(tmp_path: Path) -> No
     made = survey(photograph(eye, painted(eye, ground)))
     root, pictures = overlays(drawings.mosaic_kmz(made, tmp_path / "m.kmz", gain=1.0))
     (overlay,) = root.iter(f"{{{kmz.KML}}}GroundOverlay")
-    assert [child.tag.rpartition("}")[2] for child in overlay] == ["name", "Icon", "LatLonBox"]  # the schema's order
+    assert [child.tag.rpartition("}")[2] for child in overlay] == ["name", "Icon", "LatLonBox"]
     edges = box(overlay)
     assert list(edges) == ["north", "south", "east", "west"]
     assert overlay.find("k:LatLonBox/k:rotation", KML) is None
@@ -258,6 +260,7 @@ def test_a_large_picture_becomes_a_tree_of_tiles(tmp_path: Path) -> None:
         pages = {name: ET.fromstring(archive.read(name)) for name in names if name.endswith(".kml")}  # noqa: S314  ours
         sizes = [Image.open(io.BytesIO(archive.read(name))).size for name in names if name.endswith(".png")]
     assert max(max(size) for size in sizes) <= kmz.TILE
+    assert set(globe.check_archive(tmp_path / "large.kmz")) == set(pages)
     reached, open_pages = set(), ["doc.kml"]
     leaves = []
     while open_pages:

@@ -29,6 +29,7 @@ from dappled.daemon.publisher import Publisher, Reply
 from dappled.daemon.wire import Message
 from dappled.drivers.camera_channel import Channel, ChannelError
 from dappled.products import camera_pose
+from tests import globe
 
 STACK = (np.random.default_rng(1).random((2, 30, 40)) + 0.1).astype(np.complex64)
 POSE = {
@@ -264,8 +265,11 @@ def test_a_depth_message_becomes_a_picture(rig: Rig) -> None:
 def test_a_globe_gets_link_overlay_and_picture(rig: Rig) -> None:
     seen(rig, 4)
     with rig.client() as client:
-        assert f"{rig.url}/kml/latest.kml" in client.get("/kml").text
+        link = client.get("/kml")
+        assert f"{rig.url}/kml/latest.kml" in link.text
         latest = client.get("/kml/latest.kml").text
+        globe.check(link.content)
+        globe.check(latest.encode())
         assert f"{rig.url}/kml/4.png" in latest
         assert "<LatLonBox>" in latest
         assert client.get("/kml/4.png").headers["content-type"] == "image/png"

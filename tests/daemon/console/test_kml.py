@@ -8,11 +8,13 @@ import numpy as np
 
 from dappled.daemon.console import kml
 from dappled.daemon.console.footprint import Rectified
+from tests import globe
 
 NS = {"k": kml.NAMESPACE}
 
 
 def parsed(document: bytes) -> ET.Element:
+    globe.check(document)
     return ET.fromstring(document)  # noqa: S314  # our own
 
 
