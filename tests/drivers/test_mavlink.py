@@ -11,8 +11,10 @@ from collections.abc import Callable
 
 import pytest
 
+from dappled.drivers import mavlink as mavlink_links
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, Packet, mavlink
-from dappled.drivers.mavlink_stream import over_tcp
+from dappled.drivers.mavlink_address import Address
+from dappled.drivers.mavlink_stream import Stream, over_tcp
 
 
 class Clock:
@@ -156,6 +158,31 @@ def test_a_receiving_thread_that_ended_is_named() -> None:
             time.sleep(0.01)
         open_one.close()
     assert side.links.dead() == []  # it was asked to end
+
+
+def test_a_channel_that_is_opened_after_the_end_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server that answers while `stop` gives up waiting for the thread that asked."""
+    near, far = socket.socketpair()
+    asked, answered = threading.Event(), threading.Event()
+
+    def late(_: Address) -> Stream:
+        asked.set()
+        assert answered.wait(20)
+        return Stream(near.fileno(), near.close)
+
+    with socket.create_server(("127.0.0.1", 0)) as gone:
+        port = gone.getsockname()[1]
+    side = Side(f"tcp:127.0.0.1:{port}")
+    side.links.open()  # nobody is there yet
+    monkeypatch.setattr(mavlink_links, "open_channel", late)
+    side.links.start()
+    assert asked.wait(20)
+    side.links.stop()
+    answered.set()
+    far.settimeout(20)
+    assert far.recv(1) == b""
+    assert side.links.port(0) == 0
+    far.close()
 
 
 def test_a_serial_device() -> None:

@@ -6,15 +6,15 @@ import logging
 import select
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import reduce
 from operator import or_
 from typing import Protocol
 
-from dappled.drivers.mavlink_address import Address, LinkError, parse
+from dappled.drivers.mavlink_address import LinkError, parse
 from dappled.drivers.mavlink_channel import Channel, open_channel
-from dappled.drivers.mavlink_framing import Decoder, Framed, Framer, Message, mavlink, pack
-from dappled.drivers.mavlink_signing import Guard, Signing, SigningError, SigningStatistics
+from dappled.drivers.mavlink_framing import Decoder, Framed, Framer, Message, mavlink
+from dappled.drivers.mavlink_link import Link, LinkStatistics, Packet
+from dappled.drivers.mavlink_signing import Signing, SigningError
 
 __all__ = ["Decoder", "LinkError", "LinkStatistics", "MavlinkLinks", "Message", "Packet", "mavlink"]
 
@@ -30,41 +30,6 @@ class Clock(Protocol):
     def utc_ns(self) -> int: ...
 
     def monotonic_ns(self) -> int: ...
-
-
-@dataclass(frozen=True, slots=True)
-class Packet:
-    """One packet, in or (`sent`) out. `number` is its place in the telemetry log, None if it could not be logged.
-
-    `trusted`: False for an unsigned packet on a signed link that may be heard, but not obeyed.
-    """
-
-    number: int | None
-    stamp_us: int
-    link: int
-    message: Message
-    raw: bytes
-    sent: bool = False
-    trusted: bool = True
-
-
-@dataclass(frozen=True, slots=True)
-class LinkStatistics:
-    """What went over a link so far. `error` says why it is down, None when it is up; `signing` is None without a key.
-
-    `packets_in` counts what was taken; packets that signing refused stand in `signing` alone, and in no log.
-    """
-
-    url: str
-    packets_in: int
-    packets_out: int
-    packets_bad: int
-    packets_unsent: int
-    packets_unlogged: int
-    failures: int
-    last_heard_monotonic_ns: int | None
-    error: str | None
-    signing: SigningStatistics | None = None
 
 
 class MavlinkLinks:
@@ -99,7 +64,7 @@ class MavlinkLinks:
         self._signing_time = signing.time if signing else None
         guards = signing.guards if signing else [None] * len(urls)
         pairs = zip(urls, guards, strict=True)
-        self._links = [_Link(number, parse(url), guard) for number, (url, guard) in enumerate(pairs)]
+        self._links = [Link(number, parse(url), guard) for number, (url, guard) in enumerate(pairs)]
         self._threads: list[threading.Thread] = []
 
     def open(self) -> None:
@@ -164,21 +129,17 @@ class MavlinkLinks:
             return []
         return [thread.name for thread in self._threads if not thread.is_alive()]
 
-    def _send_on(self, link: _Link, message: Message) -> bool:
+    def _send_on(self, link: Link, message: Message) -> bool:
         channel = link.channel
         if channel is None:
             link.packets_unsent += 1
             return False
-        link.packer.srcSystem, link.packer.srcComponent = self.system_id, self.component_id
-        if link.guard is None:
-            raw = pack(message, link.packer, version_1=link.heard_1 and not link.heard_2)
-        else:
-            raw = link.guard.sign(lambda: pack(message, link.packer, version_1=False), link.packer)
+        raw = link.packed(message, self.system_id, self.component_id)
         stamp_us = self._clock.utc_ns() // 1000
         try:
             taken = channel.write(raw)
         except OSError as error:
-            link.error = f"MAVLink link {link.address.url}: {error.strerror or error}"
+            link.fail(error.strerror or error)
             taken = False
         if not taken:
             link.packets_unsent += 1
@@ -188,7 +149,7 @@ class MavlinkLinks:
         return True
 
     def _deliver(
-        self, link: _Link, stamp_us: int, raw: bytes, message: Message, *, sent: bool, trusted: bool = True
+        self, link: Link, stamp_us: int, raw: bytes, message: Message, *, sent: bool, trusted: bool = True
     ) -> None:
         number: int | None = None
         try:
@@ -203,7 +164,7 @@ class MavlinkLinks:
             link.failures += 1
             log.exception("A MAVLink packet (%s) could not be handled", message.get_type())
 
-    def _receive(self, link: _Link) -> None:
+    def _receive(self, link: Link) -> None:
         framer = Framer()
         while not self._stop.is_set():
             channel = link.channel
@@ -217,10 +178,10 @@ class MavlinkLinks:
                 data = channel.read()
                 stamp_us = self._clock.utc_ns() // 1000
             except (OSError, ValueError) as error:  # ValueError: a descriptor that another thread closed
-                link.error = f"MAVLink link {link.address.url}: {error}"
+                link.fail(error)
                 continue
             if data is None:
-                link.error = f"MAVLink link {link.address.url}: the other side closed it"
+                link.fail("the other side closed it")
                 continue
             if not data:
                 continue
@@ -241,7 +202,7 @@ class MavlinkLinks:
                 channel.flush()
         return bool(ready & ~select.POLLOUT)
 
-    def _received(self, link: _Link, stamp_us: int, framed: Framed) -> None:
+    def _received(self, link: Link, stamp_us: int, framed: Framed) -> None:
         with self._order:
             message = framed.message
             trusted = True
@@ -257,11 +218,9 @@ class MavlinkLinks:
             link.heard_2 |= framed.version == 2
             self._deliver(link, stamp_us, framed.raw, message, sent=False, trusted=trusted)
 
-    def _reopen(self, link: _Link) -> None:
+    def _reopen(self, link: Link) -> None:
         with self._order:
-            if link.channel is not None:
-                link.channel.close()
-                link.channel = None
+            link.close()
         if self._stop.wait(_REOPEN_S):
             return
         try:
@@ -271,6 +230,8 @@ class MavlinkLinks:
             return
         with self._order:
             link.channel, link.error = channel, None
+            if self._stop.is_set():  # it was opened too late for `stop` to close it
+                link.close()
 
     def _keep_signing_time(self) -> None:
         assert self._signing_time is not None
@@ -289,36 +250,4 @@ class MavlinkLinks:
 
     def _close_channels(self) -> None:
         for link in self._links:
-            if link.channel is not None:
-                link.channel.close()
-                link.channel = None
-
-
-class _Link:
-    """One link's state; its receiving thread and, under the order lock, the senders write it."""
-
-    def __init__(self, number: int, address: Address, guard: Guard | None) -> None:
-        self.number = number
-        self.address = address
-        self.guard = guard
-        self.channel: Channel | None = None
-        self.error: str | None = None
-        self.packer = mavlink.MAVLink(None)
-        self.heard_1 = self.heard_2 = False
-        self.packets_in = self.packets_out = self.packets_bad = 0
-        self.packets_unsent = self.packets_unlogged = self.failures = 0
-        self.last_heard_monotonic_ns: int | None = None
-
-    def statistics(self) -> LinkStatistics:
-        return LinkStatistics(
-            self.address.url,
-            self.packets_in,
-            self.packets_out,
-            self.packets_bad,
-            self.packets_unsent,
-            self.packets_unlogged,
-            self.failures,
-            self.last_heard_monotonic_ns,
-            self.error,
-            self.guard.statistics() if self.guard else None,
-        )
+            link.close()
