@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -136,6 +139,49 @@ def test_a_key_file_is_made_once_for_its_owner_alone(tmp_path: Path) -> None:
         signing.make_key(path)
     signing.make_key(tmp_path / "same.key", "swordfish")
     assert signing.read_key(tmp_path / "same.key").hex().startswith("b9f195c5")  # SHA-256, as ground stations do
+
+
+class Disk:
+    """What is asked of the disk, in order: fsync of a file with its size then, or of a folder; replace."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.calls: list[str | int] = []
+        fsync, replace = os.fsync, os.replace
+
+        def watched_fsync(fd: int) -> None:
+            facts = os.fstat(fd)
+            self.calls.append("folder" if stat.S_ISDIR(facts.st_mode) else facts.st_size)
+            fsync(fd)
+
+        def watched_replace(old: Path, new: Path) -> None:
+            self.calls.append("replace")
+            replace(old, new)
+
+        monkeypatch.setattr(os, "fsync", watched_fsync)
+        monkeypatch.setattr(os, "replace", watched_replace)
+
+
+def test_a_key_is_on_the_disk_when_it_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = Disk(monkeypatch)
+    signing.make_key(tmp_path / "radio.key")
+    assert disk.calls == [65, "folder"]
+
+
+def test_a_key_that_could_not_be_written_is_in_nobodys_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_fd: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(SigningError, match="No space left"):
+        signing.make_key(tmp_path / "radio.key")
+    monkeypatch.undo()
+    signing.make_key(tmp_path / "radio.key")
+
+
+def test_a_power_cut_brings_no_older_times_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = Disk(monkeypatch)
+    SigningTime(tmp_path / "time", Clock())
+    assert disk.calls == [(tmp_path / "time").stat().st_size, "replace", "folder"]
 
 
 def test_a_key_that_others_can_read_or_that_is_none_is_refused(tmp_path: Path) -> None:

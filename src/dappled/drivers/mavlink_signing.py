@@ -50,12 +50,18 @@ def make_key(path: Path, passphrase: str | None = None) -> None:
     key = secrets.token_bytes(KEY_BYTES) if passphrase is None else hashlib.sha256(passphrase.encode()).digest()
     try:
         fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        with os.fdopen(fd, "w", encoding="ascii") as file:
-            file.write(key.hex() + "\n")
-            os.fsync(fd)
     except FileExistsError:
         raise SigningError(f"{path} exists already; keys are not overwritten: name another file") from None
     except OSError as error:
+        raise SigningError(f"cannot write the key {path}: {error.strerror or error}; check its folder") from error
+    try:
+        with os.fdopen(fd, "w", encoding="ascii") as file:
+            file.write(key.hex() + "\n")
+            file.flush()
+            os.fsync(fd)
+        _sync_folder(path.parent)
+    except OSError as error:
+        path.unlink(missing_ok=True)  # half a key would be in the way of the next attempt
         raise SigningError(f"cannot write the key {path}: {error.strerror or error}; check its folder") from error
 
 
@@ -135,6 +141,7 @@ class SigningTime:
                 file.flush()
                 os.fsync(fd)
             os.replace(fresh, self._path)
+            _sync_folder(self._path.parent)
         except OSError as error:
             raise SigningError(
                 f"cannot keep the signing times in {self._path}: {error.strerror or error}; check its folder"
@@ -155,6 +162,15 @@ class SigningTime:
                 "keys and remove the file"
             ) from error
         return min(max(used, 0), _LATEST), min(max(accepted, 0), _LATEST)
+
+
+def _sync_folder(path: Path) -> None:
+    """The names in a folder are on the disk afterwards: else a power cut could bring back older times."""
+    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
 
 
 @dataclass(frozen=True, slots=True)
