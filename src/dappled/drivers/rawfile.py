@@ -9,62 +9,28 @@ its values become (R + 2G + B)/4, the mean of a Bayer cell.
 from __future__ import annotations
 
 import io
-import json
-import mmap
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from datetime import datetime
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 import rawpy
-import tifffile
-from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from dappled.drivers import exif, lytro
-from dappled.drivers.exif import Exposure, positive
+from dappled.drivers import exif, rawfile_libraw, rawfile_lytro, rawfile_pictures
+from dappled.drivers.exif import Exposure
+from dappled.drivers.rawfile_frame import RawFile, Source
 from dappled.errors import DappledError
 
-Source = Path | str | bytes | memoryview | mmap.mmap
-Values = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.float64]
+__all__ = ["RawFile", "RawFileError", "Source", "read", "read_metadata"]
 
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_DNG_VERSION, _MAX_SAMPLE = 50706, 281
 
 
 class RawFileError(DappledError):
     """A file can't be read as a frame; one sentence with its name."""
-
-
-@dataclass(frozen=True, slots=True)
-class RawFile:
-    """A frame's values and what its file says about them; unknown is None.
-
-    `mosaic` (H, W), uint8, uint16 or float, the visible part of the sensor, a copy. `black` and `white` in the same
-    units; `black` is one number, or one for each colour index. `cfa` is an int array (a, b) of colour indices that
-    repeats over the mosaic from its pixel (0, 0), or None for a single colour; `colour_names[i]` names index i.
-    `balance` are the file's own white balance gains by colour index, green 1. `taken` is the camera's local time
-    without a zone, ISO 8601. `focal_sigma_mm` is half of what the file rounds its focal length to.
-    """
-
-    mosaic: Values
-    black: float | tuple[float, ...]
-    white: float
-    cfa: NDArray[np.int64] | None
-    colour_names: tuple[str, ...]
-    camera_make: str | None
-    camera_model: str | None
-    focal_length_mm: float | None
-    f_number: float | None
-    exposure_s: float | None
-    iso: float | None
-    taken: str | None
-    balance: tuple[float, ...] | None
-    focal_sigma_mm: float | None = None
 
 
 def read(source: Source, name: str | None = None) -> RawFile:
@@ -77,13 +43,13 @@ def read(source: Source, name: str | None = None) -> RawFile:
         start = file.read(16)
         file.seek(0)
         if start.startswith(b"\x93NUMPY"):
-            return _plain(np.load(file, allow_pickle=False), Exposure())
+            return rawfile_pictures.plain(np.load(file, allow_pickle=False), Exposure())
         if start.startswith((b"\x89PNG", b"\xff\xd8\xff")):
-            return _picture(file)
-        if start.startswith(_TIFF_STARTS) and _is_plain_tiff(file, label):
-            return _tiff(file)
-        frame = _lytro(source, label, file)
-        return _raw(file) if frame is None else _of_lytro(frame)
+            return rawfile_pictures.read_picture(file)
+        if start.startswith(_TIFF_STARTS) and rawfile_pictures.is_plain_tiff(file, label):
+            return rawfile_pictures.read_tiff(file)
+        frame = rawfile_lytro.find(source, label, file)
+        return rawfile_libraw.read(file) if frame is None else rawfile_lytro.frame_of(frame)
 
 
 def read_metadata(source: Source, name: str | None = None) -> Exposure:
@@ -99,203 +65,14 @@ def read_metadata(source: Source, name: str | None = None) -> Exposure:
             Image.open(file)  # refuses what is no picture
             file.seek(0)
             return exif.read(file)
-        if start.startswith(_TIFF_STARTS) and _is_plain_tiff(file, label):
+        if start.startswith(_TIFF_STARTS) and rawfile_pictures.is_plain_tiff(file, label):
             return exif.read(file)
-        frame = _lytro(source, label, file, pixels=False)
-        told = exif.read(file) if frame is None else _exposure_of_lytro(frame)
+        frame = rawfile_lytro.find(source, label, file, pixels=False)
+        told = exif.read(file) if frame is None else rawfile_lytro.exposure_of(frame)
         if told.make is not None:
             return told
         file.seek(0)
-        with rawpy.imread(file) as raw:
-            return _exposure(file, raw)
-
-
-def _lytro(source: Source, label: str, file: BinaryIO, *, pixels: bool = True) -> lytro.Lytro | None:
-    """A Lytro camera's frame, without `pixels` only what it says; None for other files."""
-    start = file.read(len(lytro.START))
-    size = file.seek(0, os.SEEK_END)
-    file.seek(0)
-    if start == lytro.START:
-        return (lytro.read_container if pixels else lytro.read_container_metadata)(file.read())
-    told = _beside(source) or lytro.BARE.get(size) if label.lower().endswith(".raw") else None
-    if told is None:
-        return None
-    return lytro.read_bare(file.read(), told) if pixels else lytro.read_bare_metadata(told)
-
-
-def _beside(source: Source) -> Mapping[str, Any] | None:
-    """The JSON beside a bare .raw file, of the same name and .json or .txt; None without."""
-    if not isinstance(source, Path | str):
-        return None
-    for suffix in (".json", ".JSON", ".txt", ".TXT"):
-        path = Path(source).with_suffix(suffix)
-        if path.is_file():
-            told = json.loads(path.read_bytes())
-            return told if isinstance(told, dict) else None
-    return None
-
-
-def _of_lytro(frame: lytro.Lytro) -> RawFile:
-    return _with(
-        _exposure_of_lytro(frame),
-        frame.mosaic,
-        black=frame.black[0] if len(set(frame.black)) == 1 else frame.black,
-        white=frame.white,
-        cfa=frame.cfa,
-        colour_names=frame.colour_names,
-        balance=frame.balance,
-    )
-
-
-def _exposure_of_lytro(frame: lytro.Lytro) -> Exposure:
-    return Exposure(
-        frame.make, frame.model, frame.focal_length_mm, frame.f_number, frame.exposure_s, frame.iso, frame.taken_utc
-    )
-
-
-def _raw(file: BinaryIO) -> RawFile:
-    with rawpy.imread(file) as raw:
-        if raw.raw_type != rawpy.RawType.Flat:
-            raise ValueError("it holds no mosaic (linear or demosaiced raws have no masked light field to decode)")
-        mosaic = np.array(raw.raw_image_visible)
-        cfa = None if raw.num_colors == 1 or raw.raw_pattern is None else _visible_pattern(raw)
-        count = 1 if cfa is None else int(cfa.max()) + 1
-        blacks = tuple(float(level) for level in raw.black_level_per_channel[:count])
-        names = "W" if cfa is None else raw.color_desc.decode("ascii", "replace")[:count]
-        return _with(
-            _exposure(file, raw),
-            mosaic,
-            black=blacks[0] if len(set(blacks)) == 1 else blacks,
-            white=float(raw.white_level),
-            cfa=cfa,
-            colour_names=tuple(names),
-            balance=None if cfa is None else _balance(raw.camera_whitebalance, names),
-        )
-
-
-def _exposure(file: BinaryIO, raw: Any) -> Exposure:
-    """EXIF first; LibRaw's own reading where EXIF is silent (CRW, ORF variants …)."""
-    file.seek(0)
-    told = exif.read(file)
-    other = raw.other
-    stamp = other.timestamp
-    taken = stamp.isoformat() if isinstance(stamp, datetime) and stamp.year > 1970 else None
-    return replace(
-        told,
-        focal_length_mm=told.focal_length_mm or _short(other.focal_length),
-        f_number=told.f_number or _short(other.aperture),
-        exposure_s=told.exposure_s or _short(other.shutter_speed),
-        iso=told.iso or _short(other.iso_speed),
-        taken=told.taken or taken,
-    )
-
-
-def _short(value: float) -> float | None:
-    """LibRaw's single-precision numbers as the decimal that was meant: 14.8, not 14.800000190734863."""
-    return positive(str(np.float32(value)))
-
-
-def _visible_pattern(raw: Any) -> NDArray[np.int64]:
-    """LibRaw's pattern, which starts at the first masked pixel, as the smallest block that repeats over the mosaic."""
-    pattern = np.asarray(raw.raw_pattern, dtype=np.int64)
-    visible = np.roll(pattern, (-raw.sizes.top_margin, -raw.sizes.left_margin), axis=(0, 1))
-
-    def period(lines: NDArray[np.int64]) -> int:
-        count = len(lines)
-        return next(n for n in range(1, count + 1) if count % n == 0 and np.array_equal(lines, np.roll(lines, n, 0)))
-
-    return visible[: period(visible), : period(visible.T)].copy()
-
-
-def _balance(gains: list[float], names: str) -> tuple[float, ...] | None:
-    """By colour index, green 1; LibRaw gives 0 for a second green that is as the first."""
-    known = [float(gain) for gain in gains[: len(names)]]
-    green = names.find("G")
-    if green < 0 or positive(known[green]) is None:
-        return None
-    filled = [known[green] if name == "G" and gain == 0 else gain for name, gain in zip(names, known, strict=True)]
-    if any(positive(gain) is None for gain in filled):
-        return None
-    return tuple(gain / known[green] for gain in filled)
-
-
-def _picture(file: BinaryIO) -> RawFile:
-    image: Image.Image = Image.open(file)
-    if image.format == "PNG" and image.mode != "I;16" and _png_is_deep_colour(file):
-        raise ValueError("it is a colour PNG of 16 bits, which would lose its lower 8; save it as TIFF or as grey PNG")
-    if image.mode in ("P", "PA", "CMYK", "YCbCr", "LAB", "HSV"):
-        image = image.convert("RGB")
-    elif image.mode in ("1", "LA"):
-        image = image.convert("L")
-    values = np.asarray(image)
-    if values.dtype == np.int32:  # Pillow's mode "I": a 16-bit PNG in some versions
-        values = values.astype(np.uint16)
-    file.seek(0)
-    return _plain(values, exif.read(file))
-
-
-def _png_is_deep_colour(file: BinaryIO) -> bool:
-    place = file.tell()
-    file.seek(24)  # IHDR: bit depth, colour type
-    depth, colour_type = file.read(2)
-    file.seek(place)
-    return depth == 16 and colour_type in (2, 6)
-
-
-def _is_plain_tiff(file: BinaryIO, label: str) -> bool:
-    """Whether tifffile should read it: named a TIFF, and no DNG. Other files that begin as TIFF are camera raws."""
-    if not label.lower().endswith((".tif", ".tiff")):
-        return False
-    try:
-        with tifffile.TiffFile(file) as tiff:
-            if len(tiff.pages) == 0:
-                raise ValueError("it has no pages")
-            return _DNG_VERSION not in tiff.pages.first.tags
-    finally:
-        file.seek(0)
-
-
-def _tiff(file: BinaryIO) -> RawFile:
-    """The first page."""
-    with tifffile.TiffFile(file) as tiff:
-        page = tiff.pages.first
-        values = page.asarray()
-        tag = page.tags.get(_MAX_SAMPLE)
-        limit = positive(None if tag is None else tag.value)
-        if page.planarconfig == 2 and values.ndim == 3:
-            values = np.moveaxis(values, 0, -1)
-    file.seek(0)
-    frame = _plain(values, exif.read(file))
-    return frame if limit is None or values.dtype.kind != "u" else replace(frame, white=limit)
-
-
-def _plain(values: NDArray[Any], exposure: Exposure) -> RawFile:
-    """An array without a mosaic: whole numbers reach to their type's largest, floats to 1."""
-    if values.dtype.kind == "b":
-        values = values.astype(np.uint8) * np.uint8(255)
-    if values.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
-        raise ValueError(f"its values are {values.dtype}; a frame has 8 or 16 bits unsigned, or floats")
-    white = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
-    if values.ndim == 3 and values.shape[2] in (3, 4):
-        values = values[..., :3].astype(np.float32) @ np.array([0.25, 0.5, 0.25], dtype=np.float32)
-    if values.ndim != 2 or 0 in values.shape:
-        raise ValueError(f"its shape is {values.shape}; a frame has rows and columns, and 3 colours at most")
-    return _with(exposure, np.array(values), black=0.0, white=white, cfa=None, colour_names=("W",), balance=None)
-
-
-def _with(exposure: Exposure, mosaic: Values, **known: Any) -> RawFile:
-    return RawFile(
-        mosaic=mosaic,
-        camera_make=exposure.make,
-        camera_model=exposure.model,
-        focal_length_mm=exposure.focal_length_mm,
-        f_number=exposure.f_number,
-        exposure_s=exposure.exposure_s,
-        iso=exposure.iso,
-        taken=exposure.taken,
-        focal_sigma_mm=exposure.focal_sigma_mm,
-        **known,
-    )
+        return rawfile_libraw.read_metadata(file)
 
 
 def _label(source: Source, name: str | None) -> str:
