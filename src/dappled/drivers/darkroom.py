@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -10,60 +9,22 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
-from dappled.decode import plane as planes
 from dappled.decode.calibrated import Calibration
-from dappled.decode.colours import coloured, local_colours
+from dappled.decode.colours import coloured
 from dappled.decode.decoder import Decoder, MaskDecoder
-from dappled.decode.defects import Places, find_defects, mended
-from dappled.decode.developer import Developer, developer
-from dappled.decode.errors import DecodeError
-from dappled.decode.exposure import Exposure
-from dappled.decode.latest import Latest
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
 from dappled.decode.plane import Plane
 from dappled.decode.ranging import RANGING
 from dappled.decode.report import DecodeReport
-from dappled.decode.stagger import spread
-from dappled.decode.transform import Source
 from dappled.drivers import calibration_files, rawfile
+from dappled.drivers.linearising import Lineariser
 from dappled.drivers.rawfile import RawFile
-from dappled.errors import DappledError
+from dappled.drivers.recipe import DarkroomError, Recipe, camera_name, naming, read
 
-_KEPT = 4  # developers: some bodies say another black level with every frame
-
-
-class DarkroomError(DappledError):
-    """A frame or a recipe can't be decoded; one sentence."""
-
-
-@dataclass(frozen=True, slots=True)
-class Recipe:
-    """What decoding needs to know, as a person names it; see the configuration's [camera], [mask] and [decode].
-
-    `camera` a profile, a TOML file or "auto" (by the frame's model); `mask` a profile, a TOML file or "lenslet";
-    `law` "" takes the camera's; the files are "" where there are none.
-    `cfa` (as "BGGR", row by row), `black` and `white_level` are for files that don't say so themselves. `colour` asks
-    for views in red, green and blue; `taper`, 0 to 1, for slices whose bands fall off softly (printed masks).
-    """
-
-    camera: str
-    mask: str
-    law: str = ""
-    calibration: str = ""
-    white: str = ""
-    dark: str = ""
-    workers: int = 1
-    cfa: str = ""
-    black: float | None = None
-    white_level: float | None = None
-    colour: bool = False
-    taper: float = 0.0
+__all__ = ["Darkroom", "DarkroomError", "Development", "Recipe", "camera_name", "known_to"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +53,7 @@ class Darkroom:
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
         self._decoders: dict[tuple[tuple[int, int], str, bool], Decoder] = {}
-        self._dark: NDArray[Any] | None = None
-        self._defects: Places | None = None
-        self._gains: dict[tuple[int, int], Plane] = {}
-        self._balance: NDArray[np.float64] | None = None
-        self._developers: Latest[Developer] = Latest(_KEPT)
-        self._staggered: dict[tuple[tuple[int, int], str], bool] = {}
+        self._lineariser = Lineariser(recipe, self.camera)
 
     def check(self) -> None:
         """Raises DappledError when the recipe names something that isn't there or isn't right."""
@@ -130,10 +86,10 @@ class Darkroom:
         ms: dict[str, float] = {}
         with _timed(ms, "read"):
             raw = self.read(path)
-        with _named(path):
+        with naming(path):
             with _timed(ms, "plane"):
-                exposure, chroma = self._expose(raw, colour=self.recipe.colour and views)
-                plane = self._where_taken(exposure, raw)
+                exposure, chroma = self._lineariser.expose(raw, colour=self.recipe.colour and views)
+                plane = self._lineariser.where_taken(exposure, raw)
             decoder = self.decoder(plane.shape, raw.camera_model or "", colours=raw.cfa is not None)
             if isinstance(decoder, MaskDecoder):
                 decoder = known_to(decoder, None if focal_length_mm else raw.focal_sigma_mm)
@@ -158,67 +114,11 @@ class Darkroom:
 
     def plane(self, raw: RawFile) -> Plane:
         """The linear plane of a frame: black, white, dark frame; for masks also colours evened out, and white frame."""
-        exposure = self._expose(raw, colour=False)[0]
-        source = self._where_taken(exposure, raw)
-        return source.plane(self.recipe.workers) if isinstance(source, Exposure) else source
-
-    def _where_taken(self, exposure: Exposure, raw: RawFile) -> Source:
-        """The plane with each sample where it stands on the chip: a staggered one spread out."""
-        if self.recipe.mask == profiles.LENSLET:
-            return exposure
-        key = exposure.shape, raw.camera_model or ""
-        if key not in self._staggered:
-            self._staggered[key] = self.camera(key[1]).staggered(key[0])
-        return spread(exposure.plane(self.recipe.workers)) if self._staggered[key] else exposure
+        return self._lineariser.plane(raw)
 
     def read(self, path: Path | str) -> RawFile:
         """A frame's file, with what the recipe says about it. Raises DappledError."""
-        return said(rawfile.read(Path(path)), self.recipe)
-
-    def _expose(self, raw: RawFile, *, colour: bool) -> tuple[Exposure, NDArray[np.float32] | None]:
-        """The plane to be, and local colours (3, rows, columns) as shares of it where they are asked for."""
-        raw = said(raw, self.recipe)
-        lenslets = self.recipe.mask == profiles.LENSLET
-        cfa, black = _one_index_a_colour(raw)
-        balance = None if cfa is None or not lenslets else self._white_balance()
-        dark = self._dark_frame()
-        if dark is not None and dark.shape == raw.mosaic.shape:
-            period = (1, 1) if cfa is None else (cfa.shape[0], cfa.shape[1])
-            if self._defects is None:
-                self._defects = find_defects(dark, period)
-                self._dark = dark = mended(dark, self._defects, period)
-            raw = replace(raw, mosaic=mended(raw.mosaic, self._defects, period))
-        workers = self.recipe.workers
-        reference: list[int] = []
-        chroma = None
-        if cfa is not None:
-            names = raw.colour_names
-            # Behind lenslets the grey view is the mean of the colours; a masked frame has most of its detail in green.
-            reference = [names.index("G")] if "G" in names and not lenslets else sorted({int(c) for c in cfa.flat})
-            if colour and all(name in names for name in "RGB"):
-                even = planes.to_plane(
-                    raw.mosaic, black=black, white=raw.white, cfa=cfa, balance=balance, dark=dark, workers=workers
-                )
-                chroma = local_colours(even, cfa, [names.index(name) for name in "RGB"], reference)
-        elif colour:
-            raise DecodeError("the frame has no colour pattern: decode it without --colour, or name it with --cfa")
-        planes.check_shape(raw.mosaic)
-        shape = raw.mosaic.shape[0], raw.mosaic.shape[1]
-        key = shape, None if cfa is None else (cfa.shape, cfa.tobytes()), black, raw.white
-        develop = self._developers.of(
-            key, lambda: developer(shape, black=black, white=raw.white, cfa=cfa, balance=balance, reference=reference)
-        )
-        flat = self._gain(shape) if self.recipe.white and not lenslets else None
-        return develop.expose(raw.mosaic, dark=dark, flat=flat, workers=workers), chroma
-
-    def _white_balance(self) -> NDArray[np.float64] | None:
-        """The gains that make the white frame grey; None without one."""
-        if self.recipe.white and self._balance is None:
-            raw = self.read(self.recipe.white)
-            cfa, black = _one_index_a_colour(raw)
-            if cfa is not None:
-                self._balance = planes.estimate_balance(raw.mosaic, black=black, cfa=cfa)
-        return self._balance
+        return read(path, self.recipe)
 
     def decoder(self, shape: tuple[int, ...], model: str, *, colours: bool = False) -> Decoder:
         """The decoder for frames of this shape from this camera; `colours` where they are colour mosaics."""
@@ -236,7 +136,7 @@ class Darkroom:
 
     def naming(self, path: Path | str) -> AbstractContextManager[None]:
         """Around mathematics on a frame: its errors get the file's name."""
-        return _named(path)
+        return naming(path)
 
     def camera(self, model: str) -> CameraProfile:
         """The camera's profile: the recipe's, or by model."""
@@ -259,7 +159,7 @@ class Darkroom:
             if not recipe.white:
                 return LensletDecoder(shape, workers=recipe.workers, rolloff=rolloff)
             white = self.read(recipe.white)
-            with _named(recipe.white):
+            with naming(recipe.white):
                 return LensletDecoder.with_white(self.plane(white), workers=recipe.workers, rolloff=rolloff)
         camera = self.camera(model)
         known = self._calibration() if recipe.calibration else None
@@ -282,77 +182,10 @@ class Darkroom:
     def _calibration(self) -> Calibration:
         return calibration_files.load(Path(self.recipe.calibration))
 
-    def _dark_frame(self) -> NDArray[Any] | None:
-        if self.recipe.dark and self._dark is None:
-            self._dark = self.read(self.recipe.dark).mosaic
-        return self._dark
-
-    def _gain(self, shape: tuple[int, int]) -> Plane:
-        if shape not in self._gains:
-            raw = self.read(self.recipe.white)
-            with _named(self.recipe.white):
-                cfa, black = _one_index_a_colour(raw)
-                white = planes.to_plane(raw.mosaic, black=black, white=raw.white, cfa=cfa)
-                self._gains[shape] = planes.white_gain(white, cell_px=math.sqrt(white.size) / 32)
-        return self._gains[shape]
-
 
 def known_to(decoder: MaskDecoder, focal_sigma_mm: float | None) -> MaskDecoder:
     """The same decoder for a frame whose focal length is known to this; None: as the decoder has it."""
     return decoder if focal_sigma_mm is None else replace(decoder, focal_sigma_mm=focal_sigma_mm)
-
-
-def _one_index_a_colour(raw: RawFile) -> tuple[NDArray[np.int64] | None, float | tuple[float, ...]]:
-    """The colour pattern and black levels with both greens as one colour, where their black levels agree.
-
-    LibRaw gives a Bayer pattern's second green an index of its own; it is then no longer the commonest colour.
-    """
-    if raw.cfa is None:
-        return None, raw.black
-    levels = raw.black if isinstance(raw.black, tuple) else (raw.black,) * len(raw.colour_names)
-    first = [raw.colour_names.index(name) for name in raw.colour_names]
-    if any(levels[index] != levels[one] for index, one in enumerate(first)):
-        return raw.cfa, raw.black
-    return np.array(first, dtype=np.int64)[raw.cfa], raw.black
-
-
-def said(raw: RawFile, recipe: Recipe) -> RawFile:
-    """What a file says, with what the recipe says instead. Raises DarkroomError for a pattern that is none."""
-    changed: dict[str, Any] = {}
-    if recipe.cfa:
-        side = math.isqrt(len(recipe.cfa))
-        pattern = recipe.cfa.upper()
-        if side < 2 or side * side != len(pattern) or set(pattern) != set("RGB"):
-            raise DarkroomError(
-                f"--cfa {recipe.cfa} is no colour pattern: name its letters R, G, B row by row, as in BGGR"
-            )
-        changed["cfa"] = np.array(["RGB".index(letter) for letter in pattern], dtype=np.int64).reshape(side, side)
-        changed["colour_names"] = ("R", "G", "B")
-        changed["balance"] = None
-        if isinstance(raw.black, tuple):
-            changed["black"] = max(raw.black)
-    if recipe.black is not None:
-        changed["black"] = recipe.black
-    if recipe.white_level is not None:
-        changed["white"] = recipe.white_level
-    return replace(raw, **changed) if changed else raw
-
-
-def camera_name(camera: str, model: str | None) -> str:
-    """What a camera is called: its profile, by name or by model; else the model, or "unknown"."""
-    if camera != "auto":
-        return Path(camera).stem if camera.endswith(".toml") else camera
-    found = profiles.camera_for_model(model or "")
-    return found.name if found else model or "unknown"
-
-
-@contextmanager
-def _named(path: Path | str) -> Iterator[None]:
-    """Errors of the mathematics, with the file's name."""
-    try:
-        yield
-    except DecodeError as error:
-        raise DarkroomError(f"{path}: {error}") from error
 
 
 @contextmanager

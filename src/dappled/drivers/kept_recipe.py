@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from dappled.drivers.darkroom import Recipe
+from dappled.drivers.recipe import Recipe
 
 FOLDER = "inputs"
 FILES = ("calibration", "white", "dark")
