@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from dappled.drivers import exif, folder, fujifilm, matching
+from dappled.drivers import composed, exif, folder, fujifilm, matching
 from dappled.drivers.camera import Arrival, CameraError, Companion, Deferred, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.composed import ComposedCamera, Plan
 from dappled.drivers.pickup import FolderSource, Found, StorageSource
@@ -148,6 +148,41 @@ def test_a_file_that_is_still_written_is_waited_for(tmp_path: Path) -> None:
         assert isinstance(arrival, Arrival)
         assert len(content(arrival)) == 60_000
     finally:
+        camera.stop()
+
+
+def test_nothing_is_fired_before_the_first_look_says_which_files_are_old(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(composed, "_FIRST_LOOK_S", 0.02)
+    (tmp_path / "old.dng").write_bytes(b"old")
+    source = FolderSource(tmp_path)
+    listed, asked, answered = source.list, threading.Event(), threading.Event()
+
+    def slow() -> list[Found]:
+        asked.set()
+        assert answered.wait(20)
+        return listed()
+
+    monkeypatch.setattr(source, "list", slow)
+    camera = ComposedCamera(WHO, OutsideLine(), source, FAST)
+    camera.start()
+    try:
+        assert asked.wait(20)
+        until_state(camera, "starting")
+        assert camera.next_event(0.3) is None
+        camera.fire(1)
+        assert of_shots(until_shot_ends(camera, 1)) == [(ShotFailed, 1)]
+        answered.set()
+        until_state(camera, "ready")
+        camera.fire(2)
+        until(camera, lambda event: isinstance(event, Fired))
+        (tmp_path / "new.dng").write_bytes(b"new")
+        arrival = until(camera, lambda event: isinstance(event, Arrival))[-1]
+        assert isinstance(arrival, Arrival)
+        assert (arrival.shot, content(arrival)) == (2, b"new")
+    finally:
+        answered.set()
         camera.stop()
 
 

@@ -3,25 +3,13 @@
 from __future__ import annotations
 
 import os
-import queue
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dappled.drivers.camera import (
-    Arrival,
-    Blob,
-    Companion,
-    Event,
-    Fired,
-    Identity,
-    Setting,
-    SettingName,
-    ShotFailed,
-    StateChanged,
-    check_change,
-)
+from dappled.drivers.camera import Arrival, Blob, Fired, Identity, ShotFailed, StateChanged
+from dappled.drivers.camera_base import PlainCamera
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +29,7 @@ class Recorded:
     facts: Mapping[str, object] = field(default_factory=dict)
 
 
-class ReplayCamera:
+class ReplayCamera(PlainCamera):
     """A Camera (see `drivers.camera`) that plays recorded shots. Files are only ever opened for reading."""
 
     def __init__(
@@ -51,9 +39,9 @@ class ReplayCamera:
         monotonic_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """`monotonic_ns` stamps what the recording has no stamp for: the recording's own clock, in a replay."""
+        super().__init__()
         self._shots = {recorded.shot: recorded for recorded in shots}
         self._identity, self._now_ns = identity, monotonic_ns
-        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._playing = False
 
     def start(self) -> None:
@@ -85,28 +73,10 @@ class ReplayCamera:
         blob = Blob(fd, os.fstat(fd).st_size)
         self._events.put(Arrival(shot, recorded.camera_name, blob, arrived_ns, recorded.facts))
 
-    def next_event(self, timeout_s: float) -> Event | None:
-        """See Camera."""
-        try:
-            return self._events.get(timeout=timeout_s) if timeout_s > 0 else self._events.get_nowait()
-        except queue.Empty:
-            return None
-
-    def release(self, arrival: Arrival | Companion) -> None:
-        """See Camera: a recording keeps its files."""
-
     @property
     def identity(self) -> Identity:
         """See Camera."""
         return self._identity
-
-    def settings(self) -> tuple[Setting, ...]:
-        """See Camera: what was recorded is what it is."""
-        return ()
-
-    def change(self, name: SettingName, value: str) -> None:
-        """See Camera."""
-        check_change((), name, value)
 
     def stop(self) -> None:
         """See Camera."""
