@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import queue
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from dappled.drivers import usb_bus
+from dappled.drivers import camera_child, usb_bus
 from dappled.drivers.attribution import Claim
 from dappled.drivers.budget import RestartBudget
 from dappled.drivers.camera import (
@@ -35,6 +32,7 @@ from dappled.drivers.camera import (
     StateChanged,
     check_change,
 )
+from dappled.drivers.camera_base import QueuedCamera
 from dappled.drivers.camera_channel import Channel, ChannelError, message_event
 from dappled.drivers.gphoto2_before import LATE, Before
 from dappled.drivers.gphoto2_settings import GPhoto2Settings, parse_settings
@@ -54,31 +52,12 @@ def open_camera(settings: Mapping[str, Any]) -> GPhoto2Camera:
 
 def spawn_process(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
     """Start the camera's process; it dies with the calling thread. Raises OSError."""
-    channel, other = Channel.pair()
-    with other:
-        try:
-            process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-m",
-                    "dappled.drivers.gphoto2_process",
-                    str(other.fileno()),
-                    str(os.getpid()),
-                    json.dumps(settings.to_json()),
-                    json.dumps(before.to_json()),
-                ],
-                pass_fds=(other.fileno(),),
-                stdin=subprocess.DEVNULL,
-                # libgphoto2 keeps settings (capture target, ...) under HOME and would let one run change the next.
-                env={**os.environ, "HOME": "/nonexistent"},
-            )
-        except OSError:
-            channel.close()
-            raise
-    return process, channel
+    return camera_child.spawn(
+        "dappled.drivers.gphoto2_process", json.dumps(settings.to_json()), json.dumps(before.to_json())
+    )
 
 
-class GPhoto2Camera:
+class GPhoto2Camera(QueuedCamera):
     """The driver (`drivers.camera.Camera`). `fire`, `release`, `next_event` and `stop` from any thread."""
 
     def __init__(
@@ -90,12 +69,12 @@ class GPhoto2Camera:
         budget: RestartBudget | None = None,
         reset: Callable[[str], None] = usb_bus.reset,
     ) -> None:
+        super().__init__()
         self._settings = settings
         self._spawn = spawn
         self._clock_ns = clock_ns
         self._reset = reset
         self._budget = budget or RestartBudget(limit=5, window_s=60.0)
-        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._supervise, name="gphoto2", daemon=True)
         self._lock = threading.Lock()  # guards the three below
@@ -128,13 +107,6 @@ class GPhoto2Camera:
             else:
                 reason = "the camera's process is not running"
         self._events.put(ShotFailed(shot, reason, self._clock_ns()))
-
-    def next_event(self, timeout_s: float) -> Event | None:
-        """The next event; also after `stop`, until there are none."""
-        try:
-            return self._events.get(timeout=timeout_s) if timeout_s > 0 else self._events.get_nowait()
-        except queue.Empty:
-            return None
 
     @property
     def identity(self) -> Identity | None:
@@ -199,7 +171,7 @@ class GPhoto2Camera:
             fired = [Claim(shot, fired_ns) for shot, fired_ns in pending.items() if fired_ns is not None]
             self._before = replace(self._before, late=(*self._before.late, *fired)[-LATE:])
             channel.close()
-            _end(process)
+            camera_child.end(process)
             stopped = self._stopping.is_set()
             for shot in pending:
                 self._events.put(ShotFailed(shot, "the camera was stopped" if stopped else reason, self._clock_ns()))
@@ -223,8 +195,7 @@ class GPhoto2Camera:
                     if message.body.get("is") != "pong":
                         self._pass_on(message_event(message))
                 elif now_ns - heard_ns > answer_s * 1e9:
-                    process.kill()
-                    process.wait()
+                    camera_child.end(process, 0.0)
                     done = self._reset_port()
                     return (
                         f"the camera's process did not answer for {answer_s:g} s and was killed{done}; it starts again"
@@ -278,11 +249,3 @@ class GPhoto2Camera:
             self._events.put(StateChanged("faulted", reason, now_ns))
             self._stopping.wait(wait_ns / 1e9)
         self._budget.spend(self._clock_ns())
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(0.2)
-        return
-    process.kill()
-    process.wait()

@@ -7,8 +7,9 @@ from typing import Any
 
 import gphoto2 as gp
 
+from dappled.drivers.gphoto2_errors import translated
 from dappled.drivers.gphoto2_protocol import AbsentError, HeldError, SessionError
-from dappled.drivers.gphoto2_session import GPhoto2Session, let_go, translated
+from dappled.drivers.gphoto2_session import GPhoto2Session, let_go
 from dappled.drivers.gphoto2_settings import CaptureTarget, GPhoto2Settings
 
 _HELD = {gp.GP_ERROR_IO_USB_CLAIM, gp.GP_ERROR_IO_LOCK, gp.GP_ERROR_CAMERA_BUSY, gp.GP_ERROR}

@@ -1,5 +1,5 @@
-"""libgphoto2's face: fire an open body, drain its events, read its files, set it. Only the camera's own process
-imports this; every call may block for as long as libgphoto2 waits for a silent camera (up to 10 s), with the GIL held.
+"""libgphoto2's face: fire an open body, drain its events, read its files. Only the camera's own process imports this;
+every call may block for as long as libgphoto2 waits for a silent camera (up to 10 s), with the GIL held.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ from typing import Any
 
 import gphoto2 as gp
 
+from dappled.drivers import gphoto2_widgets as widgets
 from dappled.drivers.camera import Blob, Identity, Setting, SettingName
+from dappled.drivers.gphoto2_errors import LOST, sentence, translated
 from dappled.drivers.gphoto2_protocol import (
-    BusyError,
     CameraFile,
     CameraNews,
     CaptureComplete,
@@ -30,24 +31,6 @@ _FOLDERS = 256
 """More folders than a card has; a bound for the walk."""
 _DRAIN = 64
 """Events taken at one go, so that a chattering camera can't keep the process from its commands."""
-_LOST = {gp.GP_ERROR_IO, gp.GP_ERROR_TIMEOUT, gp.GP_ERROR_IO_INIT, gp.GP_ERROR_IO_READ, gp.GP_ERROR_IO_WRITE} | {
-    gp.GP_ERROR_IO_USB_CLEAR_HALT,
-    gp.GP_ERROR_IO_USB_FIND,
-    gp.GP_ERROR_IO_USB_CLAIM,
-    gp.GP_ERROR_OS_FAILURE,
-    gp.GP_ERROR_LIBRARY,
-}
-_WIDGETS: dict[SettingName, tuple[str, ...]] = {
-    "focal_length": ("focallength",),
-    "aperture": ("aperture", "f-number"),
-    "shutter_speed": ("shutterspeed", "shutterspeed2"),
-    "iso": ("iso",),
-    "image_format": ("imageformat", "imagequality"),
-    "capture_target": ("capturetarget",),
-    "battery": ("batterylevel",),
-    "free_shots": ("availableshots",),
-}
-"""What libgphoto2 calls each setting; makers differ."""
 
 
 class GPhoto2Session:
@@ -55,17 +38,17 @@ class GPhoto2Session:
 
     def __init__(self, camera: Any, port: str, target: CaptureTarget) -> None:
         self._camera = camera
-        printed = self._text("eosserialnumber")  # what stands on the body; the PTP number is another
-        reported = self._text("serialnumber")
+        printed = widgets.text(camera, "eosserialnumber")  # what stands on the body; the PTP number is another
+        reported = widgets.text(camera, "serialnumber")
         self.serials = {text for text in (printed, reported, reported.lstrip("0")) if text}
         self.identity = Identity(
-            make=self._text("manufacturer"),
-            model=self._text("cameramodel"),
+            make=widgets.text(camera, "manufacturer"),
+            model=widgets.text(camera, "cameramodel"),
             serial=printed or reported,
             port=port,
         )
         self._in_pieces = True
-        self.keeps_files = not (self._set_target(target) and target == "ram")
+        self.keeps_files = not (widgets.set_target(camera, target) and target == "ram")
 
     def trigger(self) -> None:
         """Release the shutter."""
@@ -88,12 +71,12 @@ class GPhoto2Session:
                     news.append(CaptureComplete())
         except gp.GPhoto2Error as error:
             if not news:
-                raise LostError(_sentence(error, "report what happens")) from error
+                raise LostError(sentence(error, "report what happens")) from error
         return news
 
     def fetch(self, file: CameraFile) -> Fetched:
         """A file's bytes; from the card in pieces of 1 MiB straight into a memory file."""
-        fd = os.memfd_create(file.name, os.MFD_CLOEXEC)
+        fd = os.memfd_create("camera file", os.MFD_CLOEXEC)  # a name of the camera's own may be too long for one
         try:
             size, taken_s = self._fill(fd, file)
         except gp.GPhoto2Error as error:
@@ -113,11 +96,13 @@ class GPhoto2Session:
         info = self._camera.file_get_info(file.folder, file.name).file
         announced: int = info.size
         taken_s = _time(info)
+        if not announced:
+            raise RefusedError(f"the camera announced 0 bytes of {file.name}")
         got = self._pieces(fd, file, announced) if self._in_pieces else None
         if got is None:
             self._in_pieces = False
             got = self._whole(fd, file)
-        if got != announced or not got:
+        if got != announced:
             raise RefusedError(f"the camera announced {announced} bytes of {file.name} and sent {got}")
         return got, taken_s
 
@@ -153,8 +138,8 @@ class GPhoto2Session:
         try:
             return _time(self._camera.file_get_info(file.folder, file.name).file)
         except gp.GPhoto2Error as error:
-            if error.code in _LOST:
-                raise LostError(_sentence(error, f"tell of {file.name}")) from error
+            if error.code in LOST:
+                raise LostError(sentence(error, f"tell of {file.name}")) from error
             return None
 
     def about(self, file: CameraFile) -> tuple[int, int | None]:
@@ -182,70 +167,22 @@ class GPhoto2Session:
                 inner = _names(self._camera.folder_list_folders(folder))
                 folders.extend(f"{folder.rstrip('/')}/{name}" for name in inner[: _FOLDERS - len(folders)])
         except gp.GPhoto2Error as error:
-            raise LostError(_sentence(error, "list its card")) from error
+            raise LostError(sentence(error, "list its card")) from error
         return frozenset(file for file in found if not file.in_memory)
 
     def settings(self) -> tuple[Setting, ...]:
         """What can be read of the camera, by the first of its maker's names for each that the body knows."""
-        try:
-            found = [self._setting(name, widgets) for name, widgets in _WIDGETS.items()]
-        except gp.GPhoto2Error as error:
-            raise LostError(_sentence(error, "tell its settings")) from error
-        return tuple(each for each in found if each is not None)
+        return widgets.read(self._camera)
 
     def change(self, name: SettingName, value: str) -> None:
         """Set one of them."""
-        try:
-            widget = self._widget(_WIDGETS[name])
-            if widget is None:
-                raise RefusedError(f"the camera has no setting {name}")
-            widget.set_value(value)
-            self._camera.set_single_config(widget.get_name(), widget)
-        except gp.GPhoto2Error as error:
-            raise translated(error, f"set {name} to {value}") from error
+        widgets.change(self._camera, name, value)
         if name == "capture_target":
             self.keeps_files = "ram" not in value.lower()
-
-    def _setting(self, name: SettingName, widgets: tuple[str, ...]) -> Setting | None:
-        widget = self._widget(widgets)
-        if widget is None:
-            return None
-        settable = widget.get_type() in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU) and not widget.get_readonly()
-        return Setting(name, str(widget.get_value()), tuple(widget.get_choices()) if settable else ())
-
-    def _widget(self, names: tuple[str, ...]) -> Any:
-        """The first of these that the body has; None without any."""
-        for name in names:
-            try:
-                return self._camera.get_single_config(name)
-            except gp.GPhoto2Error as error:
-                if error.code in _LOST:
-                    raise
-        return None
 
     def close(self) -> None:
         """End the session."""
         let_go(self._camera)
-
-    def _text(self, name: str) -> str:
-        widget = self._widget((name,))
-        return "" if widget is None else str(widget.get_value() or "").strip()
-
-    def _set_target(self, target: CaptureTarget) -> bool:
-        """Bodies forget this between sessions. False where the body has no choice."""
-        word = "ram" if target == "ram" else "card"
-        try:
-            widget = self._camera.get_single_config("capturetarget")
-            choice = next((each for each in widget.get_choices() if word in each.lower()), None)
-            if choice is None:
-                return False
-            widget.set_value(choice)
-            self._camera.set_single_config("capturetarget", widget)
-        except gp.GPhoto2Error as error:
-            if error.code in _LOST:
-                raise
-            return False
-        return True
 
 
 def _time(info: Any) -> int | None:
@@ -260,16 +197,3 @@ def let_go(camera: Any) -> None:
     """End a session; never raises."""
     with contextlib.suppress(gp.GPhoto2Error):  # it is being let go; a broken link can't be closed properly
         camera.exit()
-
-
-def _sentence(error: gp.GPhoto2Error, what: str) -> str:
-    return f"the camera could not {what}: {error.string} ({error.code})"
-
-
-def translated(error: gp.GPhoto2Error, what: str) -> SessionError:
-    """libgphoto2's error as one of ours; `what` the camera could not do."""
-    if error.code == gp.GP_ERROR_CAMERA_BUSY:
-        return BusyError(f"the camera is too busy to {what}")
-    if error.code in _LOST:
-        return LostError(_sentence(error, what))
-    return RefusedError(_sentence(error, what))

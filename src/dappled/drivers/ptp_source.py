@@ -12,9 +12,9 @@ import socket
 import subprocess
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
+from dappled.drivers import camera_child
 from dappled.drivers.camera import Blob, CameraError
 from dappled.drivers.camera_channel import Channel, ChannelError, Message
 from dappled.drivers.gphoto2_protocol import CameraFile, Session, SessionError
@@ -22,15 +22,9 @@ from dappled.drivers.gphoto2_settings import GPhoto2Settings
 from dappled.drivers.pickup import SUFFIXES, Found
 
 _ANSWER_S = 60.0
-_START_S = 0.2
+_SEND_S = 5.0
 _REST_S = 0.5
 """A camera that nobody asks anything is let go, so that others may have it."""
-
-
-@dataclass(slots=True)
-class _Child:
-    process: subprocess.Popen[bytes]
-    channel: Channel
 
 
 class PtpSource:
@@ -38,7 +32,7 @@ class PtpSource:
 
     def __init__(self, port: str) -> None:
         self._port = port
-        self._child: _Child | None = None
+        self._child: tuple[subprocess.Popen[bytes], Channel] | None = None
         self._taken_s: dict[str, int | None] = {}
 
     def list(self) -> list[Found]:
@@ -64,17 +58,22 @@ class PtpSource:
         child, self._child = self._child, None
         if child is None:
             return
-        child.channel.close()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            child.process.wait(_START_S)
-        child.process.kill()
-        child.process.wait()
+        process, channel = child
+        channel.close()
+        camera_child.end(process)
 
     def _ask(self, question: Mapping[str, Any]) -> Message:
-        child = self._child = self._child or _begin(self._port)
         try:
-            child.channel.send(question, timeout_s=5.0)
-            answer = child.channel.receive(_ANSWER_S)
+            _, channel = self._child = self._child or camera_child.spawn(
+                "dappled.drivers.ptp_source", self._port, quiet=True
+            )
+        except OSError as error:  # no memory, no descriptors
+            raise CameraError(
+                f"no process can be started for the camera at {self._port}: {error.strerror}; try again"
+            ) from None
+        try:
+            channel.send(question, timeout_s=_SEND_S)
+            answer = channel.receive(_ANSWER_S)
         except ChannelError as error:
             self.close()
             raise CameraError(f"the camera at {self._port} was lost ({error}): connect it again") from None
@@ -84,17 +83,6 @@ class PtpSource:
         if "error" in answer.body:
             raise CameraError(str(answer.body["error"]))
         return answer
-
-
-def _begin(port: str) -> _Child:
-    channel, other = Channel.pair()
-    with other:
-        command = [sys.executable, "-m", "dappled.drivers.ptp_source", str(other.fileno()), str(os.getpid()), port]
-        environment = {**os.environ, "HOME": "/nonexistent"}  # libgphoto2 keeps settings there
-        process = subprocess.Popen(
-            command, pass_fds=(other.fileno(),), stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment
-        )
-    return _Child(process, channel)
 
 
 # --- the process ----------------------------------------------------------------------------------------------------
@@ -148,9 +136,9 @@ def _serve(channel: Channel, files: _Files) -> None:
             continue
         answer = files.answer(question.body)
         if isinstance(answer, str):
-            channel.send({"error": answer}, timeout_s=5.0)
+            channel.send({"error": answer}, timeout_s=_SEND_S)
             continue
-        channel.send({"size": answer.size}, (answer.fd,), timeout_s=5.0)
+        channel.send({"size": answer.size}, (answer.fd,), timeout_s=_SEND_S)
         answer.close()
 
 

@@ -21,7 +21,7 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.drivers.camera_channel import Channel, ChannelError, message_event
-from dappled.drivers.gphoto2_process import CameraLoop
+from dappled.drivers.gphoto2_loop import CameraLoop
 from dappled.drivers.gphoto2_protocol import (
     AbsentError,
     BusyError,
@@ -464,6 +464,14 @@ def test_a_name_used_again_after_deletion_is_a_new_file(ready: Harness) -> None:
         assert content(arrivals(ready.turn())[0]) == data
         ready.channel.send({"do": "delete", "folder": FOLDER, "name": "IMG_0001.CR2"})
         ready.turn()
+
+
+def test_a_body_that_is_gone_when_its_card_is_searched_is_told_as_absent(ready: Harness) -> None:
+    ready.fire(1)
+    ready.turn()
+    ready.camera.errors["open"] = [AbsentError("nothing here")]
+    assert states(ready.turn(10.1, steps=1)) == [("absent", "nothing here")]
+    assert states(ready.turn(1.1)) == [("busy", "")]
 
 
 def test_stop_closes_the_camera(ready: Harness) -> None:
