@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import os
 import sqlite3
-import threading
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import cast
 
 from dappled.flight import layout, wishes
+from dappled.flight.database import Database
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
@@ -50,29 +49,17 @@ class Entry:
     state: ShotState
 
 
-class ImageIndex:
+class ImageIndex(Database):
     """`<flights>/index.sqlite`, open for reading and writing by the one daemon that holds the flights' lock."""
 
     def __init__(self, root: Path) -> None:
         """Open or make the index. Raises FlightError when it is damaged or foreign: see `open_or_rebuild`."""
         self.root = root
-        self.path = root / FILE_NAME
-        self._lock = threading.Lock()
-        try:
-            self._db = sqlite3.connect(self.path, timeout=10.0, isolation_level=None, check_same_thread=False)
-        except sqlite3.Error as error:
-            raise FlightError(f"cannot open the index {self.path}: {error}; check its folder") from error
-        try:
-            with self._speaking():
-                self._identify()
-        except BaseException:
-            self._db.close()
-            raise
+        path = root / FILE_NAME
+        super().__init__(path, f"{path.absolute().as_uri()}?mode=rwc")
 
     def _identify(self) -> None:
-        application = self._db.execute("PRAGMA application_id").fetchone()[0]
-        version = self._db.execute("PRAGMA user_version").fetchone()[0]
-        empty = self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+        empty, application, version = self._identity()
         if not (empty and application == 0) and (application, version) != (_APPLICATION_ID, _VERSION):
             raise FlightError(f"{self.path} is not an index of this dappled; move it away, it is made anew")
         self._db.execute("PRAGMA journal_mode=WAL")
@@ -80,20 +67,15 @@ class ImageIndex:
         if empty:
             self._db.executescript(_SCHEMA)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        with self._lock:
-            self._db.close()
+    def _sentence(self, error: sqlite3.Error) -> FlightError:
+        if getattr(error, "sqlite_errorname", "") == "SQLITE_CANTOPEN":
+            return FlightError(f"cannot open the index {self.path}: {error}; check its folder")
+        return FlightError(f"cannot use the index {self.path}: {error}; move it away, it is made anew")
 
     def add_flight(self, name: str, start_utc_ns: int | None, utc_correction_ns: int | None = 0) -> None:
         """A flight begins, at this UTC. Where that is not known (None), it is told later by calling this again, with
         what must be added to the flight's own stamps."""
-        self._execute(
+        self._rows(
             "INSERT INTO flights (name, start_utc_ns, utc_correction_ns) VALUES (?, ?, ?) ON CONFLICT (name) DO UPDATE "
             "SET start_utc_ns = coalesce(excluded.start_utc_ns, start_utc_ns), "
             "utc_correction_ns = coalesce(excluded.utc_correction_ns, utc_correction_ns)",
@@ -110,30 +92,30 @@ class ImageIndex:
                 f"image {entry.index} is in flight {held.flight} and again in {entry.flight}: the first counts"
             )
         values = (entry.index, entry.flight, entry.frame, entry.state)
-        self._execute("INSERT OR REPLACE INTO images VALUES (?, ?, ?, ?)", *values)
+        self._rows("INSERT OR REPLACE INTO images VALUES (?, ?, ?, ?)", *values)
 
     def lookup(self, index: int) -> Entry | None:
         """Where an image index leads; None when no flight has it."""
-        rows = self._execute("SELECT idx, flight, frame, state FROM images WHERE idx = ?", index)
+        rows = self._rows("SELECT idx, flight, frame, state FROM images WHERE idx = ?", index)
         return None if not rows else Entry(rows[0][0], rows[0][1], rows[0][2], cast(ShotState, rows[0][3]))
 
     def highest(self) -> int | None:
         """The highest image index that is indexed, or that a sealed flight mentions."""
-        rows = self._execute("SELECT max(idx) FROM images UNION ALL SELECT max(highest) FROM flights")
+        rows = self._rows("SELECT max(idx) FROM images UNION ALL SELECT max(highest) FROM flights")
         return max((row[0] for row in rows if row[0] is not None), default=None)
 
     def flights(self) -> dict[str, int | None]:
         """The flights in the order they were flown, with their start in UTC nanoseconds where known."""
-        return dict(self._execute("SELECT name, start_utc_ns FROM flights ORDER BY number"))
+        return dict(self._rows("SELECT name, start_utc_ns FROM flights ORDER BY number"))
 
     def utc_correction_ns(self, name: str) -> int | None:
         """What to add to a flight's stamps to have UTC: 0 where its machine knew; None where nobody did."""
-        rows = self._execute("SELECT utc_correction_ns FROM flights WHERE name = ?", name)
+        rows = self._rows("SELECT utc_correction_ns FROM flights WHERE name = ?", name)
         return rows[0][0] if rows else None
 
     def sealed(self) -> set[str]:
         """Flights that are closed and wholly indexed."""
-        return {row[0] for row in self._execute("SELECT name FROM flights WHERE sealed")}
+        return {row[0] for row in self._rows("SELECT name FROM flights WHERE sealed")}
 
     def take_in(self, folder: FlightFolder, *, seal: bool) -> list[str]:
         """Index all shots of a flight from its ledger; `seal` says that no more will come. Returns problems."""
@@ -151,7 +133,7 @@ class ImageIndex:
                     problems.append(str(error))
         if seal:
             highest = highest_in(folder)
-            self._execute("UPDATE flights SET sealed = 1, highest = ? WHERE name = ?", highest, folder.name)
+            self._rows("UPDATE flights SET sealed = 1, highest = ? WHERE name = ?", highest, folder.name)
         return problems
 
     def next_index(self) -> int:
@@ -161,17 +143,6 @@ class ImageIndex:
         open_flights = [folder for folder in layout.flights(self.root) if folder.name not in sealed]
         known = [self.highest(), *(highest_in(folder) for folder in open_flights)]
         return max((index for index in known if index is not None), default=-1) + 1
-
-    def _execute(self, sql: str, *values: object) -> list[Any]:
-        with self._lock, self._speaking():
-            return self._db.execute(sql, values).fetchall()
-
-    @contextmanager
-    def _speaking(self) -> Iterator[None]:
-        try:
-            yield
-        except sqlite3.Error as error:
-            raise FlightError(f"cannot use the index {self.path}: {error}; move it away, it is made anew") from error
 
 
 def open_or_rebuild(root: Path) -> tuple[ImageIndex, list[str]]:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import sqlite3
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from dappled.flight import ledger_schema
+from dappled.flight.database import Database
 from dappled.flight.entries import Event, Result, ShotRow, Stray
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger_schema import APPLICATION_ID, SCHEMA_VERSION
@@ -28,21 +27,13 @@ _REASONS = {
 }
 
 
-class LedgerReader:
+class LedgerReader(Database):
     """Everything that a ledger says, as records. One connection, behind a lock: threads may share it."""
 
     def __init__(self, path: Path, *, uri: str, create: bool = False) -> None:
-        self.path = path
-        self._lock = threading.RLock()
-        try:
-            self._db = sqlite3.connect(uri, uri=True, timeout=10.0, isolation_level=None, check_same_thread=False)
-        except sqlite3.Error as error:
-            raise self._sentence(error) from error
-        try:
-            self._identify(create)
-        except BaseException:
-            self._db.close()
-            raise
+        """Open a ledger; `create`: an empty file will do. Raises FlightError."""
+        self._create = create
+        super().__init__(path, uri)
 
     @classmethod
     def open(cls, path: Path) -> Self:
@@ -60,17 +51,6 @@ class LedgerReader:
             reader = cls(path, uri=f"{path.absolute().as_uri()}?mode=ro&immutable=1")
         reader._rows("PRAGMA query_only=ON")
         return reader
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the connection; the last one to close folds the WAL into the file."""
-        with self._lock:
-            self._db.close()
 
     def shots(self) -> list[ShotRow]:
         """All shots, by index."""
@@ -184,17 +164,6 @@ class LedgerReader:
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise FlightError(f"a record in the ledger {self.path} can't be read: {error}") from error
 
-    def _rows(self, sql: str, *values: object) -> list[Any]:
-        with self._lock, self._speaking():
-            return self._db.execute(sql, values).fetchall()
-
-    @contextmanager
-    def _speaking(self) -> Iterator[None]:
-        try:
-            yield
-        except sqlite3.Error as error:
-            raise self._sentence(error) from error
-
     def _sentence(self, error: sqlite3.Error) -> FlightError:
         code = getattr(error, "sqlite_errorname", "") or ""
         if isinstance(error, sqlite3.ProgrammingError):
@@ -206,12 +175,9 @@ class LedgerReader:
                 return FlightError(f"cannot use the ledger {self.path}: {why}")
         return FlightError(f"cannot use the ledger {self.path}: {error}; check the disk and the file")
 
-    def _identify(self, create: bool) -> None:
-        with self._speaking():
-            empty = self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
-            application = self._db.execute("PRAGMA application_id").fetchone()[0]
-            version = self._db.execute("PRAGMA user_version").fetchone()[0]
-        if empty and create and application == 0:
+    def _identify(self) -> None:
+        empty, application, version = self._identity()
+        if empty and self._create and application == 0:
             return
         if application != APPLICATION_ID:
             raise FlightError(f"{self.path} is not a dappled ledger; give a flight folder that dappled recorded")
