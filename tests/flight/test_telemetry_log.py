@@ -127,6 +127,42 @@ def test_a_full_disk_uses_up_no_number(tmp_path: Path, monkeypatch: pytest.Monke
     assert telemetry_log.summarise(log.path) == summary
 
 
+def test_a_torn_record_that_can_not_be_cut_at_once_is_cut_before_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = os.write
+
+    def short(fd: int, data: bytes) -> int:
+        return write(fd, data[:5])
+
+    def refuse(_fd: int, _size: int) -> None:
+        raise OSError(errno.EIO, "io")
+
+    log = TelemetryLog(tmp_path / "telemetry.tlog")
+    log.append(1, mavlink_1(b"a"))
+    monkeypatch.setattr(os, "write", short)
+    monkeypatch.setattr(os, "ftruncate", refuse)
+    for _ in range(2):
+        with pytest.raises(FlightError, match="input/output error"):
+            log.append(2, mavlink_1(b"b"))
+    monkeypatch.undo()
+    assert log.append(3, mavlink_1(b"c")) == 1
+    summary = log.close()
+    assert [stamp for _, stamp, _ in telemetry_log.read(log.path)] == [1, 3]
+    assert telemetry_log.summarise(log.path) == summary
+
+
+def test_what_is_logged_after_the_end_gets_into_no_other_file(tmp_path: Path) -> None:
+    log = TelemetryLog(tmp_path / "telemetry.tlog")
+    log.append(1, mavlink_1(b"a"))
+    summary = log.close()
+    told = r"cannot log telemetry in .*: the flight is closed"
+    with (tmp_path / "other").open("wb"), pytest.raises(FlightError, match=told):  # it is given the log's descriptor
+        log.append(2, mavlink_1(b"b"))
+    assert (tmp_path / "other").read_bytes() == b""
+    assert log.close() == telemetry_log.summarise(log.path) == summary
+
+
 def test_faults_of_the_file_are_told(tmp_path: Path) -> None:
     log = TelemetryLog(tmp_path / "telemetry.tlog")
     log.close()

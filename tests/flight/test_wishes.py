@@ -134,6 +134,16 @@ def test_a_note_that_the_disk_refuses_raises(tmp_path: Path, monkeypatch: pytest
     assert wishes.read(tmp_path / "shots.jsonl").shots == (shot(4),)
 
 
+def test_what_is_noted_after_the_end_gets_into_no_other_file(tmp_path: Path) -> None:
+    journal = wishes.WishJournal(tmp_path / "shots.jsonl")
+    journal.close()
+    journal.close()
+    told = r"cannot note shot 3 in .*shots\.jsonl: the flight is closed"
+    with (tmp_path / "other").open("wb"), pytest.raises(FlightError, match=told):  # it is given the same descriptor
+        journal.note(shot(3))
+    assert (tmp_path / "other").read_bytes() == (tmp_path / "shots.jsonl").read_bytes() == b""
+
+
 def test_a_flush_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_: int) -> None:
         raise OSError(errno.EIO, "io")

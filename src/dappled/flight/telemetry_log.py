@@ -14,11 +14,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled.flight.appended import AppendedFile
 from dappled.flight.errors import FlightError, disk_error
-from dappled.flight.flusher import Flusher
 
 _MAVLINK_1, _MAVLINK_2 = 0xFE, 0xFD
 _SIGNED = 0x01
+_LOGGING = "log telemetry in"
 _LATEST_US = 1 << 53  # stamps beyond (year 2255) are damage
 _Bytes = bytes | mmap.mmap | memoryview
 
@@ -53,47 +54,49 @@ class TelemetryLog:
         self._lock = threading.Lock()
         self._sha = hashlib.sha256()
         self._packets = self._size = 0
-        try:
-            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o644)
-        except OSError as error:
-            raise disk_error("make the telemetry log", path, error) from error
-        self._flusher = Flusher(self._fd, flush_interval_s)
+        self._torn = False  # the last write ended within a record
+        self._file = AppendedFile(path, "the telemetry log", flush_interval_s, new=True)
 
     def append(self, stamp_us: int, raw: bytes) -> int:
         """Log one packet; returns its running number, from 0. On disk within a second.
 
-        Raises FlightError when the disk doesn't take it (no number is used up), ValueError when `raw` is not exactly
-        one MAVLink packet.
+        Raises FlightError when the disk doesn't take it (no number is used up) or the log is closed, ValueError when
+        `raw` is not exactly one MAVLink packet.
         """
         if packet_length(raw) != len(raw):
             raise ValueError(f"{len(raw)} bytes that are not one MAVLink packet can't be logged")
         record = stamp_us.to_bytes(8, "big") + raw
         with self._lock:
-            try:
-                written = os.write(self._fd, record)
-                if written != len(record):
-                    os.ftruncate(self._fd, self._size)
-                    raise FlightError(f"cannot log telemetry in {self.path}: the disk is full; free some space")
-            except OSError as error:
-                raise disk_error("log telemetry in", self.path, error) from error
+            if self._torn:
+                self._cut()
+            written = self._file.append(record, _LOGGING)
+            if written != len(record):
+                self._torn = True
+                self._cut()
+                raise FlightError(f"cannot {_LOGGING} {self.path}: the disk is full; free some space")
             self._sha.update(record)
             self._size += written
             number = self._packets
             self._packets += 1
-        self._flusher.poke()
         return number
 
     @property
     def problem(self) -> str | None:
         """Why logged packets may not survive a power cut, if so."""
-        error = self._flusher.error
-        return None if error is None else str(disk_error("flush the telemetry log", self.path, error))
+        return self._file.problem
 
     def close(self) -> Summary:
         """Flush and close; says what the file now is."""
-        self._flusher.close()
-        os.close(self._fd)
+        with self._lock:
+            first = self._file.shut()
+        if first:
+            self._file.close()
         return Summary(self._packets, self._size, self._sha.hexdigest())
+
+    def _cut(self) -> None:
+        """Take away what there is of a record that was not taken whole; tried again before the next one."""
+        self._file.cut(self._size, _LOGGING)
+        self._torn = False
 
 
 def read(path: Path, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, int, bytes]]:

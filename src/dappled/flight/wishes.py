@@ -7,14 +7,13 @@ the disk within a second, which a power cut can't undo. Firing never waits for a
 from __future__ import annotations
 
 import json
-import os
 import threading
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from dappled.flight.appended import AppendedFile
 from dappled.flight.errors import FlightError, disk_error
-from dappled.flight.flusher import Flusher
 from dappled.flight.records import Cause, Shot, canonical
 
 
@@ -22,46 +21,38 @@ class WishJournal:
     """The open journal of one flight; owns its descriptor and its flusher. `note` may be called by any thread."""
 
     def __init__(self, path: Path, flush_interval_s: float = 0.5) -> None:
-        """Open or make the journal. A torn last line of an earlier life is closed off. Raises FlightError."""
+        """Open or make the journal. A torn last line of an earlier life is closed off before the next. Raises
+        FlightError."""
         self.path = path
-        try:
-            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
-            size = os.fstat(self._fd).st_size
-            if size and os.pread(self._fd, 1, size - 1) != b"\n":
-                os.write(self._fd, b"\n")
-        except OSError as error:
-            raise disk_error("open the wish journal", path, error) from error
+        self._file = AppendedFile(path, "the wish journal", flush_interval_s, new=False)
         self._lock = threading.Lock()
-        self._torn = False  # the last write ended within a line
-        self._flusher = Flusher(self._fd, flush_interval_s)
+        self._torn = self._file.last not in (b"", b"\n")  # the last write ended within a line
 
     def note(self, shot: Shot) -> None:
-        """Append one wish. Raises FlightError when it could not be written whole: then don't fire."""
+        """Append one wish. Raises FlightError when it could not be written whole, or the journal is closed: then don't
+        fire."""
         line = canonical(asdict(shot)) + b"\n"
         with self._lock:
             line = b"\n" + line if self._torn else line
-            try:
-                written = os.write(self._fd, line)
-            except OSError as error:
-                raise disk_error(f"note shot {shot.index} in", self.path, error) from error
+            written = self._file.append(line, f"note shot {shot.index} in")
             self._torn = written != len(line)
         if written != len(line):
             raise FlightError(
                 f"cannot note shot {shot.index} in {self.path}: the disk took {written} of {len(line)} bytes; "
                 "free some space"
             )
-        self._flusher.poke()
 
     @property
     def problem(self) -> str | None:
         """Why noted wishes may not survive a power cut, if so."""
-        error = self._flusher.error
-        return None if error is None else str(disk_error("flush the wish journal", self.path, error))
+        return self._file.problem
 
     def close(self) -> None:
         """Flush and close."""
-        self._flusher.close()
-        os.close(self._fd)
+        with self._lock:
+            first = self._file.shut()
+        if first:
+            self._file.close()
 
 
 @dataclass(frozen=True, slots=True)
