@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import dappled.cli
-from dappled.cli import VERBS, main
+from dappled.cli import VERBS, main, parser
 
 
 @pytest.mark.parametrize("verb", sorted(VERBS))
@@ -17,6 +17,33 @@ def test_every_verb_has_help_with_an_example(verb: str, capsys: pytest.CaptureFi
         main([verb, "--help"])
     assert ended.value.code == 0
     assert "example" in capsys.readouterr().out
+
+
+ACTIONS = [
+    *(("config", name) for name in ("check", "show")),
+    *(("flight", name) for name in ("list", "show", "check", "report", "offload", "pickup")),
+    *(("keys", name) for name in ("make", "show", "token")),
+    *(("mask", name) for name in ("make", "table", "diffraction", "design", "plan")),
+    ("mavlink", "key"),
+]
+
+
+@pytest.mark.parametrize(("verb", "name"), ACTIONS)
+def test_every_action_has_help_with_an_example_of_itself(
+    verb: str, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([verb, name, "--help"])
+    assert ended.value.code == 0
+    assert f"  dappled {verb} {name}" in capsys.readouterr().out.partition("example")[2]
+
+
+def test_no_action_was_left_out() -> None:
+    found = []
+    for verb in VERBS:
+        for part in parser(verb)._subparsers._group_actions[0].choices[verb]._actions:  # type: ignore[union-attr,index]  # argparse has no face for it
+            found += [(verb, name) for name in part.choices or ()] if part.dest == "action" else []
+    assert sorted(found) == sorted(ACTIONS)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Collection
 from dataclasses import dataclass
 
 
@@ -16,6 +17,11 @@ class Actions:
     def of(cls, parser: argparse.ArgumentParser) -> Actions:
         """A verb's actions: none yet."""
         return cls(parser.add_subparsers(dest="action", required=True, metavar="ACTION"))
+
+    @property
+    def all(self) -> Collection[argparse.ArgumentParser]:
+        """Their parsers, for what all of them take."""
+        return self.among.choices.values()
 
     def add(self, name: str, line: str, *examples: str) -> argparse.ArgumentParser:
         """The parser of an action that `line` explains, and calls of it that work."""

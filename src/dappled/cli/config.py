@@ -8,6 +8,7 @@ from pathlib import Path
 
 import tomli_w
 
+from dappled.cli.actions import Actions
 from dappled.config import profiles, settings
 
 
@@ -17,12 +18,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         parser.epilog = "example: dappled profiles"
         parser.set_defaults(action="profiles")
         return
-    parser.epilog = "example: dappled config check /etc/dappled.toml"
-    actions = parser.add_subparsers(dest="action", required=True)
-    check = actions.add_parser("check", help="is this file right?")
-    check.add_argument("file", type=Path)
-    show = actions.add_parser("show", help="every setting with its value, unit and meaning")
-    show.add_argument("file", type=Path, nargs="?")
+    parser.epilog = "example: dappled config check /etc/dappled/dappled.toml"
+    actions = Actions.of(parser)
+    check = actions.add("check", "is this file right?", "dappled config check /etc/dappled/dappled.toml")
+    check.add_argument("file", type=Path, metavar="FILE", help="settings")
+    show = actions.add("show", "every setting with its value, unit and meaning", "dappled config show > dappled.toml")
+    show.add_argument("file", type=Path, nargs="?", metavar="FILE", help="settings (default: every default)")
     show.add_argument("--json", action="store_true", help="as JSON")
 
 

@@ -15,15 +15,13 @@ from dappled.drivers.pickup import parse_source
 from dappled.drivers.ptp_source import PtpSource
 
 HELP = "bring the files that stayed at the camera; exits 1 while shots lack theirs"
+EXAMPLES = (
+    "dappled flight pickup --from /media/card/DCIM --dry-run",
+    "dappled flight pickup ~/flights/20261121T101503Z-0a1b2c3d --from usb: --pair 17=DSCF0042.RAF",
+)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "examples:\n  dappled flight pickup --from /media/card/DCIM --dry-run\n"
-        "  dappled flight pickup ~/flights/20261121T101503Z-0a1b2c3d --from usb: --pair 17=DSCF0042.RAF"
-    )
-    parser.formatter_class = argparse.RawTextHelpFormatter
-    parser.add_argument("flight", nargs="?", type=Path, help="flight folder (default: the last one)")
     parser.add_argument(
         "--from", dest="source", required=True, metavar="SOURCE", help="folder, storage, usb: or a libgphoto2 port"
     )

@@ -7,6 +7,7 @@ import json
 import secrets
 from pathlib import Path
 
+from dappled.cli.actions import Actions
 from dappled.daemon import curve
 
 HOME = Path("~/.config/dappled/keys")
@@ -19,20 +20,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  laptop$  dappled keys make laptop        # carry laptop.key to the vehicle's folder of clients\n"
         "  laptop$  dappled watch tcp://10.0.0.7:5555 --keys laptop.key_secret --server-key vehicle.key"
     )
-    verbs = parser.add_subparsers(dest="what", metavar="WHAT", required=True)
-    make = verbs.add_parser("make", help="a pair: NAME.key to give away, NAME.key_secret to keep")
+    actions = Actions.of(parser)
+    make = actions.add("make", "a pair: NAME.key to give away, NAME.key_secret to keep", "dappled keys make laptop")
     make.add_argument("name", metavar="NAME", help="whose it is: letters, digits, dot, dash, underscore")
     make.add_argument("-o", "--folder", type=Path, default=HOME, help=f"where to (default {HOME})")
-    show = verbs.add_parser("show", help="the public key in a file")
+    show = actions.add("show", "the public key in a file", "dappled keys show laptop.key")
     show.add_argument("file", type=Path, metavar="FILE", help="NAME.key or NAME.key_secret")
-    token = verbs.add_parser("token", help="a token for the console")
+    token = actions.add("token", "a token for the console", "dappled keys token /etc/dappled/console.token")
     token.add_argument("file", type=Path, metavar="FILE", help="where to; must not exist yet")
-    for one in (make, show, token):
+    for one in actions.all:
         one.add_argument("--json", action="store_true", help="as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    match arguments.what:
+    match arguments.action:
         case "make":
             public, secret = curve.make(arguments.folder.expanduser(), arguments.name)
             facts = {"public": str(public), "secret": str(secret)}

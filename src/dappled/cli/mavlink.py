@@ -7,15 +7,18 @@ import getpass
 import sys
 from pathlib import Path
 
+from dappled.cli.actions import Actions
 from dappled.drivers.mavlink_signing import SigningError, make_key
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "examples:\n  dappled mavlink key radio.key\n  dappled mavlink key radio.key --passphrase"
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    key = actions.add_parser("key", help="make a key file for a signed link (see mavlink.keys)")
-    key.epilog = "example: dappled mavlink key /etc/dappled/radio.key --passphrase"
-    key.add_argument("file", type=Path, help="where to write it; never overwritten")
+    key = Actions.of(parser).add(
+        "key",
+        "make a key file for a signed link (see mavlink.keys)",
+        "dappled mavlink key /etc/dappled/radio.key --passphrase",
+    )
+    key.add_argument("file", type=Path, metavar="FILE", help="where to write it; never overwritten")
     key.add_argument(
         "--passphrase",
         action="store_true",

@@ -1,0 +1,132 @@
+"""`dappled flight`: what is said of recorded flights, and the exit codes."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from dappled.cli import main
+from dappled.flight import recording
+from dappled.flight.entries import Result
+from dappled.flight.recording import Recording
+from tests.flight.makers import deliver, flip, tag, wish
+
+START_UTC_NS = 1_795_256_103_000_000_000  # 2026-11-21T10:15:03Z
+
+
+def fly(flights: Path) -> Recording:
+    """Shot 0 safe, tagged and decoded, shot 1 failed."""
+    begun = recording.begin(flights, lambda: START_UTC_NS, {"camera": {"driver": "none"}})
+    for index in range(2):
+        wish(begun, index)
+    begun.ledger.add_tag(tag(deliver(begun, 0, bytes(2_000_000))))
+    begun.ledger.add_result(Result(0, "ab", 12, 13, "geometric", "predicted"))
+    begun.ledger.failed(1, "no file came")
+    return begun
+
+
+@pytest.fixture
+def flights(tmp_path: Path) -> Path:
+    return tmp_path / "flights"
+
+
+@pytest.fixture
+def closed(flights: Path) -> Path:
+    begun = fly(flights)
+    begun.close()
+    return begun.folder.path
+
+
+def lines(words: list[str], capsys: pytest.CaptureFixture[str], code: int = 0) -> list[str]:
+    assert main(["flight", *words]) == code
+    return capsys.readouterr().out.splitlines()
+
+
+def test_a_list_has_a_line_for_each_flight_good_or_bad(
+    closed: Path, flights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    still = fly(flights)
+    bad = flights / "20261121T090000Z-00000000"
+    bad.mkdir()
+    (bad / "flight.sqlite").write_text("no ledger")
+    said = {line.split()[0]: line for line in lines(["list", str(flights)], capsys)}
+    still.close()
+    assert said[closed.name].endswith("2026-11-21 10:15  1 frames, 1 failed, 2.0 MB")
+    assert said[still.folder.name].endswith("(open)")
+    assert "ledger" in said[bad.name]
+
+
+def test_the_folder_and_the_last_flight_come_from_the_settings(
+    closed: Path, flights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "dappled.toml"
+    config.write_text(f'[record]\ndirectory = "{flights}"\n')
+    assert closed.name in lines(["list", "--config", str(config)], capsys)[0]
+    assert lines(["show", "--config", str(config)], capsys)[0] == closed.name
+
+
+def test_no_flight_yet_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["flight", "list", str(tmp_path)]) == 0
+    assert f"no flights in {tmp_path}" in capsys.readouterr().err
+    config = tmp_path / "dappled.toml"
+    config.write_text(f'[record]\ndirectory = "{tmp_path}"\n')
+    assert main(["flight", "show", "--config", str(config)]) == 1
+    assert f"there is no flight in {tmp_path} yet" in capsys.readouterr().err
+
+
+def test_every_shot_is_shown_with_what_became_of_it(closed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name, first, second = lines(["show", str(closed)], capsys)
+    assert name == closed.name
+    assert first.split() == [
+        *("0", "00:00:00.000", "mavlink:255/190", "safe", "frames/000000.cr2", "2.0", "MB"),
+        *("41.6311134", "-91.5414669", "215.1", "m", "12/13", "carriers"),
+    ]
+    assert second.endswith("failed  no file came")
+    assert main(["flight", "show", str(closed), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [line["row"]["state"] for line in told["lines"]] == ["safe", "failed"]
+
+
+def test_check_ends_with_the_verdict(closed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert lines(["check", str(closed)], capsys)[-1].startswith(f"{closed.name}: intact: 1 files, 2.0 MB")
+    flip(closed / "frames" / "000000.cr2", 1000)
+    said = lines(["check", str(closed)], capsys, code=1)
+    assert said[0].startswith("wrong: ")
+    assert "000000.cr2" in said[0]
+    assert "NOT INTACT" in said[-1]
+    assert main(["flight", "check", str(closed), "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["intact"] is False
+
+
+def test_report_adds_up(closed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = lines(["report", str(closed)], capsys)
+    assert said[0] == closed.name
+    assert said[-3].split() == ["2", "shots:", "1", "safe,", "1", "failed,", "0", "open"]
+    assert said[-2].split() == ["1", "frames,", "2.0", "MB:", "1", "tagged,", "1", "decoded"]
+    assert said[-1] == "the books balance"
+    assert main(["flight", "report", str(closed), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["balanced"] is True
+    assert told["sources"][0]["shots"] == 2
+
+
+def test_books_that_do_not_balance_are_a_failure(closed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with closing(sqlite3.connect(closed / "flight.sqlite")) as ledger:
+        ledger.execute("DELETE FROM frames")
+        ledger.commit()
+    said = lines(["report", str(closed)], capsys, code=1)
+    assert said[-1].startswith("THE BOOKS DO NOT BALANCE")
+
+
+def test_offload_says_what_it_did(closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    disk = tmp_path / "disk"
+    said = lines(["offload", str(disk), str(closed)], capsys)
+    count = sum(path.is_file() for path in disk.rglob("*"))
+    assert said == [f"{disk / closed.name}: {count} files copied and verified, 0 were there already"]
+    assert main(["flight", "offload", str(disk), str(closed), "--prune", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["copied"], told["pruned"]) == (0, 1)
