@@ -35,10 +35,7 @@ def record(
     stage: Stage[int] = Stage("decode", lambda _: None, capacity=1)
     for number in range(more.pop("items", 0)):
         stage.put(number)
-    dead = more.pop("dead", [])
-    street = SimpleNamespace(
-        camera_state=state, camera_reason=more.pop("reason", ""), stages=(stage,), dead=lambda: dead
-    )
+    street = SimpleNamespace(camera_state=state, camera_reason=more.pop("reason", ""), stages=(stage,))
     return health.record(
         settings,
         utc_ns=1,
@@ -51,7 +48,7 @@ def record(
         publisher=PublisherStatistics({}, {}, 0, 0, 0),
         folder=folder,
         utc_known=more.pop("utc_known", True),
-        dead=more.pop("dead_links", ()),
+        dead=more.pop("dead", ()),
         doubts=more.pop("doubts", ()),
     )
 
@@ -81,7 +78,7 @@ def test_well(tmp_path: Path) -> None:
         ({"doubts": ["autopilot 7 is heard"]}, "autopilot 7 is heard"),
         ({"utc_known": False}, "UTC is not known yet"),
         ({"settings": replace(WELL, record=RecordSettings(warn_free_mb=10_000_000))}, "the disk is filling up"),
-        ({"dead_links": ["mavlink 0"]}, "the mavlink 0 thread has ended: restart dappled"),
+        ({"dead": ["mavlink 0"]}, "the mavlink 0 thread has ended: restart dappled"),
         ({"dead": ["capture"]}, "the capture thread has ended: restart dappled"),
         ({"items": 3}, "decode fell behind: 2 frames are only in the record"),
     ],

@@ -66,7 +66,7 @@ def killed(settings: Settings, tmp_path: Path) -> Path:
             return bool(until)
 
         try:
-            eventually(lambda: heard(service._component and service._component.vehicle), "whose camera this is")
+            eventually(lambda: heard(service._parts.component.vehicle), "whose camera this is")
             eventually(lambda: heard(service.health()["vehicle"]), "a position")
             service.wish(Wish("test", "console", 1))
             eventually(lambda: heard(stories), "the first shot's end")

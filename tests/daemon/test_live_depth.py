@@ -29,6 +29,10 @@ class FakeMaker:
         self.problem = ""
         self.nearest_m: tuple[float, float] | None = None
         self.asked: list[tuple[str, str]] = []
+        self.closed = False
+
+    def close(self) -> None:
+        self.closed = True
 
     def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> DepthFound:
         self.asked.append((path, method))

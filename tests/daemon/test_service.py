@@ -11,6 +11,7 @@ import pytest
 
 from dappled.config import settings as configuration
 from dappled.config.settings import MaskSettings, PoseSettings, PublishSettings, RecordSettings, Settings
+from dappled.daemon import flight_parts
 from dappled.daemon import service as module
 from dappled.daemon.service import Service
 from dappled.daemon.shutter import Wish
@@ -68,7 +69,7 @@ def test_a_wish_goes_to_the_end_and_can_be_looked_up_in_the_next_flight(camera: 
     assert check.check(service.folder).intact
     assert camera.stopped
     after = started(settings, stories)
-    found = after._lookup(0)
+    found = after._parts._lookup(0)
     assert found is not None
     assert (found.ok, found.url) == (True, "frames/000000.dng")
     assert after.wish(Wish("test", "console", 1)).index == 1
@@ -83,8 +84,8 @@ def test_an_old_flight_that_was_moved_away_is_unknown(camera: FakeCamera, settin
     first.stop()
     second = started(settings, stories)
     first.folder.rename(first.folder.parent.parent / "moved")
-    assert second._lookup(0) is None
-    assert second._lookup(99) is None
+    assert second._parts._lookup(0) is None
+    assert second._parts._lookup(99) is None
     second.stop()
 
 
@@ -111,7 +112,7 @@ def test_a_start_that_fails_late_leaves_nothing(
         raise DappledError("not today")
 
     with monkeypatch.context() as broken:
-        broken.setattr(module, "Component", refuse)
+        broken.setattr(flight_parts, "Component", refuse)
         service = Service(settings)
         with pytest.raises(DappledError, match="not today"):
             service.start()
@@ -132,7 +133,7 @@ def test_a_believed_clock_that_the_satellites_contradict_is_a_problem(camera: Fa
     service = started(replace(settings, record=replace(settings.record, utc="system")), [])
     try:
         assert "clock" not in "".join(service.health()["problems"])
-        service._utc.look(UtcCorrection(-3600 * 10**9, 10**7, "SYSTEM_TIME"))
+        service._parts.navigation.utc.look(UtcCorrection(-3600 * 10**9, 10**7, "SYSTEM_TIME"))
         assert "this machine's clock is 3600 s fast" in "".join(service.health()["problems"])
     finally:
         service.stop()
@@ -147,13 +148,12 @@ def test_a_lens_that_was_zoomed_between_two_frames_is_told(
         service.wish(Wish("test", "console", 1))
         eventually(lambda: stories, "the shot's end")
         (story,) = stories
-        component, said = service._component, list[str]()
-        assert component is not None
+        component, said = service._parts.component, list[str]()
         assert story.tag is not None
         monkeypatch.setattr(component, "say", lambda text, *_: said.append(text))
         for length_mm in (35.0, None, 35.0, 55.0):
             story.tag = replace(story.tag, focal_length_mm=length_mm)
-            service._story_tagged(story)
+            service._parts.herald._tagged(story)
         assert said == ["image 0 was zoomed from 35 to 55 mm: is it calibrated?"]
     finally:
         service.stop()
@@ -175,8 +175,7 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
     service = Service(settings, watchers=Watchers(finished=stories.append), after=after)
     service.start()
     eventually(lambda: service.health()["camera"]["state"] == "ready", "the camera is ready")
-    assert service._component is not None
-    knobs = service._component._parameters._knobs
+    knobs = service._parts.component._parameters._knobs
     camera.script = lambda _: []
     assert service.wish(Wish("test", "console", 1)).index == 0
     with pytest.raises(CameraError, match="1 shots are under way"):
@@ -185,15 +184,15 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
         assert not isinstance(event, Exception)
         camera.say(event)
     eventually(lambda: stories, "the shot's end")
-    service._shutter.start_interval(Wish("test", "console", 2), 3600, 0)
+    service._parts.shutter.start_interval(Wish("test", "console", 2), 3600, 0)
     camera.script = good
     with pytest.raises(CameraError, match="stop the interval first"):
         knobs.turn("LF_MASK", "mask-3")
-    service._shutter.stop_interval()
+    service._parts.shutter.stop_interval()
     for event in good(1):
         assert not isinstance(event, Exception)
         camera.say(event)
-    eventually(lambda: service._shutter.statistics().pending == 0, "the interval's shot's end")
+    eventually(lambda: service._parts.shutter.statistics().pending == 0, "the interval's shot's end")
     assert knobs.turn("LF_MASK", "mask-3")
     assert "next flight begins" in str(service.wish(Wish("test", "console", 3)).reason)
     service.run()  # ends by itself

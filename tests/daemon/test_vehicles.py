@@ -148,7 +148,7 @@ def test_the_daemon_tags_with_the_place_of_its_own_vehicle(settings: Settings) -
     speaking = threading.Thread(target=speak)
     speaking.start()
     try:
-        eventually(lambda: service._component and service._component.vehicle, "it is decided whose camera this is")
+        eventually(lambda: service._parts.component.vehicle, "it is decided whose camera this is")
         eventually(lambda: (service.health()["vehicle"] or {}).get("latitude_deg") == pytest.approx(47), "our place")
         service.wish(Wish("test", "console", 1))
         eventually(lambda: stories, "the shot's end")

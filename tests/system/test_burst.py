@@ -21,7 +21,7 @@ def test_an_interval_of_0_s_is_a_burst_that_loses_and_doubles_nothing(sockets: P
         flying(settings_of(here, camera={"port": body.port})) as daemon,
     ):
         daemon.until_ready()
-        verdict = daemon.service._shutter.start_interval(Wish("test", "console", 1), 0.0, SHOTS)
+        verdict = daemon.service._parts.shutter.start_interval(Wish("test", "console", 1), 0.0, SHOTS)
         assert verdict.outcome != "refused", verdict.reason
         eventually(lambda: len(daemon.stories) == SHOTS, "the burst's end")
         assert body.releases == SHOTS

@@ -34,6 +34,10 @@ class Answers:
         """Answer what waits, within a second."""
         self._stage.stop(1.0)
 
+    def dead(self) -> list[str]:
+        """See `Stage.dead`."""
+        return self._stage.dead()
+
     def answer(self, request: Mapping[str, Any], reply: Reply) -> None:
         """For `Publisher`: raises WireError when too many questions wait already."""
         if not self._stage.put((request, reply)):

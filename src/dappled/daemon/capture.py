@@ -46,20 +46,9 @@ class Capture:
         self.reason = ""
         self.identity: Identity | None = None
 
-    @property
-    def name(self) -> str:
-        """The thread's."""
-        return self._thread.name
-
-    @property
-    def alive(self) -> bool:
-        """Whether the thread works, or waits for work."""
-        return self._thread.is_alive()
-
-    @property
-    def stopping(self) -> bool:
-        """Whether it was asked to end."""
-        return self._stopping.is_set()
+    def dead(self) -> list[str]:
+        """The thread's name where it has ended without being asked to: never, unless there is a bug."""
+        return [] if self._stopping.is_set() or self._thread.is_alive() else [self._thread.name]
 
     def start(self) -> None:
         """Begin: the camera first."""

@@ -5,6 +5,7 @@ The worker (`dappled.daemon.decode_worker`) runs at low priority and hands its a
 
 from __future__ import annotations
 
+import logging
 import mmap
 import os
 import socket
@@ -22,6 +23,7 @@ from dappled.drivers.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight.entries import Result
 
+log = logging.getLogger(__name__)
 NICENESS = 10
 _LOOK_S = 0.1
 
@@ -118,6 +120,16 @@ class WorkerDeveloper:
         that can't work."""
         with self._turn:
             self._ask({"do": "warm up"})
+
+    def begin_warm_up(self) -> None:
+        """The same in a thread of its own; what goes wrong is told in the log."""
+        threading.Thread(target=self._warm_up, name="decoder warm-up", daemon=True).start()
+
+    def _warm_up(self) -> None:
+        try:
+            self.warm_up()
+        except DevelopmentError as error:
+            log.warning("decoding will fail: %s", error)
 
     def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> Developed:
         """See Developer."""

@@ -1,10 +1,25 @@
-"""The headers of messages about a frame, the same whether live or asked for."""
+"""The headers of messages: of a flight's start, and about a frame, the same whether live, replayed or asked for."""
 
 from __future__ import annotations
 
+from dappled import __version__
+from dappled.config.settings import Settings
 from dappled.daemon import wire
 from dappled.daemon.development import Developed
+from dappled.daemon.story import Names
 from dappled.flight.records import Frame, Tag
+
+
+def start_header(settings: Settings, names: Names, utc_ns: int) -> dict[str, object]:
+    """The facts of a `start` message."""
+    return {
+        "utc_ns": utc_ns,
+        "software": f"dappled {__version__}",
+        "camera": names.camera,
+        "mask": names.mask,
+        "slices": settings.publish.slices,
+        "ask": settings.publish.ask,
+    }
 
 
 def slices_header(tag: Tag, developed: Developed) -> dict[str, object]:

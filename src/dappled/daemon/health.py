@@ -43,8 +43,7 @@ def record(
     doubts: Sequence[str] = (),
 ) -> dict[str, Any]:
     """The facts of a `health` message; `problems` are sentences, none when all is well. `doubts`: more of them,
-    of what is contradictory in the vehicle. `dead`: threads that have ended, beside the street's."""
-    dead = [*street.dead(), *dead]
+    of what is contradictory in the vehicle. `dead`: threads that have ended without being asked to."""
     problems = [f"the {name} thread has ended: restart dappled" for name in dead]
     if street.camera_state not in ("starting", "ready", "busy"):
         problems.append(camera_sentence(street))
@@ -96,7 +95,7 @@ def record(
         },
         "stages": [*stages, _publish(publisher)],
         "problems": problems,
-        "dead": dead,
+        "dead": list(dead),
         "utc_known": utc_known,
         "interval_s": shutter.interval_s,
         "clock": None if clock is None else {"source": clock.source, "sigma_ms": clock.sigma_ns / 1e6},
@@ -175,6 +174,19 @@ def camera_sentence(street: Street) -> str:
     """Why there is no camera to fire: "the camera is absent: …"."""
     reason = f": {street.camera_reason}" if street.camera_reason else ""
     return f"the camera is {street.camera_state}{reason}"
+
+
+def obstacle(street: Street, folder: Path, min_free_mb: int) -> str | None:
+    """Why no shot can be taken now; None where one can."""
+    if street.camera_state not in ("ready", "busy"):
+        return camera_sentence(street)
+    try:
+        free = layout.free_bytes(folder)
+    except DappledError as error:
+        return str(error)
+    if free < min_free_mb * 1_000_000:
+        return f"the disk is nearly full: {free // 1_000_000} MB left, record.min_free_mb asks for more"
+    return None
 
 
 def _free(folder: Path) -> int | None:

@@ -20,9 +20,13 @@ class DepthMaker(Protocol):
     def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> DepthFound:
         """Raises DevelopmentError."""
 
+    def close(self) -> None:
+        """End, also in the middle of a frame."""
+
 
 class LiveDepth:
-    """Takes at most one finished frame in `interval_s`, the newest, and publishes its depth as topic `depth`."""
+    """Takes at most one finished frame in `interval_s`, the newest, and publishes its depth as topic `depth`. Owns the
+    maker: a decoder of its own, as depth takes longer than a frame may wait."""
 
     def __init__(
         self,
@@ -49,8 +53,13 @@ class LiveDepth:
         self._stage.start()
 
     def stop(self) -> None:
-        """Take no more; the one in hand ends when the maker is closed."""
+        """Take no more, and close the maker: what is in hand after half a second is given up."""
         self._stage.stop(0.5)
+        self._maker.close()
+
+    def dead(self) -> list[str]:
+        """See `Stage.dead`."""
+        return self._stage.dead()
 
     def offer(self, story: Story) -> None:
         """A frame is finished; taken where one is due and it was decoded."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections import deque
+from collections.abc import Sequence
 
 from dappled.drivers.mavlink import Message, mavlink
 
@@ -11,6 +13,7 @@ PIECE_BYTES = 50
 LONGEST_BYTES = 4 * PIECE_BYTES
 AGAIN_NS = 10 * 10**9
 _REMEMBERED = 32
+_NUMBER = re.compile(r"\d+")  # a problem whose numbers change is still the same
 
 
 class PilotLines:
@@ -26,6 +29,27 @@ class PilotLines:
             return []
         self._said.append((text, now_ns))
         return list(_pieces(text, severity, next(self._numbers)))
+
+
+class Alarms:
+    """Tells each problem once, when it comes up; and when the last has gone."""
+
+    def __init__(self) -> None:
+        self._known: set[str] = set()
+
+    @property
+    def troubled(self) -> bool:
+        """Whether there is any, as told last."""
+        return bool(self._known)
+
+    def lines(self, problems: Sequence[str]) -> list[tuple[str, int]]:
+        """What is to be said now, and how severe it is."""
+        now = {_NUMBER.sub("#", text) for text in problems}
+        said = [(text, mavlink.MAV_SEVERITY_WARNING) for text in problems if _NUMBER.sub("#", text) not in self._known]
+        if self._known and not now:
+            said.append(("all is well again", mavlink.MAV_SEVERITY_INFO))
+        self._known = now
+        return said
 
 
 def _pieces(text: str, severity: int, number: int) -> list[Message]:

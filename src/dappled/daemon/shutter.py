@@ -118,6 +118,10 @@ class Shutter:
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join(2.0)
 
+    def dead(self) -> list[str]:
+        """The thread's name where it has ended without being asked to: never, unless there is a bug."""
+        return [] if self._stopped or self._thread.is_alive() else [self._thread.name]
+
     def wish(self, wish: Wish) -> Verdict:
         """One message that asks for one shot."""
         with self._lock:

@@ -63,10 +63,9 @@ class Stage(Generic[Item]):
         """Begin to work."""
         self._thread.start()
 
-    @property
-    def alive(self) -> bool:
-        """Whether the thread works, or waits for work."""
-        return self._thread.is_alive()
+    def dead(self) -> list[str]:
+        """The thread's name where it has ended without being asked to: never, unless there is a bug."""
+        return [] if self._closed or self._thread.is_alive() else [self.name]
 
     def put(self, item: Item) -> bool:
         """Hand over an item; False when it was turned away. Never waits."""

@@ -111,9 +111,7 @@ class Street:
 
     def dead(self) -> list[str]:
         """Which of the street's threads have ended without being asked to: none, unless there is a bug."""
-        if self._capture.stopping:
-            return []
-        return [part.name for part in (self._capture, *self.stages) if not part.alive]
+        return [name for part in (self._capture, *self.stages) for name in part.dead()]
 
     def decoding_idle(self, timeout_s: float = 5.0) -> bool:
         """Whether no frame waits to be decoded, at the latest after `timeout_s`."""
@@ -128,6 +126,7 @@ class Street:
         if self.decoding:
             self._decode.put(story)
         else:
+            self._stories.note("not decoded", "decoding was switched off", story.shot.index)
             self._stories.finish(story)
 
     def _dropped(self, what: str) -> Callable[[Story], None]:

@@ -1,0 +1,214 @@
+"""What one live flight is made of, and what its parts ask of each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from dappled.config.settings import Settings
+from dappled.daemon import distance_sensor, ground_facts, health, succession
+from dappled.daemon.answers import Answers
+from dappled.daemon.books import LiveBook
+from dappled.daemon.clock import Clock
+from dappled.daemon.component import Captured, Component
+from dappled.daemon.development import WorkerDeveloper
+from dappled.daemon.herald import Herald
+from dappled.daemon.knobs import Knobs, OwnKnob
+from dappled.daemon.live_depth import LiveDepth
+from dappled.daemon.logbook import Logbook
+from dappled.daemon.navigation import Navigation
+from dappled.daemon.pilot import Alarms
+from dappled.daemon.publisher import Publisher
+from dappled.daemon.shutter import Shutter, Wish
+from dappled.daemon.story import Names, Watchers
+from dappled.daemon.street import Street
+from dappled.daemon.succession import Succession
+from dappled.daemon.tagger import BodyLatency
+from dappled.drivers.camera import Camera, CameraError
+from dappled.drivers.darkroom import Recipe
+from dappled.drivers.mavlink import MavlinkLinks, Packet
+from dappled.flight.recording import Recording
+from dappled.flight.records import Shot
+
+
+class Part(Protocol):
+    """Something with threads."""
+
+    def dead(self) -> list[str]:
+        """Those that have ended without being asked to."""
+
+
+class FlightParts:
+    """Made in the order in which they need each other, none of them at work yet.
+
+    `settings()` are those of now, `recipe` what frames are decoded with (None: they are not), `after` takes what the
+    next flight is to be flown with, and `end()` ends this one soon.
+    """
+
+    def __init__(
+        self,
+        settings: Callable[[], Settings],
+        clock: Clock,
+        recording: Recording,
+        *,
+        camera: Camera,
+        names: Names,
+        recipe: Recipe | None,
+        links: MavlinkLinks,
+        publisher: Publisher,
+        logbook: Logbook,
+        outside: Watchers,
+        utc_known: bool,
+        after: Succession | None,
+        end: Callable[[], None],
+    ) -> None:
+        self._settings, self._clock, self._recording, self._links = settings, clock, recording, links
+        self._after, self._end = after, end
+        now = settings()
+        self.alarms = Alarms()
+        self.book = LiveBook(recording, clock)
+        self.navigation = Navigation(settings, clock, recording, utc_known=utc_known)
+        self.developer = None if recipe is None else WorkerDeveloper(recipe)
+        self.depth = self._depth_of(recipe, publisher) if recipe is not None and now.decode.depth else None
+        self.shutter = Shutter(
+            next_index=recording.next_index,
+            note=self._note,
+            fire=self._fire,
+            clock=clock,
+            capacity=now.camera.max_pending,
+            obstacle=self._obstacle,
+            on_change=self._changed,
+            on_refused=self._refused,
+        )
+        self.component = Component(
+            links,
+            self.shutter,
+            clock,
+            self._knobs(camera, names),
+            facts=lambda: self.herald.facts(),  # noqa: PLW0108  # the herald is made after the component
+            storage=lambda: ground_facts.storage(recording.folder.path),
+            lookup=self._lookup,
+            healthy=self.whole,
+            troubled=lambda: self.alarms.troubled,
+            pose=self.navigation.pose_now,
+            mount=now.pose.mount,
+            feedback_is_shot=now.mavlink.feedback_is_shot,
+        )
+        self.herald = Herald(
+            now,
+            recording,
+            self.shutter,
+            self.component,
+            logbook,
+            utc_ns=self.navigation.utc.utc_ns,
+            outside=outside,
+            depth=self.depth,
+        )
+        self.street = Street(
+            camera=camera,
+            book=self.book,
+            poses=self.navigation.pose,
+            developer=self.developer,
+            publisher=publisher,
+            latency=BodyLatency.of(now.camera),
+            names=names,
+            watchers=self.herald.watchers(),
+            decode_queue=now.decode.queue,
+            preview_interval_s=now.publish.preview_interval_s,
+        )
+        self.answers = Answers(self.book, self.developer, self.street.decoding_idle)
+
+    def dead(self) -> list[str]:
+        """Threads that have ended without being asked to: none, unless there is a bug."""
+        parts: list[Part] = [self.street, self._links, self.shutter, self.answers]
+        if self.depth is not None:
+            parts.append(self.depth)
+        return [name for part in parts for name in part.dead()]
+
+    def whole(self) -> bool:
+        """Whether every part still works."""
+        return not self.dead()
+
+    def on_packet(self, packet: Packet) -> None:
+        """A packet came over a link, or went out: to the poses first, so that what it asks for finds it there."""
+        self.navigation.on_packet(packet)
+        self.component.on_packet(packet)
+
+    # making
+
+    def _depth_of(self, recipe: Recipe, publisher: Publisher) -> LiveDepth:
+        decode = self._settings().decode
+        return LiveDepth(
+            WorkerDeveloper(recipe),
+            method=decode.depth,
+            interval_s=decode.depth_interval_s,
+            path=lambda story: self.book.path(story.frame) if story.frame else "",
+            publish=publisher.publish,
+            give_way=lambda: self.street.decoding_idle(),  # noqa: PLW0108  # the street is made after depth
+            tell=self._tell_distance if decode.depth_to_autopilot else lambda _: None,
+        )
+
+    def _knobs(self, camera: Camera, names: Names) -> Knobs:
+        """What a ground station may set: the body's settings, and here whether and by what frames are decoded."""
+        decoding = OwnKnob(
+            "LF_DECODE",
+            "Decode in flight",
+            lambda: "on" if self.street.decoding else "off",
+            ("on", "off"),
+            self._decode_in_flight if self.developer else None,
+        )
+        return Knobs(camera, (decoding, *succession.knobs(names, self._after, self._settings, self._hand_over)))
+
+    # the shutter asks
+
+    def _note(self, shot: Shot) -> None:
+        self._recording.journal.note(shot)
+        self.book.wished(shot)
+        self.street.expect(shot)
+
+    def _fire(self, index: int) -> None:
+        self.street.fire(index)
+
+    def _obstacle(self) -> str | None:
+        if self._after is not None and self._after.next is not None:
+            return "the next flight begins in a moment, with what the ground station has set"
+        return health.obstacle(self.street, self._recording.folder.path, self._settings().record.min_free_mb)
+
+    def _changed(self) -> None:
+        self.component.state_changed()
+
+    def _refused(self, refused: tuple[Wish, str]) -> None:
+        wish, reason = refused
+        self.book.later("refused", f"{wish.kind} from {wish.source}: {reason}")
+
+    # the ground station asks
+
+    def _lookup(self, index: int) -> Captured | None:
+        if self.street.in_hand(index):
+            return None  # its own message will come
+        return ground_facts.of_record(index, self._recording.index)
+
+    def _decode_in_flight(self, value: str) -> None:
+        self.street.decoding = value == "on"
+        self.book.later("decoding", f"{value} from now on, by the ground station")
+
+    def _hand_over(self, following: Settings, text: str) -> None:
+        """The ground station has set what belongs to a flight: this one ends between two frames, and the next follows.
+        Raises CameraError where that would cut something short."""
+        assert self._after is not None
+        now = self.shutter.statistics()
+        if now.interval_s is not None:
+            raise CameraError(f"{text} would begin another flight: stop the interval first")
+        if now.pending:
+            raise CameraError(f"{text} would begin another flight: {now.pending} shots are under way, ask again")
+        self._after.next = following
+        self.book.later("next flight", f"{text} from there on, by the ground station")
+        self._end()
+
+    # depth tells
+
+    def _tell_distance(self, nearest_m: tuple[float, float]) -> None:
+        boot_ms = (self._clock.monotonic_ns() // 10**6) % 2**32
+        told = distance_sensor.message(nearest_m, boot_ms, self._settings().pose.mount)
+        if told is not None:
+            self._links.send(told)
