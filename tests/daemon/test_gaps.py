@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.daemon.gaps import AT_ONCE, Gaps
+from dappled.daemon.gaps import AT_ONCE, MOST_MISSING, Gaps
 from dappled.daemon.wire import Message
 
 
@@ -70,4 +70,26 @@ def test_flights_are_counted_apart() -> None:
     gaps.heard(slices(7, "one"))
     gaps.heard(slices(0, "two"))
     gaps.heard(slices(1, "two"))
+    assert gaps.gaps == 0
+
+
+def test_a_header_that_claims_the_impossible_costs_no_memory() -> None:
+    gaps = Gaps(can_ask=True)
+    gaps.heard(slices(0))
+    gaps.heard(slices(10**12))
+    assert gaps.gaps == 10**12 - 1
+    assert gaps.waiting_for == MOST_MISSING
+    assert gaps.gaps == gaps.lost + gaps.waiting_for
+    assert gaps.questions(0.0)[0]["seq"] == 10**12 - MOST_MISSING
+    gaps.heard(slices(10**12 + 3))
+    assert gaps.waiting_for == MOST_MISSING + AT_ONCE - 2  # four were asked for, and two more are missing
+    assert gaps.gaps == gaps.lost + gaps.waiting_for
+
+
+def test_an_end_without_a_count_is_no_gap() -> None:
+    gaps = Gaps(can_ask=True)
+    gaps.heard(slices(0))
+    ends: list[object] = [None, [], {"slices": "many"}, {"slices": None}]
+    for sent in ends:
+        gaps.heard(Message("end", {"flight": "f", "sent": sent}))
     assert gaps.gaps == 0

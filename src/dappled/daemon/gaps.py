@@ -8,6 +8,7 @@ from typing import Any
 
 from dappled.daemon.wire import Message
 
+MOST_MISSING = 2**16  # what a publisher remembers; a header that claims more is not to be believed
 AT_ONCE = 4  # questions under way; the others wait their turn here
 
 _Key = tuple[str, int]  # flight, seq of its slices
@@ -38,16 +39,19 @@ class Gaps:
         flight, seq = str(header.get("flight", "")), header.get("seq")
         if message.topic == "slices" and isinstance(seq, int):
             until, after = seq, seq + 1
-        elif message.topic == "end" and isinstance(sent := header.get("sent"), dict):
-            until = after = int(sent.get("slices", 0))
+        elif message.topic == "end" and isinstance(sent := _sent(header), int):
+            until = after = sent
         else:
             return
-        for missed in range(self._next.get(flight, 0 if self._from_start else until), until):
-            self.gaps += 1
-            if self._can_ask:
-                self._missing.append((flight, missed))
-            else:
-                self.lost += 1
+        first = self._next.get(flight, 0 if self._from_start else until)
+        missed = max(0, until - first)
+        wanted = min(missed, MOST_MISSING) if self._can_ask else 0
+        self._missing.extend((flight, each) for each in range(until - wanted, until))
+        too_many = max(0, len(self._missing) - MOST_MISSING)
+        for _ in range(too_many):
+            self._missing.popleft()
+        self.gaps += missed
+        self.lost += missed - wanted + too_many
         self._next[flight] = max(after, self._next.get(flight, 0))
 
     def answered(self, answer: Message) -> None:
@@ -72,3 +76,9 @@ class Gaps:
             self._asked[key] = now_s + self._answer_timeout_s
             found.append({"get": "slices", "seq": seq, "flight": flight})
         return found
+
+
+def _sent(header: Mapping[str, Any]) -> Any:
+    """How many slices a flight sent, as its `end` says."""
+    sent = header.get("sent")
+    return sent.get("slices", 0) if isinstance(sent, Mapping) else None
