@@ -9,6 +9,7 @@ import struct
 import sys
 from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -53,6 +54,25 @@ def test_a_record_keeps_its_words_and_its_facts(tmp_path: Path) -> None:
     assert told["DAPPLED_PART"] == "daemon.street"
     assert told["DAPPLED_FRAME"] == "42"
     assert told["DAPPLED_A_B"] == "two\nlines"
+
+
+def test_whoever_logs_is_not_harmed_by_a_journal_that_stands_still_or_words_that_do_not_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unheard: list[logging.LogRecord] = []
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(tmp_path / "j"))
+        handler = journal.JournalHandler(str(tmp_path / "j"))
+        monkeypatch.setattr(handler, "handleError", unheard.append)
+        handler.emit(logging.LogRecord("x", logging.ERROR, "f.py", 1, "%d frames", ("many",), None))
+        assert len(unheard) == 1
+        full = logging.LogRecord("x", logging.ERROR, "f.py", 1, "again", (), None)
+        for _ in range(100_000):  # nobody reads: the socket's queue is full soon
+            handler.emit(full)
+            if len(unheard) == 2:
+                break
+        handler.close()
+    assert len(unheard) == 2
 
 
 def test_a_traceback_stands_in_a_field_of_its_own() -> None:

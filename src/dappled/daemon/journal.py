@@ -11,6 +11,7 @@ import sys
 from collections.abc import Mapping
 
 JOURNAL = "/run/systemd/journal/socket"
+_PATIENCE_S = 0.05  # with a journal that stands still: the shutter logs too
 _PRIORITY = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 
 
@@ -23,6 +24,7 @@ class JournalHandler(logging.Handler):
     def __init__(self, address: str = JOURNAL) -> None:
         super().__init__()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.settimeout(_PATIENCE_S)
         try:
             self._socket.connect(address)
         except OSError:
@@ -32,7 +34,7 @@ class JournalHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         try:
             self._socket.send(entry(fields(record)))
-        except OSError:
+        except Exception:  # noqa: BLE001  # as every handler of `logging`: whoever logs is not to blame, and goes on
             self.handleError(record)
 
     def close(self) -> None:
