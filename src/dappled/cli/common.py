@@ -93,8 +93,8 @@ def add_recipe(parser: argparse.ArgumentParser, *, mask_needed: bool = True) -> 
     parser.add_argument("--cfa", default="", metavar="BGGR", help="colour pattern, row by row, where the file has none")
     parser.add_argument("--black", type=float, metavar="N", help="black level, where the file doesn't say")
     parser.add_argument("--white-level", type=float, metavar="N", help="level of a full pixel (a 12-bit PNG: 4095)")
-    parser.add_argument("--focal-length", type=float, metavar="MM", help="where the file doesn't say")
-    parser.add_argument("--f-number", type=float, metavar="N", help="where the file doesn't say")
+    parser.add_argument("--focal-length", type=float, metavar="MM", help="of the lens, where the file doesn't say")
+    parser.add_argument("--f-number", type=float, metavar="N", help="of the exposure, where the file doesn't say")
 
 
 def recipe(arguments: argparse.Namespace) -> Recipe:

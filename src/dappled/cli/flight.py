@@ -40,12 +40,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
         f"dappled flight offload /media/disk {_FLIGHT} --prune",
     )
     bring = actions.add("pickup", flight_pickup.HELP, *flight_pickup.EXAMPLES)
-    listing.add_argument("folder", nargs="?", type=Path, help="flights folder (default: record.directory)")
+    listing.add_argument(
+        "folder", nargs="?", type=Path, metavar="FOLDER", help="flights folder (default: record.directory)"
+    )
     away.add_argument("destination", type=Path, metavar="DEST", help="folder that will hold the flight's folder")
     away.add_argument("--prune", action="store_true", help="afterwards remove the frames here; the ledger stays")
     flight_pickup.configure(bring)
     for one in (show, intact, report, away, bring):
-        one.add_argument("flight", nargs="?", type=Path, help="flight folder (default: the last one)")
+        one.add_argument("flight", nargs="?", type=Path, metavar="FLIGHT", help="flight folder (default: the last one)")
     for one in actions.all:
         one.add_argument("--config", type=Path, metavar="FILE", help="settings that say where flights are")
         one.add_argument("--json", action="store_true", help="as JSON")

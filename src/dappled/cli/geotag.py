@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "geo.txt (OpenDroneMap), pix4d.csv and track.geojson.\n"
         "The frames themselves are never touched."
     )
-    parser.add_argument("flight", type=Path, help="flight folder")
+    parser.add_argument("flight", type=Path, metavar="FLIGHT", help="flight folder")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="write everything there instead")
     parser.add_argument("--lightroom", action="store_true", help="name sidecars name.xmp instead of name.ext.xmp")
     parser.add_argument("--force", action="store_true", help="replace sidecars that another program wrote")

@@ -23,7 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     actions = Actions.of(parser)
     make = actions.add("make", "a pair: NAME.key to give away, NAME.key_secret to keep", "dappled keys make laptop")
     make.add_argument("name", metavar="NAME", help="whose it is: letters, digits, dot, dash, underscore")
-    make.add_argument("-o", "--folder", type=Path, default=HOME, help=f"where to (default {HOME})")
+    make.add_argument("-o", "--folder", type=Path, default=HOME, help=f"where to (default: {HOME})")
     show = actions.add("show", "the public key in a file", "dappled keys show laptop.key")
     show.add_argument("file", type=Path, metavar="FILE", help="NAME.key or NAME.key_secret")
     token = actions.add("token", "a token for the console", "dappled keys token /etc/dappled/console.token")

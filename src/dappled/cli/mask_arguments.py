@@ -49,7 +49,9 @@ def add_altitude(parser: argparse.ArgumentParser) -> None:
     """--altitude, and the camera that is flown there."""
     parser.add_argument("--altitude", type=float, required=True, metavar="M", help="above ground")
     add_sensor(parser)
-    parser.add_argument("--focal-length", type=float, metavar="MM", help="default: the camera's, if it has one only")
+    parser.add_argument(
+        "--focal-length", type=float, metavar="MM", help="of the lens (default: the camera's, if it has only one)"
+    )
 
 
 def sensor(camera: CameraProfile, arguments: argparse.Namespace) -> Sensor:

@@ -22,13 +22,15 @@ EXAMPLE = "dappled mask design --altitude 40 --camera fujifilm-s5200 --focal-len
 
 def configure(parser: argparse.ArgumentParser) -> None:
     mask_arguments.add_altitude(parser)
-    parser.add_argument("--f-number", type=float, default=5.6, metavar="N", help="of the lens (default 5.6)")
-    parser.add_argument("--views", type=int, default=5, metavar="N", help="views an axis, odd (default 5)")
-    parser.add_argument("--film", default="4k", choices=tuple(FILMS))
+    parser.add_argument("--f-number", type=float, default=5.6, metavar="N", help="of the lens (default: 5.6)")
+    parser.add_argument("--views", type=int, default=5, metavar="N", help="views an axis, odd (default: 5)")
+    parser.add_argument("--film", default="4k", choices=tuple(FILMS), help="to print it on (default: 4k)")
     mask_arguments.add_installation(parser, free=True)
-    parser.add_argument("--room", type=float, metavar="MM", help="the most that the mask may stand off (default 10)")
-    parser.add_argument("--wavelength", type=float, default=550.0, metavar="NM")
-    parser.add_argument("--shift-error", type=float, default=0.02, metavar="PX", help="of a shift between views")
+    parser.add_argument("--room", type=float, metavar="MM", help="the most that the mask may stand off (default: 10)")
+    parser.add_argument("--wavelength", type=float, default=550.0, metavar="NM", help="of the light (default: 550)")
+    parser.add_argument(
+        "--shift-error", type=float, default=0.02, metavar="PX", help="σ of a shift between views (default: 0.02)"
+    )
     parser.add_argument("--mask", metavar="P", help="an installed mask: its best focal length instead")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the carriers on the spectrum")
     parser.add_argument("--json", action="store_true", help="as JSON")

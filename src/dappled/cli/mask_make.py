@@ -31,23 +31,31 @@ EXAMPLE = "dappled mask make mask-2 --negative -o mask-2.png"
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("mask", nargs="?", metavar="P", help="mask profile or TOML file (or --period/--frequency)")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=".png or .tif")
-    parser.add_argument("--film", default="4k", metavar="F", help="4k, 8k, 16k, or WIDTHxHEIGHT in pixels")
+    parser.add_argument("--film", default="4k", metavar="F", help="4k (default), 8k, 16k, or WIDTHxHEIGHT in pixels")
     parser.add_argument("--density", type=float, metavar="PX/MM", help="of a film given as WIDTHxHEIGHT")
     parser.add_argument("--size-mm", type=float, nargs=2, metavar=("H", "W"), help="only the middle of the film")
     parser.add_argument("--period", type=float, metavar="PX", help="longest period in the film's pixels")
     parser.add_argument("--frequency", type=float, metavar="1/MM", help="fundamental, instead of --period")
-    parser.add_argument("--p", type=int, metavar="N", help="number of harmonics")
-    parser.add_argument("--pattern", choices=("full", "diagonal"), help="Eq 11's product, or Fig 14's diagonals")
-    parser.add_argument("--harmonics", choices=("linear", "octave"), help="1, 2, 3 … or 1, 2, 4 …")
+    parser.add_argument("--p", type=int, metavar="N", help="number of harmonics (default: the profile's, else 2)")
+    parser.add_argument(
+        "--pattern",
+        choices=("full", "diagonal"),
+        help="Eq 11's product, or Fig 14's diagonals (default: the profile's, else full)",
+    )
+    parser.add_argument(
+        "--harmonics", choices=("linear", "octave"), help="1, 2, 3 … or 1, 2, 4 … (default: the profile's, else linear)"
+    )
     parser.add_argument(
         "--negative", action="store_true", help="the negative (Eq 13), for black-and-white negative film"
     )
-    parser.add_argument("--bits", type=int, default=8, choices=(8, 16))
+    parser.add_argument("--bits", type=int, default=8, choices=(8, 16), help="of a pixel (default: 8)")
     parser.add_argument(
         "--curve", type=Path, metavar="CSV", help="level,density of this film's wedge: compensate for it"
     )
     parser.add_argument("--drawable-only", action="store_true", help="leave out harmonics finer than two pixels")
-    parser.add_argument("--wedge", type=int, nargs="?", const=21, metavar="STEPS", help="write a step wedge instead")
+    parser.add_argument(
+        "--wedge", type=int, nargs="?", const=21, metavar="STEPS", help="write a step wedge instead (default: 21 steps)"
+    )
     parser.add_argument("--json", action="store_true", help="what was written, as JSON")
 
 

@@ -21,8 +21,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     mask_arguments.add_mask(parser)
     mask_arguments.add_sensor(parser)
     mask_arguments.add_installation(parser)
-    parser.add_argument("--focal-length", type=float, nargs="+", metavar="MM", help="default: those of Table 11")
-    parser.add_argument("--rotation", type=float, default=0.0, metavar="DEGREES", help="of the installed mask")
+    parser.add_argument(
+        "--focal-length", type=float, nargs="+", metavar="MM", help="of the lens (default: those of Table 11)"
+    )
+    parser.add_argument(
+        "--rotation", type=float, default=0.0, metavar="DEGREES", help="by how much the mask is turned (default: 0)"
+    )
     parser.add_argument("--carriers", action="store_true", help="every carrier with row and column, crossed ones too")
     parser.add_argument("--json", action="store_true", help="as JSON")
 

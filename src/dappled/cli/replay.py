@@ -42,13 +42,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  dappled replay flights/20261121T101503Z-0a1b2c3d --calibration new.toml --run new\n"
         "  dappled replay frames/ --mask lenslet --white white.png --telemetry flight.tlog --publish"
     )
-    parser.add_argument("flight", type=Path, help="flight folder, or a folder of frames")
+    parser.add_argument("flight", type=Path, metavar="FLIGHT", help="flight folder, or a folder of frames")
     parser.add_argument(
         "--rate",
         default=None,
         type=_rate,
         metavar="RATE",
-        help="1.0 is as it was, 2 twice as fast, max as fast as it goes (default)",
+        help="1 is as it was, 2 twice as fast, max (default) as fast as it goes",
     )
     parser.add_argument("--step", action="store_true", help="wait for Enter before each frame")
     parser.add_argument("--publish", action=argparse.BooleanOptionalAction, default=False, help="send over ZeroMQ")
@@ -57,10 +57,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--run",
         dest="run_name",
         metavar="NAME",
-        help="keep results in the ledger by this name (another recipe: default the time); with --verify: check them",
+        help="keep the results beside those of the flight, by this name (default with another recipe: the time);\n"
+        "with --verify: check them",
     )
-    parser.add_argument("--camera", metavar="P", help="camera profile or TOML file")
-    parser.add_argument("--mask", metavar="P", help="mask profile or TOML file, or lenslet")
+    parser.add_argument("--camera", metavar="P", help="camera profile or TOML file (default: the flight's)")
+    parser.add_argument("--mask", metavar="P", help="mask profile or TOML file, or lenslet (default: the flight's)")
     parser.add_argument(
         "--telemetry", type=Path, metavar="FILE", help="of a folder of frames (default: the only .tlog in it)"
     )

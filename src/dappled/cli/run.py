@@ -30,9 +30,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "examples:\n  dappled run --config dappled.toml\n  dappled run --simulate --frames 8"
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings (default: every default)")
     parser.add_argument("--simulate", action="store_true", help="no hardware: simulated camera and autopilot")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulation (default 1)")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulation (default: 1)")
     parser.add_argument("--for", dest="seconds", type=seconds, metavar="SECONDS", help="end after this time")
-    parser.add_argument("--frames", type=whole, metavar="N", help="end after N frames; a simulated ground station asks")
+    parser.add_argument(
+        "--frames", type=whole, metavar="N", help="end after N frames; with --simulate a ground station asks for them"
+    )
     parser.add_argument("--console", metavar="HOST:PORT", help="serve the operator's console here (as console.bind)")
     parser.add_argument("--json", action="store_true", help="one JSON object a frame")
 

@@ -22,7 +22,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "example: dappled status --config /etc/dappled/dappled.toml"
     parser.add_argument("endpoint", nargs="?", help="ZeroMQ endpoint of the stream (default: by --config)")
     parser.add_argument("--config", type=Path, metavar="FILE", help="the daemon's settings (default: every default)")
-    parser.add_argument("--timeout", type=seconds, default=3.0, metavar="S", help="wait so long for it (default 3)")
+    parser.add_argument("--timeout", type=seconds, default=3.0, metavar="S", help="wait so long for it (default: 3)")
     parser.add_argument("--json", action="store_true", help="the health record as it is published")
 
 

@@ -13,12 +13,18 @@ from dappled.daemon.ground_client import GroundClient, Outcome
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "example: dappled trigger --url udpout:127.0.0.1:14550 --count 3 --interval 2"
     parser.add_argument(
-        "--url", default="udpout:127.0.0.1:14550", help="pymavlink connection string (default %(default)s)"
+        "--url", default="udpout:127.0.0.1:14550", help="pymavlink connection string (default: %(default)s)"
     )
-    parser.add_argument("--count", type=whole, default=1, metavar="N", help="photographs (default 1)")
-    parser.add_argument("--interval", type=seconds, default=0.0, metavar="S", help="seconds between them, at least")
+    parser.add_argument("--count", type=whole, default=1, metavar="N", help="photographs (default: 1)")
     parser.add_argument(
-        "--timeout", type=seconds, default=60.0, metavar="S", help="for the camera, and for each photograph"
+        "--interval", type=seconds, default=0.0, metavar="S", help="between them, at least (default: 0)"
+    )
+    parser.add_argument(
+        "--timeout",
+        type=seconds,
+        default=60.0,
+        metavar="S",
+        help="wait so long for the camera, and for each photograph (default: 60)",
     )
     parser.add_argument("--key", type=Path, metavar="FILE", help="the link's signing key (dappled mavlink key)")
     parser.add_argument("--json", action="store_true", help="one JSON object a photograph")

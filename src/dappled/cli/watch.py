@@ -15,11 +15,19 @@ from dappled.daemon.wire import Message
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "example: dappled watch --save slices/ --count 8"
-    parser.add_argument(
-        "endpoint", nargs="?", help="ZeroMQ endpoint of the stream (default: the daemon's on this machine)"
+    parser.epilog = (
+        "example: dappled watch --save slices/ --count 8\n\n"
+        "exits 1 where slices were lost, or fewer came than were asked for"
     )
-    parser.add_argument("--ask", help="endpoint that answers questions (default: beside an ipc stream)")
+    parser.add_argument(
+        "endpoint",
+        nargs="?",
+        metavar="ENDPOINT",
+        help="ZeroMQ endpoint of the stream (default: the daemon's on this machine)",
+    )
+    parser.add_argument(
+        "--ask", metavar="ENDPOINT", help="endpoint that answers questions (default: beside an ipc stream)"
+    )
     parser.add_argument("--save", type=Path, metavar="DIR", help="keep each frame's header, slices and mosaic here")
     parser.add_argument("--from-start", action="store_true", help="also what the flight sent before this began")
     parser.add_argument("--count", type=whole, metavar="N", help="end after the slices of N frames")
