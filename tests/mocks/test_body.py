@@ -25,6 +25,19 @@ def test_a_body_listens_obeys_and_ends() -> None:
         body.ask("releases")
 
 
+def test_a_wire_fires_a_body_that_nobody_is_connected_to_and_not_while_it_works() -> None:
+    with Body.start(BodyOptions(picture="pattern:1000:cr2", delay_s=20.0)) as body:
+        assert body.contact()
+        assert not body.contact()
+        assert body.releases == 1
+    with Body.start(BodyOptions(picture="pattern:1000:cr2")) as body:
+        assert body.contact()
+        deadline = time.monotonic() + 20
+        while body.card != ["IMG_0001.CR2"]:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+
 def test_a_body_ends_with_its_input() -> None:
     command = [sys.executable, "-m", "dappled.mocks.body_process", "--picture", "pattern:1000:jpg"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:

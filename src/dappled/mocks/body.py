@@ -108,6 +108,10 @@ class Body:
         """How many exposures the body has begun."""
         return int(self.ask("releases"))
 
+    def contact(self) -> bool:
+        """Close the contact of its remote socket, as a wire does. False where that makes no exposure."""
+        return self.ask("contact") == "1"
+
     @property
     def card(self) -> list[str]:
         """The names of the files on the body's card."""

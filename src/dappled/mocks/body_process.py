@@ -3,8 +3,8 @@
     python -m dappled.mocks.body_process --seed 1 --scale 0.25
 
 prints `port N` once it listens, then obeys lines on its standard input: a fault of `mocks.faults` ("busy 2"), or
-"releases", "card", "move". Every line is answered by one line, `ok …` or `error …`. The end of its input is its own
-end, so it never outlives the process that started it.
+"releases", "contact", "card", "move". Every line is answered by one line, `ok …` or `error …`. The end of its input is
+its own end, so it never outlives the process that started it.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from dappled.mocks.ptpip import Responder
 def _obey(line: str, eos: Eos450d, responder: Responder, faults: Faults) -> str:
     if line == "releases":
         return f"ok {eos.releases}"
+    if line == "contact":
+        return f"ok {int(eos.contact())}"
     if line == "card":
         return f"ok {' '.join(eos.names)}"
     if line == "move":

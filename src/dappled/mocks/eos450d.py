@@ -89,6 +89,11 @@ class Eos450d:
         with self._lock:
             return self._card.names
 
+    def contact(self) -> bool:
+        """The contact of its remote socket closes: an exposure, whoever is connected. False where it makes none."""
+        with self._lock:
+            return self._release(Request(Op.EOS_REMOTE_RELEASE, 0, ()), b"").code == Code.OK
+
     def disconnected(self) -> None:
         """The link is gone: the session with it; the card, and what the body works on, stay."""
         with self._lock:
