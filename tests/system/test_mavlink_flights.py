@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,9 +15,11 @@ from dappled.daemon.knobs import code
 from dappled.drivers import mavlink_signing
 from dappled.drivers.mavlink import mavlink
 from dappled.drivers.mavlink_signing import EPOCH_UNIX_S, UNITS_PER_S
+from dappled.flight.ledger import LedgerReader
 from dappled.mocks.body import Body, BodyOptions
-from dappled.mocks.simulation import Simulation, World
+from dappled.mocks.simulation import Simulation, World, free_port
 from tests.daemon.mavlink_rig import Peer
+from tests.system.conftest import dappled
 from tests.system.flying import Flying, eventually, flying, settings_of, told
 
 ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
@@ -108,6 +113,7 @@ def test_keys_that_do_not_match_the_links_are_refused_in_one_sentence(tmp_path: 
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)  # a replay comes after it
 def test_decoding_is_switched_from_the_ground_and_the_flight_says_so(tmp_path: Path) -> None:
     settings = settings_of(tmp_path, mavlink={"url": URL})
     with Simulation(World(), settings, tmp_path) as simulated, flying(simulated) as daemon:
@@ -123,3 +129,49 @@ def test_decoding_is_switched_from_the_ground_and_the_flight_says_so(tmp_path: P
                 assert (story.developed is not None) == decoded
                 assert story.problem == ""
             eventually(lambda: "decoding: off" in "\n".join(told(daemon.service.folder)), "the event")
+            folder = daemon.service.folder
+    assert "not decoded: decoding was switched off" in told(folder)
+    verified = dappled("replay", str(folder), "--verify", timeout_s=150)
+    assert verified.returncode == 0, verified.stderr
+    assert verified.stdout.endswith("verified 2 frames: all hashes the same (1 were left undecoded in flight)\n")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_another_law_set_from_the_ground_begins_the_next_flight_and_both_verify(tmp_path: Path) -> None:
+    port = free_port()
+    (tmp_path / "dappled.toml").write_text(
+        f'[record]\ndirectory = "flights"\nmin_free_mb = 0\n[publish]\nslices = "ipc://{tmp_path}/s"\n'
+        f'[mavlink]\nurl = "udpin:127.0.0.1:{port}"\n'
+    )
+    command = [sys.executable, "-m", "dappled", "run", "--simulate", "--config", "dappled.toml"]
+    daemon = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+
+    def photograph() -> bool:
+        return dappled("trigger", "--url", f"udpout:127.0.0.1:{port}", timeout_s=120).returncode == 0
+
+    def flights() -> list[Path]:
+        return sorted(path for path in (tmp_path / "flights").iterdir() if path.is_dir())
+
+    try:
+        eventually(photograph, "the first photograph", 120)
+        with Peer(port) as peer:
+            peer.heartbeat()
+            peer.send(mavlink.MAVLink_param_ext_set_message(1, 100, b"LF_LAW", code("fd").to_bytes(4, "little"), 5))
+            assert peer.one("PARAM_EXT_ACK").param_result == mavlink.PARAM_ACK_ACCEPTED
+        eventually(lambda: len(flights()) == 2, "the next flight", 120)
+        eventually(photograph, "a photograph of the next flight", 120)
+        daemon.send_signal(signal.SIGTERM)
+        _, err = daemon.communicate(timeout=60)
+    finally:
+        daemon.kill()
+        daemon.communicate()
+    assert daemon.returncode == 0, err
+    assert "2 shots: 2 frames safe" in err
+    for number, (flight, law) in enumerate(zip(flights(), ("geometric", "fd"), strict=True)):
+        with LedgerReader.open(flight / "flight.sqlite") as ledger:
+            assert [frame.index for frame in ledger.frames()] == [number]
+            assert [result.law for result in ledger.results().values()] == [law]
+        verified = dappled("replay", str(flight), "--verify", timeout_s=120)
+        assert verified.returncode == 0, verified.stdout + verified.stderr
+    assert "next flight: carrier law fd from there on, by the ground station" in told(flights()[0])
