@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
+import httpx
 import pytest
+from pymavlink import mavutil
+
+from dappled.mocks.simulation import free_port
+from tests.system.conftest import dappled
 
 ROOT = Path(__file__).resolve().parents[2]
 UNIT = ROOT / "systemd/dappled.service"
@@ -27,13 +36,35 @@ def manager(tmp_path: Path) -> Iterator[socket.socket]:
         yield listener
 
 
-@pytest.fixture
-def served(manager: socket.socket, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    """The daemon with no hardware at all, as a service."""
-    (tmp_path / "dappled.toml").write_text('[record]\ndirectory = "flights"\nmin_free_mb = 1\n', encoding="utf-8")
-    told = {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "400000", "RUNTIME_DIRECTORY": str(tmp_path / "r")}
-    (tmp_path / "r").mkdir(mode=0o700)
-    command = [sys.executable, "-m", "dappled", "run", "--config", str(tmp_path / "dappled.toml")]
+RECORD = '[record]\ndirectory = "flights"\nmin_free_mb = 1\n'
+HANGING = """
+import sys, threading
+from pathlib import Path
+from dappled.cli import main
+from dappled.daemon.service import Service
+
+step, flag = Service.step, Path(sys.argv[1])
+
+def until_told(self):
+    step(self)
+    while flag.exists():
+        threading.Event().wait(0.1)
+
+Service.step = until_told
+sys.exit(main(sys.argv[2:]))
+"""
+"""The daemon, its working loop standing still while a file is there; all its other threads go on."""
+
+
+@contextmanager
+def serving(
+    manager: socket.socket, folder: Path, settings: str = RECORD, program: Sequence[str] = ("-m", "dappled")
+) -> Iterator[subprocess.Popen[str]]:
+    """The daemon with no camera at all, as a service."""
+    (folder / "dappled.toml").write_text(settings, encoding="utf-8")
+    told = {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "400000", "RUNTIME_DIRECTORY": str(folder / "r")}
+    (folder / "r").mkdir(mode=0o700)
+    command = [sys.executable, *program, "run", "--config", str(folder / "dappled.toml")]
     daemon = subprocess.Popen(command, env=os.environ | told, stderr=subprocess.PIPE, text=True)
     try:
         yield daemon
@@ -42,6 +73,12 @@ def served(manager: socket.socket, tmp_path: Path) -> Iterator[subprocess.Popen[
         daemon.wait()
         assert daemon.stderr is not None
         daemon.stderr.close()
+
+
+@pytest.fixture
+def served(manager: socket.socket, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    with serving(manager, tmp_path) as daemon:
+        yield daemon
 
 
 def until(manager: socket.socket, wanted: Callable[[str], bool]) -> str:
@@ -74,7 +111,7 @@ def test_systemd_hears_of_a_whole_life(manager: socket.socket, served: subproces
     assert "reload: the settings stay as they are:" in said
 
 
-def test_a_stopped_loop_is_not_fed(manager: socket.socket, served: subprocess.Popen[str]) -> None:
+def test_a_stopped_process_is_not_fed(manager: socket.socket, served: subprocess.Popen[str]) -> None:
     until(manager, "WATCHDOG=1".__eq__)
     served.send_signal(signal.SIGSTOP)
     manager.settimeout(1)
@@ -83,6 +120,56 @@ def test_a_stopped_loop_is_not_fed(manager: socket.socket, served: subprocess.Po
     served.send_signal(signal.SIGCONT)
     manager.settimeout(30)
     until(manager, "WATCHDOG=1".__eq__)
+
+
+def test_a_loop_that_hangs_is_not_fed_by_other_threads(manager: socket.socket, tmp_path: Path) -> None:
+    flag = tmp_path / "hang"
+    with serving(manager, tmp_path, program=("-c", HANGING, str(flag))):
+        until(manager, "WATCHDOG=1".__eq__)
+        flag.touch()
+        manager.settimeout(2)
+        with pytest.raises(TimeoutError):  # what was sent before it stood still, and then nothing
+            until(manager, lambda _: False)
+        flag.unlink()
+        manager.settimeout(30)
+        until(manager, "WATCHDOG=1".__eq__)
+
+
+@pytest.mark.slow
+def test_what_is_amiss_is_told_in_every_place(manager: socket.socket, tmp_path: Path) -> None:
+    """systemd's status line, MAVLink's heartbeat and text, the stream and `dappled status`, and the console."""
+    links, pages = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
+    rest = f'[mavlink]\nurl = "udpin:127.0.0.1:{links}"\n[console]\nbind = "127.0.0.1:{pages}"\n'
+    settings, deadline = tmp_path / "dappled.toml", time.monotonic() + 60
+    with (
+        serving(manager, tmp_path, RECORD + rest) as daemon,
+        closing(mavutil.mavlink_connection(f"udpout:127.0.0.1:{links}", source_system=255)) as ground,
+    ):
+        until(manager, "READY=1".__eq__)
+        heard = listening(ground, deadline)
+        assert any(one.get_type() == "HEARTBEAT" for one in heard)  # the link is up: what comes now is heard
+        settings.write_text(RECORD.replace("= 1", "= 9000000") + rest, encoding="utf-8")
+        daemon.send_signal(signal.SIGHUP)
+        text = "disk nearly full"
+        assert any(one.get_type() == "STATUSTEXT" and text in one.text for one in heard)
+        critical = mavutil.mavlink.MAV_STATE_CRITICAL
+        assert any(one.get_type() == "HEARTBEAT" and one.system_status == critical for one in heard)
+        until(manager, lambda told: told.startswith("STATUS=") and text in told)
+        asked = dappled("status", f"ipc://{tmp_path}/r/slices", "--timeout", "30")
+        assert f"problem   {text}" in asked.stdout, asked.stderr
+        with httpx.Client(base_url=f"http://127.0.0.1:{pages}", timeout=30) as page:
+            state = page.get("/api/state").json()
+            assert any(text in problem for problem in state["health"]["problems"])
+            assert re.search(r"^dappled_problems [1-9]", page.get("/metrics").text, re.MULTILINE)
+
+
+def listening(ground: Any, deadline: float) -> Iterator[Any]:
+    """What the camera sends to a ground station that is there."""
+    while time.monotonic() < deadline:
+        ground.mav.heartbeat_send(6, 8, 0, 0, 4)
+        message = ground.recv_match(blocking=True, timeout=0.2)
+        if message is not None and message.get_srcComponent() == 100:
+            yield message
 
 
 @analyze
