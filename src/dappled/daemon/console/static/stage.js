@@ -75,7 +75,7 @@ export class Stage {
     const turn = ++this.turn, { frame, tab } = this;
     if (!frame) return;
     const index = frame.tag.frame, base = `/api/frames/${index}/`;
-    $("which").textContent = `frame ${index}`;
+    $("which").textContent = `frame ${index} is loading`;   // until then what is seen is the one before
     $("empty").textContent = `Waiting for the picture of frame ${index}.`;
     try {
       if (tab === "refocus") await this.loadViews(base, turn);
@@ -83,6 +83,7 @@ export class Stage {
     } catch (error) {
       if (turn === this.turn) await this.fall(base, turn, error.message);
     }
+    if (turn === this.turn) $("which").textContent = `frame ${index}`;
   }
 
   // Without views there is still the picture that all of them share.
