@@ -10,7 +10,7 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 CONNECTIONS = 64  # above it one that asks for nothing goes
-PER_ADDRESS = 12  # a browser opens at most six
+PER_ADDRESS = 24  # a browser opens at most six; some machines have a few pages open, and a virtual globe
 REQUEST_S = 10.0  # from the connection, or the last answer, to a whole request
 UNREAD_S = 30.0  # for a page that does not read what it is sent
 _USER_TIMEOUT_MS = 20_000  # for a peer that is gone without a word: a phone out of the Wi-Fi's reach
