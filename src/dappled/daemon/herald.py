@@ -81,7 +81,7 @@ class Herald:
         self._outside.finished(story)
 
     def _camera_changed(self, change: StateChanged) -> None:
-        log.info("camera %s %s", change.state, change.reason)
+        log.debug("camera %s %s", change.state, change.reason)  # whoever runs the daemon says it in words
         if change.state != "busy" and not (change.state == "ready" and self._identity):
             reason = f": {change.reason}" if change.reason else ""
             calm = change.state in ("ready", "starting")
