@@ -9,10 +9,9 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 from dappled.daemon import camera_messages
-from dappled.daemon.autopilot import AutopilotRequests
+from dappled.daemon.autopilot import Links, OwnAutopilot
 from dappled.daemon.camera_commands import CameraCommands
 from dappled.daemon.camera_messages import CameraFacts, Captured, Storage
 from dappled.daemon.clock import Clock
@@ -21,7 +20,6 @@ from dappled.daemon.copies import Copies
 from dappled.daemon.ftp_server import FtpServer
 from dappled.daemon.identity import Identity
 from dappled.daemon.knobs import Knobs
-from dappled.daemon.orders import Orders
 from dappled.daemon.parameters import Parameters, Reply
 from dappled.daemon.periodic import MessageIntervals
 from dappled.daemon.pilot import PilotLines
@@ -35,15 +33,6 @@ __all__ = ["CameraFacts", "Captured", "Component", "Storage"]
 HEARTBEAT_NS = 10**9
 STATUS_NS = 100_000_000
 _OLD_IMAGES_A_TICK = 2
-
-
-class Links(Protocol):
-    """What the component needs of `drivers.mavlink.MavlinkLinks`."""
-
-    system_id: int
-    component_id: int
-
-    def send(self, message: Message, link: int | None = None) -> bool: ...
 
 
 class Component:
@@ -80,9 +69,8 @@ class Component:
         self._commands = CameraCommands(shutter, clock, self._telling, knobs, self._intervals)
         self._parameters = Parameters(knobs)
         self._files = FtpServer(self._telling.files)
-        self._orders = Orders()
         self._identity = Identity(links.system_id, clock.monotonic_ns())
-        self._requests = AutopilotRequests()
+        self._autopilot = OwnAutopilot(links, self._identity, clock)
         self._copies = Copies()
         self._lines = PilotLines()
         self._results: deque[tuple[Command, int]] = deque(maxlen=64)
@@ -119,7 +107,7 @@ class Component:
             if packet.trusted:  # else anybody could say whose camera this is, and where orders to its autopilot go
                 self._identity.heard(message, packet.link, self._clock.monotonic_ns())
         elif message.get_srcSystem() == self._identity.system_id:
-            self._requests.heard(message.get_msgId())
+            self._autopilot.heard(message)
 
     def _command(self, packet: Packet) -> None:
         if not self._is_for_us(packet.message):
@@ -128,7 +116,7 @@ class Component:
         if self._is_copy(packet):
             self._acknowledge_again(command)
             return
-        echo = self._commands.fires(command) and self._is_echo(packet, str(command.name))
+        echo = self._commands.fires(command) and self._autopilot.is_echo(packet, str(command.name))
         answer = Answer(ACCEPTED) if echo else self._commands.answer(command)
         if not command.broadcast or answer.result == ACCEPTED:  # a broadcast is for whoever can: never refused
             self._acknowledge(command, answer.result)
@@ -162,7 +150,7 @@ class Component:
             return
         if name == "CAMERA_FEEDBACK" and not self._feedback_is_shot:
             return  # the hot shoe's time of a shot that is known already: telemetry has it
-        if self._is_echo(packet, name):
+        if self._autopilot.is_echo(packet, name):
             return
         source = f"mavlink:{message.get_srcSystem()}/{message.get_srcComponent()}"
         sequence = message.seq if name == "CAMERA_TRIGGER" else message.img_idx
@@ -199,41 +187,16 @@ class Component:
     def _is_copy(self, packet: Packet) -> bool:
         return self._copies.is_copy(packet, self._clock.monotonic_ns())
 
-    def _is_echo(self, packet: Packet, kind: str) -> bool:
-        """Whether our own autopilot only tells that it does what we ordered."""
-        message = packet.message
-        if (message.get_srcSystem(), message.get_srcComponent()) != (self._identity.system_id, 1):
-            return False
-        return self._orders.is_echo(kind, packet.link, self._clock.monotonic_ns())
-
     def _ordered_result(self, packet: Packet) -> None:
-        """The autopilot's answer to an order of ours: a refusal is told, since nobody else would hear of it."""
-        message = packet.message
-        ours = message.get_srcSystem() == self._identity.system_id and message.target_component in (
-            0,
-            self._links.component_id,
-        )
-        if (
-            ours
-            and message.command in self._orders.commands
-            and message.result not in (ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
-        ):
-            result = mavlink.enums["MAV_RESULT"].get(message.result)
-            word = result.name.removeprefix("MAV_RESULT_").lower() if result else message.result
-            self.say(f"the autopilot did not fire the camera: command {message.command} {word}")
+        refusal = self._autopilot.refusal(packet.message)
+        if refusal is not None:
+            self.say(refusal)
 
     # what goes out
 
     def order(self, number: int, parameters: Sequence[float]) -> str | None:
         """Give our autopilot a command (MAV_CMD, parameters from the first); a sentence where it can't be given."""
-        autopilot = self._identity.autopilot()
-        if autopilot is None:
-            return "no autopilot was heard on the MAVLink links"
-        system, link = autopilot
-        self._orders.given(number, self._clock.monotonic_ns())
-        seven = (*parameters, *(0.0,) * (7 - len(parameters)))
-        sent = self._links.send(mavlink.MAVLink_command_long_message(system, 1, number, 0, *seven), link)
-        return None if sent else "its link takes no more messages"
+        return self._autopilot.order(number, parameters)
 
     def announce(self, captured: Captured) -> None:
         """A shot ended, its frame safe or lost: tell everybody, once."""
@@ -271,10 +234,7 @@ class Component:
                     mavlink.MAV_TYPE_CAMERA, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, state, 3
                 )
             )
-        autopilot = self._identity.autopilot()
-        if autopilot is not None:
-            for message in self._requests.due(autopilot[0], now_ns, self._clock.utc_ns()):
-                self._links.send(message, autopilot[1])
+        self._autopilot.ask()
         if self._status_wanted.is_set() and now_ns >= self._status_due_ns:
             self._status_wanted.clear()
             self._status_due_ns = now_ns + STATUS_NS

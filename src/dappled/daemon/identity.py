@@ -37,9 +37,10 @@ class Identity:
             self.settled = waited = True
         if self._nobody_yet and self.autopilots and waited:
             self._nobody_yet = False
-            if len(self.autopilots) == 1:
+            heard = tuple(self.autopilots)  # as of now: another may be heard meanwhile
+            if len(heard) == 1:
                 self.settled = True
-                self.system_id = next(iter(self.autopilots))
+                self.system_id = heard[0]
         return self.settled
 
     def doubt(self) -> str | None:

@@ -102,8 +102,7 @@ class Parameters:
         except CameraError as error:
             result, value, words = _FAILED, knob.value, str(error)
         if result != _IN_PROGRESS:
-            with self._lock:
-                self._asked.pop(knob.name, None)
+            self._done(knob.name, asked)
         return Reply((_ack(knob.name, code(value), result),), words)
 
     def settled(self, now_ns: int, refused: str | None = None) -> list[tuple[int, Reply]]:
@@ -122,10 +121,17 @@ class Parameters:
                 reply = Reply((_ack(name, code(now), _FAILED),), f"{name} stays {now or 'unknown'}: {why}")
             else:
                 continue
-            with self._lock:
-                self._asked.pop(name, None)
-            replies.append((asked.link, reply))
+            if self._done(name, asked):
+                replies.append((asked.link, reply))
         return replies
+
+    def _done(self, name: str, asked: _Asked) -> bool:
+        """Whether this is still what was asked for: not another value meanwhile, and told by nobody else."""
+        with self._lock:
+            ours = self._asked.get(name) is asked
+            if ours:
+                del self._asked[name]
+        return ours
 
 
 def _value(knob: Knob, index: int, count: int) -> Message:
