@@ -173,6 +173,25 @@ def test_a_frame_that_does_not_decode_is_told_and_the_next_does(tmp_path: Path) 
         assert "not decoded: no carriers" in one.events()
 
 
+def test_frames_are_told_as_left_undecoded_where_that_was_switched_off(tmp_path: Path) -> None:
+    with rig(tmp_path) as one:
+        for number, decoding in enumerate((True, False, True)):
+            one.street.decoding = decoding
+            one.wish(number)
+            story = one.ended(number)
+            assert ((story.developed is not None), story.problem) == (decoding, "")
+        assert [text for text in one.events() if text.startswith("not decoded")] == [
+            "not decoded: decoding was switched off"
+        ]
+
+
+def test_a_flight_that_decodes_nothing_tells_it_of_no_frame(tmp_path: Path) -> None:
+    with rig(tmp_path, decode=False) as one:
+        one.wish(1)
+        assert one.ended(0).problem == ""
+        assert one.events() == []
+
+
 @pytest.mark.parametrize("method", ["fired", "add_tag", "add_result", "add_event", "safe"])
 def test_a_ledger_that_refuses_once_costs_one_shot_at_most(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str

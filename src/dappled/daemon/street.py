@@ -42,7 +42,8 @@ class Street:
         decode_queue: int,
         preview_interval_s: float = 0.0,
     ) -> None:
-        self.decoding = developer is not None  # off: frames are recorded and tagged, and decoded on the ground
+        self._decodes = developer is not None
+        self.decoding = self._decodes  # off: frames are recorded and tagged, and decoded on the ground
         self._stories = Stories(book, watchers)
         tagging = Tagging(
             book,
@@ -126,7 +127,8 @@ class Street:
         if self.decoding:
             self._decode.put(story)
         else:
-            self._stories.note("not decoded", "decoding was switched off", story.shot.index)
+            if self._decodes:
+                self._stories.note("not decoded", "decoding was switched off", story.shot.index)
             self._stories.finish(story)
 
     def _dropped(self, what: str) -> Callable[[Story], None]:
