@@ -189,7 +189,7 @@ def test_a_flight_that_decodes_nothing_tells_it_of_no_frame(tmp_path: Path) -> N
     with rig(tmp_path, decode=False) as one:
         one.wish(1)
         assert one.ended(0).problem == ""
-        assert one.events() == []
+        assert not any(text.startswith("not decoded") for text in one.events())
 
 
 @pytest.mark.parametrize("method", ["fired", "add_tag", "add_result", "add_event", "safe"])
