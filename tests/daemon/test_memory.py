@@ -1,11 +1,14 @@
-"""Large blocks are used again: seen by the page faults of a process of its own."""
+"""Large blocks are used again: seen by the page faults of a process of its own. Who goes first when it is short."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+from dappled.daemon.memory import CONSOLE_GOES, DECODER_GOES
 
 PROGRAM = """
 import resource, sys
@@ -30,3 +33,15 @@ def faults(how: str) -> int:
 
 def test_a_block_that_was_freed_is_had_again_without_page_faults() -> None:
     assert faults("reuse") * 10 < faults("plain")
+
+
+def test_looking_goes_before_decoding_and_decoding_before_the_rest() -> None:
+    program = "from dappled.daemon.memory import *; goes_first({}); print(open('/proc/self/oom_score_adj').read())"
+    own = int(Path("/proc/self/oom_score_adj").read_text(encoding="ascii"))
+    scores = [own]
+    for score in (DECODER_GOES, CONSOLE_GOES):
+        done = subprocess.run(
+            [sys.executable, "-c", program.format(score)], capture_output=True, text=True, check=True, timeout=60
+        )
+        scores.append(int(done.stdout))
+    assert scores == [own, 500, 800]

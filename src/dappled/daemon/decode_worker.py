@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import io
 import os
@@ -11,7 +10,6 @@ import socket
 import sys
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +17,7 @@ from PIL import Image
 
 from dappled.daemon import wire
 from dappled.daemon.development import NICENESS, serve
+from dappled.daemon.memory import DECODER_GOES, goes_first
 from dappled.decode import depth, evidence, viewstack
 from dappled.decode.depthmap import DepthMap
 from dappled.decode.errors import DecodeError
@@ -162,8 +161,7 @@ def main() -> None:
     end_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C is the parent's to act on
     os.nice(NICENESS)
-    with contextlib.suppress(OSError):  # short of memory, the kernel shall end this process and not the recorder
-        Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
+    goes_first(DECODER_GOES)
     serve(socket.socket(fileno=fd), Worker())
 
 

@@ -1,8 +1,12 @@
-"""Memory for large messages, used again instead of being given back to the kernel after each one."""
+"""Memory: large blocks are used again instead of being given back to the kernel; and who goes when it is short."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+from pathlib import Path
+
+DECODER_GOES, CONSOLE_GOES = 500, 800  # of 1000: looking before decoding, decoding before recording
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # <malloc.h>
 _LARGE_BYTES = 1 << 30
@@ -21,3 +25,10 @@ def reuse_large_blocks() -> bool:
     wanted = ((_M_MMAP_THRESHOLD, _LARGE_BYTES), (_M_TRIM_THRESHOLD, _LARGE_BYTES), (_M_ARENA_MAX, 1))
     taken = [mallopt(*one) for one in wanted]
     return all(taken)
+
+
+def goes_first(score: int) -> None:
+    """Let the kernel, when it is short of memory, end this process before those with a lower score (proc(5),
+    oom_score_adj); children inherit it. What the system does not allow stays as it is."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(str(score), encoding="ascii")

@@ -25,7 +25,7 @@ from dappled.daemon.console.feed import Feed
 from dappled.daemon.console.hub import Hub
 from dappled.daemon.console.parts import Parts
 from dappled.daemon.console.studio import Studio
-from dappled.daemon.memory import reuse_large_blocks
+from dappled.daemon.memory import CONSOLE_GOES, goes_first, reuse_large_blocks
 from dappled.drivers.camera_channel import Channel
 from dappled.drivers.darkroom import Recipe
 from dappled.errors import DappledError, report
@@ -39,6 +39,7 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C is the daemon's to act on
     logging.basicConfig(level=logging.WARNING, handlers=[journal.handler()])
     os.nice(NICENESS)
+    goes_first(CONSOLE_GOES)
     reuse_large_blocks()
     channel = Channel(socket.socket(fileno=int(sys.argv[1])))
     listener = socket.socket(fileno=int(sys.argv[2]))
