@@ -199,3 +199,18 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
     service.stop()
     assert after.next == replace(settings, mask=MaskSettings("mask-3"))
     assert "next flight: mask mask-3 from there on, by the ground station" in told(service.folder)
+
+
+def test_a_viewer_s_thread_that_dies_is_told_and_ends_no_flight(
+    camera: FakeCamera, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = started(settings, [])
+    try:
+        with monkeypatch.context() as broken:
+            broken.setattr(service._parts.answers, "dead", lambda: ["answers"])
+            assert "the answers thread has ended: restart dappled" in service.health()["problems"]
+            assert service.whole()
+            broken.setattr(service._parts.street, "dead", lambda: ["capture"])
+            assert not service.whole()
+    finally:
+        service.stop()

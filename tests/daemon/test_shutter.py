@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dappled.daemon import shutter as module
 from dappled.daemon.clock import RecordedClock, SystemClock
 from dappled.daemon.shutter import Shutter, Wish
 from dappled.flight.records import Shot
@@ -261,6 +262,31 @@ def test_the_thread_serves_intervals_on_the_real_clock() -> None:
     finally:
         shutter.stop()
     assert fired == [0, 1, 2]
+
+
+def test_an_interval_outlives_whoever_notes_going_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_AGAIN_S", 0.01)
+    enough, noted, fired = threading.Event(), list[int](), list[int]()
+
+    def note(shot: Shot) -> None:
+        noted.append(shot.index)
+        if len(noted) == 2:
+            raise RuntimeError("nobody foresaw this")
+
+    def fire(index: int) -> None:
+        fired.append(index)
+        if len(fired) == 3:
+            enough.set()
+
+    shutter = Shutter(next_index=0, note=note, fire=fire, clock=SystemClock())
+    shutter.start()
+    try:
+        shutter.start_interval(Wish(PILOT, "x"), 0.1, 3)
+        assert enough.wait(20)
+        assert shutter.dead() == []
+    finally:
+        shutter.stop()
+    assert (noted, fired) == ([0, 1, 1, 2], [0, 1, 2])
 
 
 def test_every_refusal_is_told() -> None:

@@ -17,7 +17,6 @@ from dappled.drivers.camera import (
     Deferred,
     Event,
     Fired,
-    Identity,
     SettingsChanged,
     ShotFailed,
     State,
@@ -44,7 +43,6 @@ class Capture:
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
         self.state: State = "starting"
         self.reason = ""
-        self.identity: Identity | None = None
 
     def dead(self) -> list[str]:
         """The thread's name where it has ended without being asked to: never, unless there is a bug."""
@@ -119,7 +117,6 @@ class Capture:
 
     def _state_changed(self, change: StateChanged) -> None:
         self.state, self.reason = change.state, change.reason
-        self.identity = change.identity or self.identity
         if not self._stopping.is_set():
             self._stories.tell(self._watchers.camera, change)
 

@@ -5,6 +5,7 @@ The worker (`dappled.daemon.decode_worker`) runs at low priority and hands its a
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import mmap
 import os
@@ -210,11 +211,12 @@ class WorkerDeveloper:
         process, self._process, self._channel = self._process, None, None
         if process is None:
             return None
-        try:
+        with contextlib.suppress(subprocess.TimeoutExpired):
             return process.wait(0.5)
-        except subprocess.TimeoutExpired:
-            process.kill()
+        process.kill()
+        with contextlib.suppress(subprocess.TimeoutExpired):  # the kernel holds it; it ends when that lets go
             return process.wait(5)
+        return None
 
 
 def _manner(code: int | None) -> str:

@@ -116,18 +116,19 @@ class FlightParts:
             decode_queue=now.decode.queue,
             preview_interval_s=now.publish.preview_interval_s,
         )
+        self._vital: tuple[Part, ...] = (self.street, links, self.shutter)
         self.answers = Answers(self.book, self.developer, self.street.decoding_idle)
 
     def dead(self) -> list[str]:
         """Threads that have ended without being asked to: none, unless there is a bug."""
-        parts: list[Part] = [self.street, self._links, self.shutter, self.answers]
+        parts: list[Part] = [*self._vital, self.answers]
         if self.depth is not None:
             parts.append(self.depth)
         return [name for part in parts for name in part.dead()]
 
     def whole(self) -> bool:
-        """Whether every part still works."""
-        return not self.dead()
+        """Whether everything works that photographs are taken and kept with: no viewer's loss ends a flight."""
+        return not any(part.dead() for part in self._vital)
 
     def on_packet(self, packet: Packet) -> None:
         """A packet came over a link, or went out: to the poses first, so that what it asks for finds it there."""

@@ -197,7 +197,7 @@ class Service:
             chore.turn(self._clock.monotonic_ns())
 
     def whole(self) -> bool:
-        """Whether every part still works."""
+        """Whether everything works that photographs are taken and kept with."""
         return self._parts.whole()
 
     def health(self) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Literal
 
 from dappled.daemon.clock import Clock
 from dappled.daemon.wishes import Recent, Wish
+from dappled.errors import report
 from dappled.flight.errors import FlightError
 from dappled.flight.records import Cause, Shot
 
@@ -19,6 +20,7 @@ __all__ = ["Shutter", "ShutterStatistics", "Verdict", "Wish"]
 log = logging.getLogger(__name__)
 _IDLE_S = 3600.0
 _SHORTEST_S = 0.05
+_AGAIN_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,4 +269,9 @@ class Shutter:
     def _run(self) -> None:
         while not self._stopped:
             self._wake.clear()
-            self._clock.wait(self._wake, self.serve())
+            try:
+                wait_s = self.serve()
+            except Exception as error:  # noqa: BLE001  # of whoever notes or fires: the interval goes on
+                report(log, "interval", error)
+                wait_s = _AGAIN_S
+            self._clock.wait(self._wake, wait_s)

@@ -18,7 +18,7 @@ from dappled.daemon.stories import Stories
 from dappled.daemon.story import Book, Names, PoseSource, Story, Watchers
 from dappled.daemon.tagger import BodyLatency
 from dappled.daemon.tagging import Tagging
-from dappled.drivers.camera import Camera, Identity, State
+from dappled.drivers.camera import Camera, State
 from dappled.errors import sentence
 from dappled.flight.records import Shot
 
@@ -104,11 +104,6 @@ class Street:
     def camera_reason(self) -> str:
         """Why it is in that state; "" where there is nothing to say."""
         return self._capture.reason
-
-    @property
-    def identity(self) -> Identity | None:
-        """Which camera it is; None before it has told."""
-        return self._capture.identity
 
     def dead(self) -> list[str]:
         """Which of the street's threads have ended without being asked to: none, unless there is a bug."""
