@@ -146,17 +146,13 @@ def _publish(publisher: PublisherStatistics) -> dict[str, Any]:
 
 def _place(pose: Pose) -> dict[str, float | None]:
     """Where the vehicle is, for a map."""
-
-    def degrees(value: float | None) -> float | None:
-        return None if value is None else math.degrees(value)
-
     speed = pose.velocity_ned_m_s
     return {
-        "latitude_deg": degrees(pose.latitude_rad),
-        "longitude_deg": degrees(pose.longitude_rad),
+        "latitude_deg": wire.degrees(pose.latitude_rad),
+        "longitude_deg": wire.degrees(pose.longitude_rad),
         "altitude_msl_m": pose.altitude_msl_m,
         "height_above_home_m": pose.height_above_home_m,
-        "yaw_deg": degrees(wire.euler(pose.attitude)[2]) if pose.attitude else None,
+        "yaw_deg": wire.degrees(wire.euler(pose.attitude)[2]) if pose.attitude else None,
         "speed_m_s": math.hypot(*speed) if speed else None,
         "position_sigma_m": pose.position_sigma_m,
         "age_ms": pose.age_ms,

@@ -36,14 +36,23 @@ class Message:
         found: dict[str, NDArray[Any]] = {}
         start = 0
         data = memoryview(self.body or b"").cast("B")
-        for entry in self.header.get("arrays", []):
-            dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
-            size = dtype.itemsize * math.prod(shape)
-            if start + size > len(data):
-                raise WireError(f"the body of {self.topic} ends inside array {entry['name']!r}")
-            found[entry["name"]] = np.frombuffer(data[start : start + size], dtype).reshape(shape)
-            start += size
+        try:
+            for entry in self.header.get("arrays", []):
+                dtype, shape = np.dtype(entry["dtype"]), _shape(entry["shape"])
+                size = dtype.itemsize * math.prod(shape)
+                if start + size > len(data):
+                    raise WireError(f"the body of {self.topic} ends inside array {entry['name']!r}")
+                found[entry["name"]] = np.frombuffer(data[start : start + size], dtype).reshape(shape)
+                start += size
+        except (KeyError, TypeError, ValueError) as error:
+            raise WireError(f"the arrays of {self.topic} are not described as they are: {error}") from None
         return found
+
+
+def _shape(sides: Sequence[int]) -> tuple[int, ...]:
+    if min(sides, default=0) < 0:
+        raise ValueError("a side is less than nothing")
+    return tuple(sides)
 
 
 def describe_array(name: str, array: NDArray[Any], unit: str) -> dict[str, Any]:
@@ -69,10 +78,6 @@ def frame_facts(tag: Tag, law: str | None) -> dict[str, Any]:
 def pose_face(tag: Tag) -> dict[str, Any]:
     """The pose as people and maps read it: degrees, and roll, pitch, yaw of the vehicle beside the quaternion."""
     pose = tag.pose
-
-    def degrees(value: float | None) -> float | None:
-        return None if value is None else math.degrees(value)
-
     roll, pitch, yaw = euler(pose.attitude) if pose.attitude else (None, None, None)
     return {
         "source": pose.source,
@@ -93,6 +98,11 @@ def pose_face(tag: Tag) -> dict[str, Any]:
     }
 
 
+def degrees(angle_rad: float | None) -> float | None:
+    """An angle as people read it; unknown stays unknown."""
+    return None if angle_rad is None else math.degrees(angle_rad)
+
+
 def euler(q: Sequence[float]) -> tuple[float, float, float]:
     """(roll, pitch, yaw) in radians of a body-to-NED quaternion (w, x, y, z); yaw from 0 to 2π."""
     w, x, y, z = q
@@ -111,7 +121,7 @@ def decode(parts: Sequence[Any]) -> Message:
     """A message from its parts. Raises WireError for anything else."""
     try:
         topic, header = bytes(parts[0]).decode(), json.loads(bytes(parts[1]))
-    except (IndexError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (IndexError, ValueError, RecursionError) as error:  # ValueError: no UTF-8, no JSON, a number without end
         raise WireError(f"not a dappled message: {error}") from None
     if not isinstance(header, dict):
         raise WireError("not a dappled message: the header is no JSON object")
