@@ -12,11 +12,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import dappled
 from dappled.cli import story
 from dappled.cli.common import seconds
 from dappled.config import settings as configuration
-from dappled.daemon import curve, inputs, replay, runs
+from dappled.daemon import curve, headers, inputs, replay, runs
 from dappled.daemon.answers import Answers
 from dappled.daemon.books import ReplayBook
 from dappled.daemon.development import WorkerDeveloper
@@ -25,7 +24,7 @@ from dappled.daemon.replay import Progress, RecordedTelemetry, ReplayError
 from dappled.daemon.runs import Run, RunBook
 from dappled.daemon.story import Names, Story, Watchers
 from dappled.daemon.street import Street
-from dappled.daemon.tagger import LATENCY_SOURCE, BodyLatency
+from dappled.daemon.tagger import BodyLatency
 from dappled.drivers.camera import Identity
 from dappled.drivers.darkroom import Recipe
 from dappled.drivers.replay import ReplayCamera
@@ -139,14 +138,7 @@ def _play(
     """The recording down the street; how many frames came to a bad end."""
     names, latency, recorded = flown
     clock, progress = replay.clock(recording), Progress.begin()
-    telemetry = RecordedTelemetry(
-        recording.telemetry,
-        recording.horizons,
-        wait_s=recorded.pose.wait_ms / 1e3,
-        vehicles=recording.vehicles,
-        component_id=recorded.mavlink.component_id,
-        attitude_sigma_rad=math.radians(recorded.pose.attitude_sigma_deg),
-    )
+    telemetry = RecordedTelemetry.flown(recorded, recording.telemetry, recording.horizons, recording.vehicles)
 
     def finished(one: Story) -> None:
         print(story.as_json(one) if arguments.json else story.line(one), flush=True)
@@ -154,7 +146,7 @@ def _play(
 
     publisher = _publisher(settings, book, developer, stack) if arguments.publish else None
     if publisher:
-        publisher.publish("start", _start(settings, names, clock.utc_ns()))
+        publisher.publish("start", headers.start_header(settings, names, clock.utc_ns()))
     identity = Identity("dappled", "recording", "", str(arguments.flight))
     street = Street(
         camera=ReplayCamera(recording.files, identity, clock.monotonic_ns),
@@ -219,8 +211,7 @@ def _as_recorded(
     if "settings" not in facts or "names" not in facts:
         raise ReplayError(f"{arguments.flight}/flight.toml lacks its settings; replay its folder frames/ with --mask")
     recorded = configuration.of_tables(facts["settings"], "flight.toml")
-    camera = recorded.camera
-    latency = BodyLatency(camera.latency_ms, camera.latency_sigma_ms, LATENCY_SOURCE)
+    latency = BodyLatency.of(recorded.camera)
     changed = any(getattr(arguments, name) for name in ("camera", "mask"))
     return inputs.names(recipe) if changed else Names(**facts["names"]), latency, recorded
 
@@ -242,17 +233,6 @@ def _publisher(
     publisher.start(book.root.absolute().name)
     stack.callback(publisher.stop)
     return publisher
-
-
-def _start(settings: configuration.Settings, names: Names, utc_ns: int) -> dict[str, Any]:
-    return {
-        "utc_ns": utc_ns,
-        "software": f"dappled {dappled.__version__}",
-        "camera": names.camera,
-        "mask": names.mask,
-        "slices": settings.publish.slices,
-        "ask": settings.publish.ask,
-    }
 
 
 def _pace(arguments: argparse.Namespace) -> replay.Pace | None:
