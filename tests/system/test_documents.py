@@ -1,4 +1,4 @@
-"""Every command that the documents print runs, as printed, and ends well."""
+"""Every command that the documents print runs, as printed, and ends well; limits that they state are the code's."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from dappled.config.settings import CameraSettings, PublishSettings
+from dappled.daemon import copies, reload, wishes
+from dappled.daemon.console import access, connection, hub
 from tests.system.documents import ROOT, Stage, commands, stage
 
 DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
@@ -34,3 +37,38 @@ def test_commands_are_found(tmp_path: Path) -> None:
 def test_the_documents_commands_run(document: Path, on_stage: Stage) -> None:
     failures = on_stage.all_fail(commands(document))
     assert not failures, "\n".join(failures)
+
+
+NUMBERS = {
+    "console.md": [
+        f"At most {hub.PAGES} pages; each has a queue of {hub.WAITING} events",
+        f"One address has {connection.PER_ADDRESS} connections, all together {connection.CONNECTIONS}",
+        (
+            f"no whole request within {connection.REQUEST_S:.0f} seconds is closed, and one whose reader stands still "
+            f"for {connection.UNREAD_S:.0f}"
+        ),
+        f"JSON, at most {access.BODY_BYTES // 1024} kB",
+    ],
+    "mavlink.md": [
+        (
+            f"comes twice over one link within {copies.COPY_NS / 1e9:g} s, or over another link within "
+            f"{copies.OTHER_LINK_NS / 1e9:g} s"
+        ),
+        f"within {wishes.RETRY_NS / 1e9:g} s of the last such message, and within {wishes.RETRY_LIMIT_NS / 1e9:g} s",
+        f"where the sender itself says that it repeats, {wishes.CONFIRMED_RETRY_NS / 1e9:g} s",
+        f"within {wishes.TRIGGER_NS / 1e9:g} s of a shot's first message",
+    ],
+    "operating.md": [
+        f"a millisecond instead of {CameraSettings().latency_sigma_ms:g}",
+        "what can change in flight ("
+        + ", ".join(f"`{table}.{key}`" for table, key in sorted(reload.SAFE, reverse=True))
+        + ")",
+    ],
+    "wire.md": [f"`publish.high_water_mark` messages ({PublishSettings().high_water_mark})"],
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_documents_say_the_numbers_that_hold(name: str) -> None:
+    text = " ".join((ROOT / "docs" / name).read_text(encoding="utf-8").split())
+    assert [sentence for sentence in NUMBERS[name] if sentence not in text] == []
