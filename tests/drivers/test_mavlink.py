@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pty
 import socket
@@ -14,7 +15,7 @@ import pytest
 from dappled.drivers import mavlink as mavlink_links
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, Packet, mavlink
 from dappled.drivers.mavlink_address import Address
-from dappled.drivers.mavlink_stream import Stream, over_tcp
+from dappled.drivers.mavlink_stream import Listener, Stream, over_tcp
 
 
 class Clock:
@@ -125,6 +126,74 @@ def test_a_client_that_fell_silent_does_not_keep_the_next_one_waiting() -> None:
             assert second.recv(300)[0] == 0xFD
             vanished.settimeout(10)
             assert vanished.recv(300) == b""  # let go: a machine that is still there comes again
+
+
+def test_a_client_is_not_let_go_while_somebody_writes_to_it() -> None:
+    """Its descriptor could be another file's by then."""
+    told: list[str] = []
+    began, go_on = threading.Event(), threading.Event()
+
+    class Slow:
+        def write(self, _data: bytes) -> bool:
+            told.append("begun")
+            began.set()
+            assert go_on.wait(20)
+            told.append("written")
+            return True
+
+        def close(self) -> None:
+            told.append("closed")
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.setblocking(False)
+        listener = Listener(server)
+        listener._client = Slow()  # type: ignore[assignment]  # all that is asked of one
+        writer = threading.Thread(target=listener.write, args=[b"x"])
+        writer.start()
+        assert began.wait(20)
+        with socket.create_connection(server.getsockname()):
+            reader = threading.Thread(target=listener.read)
+            reader.start()
+            reader.join(0.1)
+            assert told == ["begun"]
+            go_on.set()
+            for thread in (writer, reader):
+                thread.join(20)
+            assert told == ["begun", "written", "closed"]
+        listener.close()
+
+
+@pytest.mark.parametrize("number", [errno.ECONNABORTED, errno.EHOSTUNREACH])
+def test_one_who_left_before_it_was_let_in_costs_nobody_the_link(number: int) -> None:
+    class Knocked:
+        """A listening socket at which somebody knocks and runs away."""
+
+        def __init__(self, sock: socket.socket) -> None:
+            self.sock, self.away = sock, True
+
+        def accept(self) -> tuple[socket.socket, object]:
+            if self.away:
+                self.away = False
+                raise OSError(number, os.strerror(number))
+            return self.sock.accept()
+
+        def close(self) -> None:
+            self.sock.close()
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        door = Knocked(server)
+        server.setblocking(False)
+        listener = Listener(door)  # type: ignore[arg-type]  # all that it asks of one
+        with socket.create_connection(server.getsockname()) as client:
+            assert listener.read() == b""  # who ran away
+            client.sendall(b"here")
+            deadline, heard = time.monotonic() + 20, listener.read()
+            while not heard:
+                assert time.monotonic() < deadline
+                door.away = not door.away  # again and again
+                heard = listener.read()
+            assert heard == b"here"
+        listener.close()
 
 
 def test_a_connection_whose_other_side_vanished_is_given_up_within_seconds() -> None:

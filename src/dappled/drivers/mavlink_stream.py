@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import termios
+import threading
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 
 from dappled.drivers.mavlink_address import Address, LinkError
 
 _CHUNK = 65536
 _OUTBOX_LIMIT = 65536
 _GONE_S = 5
+_NOBODY = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNABORTED, errno.EPROTO, errno.ENETDOWN, errno.ENETUNREACH,
+           errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENONET)  # fmt: skip
+"""Errors of `accept` that say nothing against the listening socket: accept(2) tells what befell the newcomer."""
 
 
 class Stream:
@@ -67,15 +71,15 @@ class Listener:
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
         self._client: Stream | None = None
+        self._change = threading.Lock()  # whoever reads lets clients go; nobody may be writing to a descriptor then
 
     def descriptors(self) -> Sequence[int]:
         return (self._sock.fileno(), *(self._client.descriptors() if self._client else ()))
 
     def read(self) -> bytes | None:
-        with suppress(BlockingIOError):
-            newcomer = over_tcp(self._sock.accept()[0])
-            self._leave()
-            self._client = newcomer
+        newcomer = self._accepted()
+        if newcomer is not None:
+            self._leave(newcomer)
             return b""
         if self._client is None:
             return b""
@@ -90,7 +94,8 @@ class Listener:
 
     def write(self, data: bytes) -> bool:
         try:
-            return self._client.write(data) if self._client else False
+            with self._change:
+                return self._client.write(data) if self._client else False
         except OSError:  # reading tells that it has gone
             return False
 
@@ -99,8 +104,9 @@ class Listener:
 
     def flush(self) -> None:
         try:
-            if self._client:
-                self._client.flush()
+            with self._change:
+                if self._client:
+                    self._client.flush()
         except OSError:  # as above
             return
 
@@ -111,10 +117,25 @@ class Listener:
         self._leave()
         self._sock.close()
 
-    def _leave(self) -> None:
-        client, self._client = self._client, None
-        if client:
-            client.close()
+    def _accepted(self) -> Stream | None:
+        """Who has come; None for nobody, and for one who has left again. Raises OSError when nobody can be let in."""
+        try:
+            sock = self._sock.accept()[0]
+        except OSError as error:
+            if error.errno in _NOBODY:
+                return None
+            raise
+        try:
+            return over_tcp(sock)
+        except OSError:  # it is gone by now
+            sock.close()
+            return None
+
+    def _leave(self, newcomer: Stream | None = None) -> None:
+        with self._change:
+            client, self._client = self._client, newcomer
+            if client:
+                client.close()
 
 
 def over_tcp(sock: socket.socket) -> Stream:
