@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -240,16 +241,20 @@ def test_two_daemons_in_one_folder(flights: Path, flight: Recording) -> None:
     begin_later(flights).close()
 
 
-def test_a_beginning_that_fails_leaves_no_lock(flights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("at", [(layout, "create"), (recording, "Recorder")])
+def test_a_beginning_that_fails_leaves_no_lock_no_flight_and_no_thread(
+    flights: Path, monkeypatch: pytest.MonkeyPatch, at: tuple[ModuleType, str]
+) -> None:
     def refuse(*_: object) -> None:
         raise FlightError("no")
 
-    monkeypatch.setattr(layout, "create", refuse)
-    threads = threading.active_count()
+    monkeypatch.setattr(*at, refuse)
+    threads = set(threading.enumerate())
     with pytest.raises(FlightError, match="no"):
         recording.begin(flights, lambda: START_UTC_NS)
     assert not lock.is_held(flights)
-    assert threading.active_count() == threads
+    assert layout.flights(flights) == []
+    assert set(threading.enumerate()) <= threads
 
 
 def test_a_file_in_place_of_the_flights_folder_is_told(tmp_path: Path) -> None:

@@ -117,6 +117,7 @@ def begin(
         journal = WishJournal(folder.journal)
         stack.callback(journal.close)
         telemetry = TelemetryLog(folder.telemetry)
+        stack.callback(telemetry.close)
         _make_names_sure(folder)
         for text in recovered:
             ledger.add_event("recovery", text)
