@@ -237,6 +237,19 @@ def test_a_burst_takes_the_next_shot_when_the_last_one_is_settled() -> None:
     assert rig.fired() == [42, 43, 44]
 
 
+def test_a_burst_before_a_camera_that_is_gone_asks_once_a_second() -> None:
+    rig = Rig()
+    rig.shutter.start_interval(Wish(PILOT, "IMAGE_START_CAPTURE", 1), 0.0, 0)
+    rig.shutter.settled(42, ok=True)
+    rig.obstacle = "the camera is absent"
+    for _ in range(100):
+        rig.tick(0.05)
+    assert 4 <= rig.shutter.statistics().refused <= 6  # each is an event of the record
+    rig.obstacle = None
+    rig.tick(1.0)
+    assert rig.fired() == [42, 43]
+
+
 @pytest.mark.parametrize(("interval_s", "count"), [(-1.0, 0), (float("nan"), 0), (1e9, 0), (1.0, -2)])
 def test_a_senseless_interval_is_refused(interval_s: float, count: int) -> None:
     rig = Rig()

@@ -132,7 +132,8 @@ class Shutter:
         return verdict
 
     def start_interval(self, wish: Wish, interval_s: float, count: int) -> Verdict:
-        """A shot now and then every `interval_s` (0: as soon as the last one is settled), `count` in all, 0 for ever.
+        """A shot now and then every `interval_s` (0: as soon as the last one is settled, or a second after one that was
+        refused), `count` in all, 0 for ever.
 
         Takes the place of a running interval, unless it is a retry of the command that started it; ends at `count`
         shots taken or missed, or at `stop_interval`. A shot that can't be taken when it is due is counted as refused,
@@ -184,7 +185,7 @@ class Shutter:
             if interval is None or (interval.interval_ns == 0 and self._pending):
                 return _IDLE_S
             if now_ns >= interval.due_ns:
-                self._judge(Wish(interval.source, "interval", interval.taken, acknowledged=False))
+                verdict = self._judge(Wish(interval.source, "interval", interval.taken, acknowledged=False))
                 taken = True
                 interval.taken += 1
                 if interval.left is not None:
@@ -195,7 +196,7 @@ class Shutter:
                     behind = (now_ns - interval.due_ns) // interval.interval_ns
                     interval.due_ns += (1 + behind) * interval.interval_ns  # late ticks are missed, not bunched
                 else:
-                    interval.due_ns = now_ns + round(_SHORTEST_S * 1e9)
+                    interval.due_ns = now_ns + round((_SHORTEST_S if verdict.accepted else _AGAIN_S) * 1e9)
             wait_s = _IDLE_S if interval is None else max(0, interval.due_ns - now_ns) / 1e9
         if taken:
             self._on_change()
