@@ -161,6 +161,9 @@ def test_what_is_amiss_is_told_in_every_place(manager: socket.socket, tmp_path: 
             state = page.get("/api/state").json()
             assert any(text in problem for problem in state["health"]["problems"])
             assert re.search(r"^dappled_problems [1-9]", page.get("/metrics").text, re.MULTILINE)
+        with closing(mavutil.mavlink_connection(f"udpout:127.0.0.1:{links}", source_system=254)) as late:
+            heard = listening(late, time.monotonic() + 60)  # it missed what was said before
+            assert any(one.get_type() == "STATUSTEXT" and text in one.text for one in heard)
 
 
 def listening(ground: Any, deadline: float) -> Iterator[Any]:

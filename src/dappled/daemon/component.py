@@ -22,7 +22,7 @@ from dappled.daemon.identity import Identity
 from dappled.daemon.knobs import Knobs
 from dappled.daemon.parameters import Parameters, Reply
 from dappled.daemon.periodic import MessageIntervals
-from dappled.daemon.pilot import PilotLines
+from dappled.daemon.pilot import Audience, PilotLines
 from dappled.daemon.shutter import Shutter, Wish
 from dappled.daemon.telling import DOWN, Telling
 from dappled.drivers.mavlink import Message, Packet, mavlink
@@ -72,7 +72,7 @@ class Component:
         self._identity = Identity(links.system_id, clock.monotonic_ns())
         self._autopilot = OwnAutopilot(links, self._identity, clock)
         self._copies = Copies()
-        self._lines = PilotLines()
+        self._lines, self._audience = PilotLines(), Audience()
         self._results: deque[tuple[Command, int]] = deque(maxlen=64)
         self._heartbeat_due_ns = self._status_due_ns = 0
         self._status_wanted = threading.Event()
@@ -105,7 +105,9 @@ class Component:
             handler(self, packet)
         elif message.get_type() == "HEARTBEAT":
             if packet.trusted:  # else anybody could say whose camera this is, and where orders to its autopilot go
-                self._identity.heard(message, packet.link, self._clock.monotonic_ns())
+                now_ns = self._clock.monotonic_ns()
+                self._identity.heard(message, packet.link, now_ns)
+                self._audience.heard(message, now_ns)
         elif message.get_srcSystem() == self._identity.system_id:
             self._autopilot.heard(message)
 
@@ -218,6 +220,10 @@ class Component:
         """A line for the pilot (STATUSTEXT)."""
         for message in self._lines.messages(text, severity, self._clock.monotonic_ns()):
             self._links.send(message)
+
+    def audience_has_grown(self) -> bool:
+        """Whether a ground station listens that missed what was said before; True once."""
+        return self._audience.has_grown(self._clock.monotonic_ns())
 
     def tick(self) -> None:
         """What is due by now: heartbeat, time requests, stream requests, status, periodic messages, old images."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import threading
 from collections import deque
 from collections.abc import Sequence
 
@@ -12,6 +13,7 @@ from dappled.drivers.mavlink import Message, mavlink
 PIECE_BYTES = 50
 LONGEST_BYTES = 4 * PIECE_BYTES
 AGAIN_NS = 10 * 10**9
+AWAY_NS = 60 * 10**9
 _REMEMBERED = 32
 _NUMBER = re.compile(r"\d+")  # a problem whose numbers change is still the same
 
@@ -42,14 +44,46 @@ class Alarms:
         """Whether there is any, as told last."""
         return bool(self._known)
 
-    def lines(self, problems: Sequence[str]) -> list[tuple[str, int]]:
-        """What is to be said now, and how severe it is."""
+    def lines(self, problems: Sequence[str], *, again: bool = False) -> list[tuple[str, int]]:
+        """What is to be said now, and how severe it is. `again`: also what was said before, as long as it lasts."""
         now = {_NUMBER.sub("#", text) for text in problems}
-        said = [(text, mavlink.MAV_SEVERITY_WARNING) for text in problems if _NUMBER.sub("#", text) not in self._known]
+        told = set() if again else self._known
+        said = [(text, mavlink.MAV_SEVERITY_WARNING) for text in problems if _NUMBER.sub("#", text) not in told]
         if self._known and not now:
             said.append(("all is well again", mavlink.MAV_SEVERITY_INFO))
         self._known = now
         return said
+
+
+class Audience:
+    """The ground stations that read the lines. A daemon starts with the machine, long before anybody listens: who comes
+    later, or back after a minute, has missed what still lasts. Times are monotonic."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._heard_ns: dict[tuple[int, int], int] = {}
+        self._due_ns: int | None = None
+
+    def heard(self, message: Message, now_ns: int) -> None:
+        """A heartbeat."""
+        if message.type != mavlink.MAV_TYPE_GCS:
+            return
+        station = (message.get_srcSystem(), message.get_srcComponent())
+        with self._lock:  # each link has a thread
+            before_ns = self._heard_ns.pop(station, None)
+            self._heard_ns[station] = now_ns
+            if len(self._heard_ns) > _REMEMBERED:
+                del self._heard_ns[next(iter(self._heard_ns))]
+        if before_ns is None or now_ns - before_ns > AWAY_NS:
+            self._due_ns = now_ns + AGAIN_NS  # what was said a moment ago would not be said again
+
+    def has_grown(self, now_ns: int) -> bool:
+        """Whether somebody new listens; True once."""
+        due_ns = self._due_ns
+        if due_ns is None or now_ns < due_ns:
+            return False
+        self._due_ns = None
+        return True
 
 
 def _pieces(text: str, severity: int, number: int) -> list[Message]:

@@ -129,23 +129,24 @@ class Service:
         return kept
 
     def _begin_parts(self, names: Names, stack: ExitStack) -> None:
-        """The end of the street first: whatever is handed on finds somebody at work."""
+        """The end of the street first: whatever is handed on finds somebody at work. What begins badly is stopped
+        too."""
         parts = self._parts
         if parts.developer is not None:
             stack.callback(parts.developer.close)
             parts.developer.begin_warm_up()
-        parts.answers.start()
         stack.callback(parts.answers.stop)
+        parts.answers.start()
         self._publisher.start(self._recording.folder.name)
         self._publisher.publish("start", headers.start_header(self.settings, names, self._clock.utc_ns()))
         stack.callback(self._say_end)
         if parts.depth is not None:
-            parts.depth.start()
             stack.callback(parts.depth.stop)
-        parts.street.start()
+            parts.depth.start()
         stack.callback(parts.street.stop, STOP_S)
-        parts.shutter.start()
+        parts.street.start()
         stack.callback(parts.shutter.stop)
+        parts.shutter.start()
 
     def _say_end(self) -> None:
         try:
@@ -226,8 +227,9 @@ class Service:
     def _tell_health(self) -> None:
         record = self.health()
         self._publisher.publish("health", record)
-        for text, severity in self._parts.alarms.lines(record["problems"]):
-            self._parts.component.say(text, severity)
+        component = self._parts.component
+        for text, severity in self._parts.alarms.lines(record["problems"], again=component.audience_has_grown()):
+            component.say(text, severity)
 
     # what others may look at, and ask for
 
