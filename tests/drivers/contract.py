@@ -68,6 +68,20 @@ def until_shot_ends(camera: Camera, shot: int) -> list[Event]:
     return until(camera, lambda event: isinstance(event, Arrival | ShotFailed) and event.shot == shot)
 
 
+def arrived(camera: Camera, shot: int) -> Arrival:
+    """The file of this shot. Fails where it ends in another way."""
+    end = until_shot_ends(camera, shot)[-1]
+    assert isinstance(end, Arrival), end
+    return end
+
+
+def failed(camera: Camera, shot: int) -> str:
+    """Why this shot failed. Fails where it did not."""
+    end = until_shot_ends(camera, shot)[-1]
+    assert isinstance(end, ShotFailed), end
+    return end.reason
+
+
 def until_quiet(camera: Camera) -> None:
     """Until no event came for a while: a camera may tell its settings after it is ready."""
     deadline = time.monotonic() + PATIENCE_S

@@ -20,7 +20,16 @@ from dappled.mocks import simulated
 from dappled.mocks.eos450d import thumbnail
 from dappled.mocks.finepix import FinePix, picture
 from dappled.mocks.pictures import pattern
-from tests.drivers.contract import CameraContract, Rig, content, of_shots, until, until_shot_ends, until_state
+from tests.drivers.contract import (
+    CameraContract,
+    Rig,
+    content,
+    failed,
+    of_shots,
+    until,
+    until_shot_ends,
+    until_state,
+)
 
 WHO = Identity("FUJIFILM", "FinePix S5200", "", "gpio")
 FAST = Plan(file_s=5.0, hold_s=0.01, poll_s=0.02, retry_s=0.02)
@@ -217,8 +226,7 @@ def test_no_file_fails_the_shot_and_a_late_one_is_told_by_the_camera_s_clock(tmp
         until(camera, lambda event: isinstance(event, Fired) and event.shot == 2)
         taken_s = now_s
         now_s += 20
-        failed = until_shot_ends(camera, 2)[-1]
-        assert isinstance(failed, ShotFailed)
+        failed(camera, 2)
         camera.fire(3)
         until(camera, lambda event: isinstance(event, Fired) and event.shot == 3)
         (body.card / "DCIM" / "late.RAF").write_bytes(picture(2, 6.3, T0 + taken_s + 3600))
@@ -439,9 +447,7 @@ def test_a_line_that_raises_anything_when_pressed_fails_that_shot_only(
     until_state(by_bad_line, "ready")
     bad.raises["press"] = error
     by_bad_line.fire(1)
-    failed = until_shot_ends(by_bad_line, 1)[-1]
-    assert isinstance(failed, ShotFailed)
-    assert "stuck" in failed.reason
+    assert "stuck" in failed(by_bad_line, 1)
     until_state(by_bad_line, "ready")
     assert bad.calls == ["open", "press", "close", "open"]  # taken anew: it may have been lost
     del bad.raises["press"]
@@ -541,9 +547,7 @@ def test_a_shot_without_a_file_says_what_was_wrong_with_the_folder(tmp_path: Pat
         until_state(camera, "ready")
         folder.rmdir()
         camera.fire(1)
-        failed = until_shot_ends(camera, 1)[-1]
-        assert isinstance(failed, ShotFailed)
-        assert "card is not there" in failed.reason
+        assert "card is not there" in failed(camera, 1)
     finally:
         camera.stop()
 

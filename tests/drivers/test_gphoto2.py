@@ -26,7 +26,17 @@ from dappled.drivers.gphoto2_settings import GPhoto2Settings, parse_settings
 from dappled.mocks.body import Body, BodyOptions
 from dappled.mocks.eos450d import thumbnail
 from dappled.mocks.pictures import pattern
-from tests.drivers.contract import CameraContract, Rig, content, of_shots, until, until_shot_ends, until_state
+from tests.drivers.contract import (
+    CameraContract,
+    Rig,
+    arrived,
+    content,
+    failed,
+    of_shots,
+    until,
+    until_shot_ends,
+    until_state,
+)
 
 SIZE = 3_000_001
 
@@ -51,6 +61,19 @@ def make(body: Body) -> Iterator[Make]:
     yield make
     for camera in made:
         camera.stop()
+
+
+@pytest.fixture
+def ready(make: Make) -> Make:
+    """Likewise, started and ready."""
+
+    def ready(**settings: Any) -> GPhoto2Camera:
+        camera = make(**settings)
+        camera.start()
+        until_state(camera, "ready")
+        return camera
+
+    return ready
 
 
 class TestContractToTheCard(CameraContract):
@@ -92,32 +115,25 @@ def test_identity_is_what_the_body_says(make: Make, body: Body) -> None:
     assert (ready.identity.serial, ready.identity.port) == ("0830412345", body.port)
 
 
-def test_a_file_on_the_card_keeps_its_name_and_stays_until_released(make: Make, body: Body) -> None:
-    camera = make(delete_after_download=True)
-    camera.start()
-    until_state(camera, "ready")
+def test_a_file_on_the_card_keeps_its_name_and_stays_until_released(ready: Make, body: Body) -> None:
+    camera = ready(delete_after_download=True)
     camera.fire(0)
-    arrival = until_shot_ends(camera, 0)[-1]
-    assert isinstance(arrival, Arrival)
+    arrival = arrived(camera, 0)
     assert arrival.name == "IMG_0001.DNG"
     assert body.card == ["IMG_0001.DNG"]
     arrival.blob.close()
     camera.release(arrival)
     camera.fire(1)  # commands are obeyed in order: the deletion comes first
-    last = until_shot_ends(camera, 1)[-1]
-    assert isinstance(last, Arrival)
+    last = arrived(camera, 1)
     last.blob.close()
     assert body.card == ["IMG_0002.DNG"]
 
 
-def test_by_default_the_card_is_left_alone(make: Make, body: Body) -> None:
-    camera = make()
-    camera.start()
-    until_state(camera, "ready")
+def test_by_default_the_card_is_left_alone(ready: Make, body: Body) -> None:
+    camera = ready()
     for shot in range(2):
         camera.fire(shot)
-        arrival = until_shot_ends(camera, shot)[-1]
-        assert isinstance(arrival, Arrival)
+        arrival = arrived(camera, shot)
         arrival.blob.close()
         camera.release(arrival)
     camera.stop()
@@ -144,9 +160,7 @@ def test_no_camera_says_what_to_do_and_goes_on_looking() -> None:
     try:
         assert port in until_state(camera, "absent").reason
         camera.fire(1)
-        failed = until_shot_ends(camera, 1)[-1]
-        assert isinstance(failed, ShotFailed)
-        assert port in failed.reason
+        assert port in failed(camera, 1)
     finally:
         camera.stop()
 
@@ -161,10 +175,8 @@ def test_a_camera_held_by_another_program_is_named_and_taken_when_it_is_free(mak
 
 
 @pytest.mark.parametrize("target", ["card", "ram"])
-def test_a_busy_body_is_asked_again(make: Make, body: Body, target: str) -> None:
-    camera = make(capture_target=target)
-    camera.start()
-    until_state(camera, "ready")
+def test_a_busy_body_is_asked_again(ready: Make, body: Body, target: str) -> None:
+    camera = ready(capture_target=target)
     body.fault("busy 0.3")
     camera.fire(1)
     assert of_shots(_ended(until_shot_ends(camera, 1))) == [(Fired, 1), (Arrival, 1)]
@@ -172,24 +184,18 @@ def test_a_busy_body_is_asked_again(make: Make, body: Body, target: str) -> None
 
 
 @pytest.mark.slow
-def test_a_body_that_stays_busy_fails_the_shot_and_takes_the_next(make: Make, body: Body) -> None:
-    camera = make(timeouts={"busy_s": 0.2})
-    camera.start()
-    until_state(camera, "ready")
+def test_a_body_that_stays_busy_fails_the_shot_and_takes_the_next(ready: Make, body: Body) -> None:
+    camera = ready(timeouts={"busy_s": 0.2})
     body.fault("busy")
     camera.fire(1)
-    failed = until_shot_ends(camera, 1)[-1]
-    assert isinstance(failed, ShotFailed)
-    assert "busy" in failed.reason
+    assert "busy" in failed(camera, 1)
     body.fault("clear")
     camera.fire(2)
     assert of_shots(_ended(until_shot_ends(camera, 2))) == [(Fired, 2), (Arrival, 2)]
 
 
-def test_a_refused_release_fails_the_shot_and_takes_the_next(make: Make, body: Body) -> None:
-    camera = make()
-    camera.start()
-    until_state(camera, "ready")
+def test_a_refused_release_fails_the_shot_and_takes_the_next(ready: Make, body: Body) -> None:
+    camera = ready()
     body.fault("error")
     camera.fire(1)
     camera.fire(2)
@@ -211,59 +217,44 @@ def test_a_full_card_fails_the_shot_with_a_hint() -> None:
             camera.stop()
 
 
-def test_a_lost_event_s_file_is_found_on_the_card(make: Make, body: Body) -> None:
-    camera = make(timeouts={"complete_s": 0.2})
-    camera.start()
-    until_state(camera, "ready")
+def test_a_lost_event_s_file_is_found_on_the_card(ready: Make, body: Body) -> None:
+    camera = ready(timeouts={"complete_s": 0.2})
     camera.fire(1)
     _ended(until_shot_ends(camera, 1))
     body.fault("no-event")
     camera.fire(2)
-    arrival = until_shot_ends(camera, 2)[-1]
-    assert isinstance(arrival, Arrival)
+    arrival = arrived(camera, 2)
     assert arrival.name == "IMG_0002.DNG"
     assert content(arrival) == pattern(2, SIZE)
 
 
-def test_a_lost_event_s_file_in_memory_fails_the_shot(make: Make, body: Body) -> None:
-    camera = make(capture_target="ram", timeouts={"file_s": 0.5})
-    camera.start()
-    until_state(camera, "ready")
+def test_a_lost_event_s_file_in_memory_fails_the_shot(ready: Make, body: Body) -> None:
+    camera = ready(capture_target="ram", timeouts={"file_s": 0.5})
     body.fault("no-event")
     camera.fire(1)
-    failed = until_shot_ends(camera, 1)[-1]
-    assert isinstance(failed, ShotFailed)
-    assert "0.5 s" in failed.reason
+    assert "0.5 s" in failed(camera, 1)
 
 
-def test_a_file_of_the_wrong_length_is_asked_for_again(make: Make, body: Body) -> None:
-    camera = make()
-    camera.start()
-    until_state(camera, "ready")
+def test_a_file_of_the_wrong_length_is_asked_for_again(ready: Make, body: Body) -> None:
+    camera = ready()
     body.fault("short")
     camera.fire(1)
-    arrival = until_shot_ends(camera, 1)[-1]
-    assert isinstance(arrival, Arrival)
+    arrival = arrived(camera, 1)
     assert content(arrival) == pattern(1, SIZE)
 
 
-def test_a_file_that_stays_of_the_wrong_length_fails_the_shot_and_stays_on_the_card(make: Make, body: Body) -> None:
-    camera = make()
-    camera.start()
-    until_state(camera, "ready")
+def test_a_file_that_stays_of_the_wrong_length_fails_the_shot_and_stays_on_the_card(ready: Make, body: Body) -> None:
+    camera = ready()
     body.fault("short 1000")
     camera.fire(1)
-    failed = until_shot_ends(camera, 1)[-1]
-    assert isinstance(failed, ShotFailed)
-    assert str(SIZE) in failed.reason
-    assert "IMG_0001.DNG" in failed.reason
+    reason = failed(camera, 1)
+    assert str(SIZE) in reason
+    assert "IMG_0001.DNG" in reason
     assert body.card == ["IMG_0001.DNG"]
 
 
-def test_a_link_dropped_while_idle_comes_back(make: Make, body: Body) -> None:
-    camera = make()
-    camera.start()
-    until_state(camera, "ready")
+def test_a_link_dropped_while_idle_comes_back(ready: Make, body: Body) -> None:
+    camera = ready()
     body.fault("drop")
     assert until_state(camera, "faulted").reason
     until_state(camera, "ready")
@@ -271,10 +262,8 @@ def test_a_link_dropped_while_idle_comes_back(make: Make, body: Body) -> None:
     assert of_shots(_ended(until_shot_ends(camera, 1))) == [(Fired, 1), (Arrival, 1)]
 
 
-def test_a_link_dropped_in_mid_transfer_loses_no_file_on_the_card(make: Make, body: Body) -> None:
-    camera = make()
-    camera.start()
-    until_state(camera, "ready")
+def test_a_link_dropped_in_mid_transfer_loses_no_file_on_the_card(ready: Make, body: Body) -> None:
+    camera = ready()
     body.fault("drop-transfer")
     camera.fire(1)
     events = until_shot_ends(camera, 1)
@@ -294,8 +283,7 @@ def test_a_link_dropped_in_mid_exposure_loses_no_file_on_the_card() -> None:
             camera.fire(1)
             until(camera, lambda event: isinstance(event, Fired))
             body.fault("drop")
-            arrival = until_shot_ends(camera, 1)[-1]
-            assert isinstance(arrival, Arrival)
+            arrival = arrived(camera, 1)
             assert content(arrival) == pattern(1, SIZE)
             assert body.releases == 1
         finally:
@@ -303,15 +291,11 @@ def test_a_link_dropped_in_mid_exposure_loses_no_file_on_the_card() -> None:
 
 
 @pytest.mark.slow
-def test_a_silent_body_costs_the_shot_and_the_process_but_not_the_camera(make: Make, body: Body) -> None:
-    camera = make(timeouts={"answer_s": 1.5})
-    camera.start()
-    until_state(camera, "ready")
+def test_a_silent_body_costs_the_shot_and_the_process_but_not_the_camera(ready: Make, body: Body) -> None:
+    camera = ready(timeouts={"answer_s": 1.5})
     body.fault("silence")
     camera.fire(1)
-    failed = until_shot_ends(camera, 1)[-1]
-    assert isinstance(failed, ShotFailed)
-    assert "1.5 s" in failed.reason
+    assert "1.5 s" in failed(camera, 1)
     body.fault("clear")
     until_state(camera, "ready")
     camera.fire(2)
@@ -319,10 +303,8 @@ def test_a_silent_body_costs_the_shot_and_the_process_but_not_the_camera(make: M
 
 
 @pytest.mark.slow
-def test_a_silent_body_is_given_up_by_libgphoto2_itself_and_served_again(make: Make, body: Body) -> None:
-    camera = make()
-    camera.start()
-    until_state(camera, "ready")
+def test_a_silent_body_is_given_up_by_libgphoto2_itself_and_served_again(ready: Make, body: Body) -> None:
+    camera = ready()
     body.fault("silence")
     camera.fire(1)
     camera.fire(2)
@@ -337,10 +319,8 @@ def test_a_silent_body_is_given_up_by_libgphoto2_itself_and_served_again(make: M
 
 
 @pytest.mark.slow
-def test_stop_does_not_wait_for_a_silent_body(make: Make, body: Body) -> None:
-    camera = make()
-    camera.start()
-    until_state(camera, "ready")
+def test_stop_does_not_wait_for_a_silent_body(ready: Make, body: Body) -> None:
+    camera = ready()
     body.fault("silence")
     camera.fire(1)
     stopper = threading.Thread(target=camera.stop)
@@ -395,12 +375,10 @@ def test_what_a_dead_process_had_fired_is_fetched_by_the_next_one(body: Body) ->
         until(camera, lambda event: isinstance(event, Fired) and event.shot == 2)
         started[0].send_signal(signal.SIGKILL)
         until(camera, lambda event: isinstance(event, ShotFailed) and event.shot == 2)
-        arrival = until_shot_ends(camera, 2)[-1]
-        assert isinstance(arrival, Arrival)
+        arrival = arrived(camera, 2)
         assert content(arrival) == pattern(2, SIZE)
         camera.fire(3)
-        arrival = until_shot_ends(camera, 3)[-1]
-        assert isinstance(arrival, Arrival)
+        arrival = arrived(camera, 3)
         assert content(arrival) == pattern(3, SIZE)
     finally:
         camera.stop()
@@ -458,10 +436,8 @@ def _lives(pid: int) -> bool:
     return state != "Z"
 
 
-def test_a_shot_in_flight_can_not_be_fired_again(make: Make) -> None:
-    camera = make()
-    camera.start()
-    until_state(camera, "ready")
+def test_a_shot_in_flight_can_not_be_fired_again(ready: Make) -> None:
+    camera = ready()
     camera.fire(1)
     with pytest.raises(CameraError, match="shot 1"):
         camera.fire(1)
@@ -512,27 +488,20 @@ def test_raw_and_jpeg_are_one_frame_and_its_companion(target: str) -> None:
             camera.stop()
 
 
-def test_no_focus_fails_the_shot_soon_and_takes_the_next(make: Make, body: Body) -> None:
-    camera = make(timeouts={"complete_s": 0.5})
-    camera.start()
-    until_state(camera, "ready")
+def test_no_focus_fails_the_shot_soon_and_takes_the_next(ready: Make, body: Body) -> None:
+    camera = ready(timeouts={"complete_s": 0.5})
     body.fault("no-focus")
     camera.fire(1)
-    failed = until_shot_ends(camera, 1)[-1]
-    assert isinstance(failed, ShotFailed)
-    assert "focus" in failed.reason
+    assert "focus" in failed(camera, 1)
     camera.fire(2)
     assert of_shots(_ended(until_shot_ends(camera, 2))) == [(Fired, 2), (Arrival, 2)]
 
 
-def test_a_slow_transfer_is_waited_for(make: Make, body: Body) -> None:
-    camera = make(timeouts={"file_s": 1.0})
-    camera.start()
-    until_state(camera, "ready")
+def test_a_slow_transfer_is_waited_for(ready: Make, body: Body) -> None:
+    camera = ready(timeouts={"file_s": 1.0})
     body.fault("slow 1.5")
     camera.fire(1)
-    arrival = until_shot_ends(camera, 1)[-1]
-    assert isinstance(arrival, Arrival)
+    arrival = arrived(camera, 1)
     assert content(arrival) == pattern(1, SIZE)
 
 
@@ -599,21 +568,6 @@ def test_a_process_that_can_t_be_started_now_is_tried_again(body: Body) -> None:
         camera.stop()
 
 
-def test_a_process_that_was_not_started_leaves_no_descriptor(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: Any, **__: Any) -> None:
-        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
-
-    monkeypatch.setattr(subprocess, "Popen", full)
-    before = sorted(os.listdir("/proc/self/fd"))
-    error = None
-    try:
-        spawn_process(parse_settings({}), Before())
-    except OSError as caught:
-        error = caught  # with its traceback, which must hold no open channel
-    assert error is not None
-    assert sorted(os.listdir("/proc/self/fd")) == before
-
-
 def test_a_body_that_comes_back_under_another_address_is_found() -> None:
     with Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", addresses=2)) as body:
         camera = open_camera({"port": body.port, "timeouts": {"retry_s": 0.1}})
@@ -647,9 +601,7 @@ def test_a_silent_body_on_usb_has_its_port_reset(body: Body) -> None:
         until_state(camera, "busy")
         assert camera.identity is not None
         camera._identity = replace(camera.identity, port="usb:001,005")  # as if it were there
-        failed = until_shot_ends(camera, 1)[-1]
-        assert isinstance(failed, ShotFailed)
-        assert "port reset" in failed.reason
+        assert "port reset" in failed(camera, 1)
         assert resets == ["usb:001,005"]
         body.fault("clear")
         until_state(camera, "ready")
