@@ -37,6 +37,14 @@ from dappled.mocks.simulation import Simulation, World, free_port
 
 SO_TIMESTAMPNS = 35
 RATE_HZ = 200
+LIMITS = {
+    "ack_ms_decoding_p99": 20.0,
+    "ack_ms_decoding_max": 50.0,
+    "ack_ms_camera_hung_p99": 20.0,
+    "ack_ms_camera_hung_max": 50.0,
+    "wish_to_trigger_call_ms_p99": 10.0,
+    "cpu_share_at_1000_per_s": 0.25,
+}
 
 
 def main() -> None:
@@ -53,7 +61,8 @@ def main() -> None:
         print(json.dumps(figures))
     else:
         for name, value in figures.items():
-            print(f"{name:44} {value:10.3f}")
+            limit = f"   (at most {LIMITS[name]:g})" if name in LIMITS else ""
+            print(f"{name:44} {value:10.3f}{limit}")
 
 
 def idle_share(folder: Path, seconds: float) -> dict[str, float]:
