@@ -34,15 +34,16 @@ def depth(evidence: Evidence, search: Search) -> DepthMap:
     disparities = search.disparities()
     seen = _by_contrast(evidence, search) if evidence.white else _by_both(evidence, search)
     likelihood, samples = seen.likelihood, seen.samples
+    window = search.window if evidence.white else _NARROW
     smooth = semiglobal.smoothed(-likelihood, small=_SMALL, large=_LARGE, workers=search.workers)
     start = smooth.argmin(axis=0)
     if not evidence.white:
-        likelihood, _ = windowed(likelihood, _NARROW)
-        samples *= box(_NARROW) ** 2
+        likelihood, _ = windowed(likelihood, window)
+        samples *= box(window) ** 2
     disparity, curvature = peaked(likelihood, disparities, start)
     best = np.take_along_axis(likelihood, start[None], axis=0)[0]
     sure = confidence(likelihood, best, samples)
-    return judged(disparity, curvature, sure, spread=seen.spread, method="combined")
+    return judged(disparity, curvature, sure, spread=seen.spread, window=window, method="combined")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -30,7 +30,7 @@ def depth(evidence: Evidence, search: Search) -> DepthMap:
     likelihood, spread = windowed(explained(evidence, disparities, workers=search.workers), search.window)
     disparity, curvature = peaked(likelihood, disparities, likelihood.argmax(axis=0))
     sure = confidence(likelihood, likelihood.max(axis=0), float(box(search.window) ** 2))
-    return judged(disparity, curvature, sure, spread=spread, method="contrast")
+    return judged(disparity, curvature, sure, spread=spread, window=search.window, method="contrast")
 
 
 def explained(evidence: Evidence, disparities: NDArray[np.float64], *, workers: int = 1) -> Volume:

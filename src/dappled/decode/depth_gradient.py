@@ -60,6 +60,7 @@ def depth(evidence: Evidence, search: Search) -> DepthMap:
         np.where(inside, information, 0),
         np.where(inside, sure, 0),
         spread=spread,
+        window=search.window,
         method="gradient",
         bias=_BIAS,
     )

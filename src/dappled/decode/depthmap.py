@@ -13,10 +13,11 @@ from dappled.decode.errors import DecodeError
 
 Volume = NDArray[np.float32]
 Map = NDArray[np.float32]
-# Measured on simulated masked frames (SNR 100 and 50, windows 5 to 15): what scatters more than the noise alone, and
-# what the window's edge adds as the picture moves across it.
-_SCATTER = 1.2
-_EDGE, _EDGE_SHARE = 0.0009, 0.0036  # px/view, and of the disparity
+# Measured on simulated masked frames (SNR 100 and 50): what scatters more than the noise alone, and what the window's
+# edge adds as the picture moves across it, on even surfaces; and what a window that sees two of them is off by.
+_SCATTER = 1.1
+_EDGE, _EDGE_SHARE = 0.0005, 0.0005  # px/view, and of the disparity
+_SEAM = 2.0  # of the disparities' spread under the window
 _LEAST_CONFIDENCE = 0.5
 _MOST_DISPARITIES = 400
 
@@ -129,19 +130,41 @@ def confidence(likelihood: Volume, best: Map, samples: float) -> Map:
     return made.astype(np.float32)
 
 
+def seams(disparity: Map, variance: Map, window: int) -> Map:
+    """(h, w): the rms by which disparities (NaN: unknown) bend under a window, beyond what their `variance` explains.
+
+    A window across the seam of two surfaces sees both, and its answer may be either's, or lie between. On a plane,
+    however it leans, this is 0.
+    """
+    wide = math.sqrt((box(window) ** 2 - 1) / 6)  # a box used twice has the variance of two
+    known = np.isfinite(disparity)
+
+    def summed(values: NDArray[np.floating]) -> NDArray[np.float64]:
+        inside = np.where(known, values, 0).astype(np.float64)
+        return np.asarray(ndimage.gaussian_filter(inside, wide, truncate=3.0, mode="nearest"))
+
+    share = np.maximum(summed(np.ones_like(disparity)), 1e-6)
+    level, square, noise = (summed(values) / share for values in (disparity, disparity**2, variance))
+    lean = sum((ndimage.correlate1d(level, [-0.5, 0, 0.5], axis=axis, mode="nearest") * wide) ** 2 for axis in (0, 1))
+    made: Map = np.sqrt(np.maximum(square - level**2 - lean - noise, 0)).astype(np.float32)
+    return made
+
+
 def judged(
     disparity: Map,
     curvature: Map,
     sure: Map,
     *,
     spread: float,
+    window: int,
     method: str,
     most_sigma: float = 0.25,
     bias: float = 0.0,
 ) -> DepthMap:
     """The map: standard errors from curvatures of the likelihood, unknown where these or the confidence won't do.
 
-    `spread` is variance over information, from `windowed`; `bias` what a method is known to be off by, in px/view.
+    At seams within the window (px a side) the error is larger, but the disparity known all the same. `spread` is
+    variance over information, from `windowed`; `bias` what a method is known to be off by, in px/view.
     """
     with np.errstate(divide="ignore"):
         noise = np.float32(_SCATTER**2 * spread) / curvature
@@ -149,7 +172,6 @@ def judged(
     sigma = np.sqrt(noise + edge**2 + bias**2)
     known = (sure >= _LEAST_CONFIDENCE) & (sigma <= most_sigma)
     unknown = np.float32(np.nan)
-    return DepthMap(
-        np.where(known, disparity, unknown).astype(np.float32), np.where(known, sigma, unknown).astype(np.float32),
-        sure.astype(np.float32), method,
-    )  # fmt: skip
+    shown = np.where(known, disparity, unknown).astype(np.float32)
+    sigma = np.hypot(sigma, np.float32(_SEAM) * seams(shown, noise, window))
+    return DepthMap(shown, np.where(known, sigma, unknown).astype(np.float32), sure.astype(np.float32), method)
