@@ -172,13 +172,19 @@ def eventually(condition: Callable[[], object], what: str) -> None:
 
 @contextmanager
 def rig(
-    flights: Path, script: Script = good, *, decode: bool = True, queue_: int = 4, stop_s: float = 5.0
+    flights: Path,
+    script: Script = good,
+    *,
+    decode: bool = True,
+    queue_: int = 4,
+    stop_s: float = 5.0,
+    camera: FakeCamera | None = None,
 ) -> Iterator[Rig]:
     """A street at work on a new flight in `flights`; stopped and closed at the end."""
     clock = SystemClock()
     flight = recording.begin(flights, clock.utc_ns, {})
     book = LiveBook(flight, clock)
-    camera = FakeCamera(script)
+    camera = camera or FakeCamera(script)
     developer = FakeDeveloper() if decode else None
     made: list[Rig] = []
 

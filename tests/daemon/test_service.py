@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -120,6 +121,22 @@ def test_a_start_that_fails_late_leaves_nothing(
     assert [path.name for path in root.iterdir() if path.is_dir()] == []
     assert not Path(settings.publish.slices.removeprefix("ipc://")).exists()
     started(settings, []).stop()
+
+
+def test_a_camera_that_can_t_begin_leaves_no_thread_behind(
+    camera: FakeCamera, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse() -> None:
+        raise CameraError("no such port")
+
+    before = set(threading.enumerate())
+    with monkeypatch.context() as broken:
+        broken.setattr(camera, "start", refuse)
+        with pytest.raises(CameraError, match="no such port"):
+            Service(settings).start()
+    eventually(lambda: not {thread.name for thread in set(threading.enumerate()) - before}, "every thread has ended")
+    assert camera.stopped
+    assert [path.name for path in Path(settings.record.directory).iterdir() if path.is_dir()] == []
 
 
 def test_stop_twice_and_before_start_is_harmless(camera: FakeCamera, settings: Settings) -> None:

@@ -13,10 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from dappled.daemon import capture
 from dappled.drivers.camera import Blob, CameraError, Companion, Deferred, Event
 from dappled.flight import check, summary
 from dappled.flight.records import ShotState
-from tests.daemon.fakes import arrival, eventually, failed, fired, good, rig
+from tests.daemon.fakes import FakeCamera, arrival, eventually, failed, fired, good, rig
 
 
 def states(flight: Path) -> dict[int, ShotState]:
@@ -133,6 +134,24 @@ def test_a_shot_that_brings_nothing_fails_when_the_flight_ends(tmp_path: Path) -
     assert one.settled == [(0, False)]
     assert "the flight ended" in one.ended(0).problem
     assert states(one.flight.folder.path) == {0: "failed"}
+
+
+def test_a_file_that_comes_as_the_camera_is_let_go_of_is_taken_though_the_driver_raises(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(capture, "_LAST_EVENTS_S", 20.0)
+
+    class Late(FakeCamera):
+        """Finishes its last file when it is stopped, with a bug on the way."""
+
+        def stop(self) -> None:
+            self._events.put(RuntimeError("bug"))
+            self.say(arrival(0))
+
+    with rig(tmp_path, camera=Late(lambda shot: [fired(shot)]), stop_s=0.1) as one:
+        one.wish(1)
+    assert one.settled == [(0, True)]
+    assert states(one.flight.folder.path) == {0: "safe"}
 
 
 def test_a_watcher_that_raises_stops_nobody(tmp_path: Path) -> None:

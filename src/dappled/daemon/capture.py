@@ -73,7 +73,7 @@ class Capture:
 
     def _run(self) -> None:
         while not self._stopping.is_set() or self._worth_waiting():
-            self._handle(self._next_event(_LOOK_S))
+            self._take(_LOOK_S)
 
     def _worth_waiting(self) -> bool:
         return time.monotonic() < self._give_up_at and bool(self._stories.waiting())
@@ -81,22 +81,25 @@ class Capture:
     def _last_events(self) -> None:
         """What came while the camera was let go of; then every shot that is still open has failed."""
         until = time.monotonic() + _LAST_EVENTS_S
-        while (event := self._next_event(0.0)) is not None and time.monotonic() < until:
-            self._handle(event)
+        while time.monotonic() < until and self._take(0.0):
+            pass
         for index in self._stories.waiting():
             self._handle(ShotFailed(index, "the flight ended before its file came", time.monotonic_ns()))
 
-    def _next_event(self, timeout_s: float) -> Event | None:
-        if self._unfired:
-            return self._unfired.popleft()
+    def _take(self, timeout_s: float) -> bool:
+        """Pull one event and act on it; False where none came in time."""
         try:
-            return self._camera.next_event(timeout_s)
+            event = self._unfired.popleft() if self._unfired else self._camera.next_event(timeout_s)
         except Exception as error:  # noqa: BLE001  # any driver's; the capture goes on, at a pace that leaves others their time
             report(log, "the camera driver", error)
-            time.sleep(timeout_s)
-            return None
+            time.sleep(_LOOK_S)
+            return True
+        if event is None:
+            return False
+        self._handle(event)
+        return True
 
-    def _handle(self, event: Event | None) -> None:
+    def _handle(self, event: Event) -> None:
         try:
             if isinstance(event, StateChanged):
                 self._state_changed(event)
