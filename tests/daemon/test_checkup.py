@@ -13,7 +13,9 @@ import pytest
 from dappled.config.settings import CameraSettings, MavlinkSettings, RecordSettings, Settings
 from dappled.daemon import checkup
 from dappled.daemon.checkup import Finding, Machine, next_step
+from dappled.drivers.camera import CameraError
 from dappled.drivers.usb_bus import CANON, FUJIFILM, UsbBody, UsbError
+from tests.daemon.fakes import FakeCamera
 
 EOS = UsbBody(1, 5, CANON, 0x3145, "PTP", "EOS 450D")
 
@@ -122,6 +124,36 @@ def test_a_driver_that_can_t_be_opened_says_why(machine: Machine, camera: dict[s
     assert found.state == "wrong"
     assert words in found.text
     assert found.todo
+
+
+def test_a_driver_that_fails_as_it_begins_costs_no_other_finding(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Broken(FakeCamera):
+        def start(self) -> None:
+            raise CameraError("no such port")
+
+    broken = Broken()
+    monkeypatch.setattr(checkup, "open_camera", lambda _: broken)
+    found = checkup.checkup(Settings(), machine, [checkup.camera, checkup.mask])
+    assert [one.name for one in found] == ["camera", "mask"]
+    assert (found[0].state, "no such port" in found[0].text, broken.stopped) == ("wrong", True, True)
+
+
+def test_the_disk_behind_a_closed_door(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder in one that may not be looked into: as if it were not there yet."""
+    closed = tmp_path / "closed"
+    real = os.stat
+
+    def stat(path: Any, **how: Any) -> os.stat_result:
+        if str(path).startswith(f"{closed}/"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path, **how)
+
+    closed.mkdir()
+    monkeypatch.setattr(os, "stat", stat)
+    settings = Settings(record=RecordSettings(directory=str(closed / "flights")))
+    assert the_one(checkup.disk(settings, machine)).state == "ok"
 
 
 def test_the_disk(machine: Machine, tmp_path: Path) -> None:

@@ -142,9 +142,9 @@ def camera(settings: Settings, machine: Machine) -> list[Finding]:
         driver = open_camera(settings.camera)
     except DappledError as error:
         return [Finding("camera", "wrong", str(error), "correct [camera] in your settings")]
-    driver.start()
     last: StateChanged | None = None
     try:
+        driver.start()
         until = time.monotonic() + machine.open_s
         while (left_s := until - time.monotonic()) > 0:
             event = driver.next_event(left_s)
@@ -152,6 +152,8 @@ def camera(settings: Settings, machine: Machine) -> list[Finding]:
                 last = event
                 if event.state in ("ready", "absent"):
                     break
+    except DappledError as error:
+        last = StateChanged("absent", str(error), time.monotonic_ns())
     finally:
         driver.stop()
     return [_opened(settings, last)]
@@ -170,7 +172,7 @@ def _opened(settings: Settings, last: StateChanged | None) -> Finding:
 def disk(settings: Settings, machine: Machine) -> list[Finding]:
     """Where flights are recorded."""
     folder = Path(settings.record.directory)
-    place = next(one for one in (folder, *folder.parents) if one.exists())
+    place = next(one for one in (folder, *folder.parents) if os.path.exists(one))  # False where one may not look
     if not os.access(place, os.W_OK):
         return [
             Finding("disk", "wrong", f"{place} can't be written to", f"make {folder} yours, or set record.directory")
