@@ -107,7 +107,7 @@ def test_design_from_altitude_to_film(tmp_path: Path, capsys: pytest.CaptureFixt
         (["make", "--period", "nan", "-o", "x.png"], "period = nan"),
         (["make", "mask-2", "-o", "x.jpg"], "written as .png or .tif"),
         (["table", "--mask", "mask-2", "--camera", "fujifilm-s5200", "--focal-length", "0.013"], "millimetres"),
-        (["design", "--altitude", "40", "--camera", "fujifilm-s5200"], "--focal-length says"),
+        (["design", "--altitude", "40", "--camera", "fujifilm-s5200"], "say with --focal-length"),
         (["plan", "--altitude", "40", "--camera", "reference-36mm", "--speed", "-3"], "ground speed = -3"),
         (["diffraction", "--mask", "mask-2", "--measured", "nowhere.csv"], "nowhere.csv can't be read"),
     ],

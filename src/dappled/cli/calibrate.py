@@ -48,14 +48,14 @@ def run(arguments: argparse.Namespace) -> int:
             common.recipe(arguments), arguments.frames, arguments.target, arguments.output, arguments.focal_length
         )
     if not arguments.mask:
-        raise ConfigError("which mask? Name its profile or TOML file with --mask")
+        raise ConfigError("name the mask to calibrate with --mask: a profile or TOML file")
     if arguments.mask == profiles.LENSLET:
         raise ConfigError("a lenslet array needs no calibration: give its white frame with --white when decoding")
     darkroom = Darkroom(common.recipe(arguments))
     darkroom.check()
     seen, bad = _sights(darkroom, arguments)
     if not seen:
-        raise DarkroomError("no frame is left to calibrate on")
+        raise DarkroomError("no frame is left to calibrate on: each was refused, for the reason above")
     camera = darkroom.camera(seen[0].model)
     found = _fitted(darkroom, seen, choose_law=not arguments.law)
     written = calibration_files.save(arguments.output, found)

@@ -28,7 +28,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(recipe: Recipe, frames: list[Path], board: str, output: Path, focal_length_mm: float | None) -> int:
     """Calibrate from frames, decoded where a mask is named. A frame without the board is named and left out."""
     if output.suffix != ".toml":
-        raise DarkroomError(f"{output}: a camera profile ends in .toml")
+        raise DarkroomError(f"{output}: a camera profile ends in .toml; name it so")
     size = _board(board)
     darkroom = Darkroom(recipe)
     seen: list[NDArray[np.float64]] = []
@@ -38,7 +38,9 @@ def run(recipe: Recipe, frames: list[Path], board: str, output: Path, focal_leng
     for path in tqdm(frames, unit="frame", disable=not sys.stderr.isatty()):
         image, grid, raw_shape, raw_model, raw_length = _picture(darkroom, path, focal_length_mm)
         if shape not in ((0, 0), raw_shape):
-            raise DarkroomError(f"{path} is {raw_shape} px, the others {shape}: calibrate frames of one size")
+            raise DarkroomError(
+                f"{path} is {_size(raw_shape)}, the others {_size(shape)}: calibrate frames of one size"
+            )
         if length is not None and raw_length is not None and abs(raw_length / length - 1) > 0.01:
             raise DarkroomError(
                 f"{path} was taken at {raw_length:g} mm, the others at {length:g}: one length at a time"
@@ -79,6 +81,10 @@ def _picture(
     grid = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     length = focal_length_mm or raw.focal_length_mm
     return np.asarray(plane), grid, (plane.shape[0], plane.shape[1]), raw.camera_model or "", length
+
+
+def _size(shape: tuple[int, int]) -> str:
+    return f"{shape[0]} × {shape[1]} px"
 
 
 def _write(camera: str, lens: profiles.Lens, output: Path) -> None:

@@ -29,7 +29,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(recipe: Recipe, frames: list[Path], metres: list[float], output: Path, focal_length_mm: float | None) -> int:
     """Fit the ranging and write it beside the calibration that the frames were decoded with."""
     if output.suffix != ".toml":
-        raise DarkroomError(f"{output}: a calibration with distances ends in .toml")
+        raise DarkroomError(f"{output}: a calibration with distances ends in .toml; name it so")
     found, targets = from_frames(recipe, frames, metres, focal_length_mm)
     written = _write(recipe, output, found)
     for path, target in zip(frames, targets, strict=True):

@@ -71,7 +71,9 @@ def camera_set(arguments: argparse.Namespace) -> tuple[CameraProfile, Sensor, fl
     camera = profiles.camera(arguments.camera)
     length = only_length(camera) if arguments.focal_length is None else arguments.focal_length
     if length is None:
-        raise ConfigError(f"--focal-length says, in mm, how {camera.name} is set: it has no single one")
+        raise ConfigError(
+            f"{camera.name} has no focal length of its own: say with --focal-length, in mm, how the lens is set"
+        )
     return camera, sensor(camera, arguments), optics.focal_length(length)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 import time
 from collections.abc import Mapping
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled.cli import story
-from dappled.cli.common import seconds
+from dappled.cli.common import positive, seconds
 from dappled.config import settings as configuration
 from dappled.daemon import curve, headers, inputs, replay, runs
 from dappled.daemon.answers import Answers
@@ -245,15 +244,15 @@ def _rate(text: str) -> float | None:
     """How many times as fast as it was; None for max."""
     if text == "max":
         return None
-    rate = float(text)
-    if not (math.isfinite(rate) and rate > 0):
-        raise argparse.ArgumentTypeError(f"{text} is neither a number above 0 nor max")
-    return rate
+    try:
+        return positive(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number above 0 nor max") from None
 
 
 def _utc_ns(text: str) -> int:
     try:
         time = datetime.fromisoformat(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text} is no UTC time such as 2026-11-21T10:15:03Z") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is no UTC time such as 2026-11-21T10:15:03Z") from None
     return round((time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp() * 1e9)

@@ -135,7 +135,7 @@ def white_gain(white_plane: Plane, cell_px: float) -> Plane:
     smooth = ndimage.uniform_filter(ndimage.uniform_filter(white_plane, side, mode="nearest"), side, mode="nearest")
     top = float(smooth.max())
     if not top > 0:
-        raise DecodeError("the white frame is black")
+        raise DecodeError("the white frame is black: take another, of an evenly lit card")
     return np.asarray(top / np.maximum(smooth, 0.02 * top), dtype=np.float32)
 
 

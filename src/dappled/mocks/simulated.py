@@ -13,9 +13,11 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from dappled.config.schema import ConfigError, Source, build, setting
 from dappled.drivers.camera import CameraError, Identity
 from dappled.drivers.composed import ComposedCamera, Plan
 from dappled.drivers.options import only, seconds_of
@@ -23,19 +25,35 @@ from dappled.drivers.pickup import FolderSource
 from dappled.mocks.body import BodyOptions
 from dappled.mocks.pictures import exposer
 
-_KNOWN = ("timeouts", "seed", "scale", "scene", "law", "f_number", "folder", "picture")
 _HOLD_S = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class _Options:
+    """`[camera.options]`, as `BodyOptions` has them; `folder` is its `truth`."""
+
+    seed: int = setting(1, "what is drawn", low=0, high=2**32)
+    scale: float = setting(1.0, "share of the sensor's side", low=0.01, high=4)
+    scene: str = setting("terrain", "terrain, bench, white, or a folder of views")
+    law: str = setting("geometric", "where the carriers stand", choices=("geometric", "fd"))
+    f_number: float | None = setting(None, "the lens' aperture", low=0.1, high=1000)
+    folder: str | None = setting(None, "for what the simulation knows of each shot")
+    picture: str = setting("simulated", "simulated, pattern:SIZE:EXTENSION, or a file")
+
+
+_KNOWN = ("timeouts", *(one.name for one in fields(_Options)))
 
 
 def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
     """The driver for these settings; `start` it. Raises CameraError for a wrong one."""
     only(settings, _KNOWN)
-    folder = settings.get("folder")
-    given = {name: settings[name] for name in _KNOWN if name in settings and name not in ("timeouts", "folder")}
+    given = {name: value for name, value in settings.items() if name != "timeouts"}
     try:
-        options = BodyOptions(**given, truth=None if folder is None else Path(folder))
-    except TypeError as error:
-        raise CameraError(f"camera.options of the simulated camera are not right: {error}") from None
+        wanted = asdict(build(_Options, given, Source("camera.options"), ""))
+    except ConfigError as error:
+        raise CameraError(str(error)) from None
+    folder = wanted.pop("folder")
+    options = BodyOptions(**wanted, truth=None if folder is None else Path(folder))
     card = Path(tempfile.gettempdir()) / f"dappled-card-{secrets.token_hex(8)}"
     plan = Plan(file_s=seconds_of(settings, "file_s", 30.0), hold_s=_HOLD_S, poll_s=0.02)
     identity = Identity("dappled", "Simulated Masked Camera", f"SIM{options.seed:08d}", "simulated")

@@ -174,8 +174,10 @@ def _numbers(path: Path, wanted: tuple[str, ...]) -> list[tuple[float, ...]]:
                 if any(text in ("", "-") for text in texts):
                     continue
                 found.append(tuple(float(text) for text in texts))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise MaskFileError(f"{path} can't be read: {error}") from None
+    except OSError as error:
+        raise MaskFileError(f"{path} can't be read: {error.strerror or error}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise MaskFileError(f"{path} can't be read as CSV: {error}") from None
     except ValueError as error:
         raise MaskFileError(f"{path}, line {reader.line_num}: {error}") from None
     return found
