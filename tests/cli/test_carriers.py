@@ -89,6 +89,25 @@ def test_stopped_down_carriers_are_measured_to_a_twentieth_of_a_bin(
     assert _rms(bench.off_bins(seen, key="measured")) < 0.05
 
 
+def test_a_mask_that_is_not_where_it_is_said_to_be_is_found_and_doubted(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    height, width = bench.camera.sensor.shape
+    (tmp_path / "off.toml").write_text(
+        'law = "geometric"\nmask_distance_mm = 0.48\n[[raw]]\nname = "half"\n'
+        f"shape = [{height}, {width}]\nrow_mm = [0.0092, 0.0]\ncolumn_mm = [0.0, 0.0092]\n"
+    )
+    words = [str(bench.frame(tmp_path, 4)), "--mask", MASK, "--camera", str(tmp_path / "off.toml")]
+    told = _asked(capsys, *words)
+    assert told["carriers_from"] == "measured"
+    seen = [c for c in told["carriers"] if c["measured"] and (c["ky"], c["kx"]) != (0, 0)]
+    assert _rms(bench.off_bins(seen, key="measured")) < 0.05
+    assert main(["carriers", *words]) == 0
+    assert "they stand 8.7% farther out than predicted" in capsys.readouterr().out
+    assert main(["decode", *words, "-o", str(tmp_path / "out.npz")]) == 0
+    assert "they stand 8.7% farther out than predicted" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("stops", [8, 4, 2, 1.4, 1])
 def test_over_all_apertures_the_calibrated_carriers_are_right_and_it_is_said_where_they_come_from(
     bench: Bench, stops: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]

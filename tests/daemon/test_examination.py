@@ -66,6 +66,17 @@ def test_the_wrong_mask_shows_no_carriers(good: Path) -> None:
     assert "mask" in found["carriers"].text
 
 
+def test_a_mask_away_from_its_place_is_cautioned_of(good: Path, tmp_path: Path) -> None:
+    height, width = reference_camera(1, scale=0.5).sensor.shape
+    (tmp_path / "off.toml").write_text(
+        'law = "geometric"\nmask_distance_mm = 0.48\n[[raw]]\nname = "half"\n'
+        f"shape = [{height}, {width}]\nrow_mm = [0.0092, 0.0]\ncolumn_mm = [0.0, 0.0092]\n"
+    )
+    found = by_name(examine(good, Recipe(camera=str(tmp_path / "off.toml"), mask="reference-5x5")))
+    assert found["carriers"].state == "caution"
+    assert "farther out than predicted" in found["carriers"].text
+
+
 def test_a_file_that_is_no_picture_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "x.dng"
     path.write_bytes(b"nothing")

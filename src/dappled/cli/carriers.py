@@ -21,7 +21,7 @@ from dappled.decode.masks import Mask, Order
 from dappled.decode.peaks import Measured, measure
 from dappled.decode.plane import Plane
 from dappled.decode.prediction import crossed_orders, lattice_rotation
-from dappled.decode.report import CarriersFrom
+from dappled.decode.report import CarriersFrom, doubt
 from dappled.decode.slices import default_size
 from dappled.decode.spectrum import Spectrum, padded_shape
 from dappled.decode.spectrum_pictures import LOOKS, Look, around, spectrum_boxes
@@ -266,7 +266,10 @@ def _summary(table: Table) -> str:
     there = sum(c.on_sensor for c, _ in table.rows) - 1
     if table.carriers_from == "measured" and table.rotation_rad is not None:
         turned = math.degrees(table.rotation_rad)
-        return f"{start}; {table.seen} of {there} carriers seen, on a lattice turned by {turned:.3f}°"
+        told = f"{start}; {table.seen} of {there} carriers seen, on a lattice turned by {turned:.3f}°"
+        orders = [(c.ky, c.kx) for c, _ in table.rows]
+        strange = doubt(table.used.carriers(orders), [c for c, _ in table.rows])
+        return f"{told}; {strange}" if strange else told
     whose = "calibration's" if table.carriers_from == "calibrated" else "law's"
     if table.seen == 0:
         return (

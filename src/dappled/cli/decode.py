@@ -79,4 +79,6 @@ def summary(made: Development) -> str:
             f": no carriers in this frame, cut at the {whose} prediction; unless it was taken near the mask's ideal "
             "aperture, mask, camera or focal length are not the right ones"
         )
+    if made.report.doubt:
+        whole += f": {made.report.doubt}"
     return whole

@@ -87,6 +87,8 @@ def _carriers(made: Development, recipe: Recipe) -> Finding:
     if recipe.mask == profiles.LENSLET or predicted == 0:
         return Finding("carriers", "go", f"{made.report.carriers_from}", measured)
     text = f"{seen} of {predicted} where they are predicted"
+    if made.report.doubt:
+        return Finding("carriers", "caution", f"{seen} of {predicted} seen; {made.report.doubt}", measured)
     if seen >= SEEN_SHARE * predicted:
         return Finding("carriers", "go", text, measured)
     if recipe.calibration:

@@ -22,7 +22,7 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import LightField
 from dappled.decode.masks import Mask, Order
 from dappled.decode.noise import Noise
-from dappled.decode.ownlattice import STRONG, STRONGER, own_lattice, turn_between
+from dappled.decode.ownlattice import STRONG, STRONGER, farther_lattice, own_lattice, turn_between
 from dappled.decode.peaks import Measured, measure
 from dappled.decode.plan import Plans
 from dappled.decode.report import CarriersFrom, DecodeReport, ViewsFrom, light_field, no_views
@@ -179,9 +179,10 @@ class MaskDecoder:
         each(look, range(len(predicted)), self.workers)
         least = STRONGER if self.calibration is not None else STRONG
         own = own_lattice(spectrum, predicted, measured, least)
+        if own is None and self.calibration is not None:
+            return lattice, measured, "calibrated"
+        own = own or farther_lattice(spectrum, predicted)
         if own is None:
-            if self.calibration is not None:
-                return lattice, measured, "calibrated"
             # Wide searches find a fence's or a roof's own period, too: peaks on no common lattice are no carriers.
             kept = [
                 m if m is not None and (m.suspect or (c.ky, c.kx) == (0, 0)) else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from dappled.decode.carriers import Carrier
 from dappled.decode.lightfield import LightField
+from dappled.decode.ownlattice import stretch
 from dappled.decode.peaks import Measured
 from dappled.decode.slices import Slices
 from dappled.decode.views import Views
 
 CarriersFrom = Literal["measured", "calibrated", "predicted", "found"]
+DOUBTED = 0.04  # of a carrier's frequency: so far off lies no mask that is where it is said to be
 ViewsFrom = Literal["calibration", "frame", "white", "none"]
 
 
@@ -41,6 +43,20 @@ class DecodeReport:
     def found(self) -> int:
         """How many carriers were seen, the mean (0, 0) included; suspect ones don't count."""
         return sum(m is not None and not m.suspect for m in self.measured)
+
+    @property
+    def doubt(self) -> str | None:
+        """What is strange about the carriers that were measured, in a sentence."""
+        return doubt(self.used, self.predicted) if self.carriers_from == "measured" else None
+
+
+def doubt(used: Sequence[Carrier], predicted: Sequence[Carrier]) -> str | None:
+    """Carriers of a mask that seems not to be where it is said to be, in a sentence; None for those near enough."""
+    off = stretch(used, predicted)
+    if abs(off) <= DOUBTED:
+        return None
+    way = "farther out" if off > 0 else "farther in"
+    return f"they stand {abs(off):.1%} {way} than predicted: check mask distance and focal length, or calibrate"
 
 
 def no_views(slices: Slices) -> tuple[Views, NDArray[np.float64]]:

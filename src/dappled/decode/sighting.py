@@ -15,11 +15,11 @@ from dappled.decode.carriers import LAWS, Carrier, Lattice, Sensor
 from dappled.decode.errors import DecodeError
 from dappled.decode.lattice import candidates, find_lattice, fit, residual_bins
 from dappled.decode.masks import Mask, Order
+from dappled.decode.ownlattice import FARTHER
 from dappled.decode.peaks import Measured, measure
 from dappled.decode.slices import default_size, extract
 from dappled.decode.spectrum import Spectrum
 
-_SEARCH = 0.12  # of a carrier's frequency: 2° of rotation and, under the fd law, 10 % of the mask's distance
 _ALIKE_BINS = 0.5  # rms from their lattice: what lies farther off are peaks of the scene
 _ENOUGH = 0.6  # of a mask's carriers: a prediction near which so many stand is the right one
 
@@ -157,7 +157,7 @@ def _verified(
     return lattice, found, len(found) / len(looked)
 
 
-def search(spectrum: Spectrum, predicted: Lattice, orders: Sequence[Order], tolerance: float = _SEARCH) -> Lattice:
+def search(spectrum: Spectrum, predicted: Lattice, orders: Sequence[Order], tolerance: float = FARTHER) -> Lattice:
     """The lattice near a predicted one that most of a frame's peaks lie on: any small rotation, scale and shear.
 
     Tries each pair of peaks near (0, 1) and (1, 0). Raises DecodeError where no such pair explains other orders.
