@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from dappled.decode.carriers import Carrier
-from dappled.decode.spectrum import TILE, Complex, Run, Spectrum, column_runs, row_runs
+from dappled.decode.spectrum import TILE, Complex, Run, Spectrum, column_runs, in_runs, row_runs
 from dappled.decode.threads import share
 
 
@@ -99,12 +99,12 @@ class Bands:
             target = block[:, piece.at : piece.at + piece.count]
             if piece.mirrored:
                 target = target[::-1, ::-1]
-            for run in band.rows[piece.mirrored]:
-                source = tile[run.source : run.source + run.count]
-                if piece.mirrored:
-                    np.conjugate(source, out=target[run.at : run.at + run.count])
-                else:
-                    target[run.at : run.at + run.count] = source
+                for run in band.rows[1]:
+                    np.conjugate(tile[run.source : run.source + run.count], out=target[run.at : run.at + run.count])
+            else:
+                lines, found = in_runs(target, piece.count), in_runs(tile, piece.count)
+                for run in band.rows[0]:
+                    lines[run.at : run.at + run.count] = found[run.source : run.source + run.count]
         if self.cell is not None:
             block *= self.cell
 

@@ -18,6 +18,8 @@ from dappled.decode.exposure import STEP, Between, Exposure
 from dappled.decode.plane import Plane, check_frame, colour_gains, levels_of
 from dappled.decode.threads import each, share, spans
 
+_FOUR_FIT = 1 << 14  # four values below it add up within 16 bits
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Developer:
@@ -72,9 +74,11 @@ class Developer:
                 sums -= self._sums(dark, workers)
             places = self._means(sums, zero=dark is not None)
             gains = colour_gains(self.pattern, places) if self.balance is None else self.balance
-            factors, level = self._uniform(gains), self._level(mosaic, dark, gains)
+            level = self._level(mosaic, dark, gains)
             if self.reference and min(self.cells) > 0:
                 factors, level = self._even(sums, gains, zero=dark is not None, workers=workers)
+            else:
+                factors = self._uniform(gains)
         if flat is not None:
             level *= float(flat[::STEP, ::STEP].mean(dtype=np.float64))
         return Exposure(mosaic, self.black, self.down, factors, level, dark, flat)
@@ -93,16 +97,22 @@ class Developer:
         group = a * self.steps[0]
         groups = spans(self.shape[0], group)
         sums = np.zeros((len(groups), a, self.shape[1]), dtype=np.float32)
+        small = mosaic.dtype == np.uint16
 
         def start() -> Any:
-            lines = np.empty((self.steps[0], self.shape[1]), dtype=np.float32)
+            lines = np.empty((self.steps[0], a, self.shape[1]), dtype=np.float32)
+            fours = np.empty((self.steps[0] // 4, a, self.shape[1]), dtype=np.uint16)
 
             def add(index: int) -> None:
-                rows = groups[index]
-                for place in range(a):
-                    part = mosaic[rows.start + place : rows.stop : a]
-                    np.copyto(lines[: len(part)], part, casting="unsafe")
-                    np.add.reduce(lines[: len(part)], axis=0, out=sums[index, place])
+                rows = mosaic[groups[index]]
+                whole = len(rows) // a
+                part: NDArray[Any] = rows[: whole * a].reshape(whole, a, self.shape[1])
+                if small and whole % 4 == 0 and part.max(initial=0) < _FOUR_FIT:
+                    part = _in_fours(part, fours[: whole // 4])
+                np.copyto(lines[: len(part)], part, casting="unsafe")
+                np.add.reduce(lines[: len(part)], axis=0, out=sums[index])
+                for place, line in enumerate(rows[whole * a :]):
+                    sums[index, place] += line
 
             return add
 
@@ -176,6 +186,15 @@ class Developer:
         return float(some.mean())
 
 
+def _in_fours(rows: NDArray[np.uint16], out: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Sums of four rows each: (4n, …) to (n, …), for values below `_FOUR_FIT`."""
+    count = len(out)
+    np.add(rows[:count], rows[count : 2 * count], out=out)
+    for begin in (2 * count, 3 * count):
+        out += rows[begin : begin + count]
+    return out
+
+
 def developer(
     shape: tuple[int, int],
     *,
@@ -202,7 +221,8 @@ def developer(
     down: tuple[Between, ...] = ()
     across: tuple[Between, ...] = ()
     if known:
-        down = tuple(_between(len(range(row, shape[0], a)), cells[0], steps[0]) for row in range(a))
+        lines = (_between(len(range(row, shape[0], a)), cells[0], steps[0]) for row in range(a))
+        down = tuple((below, np.stack([1 - share_next, share_next], axis=1)) for below, share_next in lines)
         across = tuple(_between(len(range(column, shape[1], b)), cells[1], steps[1]) for column in range(b))
     blacks = tuple(levels[np.resize(pattern[row], shape[1])].astype(np.float32) for row in range(a))
     return Developer(shape, pattern, levels, 1.0 / (white - levels), white, gains, known, steps, blacks, down, across)

@@ -5,6 +5,7 @@ The plane itself is never laid out when an exposure goes straight into a transfo
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
@@ -19,7 +20,7 @@ _PRODUCT = 250_000  # multiplications in a matrix product: more would wake BLAS'
 STEP = 29  # every so many rows and columns tell the mean: odd, so that all colours are among them
 
 Between: TypeAlias = tuple[NDArray[np.intp], NDArray[np.float32]]
-"""For each line or pixel the cell before it, and the share of the next one."""
+"""For each line or pixel the cell before it, and the share of the next one, or the shares of both."""
 
 
 class RowSource(Protocol):
@@ -77,8 +78,9 @@ class Exposure:
     """One mosaic and the factors that make it linear; a row source. A `Developer` makes it.
 
     plane[y, x] = (mosaic[y, x] − black) · factor(y, x) (· flat[y, x]), the factor between `factors` float32
-    (a, cells, W) for the a rows of the colour pattern: `down` says for each of these rows between which cells its lines
-    lie. `black` holds one float32 (W,) a row of the pattern; `dark`, a mosaic, takes its place.
+    (a, cells, W) for the a rows of the colour pattern: `down` says for each of these rows which cell lies before each
+    of its lines, with the shares (n, 2) of that one and the next. `black` holds one float32 (W,) a row of the pattern;
+    `dark`, a mosaic, takes its place.
     """
 
     mosaic: NDArray[Any]
@@ -101,29 +103,35 @@ class Exposure:
 
     def rows_into(self, out: NDArray[np.float32], rows: slice) -> None:
         """Develop these rows into `out` float32 (n, W)."""
-        period = self.period
-        for row in range(period):
-            these = slice(rows.start + row, rows.stop, period)
-            target = out[row::period]
-            if not len(target):
-                break
-            np.copyto(target, self.mosaic[these], casting="unsafe")
-            if self.dark is None:
-                target -= self.black[row]
-            else:
-                np.subtract(target, self.dark[these], out=target, casting="unsafe")
-            if self.factors.shape[1] == 1:
-                target *= self.factors[row, 0]
-            else:
-                first = rows.start // period
-                below, share_next = (of_all[first : first + len(target)] for of_all in self.down[row])
-                for same in np.split(np.arange(len(target)), np.flatnonzero(np.diff(below)) + 1):
-                    cell, lines = int(below[same[0]]), slice(int(same[0]), int(same[-1]) + 1)
-                    shares = np.array([1 - share_next[lines], share_next[lines]], dtype=np.float32).T
-                    for across in spans(self.shape[1], _PRODUCT // (2 * len(same))):
-                        target[lines, across] *= shares @ self.factors[row, cell : cell + 2, across]
+        for row in range(self.period):
+            these = slice(rows.start + row, rows.stop, self.period)
+            target, light = out[row :: self.period], self.mosaic[these]
+            dark = None if self.dark is None else self.dark[these]
+            first = rows.start // self.period
+            for lines, cell in self._runs(row, first, len(target)):  # each stays in the cache
+                part = target[lines]
+                np.copyto(part, light[lines], casting="unsafe")
+                if dark is None:
+                    part -= self.black[row]
+                else:
+                    np.subtract(part, dark[lines], out=part, casting="unsafe")
+                if cell is None:
+                    part *= self.factors[row, 0]
+                    continue
+                shares = self.down[row][1][first + lines.start : first + lines.stop]
+                for across in spans(self.shape[1], _PRODUCT // (2 * len(part))):
+                    part[:, across] *= shares @ self.factors[row, cell : cell + 2, across]
         if self.flat is not None:
             out *= self.flat[rows]
+
+    def _runs(self, row: int, first: int, count: int) -> list[tuple[slice, int | None]]:
+        """The lines 0…count of a row of the pattern, from its line `first` on, by the cell before them; None where one
+        factor holds for the whole frame."""
+        if self.factors.shape[1] == 1:
+            return [(slice(0, count), None)]
+        below = self.down[row][0][first : first + count]
+        edges = [0, *(np.flatnonzero(np.diff(below)) + 1).tolist(), count]
+        return [(slice(a, b), int(below[a])) for a, b in itertools.pairwise(edges) if a < b]
 
     def plane(self, workers: int = 1) -> Plane:
         """The whole plane, float32 (H, W)."""

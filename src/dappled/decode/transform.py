@@ -12,7 +12,7 @@ from scipy import fft
 from dappled.decode.errors import DecodeError
 from dappled.decode.exposure import Exposure, Laid, rows_at_once
 from dappled.decode.plane import Plane, check_sides
-from dappled.decode.spectrum import TILE, Complex, Spectrum, padded_shape
+from dappled.decode.spectrum import TILE, Complex, Spectrum, in_runs, padded_shape
 from dappled.decode.threads import each, share, spans
 
 _TILES = 4  # transformed at a time
@@ -74,9 +74,9 @@ class Transform:
 
 def _into_tiles(lines: Complex, tiles: Complex) -> None:
     """Rows (n, C) to tiles (k, n, TILE); what lies beyond C is 0."""
-    count, height, _ = tiles.shape
+    count = len(tiles)
     whole = min(count, lines.shape[1] // TILE)
-    tiles[:whole] = lines[:, : whole * TILE].reshape(height, whole, TILE).transpose(1, 0, 2)
+    in_runs(tiles[:whole], TILE)[..., 0] = in_runs(lines[:, : whole * TILE], TILE).T
     if whole < count:
         rest = lines[:, whole * TILE :]
         tiles[whole, :, : rest.shape[1]] = rest
