@@ -262,6 +262,29 @@ def test_forged_replayed_and_unsigned_packets_fire_nothing_on_a_signed_link(tmp_
         assert all(m.get_msgbuf()[2] & 1 for m in gcs.heard), "something went out unsigned"
 
 
+@pytest.mark.parametrize("clock_off_s", [-365 * 86400, -3600, 0, 3600])
+def test_a_station_with_a_wrong_clock_is_taken_once_it_has_heard_the_camera(tmp_path: Path, clock_off_s: int) -> None:
+    mavlink_signing.make_key(tmp_path / "key")
+    key = mavlink_signing.read_key(tmp_path / "key")
+    signing = mavlink_signing.signing([tmp_path / "key"], tmp_path / "time", SystemClock())
+    with Camera(signing=signing) as camera:
+        for system, off_s in ((255, clock_off_s), (254, 0)):  # the second with the right clock, whatever the first had
+            with Peer(camera.links.port(0), system) as station:
+                signer = station.packer.signing
+                signer.secret_key, signer.sign_outgoing = key, True
+                now = time.time() - mavlink_signing.EPOCH_UNIX_S
+                signer.timestamp = round((now + off_s) * mavlink_signing.UNITS_PER_S)
+                listener = mavlink.MAVLink(None)  # as programs have it: one object signs, hears, and learns the time
+                listener.signing = signer
+                station._decode = listener.decode
+                station.heartbeat()
+                station.one("HEARTBEAT")
+                station.command(2000, 0, 0, 1, 1)
+                assert station.ack(2000) == ACCEPTED
+        camera.idle()
+        assert [cause.source for cause in camera.causes] == ["mavlink:255/190", "mavlink:254/190"]
+
+
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
 def test_a_client_that_dies_in_the_middle_of_a_packet_leaves_the_camera_to_the_next(kind: str) -> None:
     with Camera(urls=[f"{kind}:127.0.0.1:0"]) as camera:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from dappled.daemon.shutter import Wish
 from dappled.flight.ledger import LedgerReader
+from dappled.flight.records import Frame
 from dappled.mocks.body import Body, BodyOptions
 from dappled.mocks.pictures import pattern
 from tests.system.flying import eventually, flying, settings_of
@@ -34,3 +37,35 @@ def test_an_interval_of_0_s_is_a_burst_that_loses_and_doubles_nothing(sockets: P
         assert sorted(row.fired_called_monotonic_ns for row in rows if row and row.fired_called_monotonic_ns) == [
             row.fired_called_monotonic_ns for row in rows if row
         ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["unplug", "drop-transfer", "no-event"])
+def test_in_a_burst_each_shot_ends_once_whatever_the_body_does(sockets: Path, tmp_path: Path, fault: str) -> None:
+    here = sockets / tmp_path.name[-12:]
+    here.mkdir()
+    with (
+        Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", delay_s=0.1)) as body,
+        flying(settings_of(here, camera={"port": body.port, "file_timeout_s": 20})) as daemon,
+    ):
+        daemon.until_ready()
+        shutter = daemon.service._parts.shutter
+
+        def safe() -> list[Frame]:
+            return [story.frame for story in list(daemon.stories) if story.frame is not None]
+
+        assert shutter.start_interval(Wish("test", "console", 1), 0.0, 0).outcome == "shot"
+        eventually(lambda: len(daemon.stories) >= 2, "two shots of the burst")
+        body.fault(fault)
+        if fault == "unplug":
+            eventually(lambda: daemon.camera == "absent", "the camera is absent")
+            body.fault("clear")
+        seen = len(safe())
+        eventually(lambda: len(safe()) >= seen + 3, "the burst goes on by itself", 60)
+        shutter.stop_interval()
+        eventually(lambda: shutter.statistics().pending == 0, "the last shot's end")
+        shots = shutter.statistics().shots
+        eventually(lambda: len(daemon.stories) == shots, "every shot's end")
+        assert len(safe()) + sum(bool(story.problem) for story in daemon.stories) == shots  # a frame, or why not
+        pictures = {(daemon.service.folder / frame.name).read_bytes() for frame in safe()}
+        assert len(pictures) == len(safe()), "one picture became two frames"
