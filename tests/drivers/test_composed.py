@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from dappled.mocks.pictures import pattern
 from tests.drivers.contract import (
     CameraContract,
     Rig,
+    arrived,
     content,
     failed,
     of_shots,
@@ -32,7 +34,7 @@ from tests.drivers.contract import (
 )
 
 WHO = Identity("FUJIFILM", "FinePix S5200", "", "gpio")
-FAST = Plan(file_s=5.0, hold_s=0.01, poll_s=0.02, retry_s=0.02)
+FAST = Plan(file_s=20.0, hold_s=0.01, poll_s=0.02, retry_s=0.02)
 T0 = 1_700_000_000.0
 
 
@@ -119,7 +121,7 @@ class TestContractOfReplay(CameraContract):
 
 
 def test_raw_and_jpeg_in_a_folder_are_one_frame(tmp_path: Path) -> None:
-    camera = ComposedCamera(WHO, OutsideLine(), FolderSource(tmp_path), FAST)
+    camera = ComposedCamera(WHO, OutsideLine(), FolderSource(tmp_path), replace(FAST, pair_s=20.0))
     camera.start()
     try:
         until_state(camera, "ready")
@@ -135,27 +137,25 @@ def test_raw_and_jpeg_in_a_folder_are_one_frame(tmp_path: Path) -> None:
         camera.stop()
 
 
-def test_a_file_that_is_still_written_is_waited_for(tmp_path: Path) -> None:
-    camera = ComposedCamera(WHO, OutsideLine(), FolderSource(tmp_path), FAST)
+def test_a_file_that_is_still_written_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = FolderSource(tmp_path)
+    listed, fired, pieces = source.list, threading.Event(), iter(range(60))
+
+    def growing() -> list[Found]:
+        """Each look finds the file longer than the last one did, until it is whole."""
+        if fired.is_set() and next(pieces, None) is not None:
+            with (tmp_path / "slow.dng").open("ab") as file:
+                file.write(bytes(1000))
+        return listed()
+
+    monkeypatch.setattr(source, "list", growing)
+    camera = ComposedCamera(WHO, OutsideLine(), source, FAST)
     camera.start()
     try:
         until_state(camera, "ready")
         camera.fire(1)
-        stop = threading.Event()
-
-        def write() -> None:
-            with (tmp_path / "slow.dng").open("wb") as file:
-                for _ in range(60):
-                    file.write(bytes(1000))
-                    file.flush()
-                    stop.wait(0.005)
-
-        writer = threading.Thread(target=write)
-        writer.start()
-        arrival = until_shot_ends(camera, 1)[-1]
-        writer.join()
-        assert isinstance(arrival, Arrival)
-        assert len(content(arrival)) == 60_000
+        fired.set()
+        assert len(content(arrived(camera, 1))) == 60_000
     finally:
         camera.stop()
 
