@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import shutil
 import time
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from dappled.config.settings import Settings
+from dappled.daemon import utc
 from dappled.daemon.cameras import open_camera
 from dappled.drivers import usb_bus
 from dappled.drivers.camera import CameraError, StateChanged
@@ -26,7 +26,6 @@ State = Literal["ok", "note", "wrong"]
 
 OPEN_S = 12.0
 _GRABBERS = ("gvfs-gphoto2-vo", "gvfsd-gphoto2", "gvfs-gphoto2-volume-monitor")  # /proc cuts names at 15 letters
-_NOT_SYNCHRONISED = 0x0040  # STA_UNSYNC (adjtimex(2))
 _FRAME_BYTES = 20e6
 
 
@@ -48,7 +47,7 @@ class Machine:
     proc: Path = Path("/proc")
     dev: Path = Path("/dev")
     open_s: float = OPEN_S
-    unsynchronised: Callable[[], bool] = field(default=lambda: _clock_state() & _NOT_SYNCHRONISED != 0)
+    unsynchronised: Callable[[], bool] = field(default=lambda: not utc.kernel_synchronised())
 
 
 Check = Callable[[Settings, Machine], list[Finding]]
@@ -231,13 +230,3 @@ def _names(proc: Path) -> list[str]:
             except OSError:
                 continue  # it ended
     return names
-
-
-def _clock_state() -> int:
-    """The status word of the kernel's clock (adjtimex(2)); 0 where it can't be had."""
-    size = 256  # struct timex has 208 bytes on 64-bit Linux
-    buffer = (ctypes.c_char * size)()
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.adjtimex(ctypes.byref(buffer)) < 0:
-        return 0
-    return ctypes.c_int.from_buffer(buffer, 40).value  # modes, offset, freq, maxerror, esterror come before it
