@@ -81,7 +81,18 @@ def test_what_was_set_is_asked_for_and_a_second_setting_comes_on_top_of_the_firs
     assert asked == ["mask mask-2", "carrier law fd"]
     assert after.next is not None
     assert (after.next.mask.profile, after.next.decode.law) == ("mask-2", "fd")
-    assert [knob.value for knob in found.all()] == list(succession.words(inputs.called(CONFIGURED)))  # of this flight
+    assert [knob.value for knob in found.all()] == ["mask-2", "fd"]  # what all ground stations are told
+
+
+def test_what_is_refused_is_not_shown() -> None:
+    def ask(_: Settings, text: str) -> None:
+        raise CameraError(f"{text}: 1 shots are under way")
+
+    found = knobs(CONFIGURED, Succession(CONFIGURED), ask)
+    for name, word in (("LF_MASK", "mask-2"), ("LF_LAW", "fd")):
+        with pytest.raises(CameraError, match="under way"):
+            found.turn(name, word)
+    assert [knob.value for knob in found.all()] == list(succession.words(inputs.called(CONFIGURED)))
 
 
 def test_where_no_flight_can_follow_they_are_to_be_read() -> None:

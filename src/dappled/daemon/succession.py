@@ -77,17 +77,21 @@ def knobs(
     """LF_MASK and LF_LAW of a flight, to be read only where nothing can come `after` it.
 
     `ask` takes the next flight's settings, made from those of `now`, and a sentence; a CameraError from it says why
-    not at once.
+    not at once. Once it has taken them, they say what is to come: this flight takes no frame any more.
     """
     mask, law = words(flown)
     if after is None:
         return OwnKnob("LF_MASK", "Mask", lambda: mask), OwnKnob("LF_LAW", "Carrier law", lambda: law)
 
     def turn_mask(word: str) -> None:
+        nonlocal mask
         ask(after.with_mask(after.next or now(), word), f"mask {word}")
+        mask = word
 
     def turn_law(word: str) -> None:
+        nonlocal law
         ask(after.with_law(after.next or now(), word), f"carrier law {word}")
+        law = word
 
     return (
         OwnKnob("LF_MASK", "Mask", lambda: mask, after.masks(), turn_mask),
