@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.exposure import STEP, Between, Exposure
-from dappled.decode.plane import Plane, check_frame, colour_gains, levels_of
+from dappled.decode.plane import Plane, check_frame, colour_gains, levels_of, size_text
 from dappled.decode.threads import each, share, spans
 
 _FOUR_FIT = 1 << 14  # four values below it add up within 16 bits
@@ -63,7 +63,7 @@ class Developer:
         """
         check_frame(mosaic, self.white, dark=dark, flat=flat)
         if mosaic.shape != self.shape:
-            raise DecodeError(f"the frame is {mosaic.shape} px, these settings are for {self.shape}")
+            raise DecodeError(f"the frame is {size_text(mosaic.shape)}, these settings are for {size_text(self.shape)}")
         colours = np.unique(self.pattern)
         if len(colours) == 1 or (not self.reference and self.balance is not None):
             gains = np.ones(len(self.levels)) if self.balance is None else self.balance

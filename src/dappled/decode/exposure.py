@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,25 +21,6 @@ STEP = 29  # every so many rows and columns tell the mean: odd, so that all colo
 
 Between: TypeAlias = tuple[NDArray[np.intp], NDArray[np.float32]]
 """For each line or pixel the cell before it, and the share of the next one, or the shares of both."""
-
-
-class RowSource(Protocol):
-    """What a transform reads: a plane, row by row."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-
-    @property
-    def level(self) -> float:
-        """About the plane's mean."""
-
-    @property
-    def period(self) -> int:
-        """Rows are asked for from a multiple of this on."""
-
-    def rows_into(self, out: NDArray[np.float32], rows: slice) -> None:
-        """Write these rows to `out` float32 (n, W)."""
 
 
 def rows_at_once(period: int) -> int:
@@ -98,7 +79,7 @@ class Exposure:
 
     @property
     def period(self) -> int:
-        """Rows of the colour pattern."""
+        """Rows of the colour pattern; rows are asked for from a multiple of it on."""
         return len(self.black)
 
     def rows_into(self, out: NDArray[np.float32], rows: slice) -> None:

@@ -17,6 +17,7 @@ from dappled.decode.lattice import FoundLattice, find_lattice
 from dappled.decode.lightfield import LightField
 from dappled.decode.noise import noise_rms
 from dappled.decode.plan import Plan, Plans
+from dappled.decode.plane import size_text
 from dappled.decode.report import DecodeReport, light_field, no_views
 from dappled.decode.sighting import relative_transfer
 from dappled.decode.slices import Slices, default_size
@@ -84,7 +85,9 @@ class LensletDecoder:
         Focal length and f-number only go into the attributes.
         """
         if plane.shape != self.shape:
-            raise DecodeError(f"the frame is {plane.shape} px, this decoder is made for {self.shape}")
+            raise DecodeError(
+                f"the frame is {size_text(plane.shape)}, this decoder is made for {size_text(self.shape)}"
+            )
         with self.plans.lend(self.shape) as plan:
             spectrum = plan.spectrum(plane, workers=self.workers)
             found = self.white.found if self.white is not None else find_lattice(spectrum)

@@ -148,7 +148,7 @@ def check_shape(mosaic: NDArray[Any]) -> None:
 
 def check_sides(shape: tuple[int, int]) -> None:
     """Raises DecodeError for frames that are too small to hold carriers, or too large for memory."""
-    size = f"{shape[0]}×{shape[1]} px"
+    size = size_text(shape)
     if min(shape) < _SMALLEST_SIDE:
         raise DecodeError(f"the frame is {size}: too small to hold carriers")
     if shape[0] * shape[1] > LARGEST_PIXELS:
@@ -160,12 +160,10 @@ def check_frame(
 ) -> None:
     """Raises DecodeError for a frame that holds no picture, or a dark or white frame of another size."""
     check_shape(mosaic)
-    if dark is not None and dark.shape != mosaic.shape:
-        raise DecodeError(f"the dark frame is {_size(dark)}, the frame {_size(mosaic)}: take a dark frame of its size")
-    if flat is not None and flat.shape != mosaic.shape:
-        raise DecodeError(
-            f"the white frame is {_size(flat)}, the frame {_size(mosaic)}: take a white frame of its size"
-        )
+    for name, other in (("dark", dark), ("white", flat)):
+        if other is not None and other.shape != mosaic.shape:
+            its, ours = size_text(other.shape), size_text(mosaic.shape)
+            raise DecodeError(f"the {name} frame is {its}, the frame {ours}: take a {name} frame of its size")
     _check_values(mosaic, white)
 
 
@@ -185,5 +183,6 @@ def _repeat(pattern_row: NDArray[np.intp], width: int) -> NDArray[np.intp]:
     return np.resize(pattern_row, width)
 
 
-def _size(array: NDArray[Any]) -> str:
-    return "×".join(str(side) for side in array.shape) + " px"
+def size_text(shape: Sequence[int]) -> str:
+    """A shape as a person reads it: rows × columns."""
+    return "×".join(map(str, shape)) + " px"

@@ -11,7 +11,7 @@ from scipy import fft
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.exposure import Exposure, Laid, rows_at_once
-from dappled.decode.plane import Plane, check_sides
+from dappled.decode.plane import Plane, check_sides, size_text
 from dappled.decode.spectrum import TILE, Complex, Spectrum, in_runs, padded_shape
 from dappled.decode.threads import each, share, spans
 
@@ -37,7 +37,7 @@ class Transform:
     def apply(self, source: Source, *, workers: int = 1, largest_fx: float = 0.5) -> Spectrum:
         """The spectrum up to `largest_fx` cycles/pixel along columns; the same bytes for any number of workers."""
         if source.shape != self.shape:
-            raise DecodeError(f"the frame is {source.shape} px, this transform is for {self.shape}")
+            raise DecodeError(f"the frame is {size_text(source.shape)}, this transform is for {size_text(self.shape)}")
         rows = source if isinstance(source, Exposure) else Laid(source)
         columns = min(self.padded[1] // 2 + 1, int(np.ceil(largest_fx * self.padded[1])) + 2)
         tiles = self._tiles[: -(-columns // TILE)]
