@@ -82,7 +82,7 @@ def test_a_commit_is_durable_by_the_settings_of_sqlite(tmp_path: Path) -> None:
 
 
 def test_a_reader_sees_a_ledger_that_is_written(tmp_path: Path) -> None:
-    with ledger_at(tmp_path / "flight.sqlite") as ledger, ledger.reader() as reader:
+    with ledger_at(tmp_path / "flight.sqlite") as ledger, LedgerReader.open(ledger.path) as reader:
         ledger.add_shot(shot(1))
         assert [row.state for row in reader.shots()] == ["wished"]
         with pytest.raises(FlightError, match="read-only"):

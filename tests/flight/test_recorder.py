@@ -17,7 +17,7 @@ from dappled.flight import durable
 from dappled.flight.check import check
 from dappled.flight.entries import Stray
 from dappled.flight.errors import FlightError
-from dappled.flight.ledger import Ledger
+from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.recorder import StrayFileError
 from dappled.flight.recording import Recording
 from dappled.flight.records import Frame
@@ -37,7 +37,7 @@ def test_a_frame_is_safe_when_record_returns(flight: Recording) -> None:
     assert (frame.camera_name, frame.size, frame.arrived_utc_ns) == ("IMG_0001.CR2", len(DATA), 5)
     assert frame.sha256 == hashlib.sha256(DATA).hexdigest()
     assert (flight.folder.path / frame.name).read_bytes() == DATA
-    with flight.ledger.reader() as reader:
+    with LedgerReader.open(flight.ledger.path) as reader:
         assert reader.frames() == [frame]
 
 

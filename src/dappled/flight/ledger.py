@@ -45,10 +45,6 @@ class Ledger(LedgerReader):
             self._db.close()
             raise
 
-    def reader(self) -> LedgerReader:
-        """A connection of its own for another thread."""
-        return LedgerReader.open(self.path)
-
     def add_shot(self, shot: Shot) -> None:
         """A wish, from the journal."""
         with self._transaction():
