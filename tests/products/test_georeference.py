@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import laspy
 import numpy as np
 import pytest
 import rasterio
+from numpy.typing import NDArray
 
 from dappled.cli import main
 from dappled.config.profiles import CameraProfile
@@ -21,12 +23,14 @@ from dappled.drivers.darkroom import Darkroom
 from dappled.errors import DappledError
 from dappled.flight import recording
 from dappled.flight.records import Tag
+from dappled.mocks.bench_calibration import CAMERA, MASK
 from dappled.mocks.path import TruePose
+from dappled.mocks.truth import Truth
 from dappled.products import camera_pose, difference, georeference, photographs
 from dappled.products.earth import Projection
-from dappled.products.georeference import Options
+from dappled.products.georeference import Options, Survey
 from dappled.products.ground import Flat
-from dappled.products.photographs import Mounting, PhotographError, Station
+from dappled.products.photographs import Mounting, Photograph, PhotographError, Station
 from tests import globe
 from tests.flight.makers import deliver, pose, wish
 from tests.products import flown
@@ -115,10 +119,45 @@ def test_terrain_and_difference(short_flight: Flown, tmp_path: Path, capsys: pyt
         height, sigma = read.read()
         assert read.descriptions[0] == "height above sea level, m"
         assert np.isfinite(height).sum() == len(points.points) == np.isfinite(sigma).sum()
+        bounds, found = read.bounds, height[np.isfinite(height)]
+    with rasterio.open(tmp_path / "ground.tif") as read:
+        ground = read.read(1, window=read.window(*bounds))
+        assert np.isfinite(read.read(1)).all()
+        assert ground[np.isfinite(height)] == pytest.approx(found, abs=1e-3)
     with rasterio.open(tmp_path / "difference.tif") as read:
         assert np.nanmax(np.abs(read.read(1))) < 1e-4  # a flight differs from itself by nothing
     with rasterio.open(tmp_path / "height-difference.tif") as read:
         assert np.nanmax(np.abs(read.read(1))) < 1e-4
+
+
+def test_frames_are_laid_on_heights_that_they_showed_themselves(short_flight: Flown, tmp_path: Path) -> None:
+    """Where each pixel really lies the simulation knows; on flat ground what stands up leans."""
+    assert main(words(short_flight, tmp_path, "--as", "terrain", "--gsd", "0.05")) == 0
+    with ExitStack() as stack:
+        errors = {}
+        for name, chosen in (("flat", Options()), ("own", Options(terrain=tmp_path / "ground.tif"))):
+            made = georeference.survey(short_flight.folder, short_flight.recipe, chosen, lambda *_: None, stack)
+            assert len(made.photographs) == 2
+            errors[name] = np.concatenate(
+                [misplaced_m(short_flight, made, *pair)
+                 for pair in zip(made.photographs, short_flight.truths, strict=True)]
+            )  # fmt: skip
+    assert np.isfinite(errors["own"]).all()
+    assert np.median(errors["own"]) < 0.3 * np.median(errors["flat"])
+    assert np.mean(errors["own"]) < 0.7 * np.mean(errors["flat"])
+
+
+def misplaced_m(flight: Flown, made: Survey, one: Photograph, truth: Truth) -> NDArray[np.float64]:
+    """How far from its true place the survey's ground puts each of a frame's pixels (every eighth)."""
+    assert truth.depth_m is not None
+    rows, columns = (range(2, side, 8) for side in truth.depth_m.shape)
+    pixels = np.array(
+        [(truth.grid[1, 1] * c / one.grid[1, 1], truth.grid[0, 0] * r / one.grid[0, 0]) for r in rows for c in columns]
+    )
+    north, east, _ = np.array([flown.true_ground(truth, r, c) for r in rows for c in columns]).T
+    true = np.stack(made.projection.to_map(*flight.to_geodetic(north, east)), axis=1)
+    met = made.ground.meet(one.eye, pixels)[:, :2]
+    return np.asarray(np.linalg.norm(met - true, axis=1))
 
 
 @pytest.fixture
@@ -184,7 +223,7 @@ def test_what_cant_be_compared_leaves_the_maps_and_a_report(
     more = ["--as", "cog", "terrain", "difference", "--against", str(later_flight), "--gsd", "0.1"]
     assert main(words(short_flight, tmp_path / "maps", *more)) == 1
     report = json.loads((tmp_path / "maps" / "report.json").read_text())
-    assert report["files"] == ["mosaic.tif", "terrain.tif", "terrain.las", "difference.tif"]
+    assert report["files"] == ["mosaic.tif", "terrain.tif", "terrain.las", "ground.tif", "difference.tif"]
     (why,) = report["notes"]
     assert why.startswith(f"no difference to {later_flight}: no two frames")
 
@@ -239,7 +278,7 @@ def true_pose(flight: Flown) -> TruePose:
 
 
 def tagged(sha256: str, index: int) -> Tag:
-    return Tag(index, 1, 1, "hot shoe", 50.0, flown.F_NUMBER, 0.001, 100, flown.CAMERA, flown.MASK, sha256, pose())
+    return Tag(index, 1, 1, "hot shoe", 50.0, flown.F_NUMBER, 0.001, 100, CAMERA, MASK, sha256, pose())
 
 
 @pytest.mark.parametrize(

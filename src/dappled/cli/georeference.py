@@ -111,6 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
                 terrain_of = _heights(made, arguments, progress)
                 files.append(terrain.write_raster(made, terrain_of, output / "terrain.tif"))
                 files.append(terrain.write_points(made, terrain_of, output / "terrain.las"))
+                files.append(terrain.write_ground(made, terrain_of, output / "ground.tif"))
             except HyperstereoError as error:
                 missing.append(str(error))
         if arguments.against is not None:

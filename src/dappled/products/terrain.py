@@ -14,7 +14,7 @@ import pyproj
 from numpy.typing import NDArray
 
 from dappled.flight import durable
-from dappled.products import cog, hyperstereo, mosaic
+from dappled.products import cog, hyperstereo, mosaic, own_ground
 from dappled.products.earth import Projection
 from dappled.products.extras import need
 from dappled.products.georeference import Survey
@@ -62,6 +62,14 @@ def write_raster(made: Survey, terrain: Terrain, path: Path) -> Path:
         names.append("difference to the given terrain, m")
     tags = {**made.tags(), "DAPPLED_LEVEL_SIGMA_M": f"{surface.level_sigma_m:.3f}"}
     cog.write(path, surface.grid, np.stack(bands, axis=-1), tags, tuple(names))
+    return path
+
+
+def write_ground(made: Survey, terrain: Terrain, path: Path) -> Path:
+    """The heights as ground to lay frames on: a COG without holes, with the survey's own ground around it."""
+    grid, heights = own_ground.heights(terrain.surface, made.ground)
+    names = ("height above sea level, m: found, between found ones, or given",)
+    cog.write(path, grid, heights[..., None].astype(np.float32), made.tags(), names)
     return path
 
 
