@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from dappled.decode.aperture import used_aperture
 from dappled.decode.masks import Mask
-from dappled.decode.views import Aperture, angular_frequencies, transfer
+from dappled.decode.views import Aperture, angular_frequencies, from_slices, transfer
 
 ORDERS = Mask(15.5, 2).half_orders()
 TRANSFERS = transfer(ORDERS, [1.0, *[0.36] * 6, *[0.18] * 6], (0.31, -0.12))
@@ -41,7 +41,7 @@ def test_the_aperture_is_found_behind_a_rounded_f_number(kappa: float, off: floa
 
 @pytest.mark.parametrize("kappa", [0.8, 0.9, 1.1])
 def test_beams_are_told_from_a_filled_aperture(kappa: float) -> None:
-    for true, filled in ((Aperture(5), False), (Aperture(5, 15), True)):
+    for true in (Aperture(5), Aperture(5, "filled")):
         found = used_aperture(
             _slices(kappa, 0.01, true, texture=0.01),
             TRANSFERS,
@@ -50,24 +50,59 @@ def test_beams_are_told_from_a_filled_aperture(kappa: float) -> None:
             rotation_rad=0.01,
             aperture=Aperture(5),
         )
-        assert (found.fitted, found.filled) == (True, filled)
+        assert (found.fitted, found.aperture) == (True, true)
         assert found.kappa == pytest.approx(kappa, abs=0.002)
-        cells = found.cells(ORDERS, Aperture(5), 0.01)
-        assert cells[0] == 1
-        assert (cells.min() < 0.8) == filled
 
 
-@pytest.mark.parametrize("aperture", [Aperture(5, 9, round=True)])
-def test_another_shape_of_aperture_is_not_fitted(aperture: Aperture) -> None:
-    found = used_aperture(
-        _slices(1.0, 0.0, aperture, texture=0.0),
-        TRANSFERS,
-        ORDERS,
-        nominal_kappa=1.0,
-        rotation_rad=0.0,
-        aperture=Aperture(5),
-    )
-    assert (found.kappa, found.fitted) == (1.0, False)
+@pytest.mark.parametrize("kappa", [0.5, 0.8, 1.0, 1.1])
+def test_a_round_stop_is_told_from_a_square_one(kappa: float) -> None:
+    for true in (Aperture(5), Aperture(5, "round")):
+        found = used_aperture(
+            _slices(kappa, 0.01, true, texture=0.01),
+            TRANSFERS,
+            ORDERS,
+            nominal_kappa=1.01 * kappa,
+            rotation_rad=0.01,
+            aperture=Aperture(5),
+        )
+        assert (found.fitted, found.aperture) == (True, true)
+        assert found.kappa == pytest.approx(kappa, abs=0.003)
+
+
+def test_views_through_a_round_stop_are_those_of_its_cells() -> None:
+    rng = np.random.default_rng(4)
+    stop, angular = Aperture(5, "round"), angular_frequencies(ORDERS, 0.95, 0.01)
+    views = 0.4 + 0.05 * rng.normal(size=(40, 50)) + 0.01 * rng.normal(size=(25, 40, 50))
+    slices = TRANSFERS[:, None, None] * np.tensordot(stop.cells(angular), views, axes=1)
+    noise = 1e-5 * rng.normal(size=(2, *slices.shape))
+    slices = (slices + noise[0] + 1j * noise[1]).astype(np.complex64)
+    found = used_aperture(slices, TRANSFERS, ORDERS, nominal_kappa=0.96, rotation_rad=0.01, aperture=Aperture(5))
+    assert found.aperture == stop
+    lit = stop.cells(np.zeros((1, 2)))[0].real > 0.5 / 25
+    assert lit.sum() == 21
+
+    def error(aperture: Aperture, kappa: float) -> float:
+        made, _ = from_slices(
+            slices,
+            ORDERS,
+            TRANSFERS,
+            kappa_cycles=kappa,
+            rotation_rad=0.01,
+            aperture=aperture,
+            noise_variance=2e-10,
+            model_error=1e-3,
+        )
+        return float(np.sqrt(np.mean((made.reshape(views.shape) - views)[lit] ** 2)))
+
+    assert error(stop, found.kappa) < 0.01
+    assert error(stop, found.kappa) < 0.1 * error(Aperture(5), 0.96)
+
+
+def test_another_shape_of_aperture_is_not_fitted() -> None:
+    ring = 1.5 * Aperture(5, "round").transform(angular_frequencies(ORDERS, 1.0, 0.0)) - 0.5
+    slices = np.asarray((TRANSFERS * ring)[:, None, None] * np.full((60, 80), 0.4), dtype=np.complex64)
+    found = used_aperture(slices, TRANSFERS, ORDERS, nominal_kappa=1.0, rotation_rad=0.0, aperture=Aperture(5))
+    assert (found.kappa, found.fitted, found.aperture) == (1.0, False, Aperture(5))
 
 
 def test_what_tells_nothing_leaves_the_f_number_s_word() -> None:

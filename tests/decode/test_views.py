@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dappled.decode.aperture import SHAPES
 from dappled.decode.masks import Mask
 from dappled.decode.views import (
     Aperture,
@@ -113,13 +114,17 @@ def test_a_diagonal_mask_leaves_what_it_does_not_sample_at_the_common_image() ->
 
 
 def test_apertures_sum_to_one_and_a_round_one_loses_its_corners() -> None:
-    for aperture in (Aperture(5), Aperture(5, 3), Aperture(5, 3, round=True)):
-        assert aperture.weights().sum() == pytest.approx(1.0)
+    angular = angular_frequencies(ORDERS, 0.97, 0.02)
+    for shape in SHAPES:
+        aperture = Aperture(5, shape)
+        assert aperture.cells(np.zeros((1, 2))).sum() == pytest.approx(1.0)
         assert aperture.transform(np.zeros((1, 2)))[0] == pytest.approx(1.0)
-    assert Aperture(5, 3, round=True).weights()[0] == 0
+        np.testing.assert_allclose(aperture.cells(angular).sum(axis=1), aperture.transform(angular), atol=5e-4)
+    shares = Aperture(5, "round").cells(np.zeros((1, 2)))[0].real.reshape(5, 5)
+    assert shares[2, 2] == pytest.approx(4 / (25 * np.pi), rel=1e-3)
+    assert shares[0, 0] < 0.4 * shares[2, 2]
     bessel_at_half = 0.7217  # 2 J1(π/2) / (π/2)
-    fine = Aperture(5, 41, round=True).transform(np.array([[0.0, 0.5]]))[0]
-    assert fine.real == pytest.approx(bessel_at_half, abs=2e-3)
+    assert Aperture(5, "round").transform(np.array([[0.0, 0.5]]))[0].real == pytest.approx(bessel_at_half, abs=1e-4)
 
 
 def test_combining_is_the_real_part_of_the_product() -> None:

@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.masks import Order
-from dappled.decode.views import Aperture, angular_frequencies
+from dappled.decode.views import Aperture, Shape, angular_frequencies
 
 ROUNDING = 0.05  # relative: f-numbers are off by no more (nominal f/22 is 22.6, f/3.5 is 3.56)
 _NOMINAL_SIGMA = 0.02  # relative: how far an f-number is believed
 _TEXTURE = 1.5e-3  # of the mean: what the scene adds to the mean of a slice
-_EVIDENCE = 9.0  # squared deviations: less than that doesn't tell a filled aperture from beams (at κ = 1 nothing does)
+_EVIDENCE = 9.0  # squared deviations: less doesn't tell one shape from another (beams from filled cells never at κ = 1)
+SHAPES: tuple[Shape, ...] = ("beams", "filled", "round")
 _AGREEMENT = 6.0  # times their own error: means further from any aperture's are some other aperture's
 
 
@@ -29,17 +30,13 @@ _AGREEMENT = 6.0  # times their own error: means further from any aperture's are
 class UsedAperture:
     """κ in periods of the mask's fundamental, and its standard error; `fitted` False is the f-number's own.
 
-    `filled`: light comes through the whole of each view's cell, not through a beam in its middle.
+    `aperture` says how light comes through: beams, filled cells, or a round stop.
     """
 
     kappa: float
     sigma: float
     fitted: bool
-    filled: bool = False
-
-    def cells(self, orders: Sequence[Order], aperture: Aperture, rotation_rad: float) -> NDArray[np.float64]:
-        """(K,) what one view's cell leaves of each carrier: 1 for beams."""
-        return _cells(angular_frequencies(orders, self.kappa, rotation_rad), aperture, self.filled)
+    aperture: Aperture
 
 
 def used_aperture(
@@ -55,7 +52,7 @@ def used_aperture(
 
     The most probable κ near `nominal_kappa`. The nominal one where the means tell nothing or fit no aperture.
     """
-    nominal = UsedAperture(nominal_kappa, _NOMINAL_SIGMA * nominal_kappa, False)
+    nominal = UsedAperture(nominal_kappa, _NOMINAL_SIGMA * nominal_kappa, False, aperture)
     means = mean_of_slices(slices)
     known = np.abs(transfers) > 1e-3
     known[0] = False
@@ -66,14 +63,20 @@ def used_aperture(
     wanted = [order for order, usable in zip(orders, known, strict=True) if usable]
 
     shares = 1 + ROUNDING * np.linspace(-1, 1, 201)
-    beams, filled = (
-        _fitted(
-            seen, error, wanted, nominal_kappa * shares, rotation_rad=rotation_rad, aperture=aperture, filled=filled
+    best: UsedAperture | None = None
+    least = math.inf
+    for shape in SHAPES:
+        found, cost = _fitted(
+            seen,
+            error,
+            wanted,
+            nominal_kappa * shares,
+            rotation_rad=rotation_rad,
+            aperture=Aperture(aperture.views, shape),
         )
-        for filled in (False, True)
-    )
-    best = filled if filled[1] + _EVIDENCE < beams[1] else beams
-    return nominal if best[0] is None else best[0]
+        if found is not None and cost + (_EVIDENCE if best else 0.0) < least:
+            best, least = found, cost
+    return best or nominal
 
 
 def _fitted(
@@ -84,12 +87,11 @@ def _fitted(
     *,
     rotation_rad: float,
     aperture: Aperture,
-    filled: bool,
 ) -> tuple[UsedAperture | None, float]:
     """The most probable of evenly spaced `kappas` (the nominal one in the middle), and its cost; None for no fit."""
     nominal = float(kappas[len(kappas) // 2])
     angular = [angular_frequencies(orders, float(kappa), rotation_rad) for kappa in kappas]
-    there = np.array([aperture.transform(a).real * _cells(a, aperture, filled) for a in angular])
+    there = np.array([aperture.transform(a).real for a in angular])
     deviations = ((there - seen) / error) ** 2
     cost = deviations.sum(axis=1) + ((kappas / nominal - 1) / _NOMINAL_SIGMA) ** 2
     best = int(np.argmin(cost))
@@ -99,14 +101,7 @@ def _fitted(
     curvature = below - 2 * centre + above
     step = float(kappas[1] - kappas[0])
     kappa = float(kappas[best]) + 0.5 * step * (below - above) / curvature
-    return UsedAperture(kappa, step * math.sqrt(2 / curvature), True, filled), centre
-
-
-def _cells(angular: NDArray[np.float64], aperture: Aperture, filled: bool) -> NDArray[np.float64]:
-    """(K,) the transform of one square cell, 1/N of the aperture wide; 1 for a beam."""
-    if not filled:
-        return np.ones(len(angular))
-    return np.asarray(np.sinc(angular / aperture.views).prod(axis=1))
+    return UsedAperture(kappa, step * math.sqrt(2 / curvature), True, aperture), centre
 
 
 def mean_of_slices(slices: NDArray[np.complex64]) -> NDArray[np.complex128]:

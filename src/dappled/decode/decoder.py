@@ -7,7 +7,7 @@ same bytes.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -34,6 +34,7 @@ from dappled.decode.transform import Source, Transform
 from dappled.decode.views import Aperture, Views, angular_frequencies, from_slices, kappa, transfer
 
 _ROTATION = 0.04  # of a carrier's frequency: the search without a calibration allows for 2.3°
+_NOTHING_TOLD: Mapping[str, Any] = {"transfers": None, "aperture": None}
 _LEAST_THROUGH = 0.1  # a carrier of which the aperture leaves less doesn't tell the mask's transfer
 
 
@@ -134,7 +135,7 @@ class MaskDecoder:
                 slices, lattice, carriers_from, focal_length_mm=focal_length_mm, f_number=f_number, noise_rms=noise
             )
         else:
-            made, offsets, views_from, told = *no_views(slices), "none", None
+            made, offsets, views_from, told = *no_views(slices), "none", _NOTHING_TOLD
         report = DecodeReport(tuple(predicted), tuple(measured), tuple(used), carriers_from, views_from, noise)
         facts: dict[str, Any] = {
             "law": self.law,
@@ -142,7 +143,7 @@ class MaskDecoder:
             "f_number": f_number,
             "mask_distance_mm": self._distance(focal_length_mm),
             "calibrated": self.calibration is not None,
-            "transfers": told,
+            **told,
         }
         return light_field(slices, made, offsets, shape=plane.shape, report=report, facts=facts), report
 
@@ -227,12 +228,13 @@ class MaskDecoder:
         focal_length_mm: float,
         f_number: float | None,
         noise_rms: float,
-    ) -> tuple[Views, NDArray[np.float64], ViewsFrom, list[list[float]] | None]:
+    ) -> tuple[Views, NDArray[np.float64], ViewsFrom, Mapping[str, Any]]:
         """Views of slices that were cut before, their offsets, where phases came from, and what each slice is of the
-        light field: rows [ωv, ωu, Re T, Im T], T = 0 where a slice was not used."""
+        light field: `transfers`, rows [ωv, ωu, Re T, Im T], T = 0 where a slice was not used, and the `aperture` that
+        it was taken through (see `Aperture.shape`)."""
         none = no_views(slices)
         if f_number is None:
-            return *none, "none", None
+            return *none, "none", _NOTHING_TOLD
         orders = [(c.ky, c.kx) for c in slices.carriers]
         aperture = self.aperture or Aperture(self.mask.views_per_axis)
         cycles = kappa(self.mask.frequency_per_mm, self._distance(focal_length_mm), focal_length_mm, f_number)
@@ -246,19 +248,18 @@ class MaskDecoder:
             width = used_aperture(
                 slices.values, transfers, orders, nominal_kappa=cycles, rotation_rad=rotation, aperture=aperture
             )
-            cycles = width.kappa
-            transfers = transfers * width.cells(orders, aperture, rotation)
+            cycles, aperture = width.kappa, width.aperture
             views_from: ViewsFrom = "calibration"
         elif carriers_from == "measured":
             rotation = turn_between(lattice, self.lattice_at(focal_length_mm))
             through = aperture.transform(angular_frequencies(orders, cycles, rotation)).real
             keep = np.abs(through) > _LEAST_THROUGH
             if np.linalg.matrix_rank([order for order, usable in zip(orders, keep, strict=True) if usable]) < 2:
-                return *none, "none", None
+                return *none, "none", _NOTHING_TOLD
             transfers = _own_transfer(slices.values, orders, through, keep)
             views_from = "frame"
         else:
-            return *none, "none", None
+            return *none, "none", _NOTHING_TOLD
         keep &= np.abs(transfers) > 1e-3  # a carrier that the mask doesn't make tells nothing
         views, offsets = from_slices(
             slices.values if keep.all() else slices.values[keep],
@@ -272,8 +273,8 @@ class MaskDecoder:
         )
         angular = angular_frequencies(orders, cycles, rotation)
         used = np.where(keep, transfers, 0)
-        told = np.column_stack([angular, used.real, used.imag]).tolist()
-        return views, offsets, views_from, told
+        rows = np.column_stack([angular, used.real, used.imag]).tolist()
+        return views, offsets, views_from, {"transfers": rows, "aperture": aperture.shape}
 
 
 def _own_transfer(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import LightField
-from dappled.decode.views import finest_detail
+from dappled.decode.views import Aperture, finest_detail
 from dappled.decode.viewstack import Image, ViewStack, needs_parallax, of
 
 _LEAST_NOISE = 1e-9  # variance: float32
@@ -83,8 +83,7 @@ def of_light_field(field: LightField) -> Evidence:
     if table.shape != (len(field.slices), 4) or not used.any():
         raise DecodeError("the light field's transfers don't fit its slices: decode the frame again")
     angular, transfers = table[used, :2], transfers[used]
-    points = field.view_offsets.reshape(-1, 2)
-    kernel = np.exp(2j * np.pi * angular @ points.T) / len(points)
+    kernel = Aperture(field.views.shape[0], field.attributes.get("aperture") or "beams").cells(angular)
     # The band that a slice takes of the frame's spectrum holds that share of the frame's white noise.
     band = 1 / float(np.hypot(*field.grid[:, 0]) * np.hypot(*field.grid[:, 1]))
     variance = max(float(noise) ** 2 * band, _LEAST_NOISE)

@@ -22,55 +22,80 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from dappled.decode.carriers import Carrier
 from dappled.decode.masks import Order
 
 Views = NDArray[np.float32]
+Shape = Literal["beams", "filled", "round"]
 _SHARED = 1e3  # variance of what all views share, over that of what one view has alone
 _MODEL_ERROR = 0.45  # over the root of a slice's shorter side: the frame's end rings in a share of each slice
 _COLOURED = 0.3  # of a band's finest detail is taken for chroma; all of it would take parallax for chroma, too
+_PARTS = 15  # of a cell's side, where a circle cuts through cells
 _SMALLEST_NOISE = 1e-9  # relative variance of a coefficient: float32 and its transforms
 
 
 @dataclass(frozen=True, slots=True)
 class Aperture:
-    """How the aperture is sampled in the model: N views an axis over its full width, each by `samples` points.
+    """How light comes through the aperture in the model: N views an axis over its full width, each one cell of it.
 
-    One sample a view takes the light field as N×N beams. `round` leaves out the points beyond the circle (a view
-    whose own centre lies there keeps its place, and shows what the others say about it).
+    "beams": through the middle of each cell. "filled": through the whole of each cell. "round": through what of each
+    cell lies in the circle; a view whose cell lies outside keeps its place, and shows what the others say about it.
     """
 
     views: int
-    samples: int = 1
-    round: bool = False
+    shape: Shape = "beams"
 
     def points(self) -> NDArray[np.float64]:
-        """(P, 2) points (v, u) in shares of the full aperture, −0.5 to 0.5, rows first."""
-        n = self.views * self.samples
-        axis = (np.arange(n) - (n - 1) / 2) / n
-        return np.array(list(itertools.product(axis, axis)), dtype=np.float64)
-
-    def weights(self) -> NDArray[np.float64]:
-        """(P,) share of the light that comes through each point; their sum is 1."""
-        points = self.points()
-        inside = np.hypot(points[:, 0], points[:, 1]) <= 0.5 if self.round else np.ones(len(points), dtype=bool)
-        weights: NDArray[np.float64] = inside / inside.sum()
-        return weights
+        """(V·U, 2) the cells' middles (v, u) in shares of the full aperture, −0.5 to 0.5, rows first."""
+        return _middles(self.views)
 
     def offsets(self) -> NDArray[np.float64]:
         """(V, U, 2) the views' own points."""
-        n = self.views
-        axis = (np.arange(n) - (n - 1) / 2) / n
-        return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+        return self.points().reshape(self.views, self.views, 2)
+
+    def cells(self, angular: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """(K, V·U) ∫ e^{2πi ω·θ} dθ over each view's cell for (K, 2) frequencies ω in cycles over the aperture, as a
+        share of the whole aperture: at 0 the share of the light that each view has."""
+        angular, n = np.asarray(angular), self.views
+        if self.shape != "round":
+            cells = np.asarray(np.exp(2j * np.pi * angular @ self.points().T) / n**2, dtype=np.complex128)
+            if self.shape == "filled":
+                cells *= np.sinc(angular / n).prod(axis=1)[:, None]
+            return cells
+        fine = n * _PARTS
+        parts = np.exp(2j * np.pi * angular @ _middles(fine).T) * _in_circle(fine)
+        parts *= np.sinc(angular / fine).prod(axis=1)[:, None]
+        return np.asarray(parts.reshape(-1, n, _PARTS, n, _PARTS).sum(axis=(2, 4)).reshape(-1, n * n))
 
     def transform(self, angular: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """(K,) ∫ e^{2πi ω·θ} dθ over the aperture for (K, 2) frequencies ω in cycles over it; 1 at 0."""
-        kernel = np.exp(2j * np.pi * np.asarray(angular) @ self.points().T)
-        return np.asarray(kernel @ self.weights(), dtype=np.complex128)
+        """(K,) the same over the whole aperture; 1 at 0."""
+        if self.shape != "round":
+            return np.asarray(self.cells(angular).sum(axis=1), dtype=np.complex128)
+        turns = np.pi * np.hypot(*np.asarray(angular).T)
+        whole = 2 * special.j1(turns) / np.where(turns > 0, turns, 1.0)
+        return np.where(turns > 0, whole, 1.0).astype(np.complex128)
+
+
+def _middles(n: int) -> NDArray[np.float64]:
+    """(n², 2) the middles of n × n cells over the full aperture, rows first."""
+    axis = (np.arange(n) - (n - 1) / 2) / n
+    return np.array(list(itertools.product(axis, axis)), dtype=np.float64)
+
+
+@cache
+def _in_circle(n: int) -> NDArray[np.float64]:
+    """(n²,) what each of n × n cells has of the circle, as a share of the circle."""
+    fine = 16
+    axis = (np.arange(n * fine) - (n * fine - 1) / 2) / (n * fine)
+    inside = (np.hypot(axis[:, None], axis[None, :]) <= 0.5).reshape(n, fine, n, fine).sum(axis=(1, 3)).ravel()
+    return np.asarray(inside / inside.sum(), dtype=np.float64)
 
 
 def kappa(frequency_per_mm: float, mask_distance_mm: float, focal_length_mm: float, f_number: float) -> float:
@@ -108,18 +133,14 @@ def unmixing(
     `noise_variance` of a slice's pixel (real and imaginary part together; one, or one per slice), `view_variance`
     of what one view has beside the image that all share; both in squared plane units.
     """
-    points, weights = aperture.points(), aperture.weights()
-    kernel = np.exp(2j * np.pi * angular @ points.T) * weights
+    kernel = aperture.cells(angular)
     is_dc = np.all(angular == 0, axis=1)
     parts = np.concatenate([kernel.real, kernel.imag[~is_dc]])
     noise = noise_variance / np.abs(transfers) ** 2 / np.where(is_dc, 1.0, 2.0)
     noise = np.concatenate([noise, noise[~is_dc]]) / max(view_variance, 1e-30) + _SMALLEST_NOISE
     shared = _SHARED * np.outer(parts.sum(axis=1), parts.sum(axis=1))  # parts @ 11ᵀ @ partsᵀ
     data = parts @ parts.T + shared + np.diag(noise)
-    centre = (aperture.samples - 1) // 2
-    n = aperture.views * aperture.samples
-    wanted = np.arange(n * n).reshape(n, n)[centre :: aperture.samples, centre :: aperture.samples].ravel()
-    cross = parts.T[wanted] + _SHARED * parts.sum(axis=1)
+    cross = parts.T + _SHARED * parts.sum(axis=1)
     solution = np.linalg.solve(data, cross.T).T
     count = len(transfers)
     coefficients = solution[:, :count].astype(np.complex128)
@@ -136,9 +157,10 @@ def view_variance(
     noise_variance: NDArray[np.float64],
 ) -> float:
     """The mean square of what one view has beside the common image, from the slices themselves less their noise."""
-    common = aperture.transform(angular)
+    common, cells = aperture.transform(angular), aperture.cells(angular)
     total, share = 0.0, 0.0
-    per_point = float((aperture.weights() ** 2).sum())
+    one = float((np.abs(cells[0]) ** 2).sum())
+    own = (np.abs(cells - common[:, None] * cells[0]) ** 2).sum(axis=1)  # what comes through of views' own power
     step = max(1, math.isqrt(slices[0].size // 16384))
     height, width = slices.shape[1:]
     # The tenth at each edge is left out: there the frame's end rings in every band.
@@ -149,7 +171,7 @@ def view_variance(
         power = float(np.mean(alone.real**2 + alone.imag**2)) - noise_variance[k] / abs(transfers[k]) ** 2
         weight = abs(transfers[k]) ** 2  # a strong carrier knows better
         total += weight * max(power, 0.0)
-        share += weight * max(1 - abs(common[k]) ** 2, 1e-3) * per_point
+        share += weight * max(float(own[k]), 1e-3 * one)
     floor = 1e-6 * float(np.mean(dc.real**2))
     ceiling = max(float(np.var(dc.real)), floor)  # views differ by where the picture is, not by more than it holds
     return max(min(total / share if share else 0.0, ceiling), floor, 1e-12)
