@@ -114,9 +114,9 @@ def _picture(plane: Plane, table: Table, arguments: argparse.Namespace) -> Any:
 
 def _predicted(arguments: argparse.Namespace) -> Table:
     if not arguments.shape or arguments.camera == "auto" or arguments.mask == profiles.LENSLET:
-        raise ConfigError("without a frame --shape, --camera and --mask say what to predict for")
+        raise ConfigError("name a frame; or say what to predict for: --shape, --camera, --mask and --focal-length")
     if not arguments.focal_length or arguments.focal_length <= 0:
-        raise ConfigError("without a frame --focal-length says, in mm, what to predict for")
+        raise ConfigError("without a frame nothing tells the focal length: give --focal-length, in mm")
     camera = profiles.camera(arguments.camera)
     darkroom = Darkroom(common.recipe(arguments))
     decoder = darkroom.mask_decoder((arguments.shape[0], arguments.shape[1]), next(iter(camera.models), ""))
