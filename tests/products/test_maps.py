@@ -282,6 +282,18 @@ def test_a_large_picture_becomes_a_tree_of_tiles(tmp_path: Path) -> None:
     assert again.read_bytes() == (tmp_path / "large.kmz").read_bytes()
 
 
+@pytest.mark.skipif(shutil.which("gdalinfo") is None, reason="GDAL's command line is not installed")
+def test_gdal_reads_the_tree_of_tiles(tmp_path: Path) -> None:
+    picture = np.full((1300, 1100, 2), 255, np.uint8)
+    path, grid = tmp_path / "m.kmz", MapGrid("EPSG:4326", -91.5, 41.6, 1e-6, 1e-6, (1300, 1100))
+    kmz.write(path, "m", [Overlay("m", picture, grid)])
+    said = json.loads(subprocess.run(["gdalinfo", "-json", str(path)], check=True, capture_output=True).stdout)  # noqa: S607  on PATH
+    assert said["driverShortName"] == "KMLSUPEROVERLAY"
+    corners = said["cornerCoordinates"]
+    assert [*corners["upperLeft"], *corners["lowerRight"]] == pytest.approx([-91.5, 41.6, -91.4989, 41.5987], abs=1e-8)
+    assert min(said["size"]) >= 1024  # finer than the first page's picture
+
+
 def test_a_quad_keeps_the_view_as_it_is(tmp_path: Path) -> None:
     eye, ground = eye_at(height_m=100.0), Flat(0.0)
     made = survey(photograph(eye, painted(eye, ground)))

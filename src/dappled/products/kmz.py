@@ -95,6 +95,7 @@ def _tree(files: dict[str, bytes], place: str, overlay: Overlay, folder: str = "
     target.append(_element("viewRefreshMode", "onRegion"))
     root = ET.Element(_k("kml"))
     document = ET.SubElement(root, _k("Document"))
+    document.append(_region(grid))  # GDAL looks for it here
     step = -(-max(grid.shape) // TILE)
     drawn = _box(overlay.name, grid, _picture(files, f"{_FOLDER}{place}", _shrunk(picture, step)).removeprefix(_FOLDER))
     drawn.insert(1, _region(grid))
