@@ -96,7 +96,7 @@ def test_a_file_without_a_shot_is_kept_and_told(tmp_path: Path) -> None:
     flight.close()
 
 
-def replay(tmp_path: Path, **digests: str | None) -> tuple[ReplayBook, Frame]:
+def replay(tmp_path: Path, **digests: Any) -> tuple[ReplayBook, Frame]:
     """The book of a replay of one frame, which stands on disk."""
     blob = Blob.of(DATA)
     from dappled.flight import durable  # noqa: PLC0415  # used here only
