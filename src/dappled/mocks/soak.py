@@ -91,13 +91,16 @@ def soak(plan: Plan, folder: Path, tell: Callable[[str], None] = lambda _: None)
         wisher = _Wisher(ground, plan.interval_s, answers)
         stack.callback(wisher.stop)
         wisher.start()
-        end, next_fault = time.monotonic() + plan.seconds, time.monotonic() + SETTLE_S
-        last_life = time.monotonic() + plan.seconds / 2  # the daemon dies in the first half only: then it is measured
+        began = time.monotonic()
+        end, next_fault = began + plan.seconds, began + SETTLE_S
+        # The daemon dies in the first half only; then it lives itself warm (a minute of telemetry, the heap's largest
+        # need), and is measured.
+        last_life, warm = began + plan.seconds / 2, began + plan.seconds * 2 / 3
         before: Resources | None = None
         while time.monotonic() < end:
             time.sleep(0.1)
             daemon.keep_alive()
-            if before is None and time.monotonic() > last_life + SETTLE_S:
+            if before is None and time.monotonic() > max(warm, last_life + SETTLE_S):
                 troubles.clear()
                 before = _calm(daemon, SETTLE_S)
             if time.monotonic() > next_fault:
