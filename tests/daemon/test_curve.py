@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import stat
 import threading
 import time
@@ -94,7 +95,7 @@ def test_any_file_is_a_key_or_an_error(tmp_path_factory: pytest.TempPathFactory,
 
 def test_only_those_on_the_list_get_in(keys: tuple[ServerKeys, ClientKeys, ClientKeys]) -> None:
     server, friend, stranger = keys
-    endpoint, ask = (f"tcp://127.0.0.1:{free_port()}" for _ in range(2))
+    endpoint, ask = (f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}" for _ in range(2))
     one = Publisher(
         endpoint, ask, flight="f", answer=lambda _, reply: reply(Message("error", {"error": "x"})), keys=server
     )
@@ -133,7 +134,7 @@ def test_only_those_on_the_list_get_in(keys: tuple[ServerKeys, ClientKeys, Clien
 def test_the_daemon_s_own_door_needs_no_key(keys: tuple[ServerKeys, ClientKeys, ClientKeys], tmp_path: Path) -> None:
     private = f"ipc://{tmp_path}/own"
     one = Publisher(
-        f"tcp://127.0.0.1:{free_port()}",
+        f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}",
         "",
         flight="f",
         answer=lambda request, reply: reply(Message("frame", dict(request))),

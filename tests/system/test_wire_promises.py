@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -30,7 +31,7 @@ def watch(folder: Path, *arguments: str) -> subprocess.Popen[str]:
 def test_who_is_on_the_list_receives_and_a_stranger_does_not(tmp_path: Path) -> None:
     for name, folder in (("vehicle", "keys"), ("laptop", "clients"), ("stranger", "keys")):
         assert main(["keys", "make", name, "-o", str(tmp_path / folder)]) == 0
-    stream, ask = (f"tcp://127.0.0.1:{free_port()}" for _ in range(2))
+    stream, ask = (f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}" for _ in range(2))
     (tmp_path / "dappled.toml").write_text(
         f'[record]\ndirectory = "flights"\n[publish]\nslices = "{stream}"\nask = "{ask}"\n'
         'keys = "keys/vehicle.key_secret"\nclients = "clients"\n'

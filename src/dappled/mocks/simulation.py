@@ -6,6 +6,9 @@ like is drawn from the seed and told to nobody; the calibration comes from a ben
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import secrets
 import socket
 import time
 from contextlib import ExitStack
@@ -122,11 +125,22 @@ class Simulation:
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    """A port of loopback that nobody uses at the moment, of UDP or as `kind` says."""
-    with socket.socket(socket.AF_INET, kind) as one:
-        one.bind(("127.0.0.1", 0))
-        port: int = one.getsockname()[1]
-        return port
+    """A port of loopback that nobody uses at the moment, of UDP or as `kind` says.
+
+    It is none of those that the kernel gives to whoever asks for any, so it is still free when it is bound.
+    """
+    last = _first_given_out() - 1
+    first = max(1024, last - 12_000)  # above those that services like to have
+    for _ in range(1000):
+        port = first + secrets.randbelow(last - first + 1)
+        with socket.socket(socket.AF_INET, kind) as one, contextlib.suppress(OSError):
+            one.bind(("127.0.0.1", port))
+            return port
+    raise OSError(errno.EADDRINUSE, f"no port of loopback between {first} and {last} is free")
+
+
+def _first_given_out() -> int:
+    return int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text("ascii").split()[0])
 
 
 def _keys(given: Settings) -> tuple[str, ...]:
