@@ -66,13 +66,15 @@ def test_the_wrong_mask_shows_no_carriers(good: Path) -> None:
     assert "mask" in found["carriers"].text
 
 
-def test_a_mask_away_from_its_place_is_cautioned_of(good: Path, tmp_path: Path) -> None:
-    height, width = reference_camera(1, scale=0.5).sensor.shape
+def test_a_mask_away_from_its_place_is_cautioned_of(tmp_path: Path) -> None:
+    camera = reference_camera(1, scale=0.5)
+    (tmp_path / "stopped.dng").write_bytes(camera.expose(10.0, 1, f_number=59.2).file)
+    height, width = camera.sensor.shape
     (tmp_path / "off.toml").write_text(
         'law = "geometric"\nmask_distance_mm = 0.48\n[[raw]]\nname = "half"\n'
         f"shape = [{height}, {width}]\nrow_mm = [0.0092, 0.0]\ncolumn_mm = [0.0, 0.0092]\n"
     )
-    found = by_name(examine(good, Recipe(camera=str(tmp_path / "off.toml"), mask="reference-5x5")))
+    found = by_name(examine(tmp_path / "stopped.dng", Recipe(camera=str(tmp_path / "off.toml"), mask="reference-5x5")))
     assert found["carriers"].state == "caution"
     assert "farther out than predicted" in found["carriers"].text
 
