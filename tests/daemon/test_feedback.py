@@ -111,8 +111,18 @@ def test_the_cameras_clock_is_learnt_from_shots() -> None:
     assert exposure is not None
     assert abs(exposure.utc_ns - START_NS - MS) <= 0.6 * 10**9
     assert exposure.sigma_ns == pytest.approx(290 * MS, rel=0.02)
-    set_anew = clock.learnt(START_NS, 10**9, Exposure(START_NS, MS, "latency"))
-    assert set_anew.offset_ns() is None
+
+
+def test_a_camera_clock_that_was_set_is_learnt_anew() -> None:
+    clock = CameraClock()
+    for number in range(8):
+        begin_ns = START_NS + number * 10**9
+        offset_ns = 0 if number < 5 else 3_600 * 10**9
+        clock = clock.learnt(begin_ns + offset_ns, 10**9, Exposure(begin_ns, MS, "latency"))
+        assert (clock.offset_ns() is None) == (number in (0, 1, 5, 6))
+    found = clock.offset_ns()
+    assert found is not None
+    assert abs(found[0] - 3_600 * 10**9) <= 10**9
 
 
 def test_what_exif_shows() -> None:

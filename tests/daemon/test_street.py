@@ -6,6 +6,7 @@ import io
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from dappled.daemon import capture
+from dappled.daemon import camera_clock, capture, tagger
 from dappled.drivers.camera import Blob, CameraError, Companion, Deferred, Event
 from dappled.flight import check, summary
 from dappled.flight.records import ShotState
@@ -345,9 +346,28 @@ def test_a_zoom_that_changed_is_told(tmp_path: Path) -> None:
     assert told == ["zoom: the focal length is 24 mm; it was 10 mm at frame 1"]
 
 
-def jpeg_at(focal_length_mm: float) -> bytes:
+@pytest.mark.parametrize(("doubt", "by"), [("", camera_clock.SOURCE), ("it may be another's", tagger.WISH_SOURCE)])
+def test_a_shot_in_doubt_teaches_no_time(tmp_path: Path, doubt: str, by: str) -> None:
+    taken = time.strftime("%Y:%m:%d %H:%M:%S", time.gmtime())
+
+    def script(shot: int) -> list[Event | Exception]:
+        came = replace(arrival(shot, jpeg_at(10.0, taken), "A.JPG"), facts={"doubt": doubt} if doubt else {})
+        return [fired(shot), came] if shot < 3 else [came]
+
+    with rig(tmp_path, script) as one:
+        for number in range(4):
+            index = one.wish(number).index
+            assert index is not None
+            last = one.ended(index)
+    assert last.tag is not None
+    assert last.tag.time_source.startswith(by)
+
+
+def jpeg_at(focal_length_mm: float, taken: str = "") -> bytes:
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0x920A] = focal_length_mm
+    if taken:
+        exif.get_ifd(0x8769)[0x9003] = taken
     file = io.BytesIO()
     Image.new("L", (64, 48)).save(file, "JPEG", exif=exif)
     return file.getvalue()

@@ -23,25 +23,33 @@ class CameraClock:
     shots: tuple[tuple[int, int, int], ...] = ()
 
     def learnt(self, shown_ns: int, step_ns: int, exposure: Exposure) -> CameraClock:
-        """With one more shot, whose begin is known otherwise. The last 256 count."""
+        """With one more shot, whose begin is known otherwise. The last 256 count; only this one where it contradicts
+        them: then the camera's clock was set in between."""
         offset_ns = shown_ns - (exposure.utc_ns - exposure.half_ns)
-        return CameraClock((*self.shots, (offset_ns, exposure.sigma_ns, step_ns))[-_KEPT:])
+        shots = (*self.shots, (offset_ns, exposure.sigma_ns, step_ns))[-_KEPT:]
+        return CameraClock(shots if _agree(shots) else shots[-1:])
 
     def offset_ns(self) -> tuple[int, int] | None:
-        """The camera's time minus UTC with 1 σ; None from fewer than three shots, or where they contradict each other
-        (the camera's clock was set in between)."""
+        """The camera's time minus UTC with 1 σ; None from fewer than three shots."""
         if len(self.shots) < _LEAST:
             return None
-        centre = self.shots[-1][0]
-        sigma = math.sqrt(sum(s * s for _, s, _ in self.shots) / len(self.shots))
-        step = max(step for _, _, step in self.shots)
+        centre, (sigma, step) = self.shots[-1][0], _spread(self.shots)
         shifts = [offset - centre for offset, _, _ in self.shots]
-        if max(shifts) - min(shifts) > step + 8 * sigma:
-            return None
         # A cut-off time is uniform over one step: its mean is half a step early, with step / √12 a shot.
         mean = sum(shifts) / len(shifts) + step / 2
         by_mean = math.hypot(sigma, step / math.sqrt(12)) / math.sqrt(len(shifts))
         return centre + round(mean), round(by_mean)
+
+
+def _spread(shots: tuple[tuple[int, int, int], ...]) -> tuple[float, int]:
+    """(1 σ of their times, the clock's step)."""
+    return math.sqrt(sum(s * s for _, s, _ in shots) / len(shots)), max(step for _, _, step in shots)
+
+
+def _agree(shots: tuple[tuple[int, int, int], ...]) -> bool:
+    sigma, step = _spread(shots)
+    offsets = [offset for offset, _, _ in shots]
+    return max(offsets) - min(offsets) <= step + 8 * sigma
 
 
 def exposure_from_camera(clock: CameraClock, shown_ns: int, step_ns: int, exposure_s: float | None) -> Exposure | None:

@@ -64,7 +64,8 @@ class Tagging:
             log.warning("zoom: %s", zoomed)
             self._stories.note("zoom", zoomed, frame.index)
         exposure, pose = self._poses(frame.index, self._expected(story, settings))
-        if story.fired and (told := camera_clock.shown(settings.taken)):
+        # A file that may be another shot's would teach another shot's time.
+        if story.fired and not story.doubt and (told := camera_clock.shown(settings.taken)):
             self._camera_clock = self._camera_clock.learnt(*told, exposure)
         if story.doubt:
             exposure = replace(exposure, source=f"{exposure.source}; in doubt: {story.doubt}")
