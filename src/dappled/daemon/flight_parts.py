@@ -63,7 +63,7 @@ class FlightParts:
         end: Callable[[], None],
     ) -> None:
         self._settings, self._clock, self._recording, self._links = settings, clock, recording, links
-        self._after, self._end = after, end
+        self._after, self._end, self._publisher = after, end, publisher
         now = settings()
         self.alarms = Alarms()
         self.book = LiveBook(recording, clock)
@@ -121,7 +121,7 @@ class FlightParts:
 
     def dead(self) -> list[str]:
         """Threads that have ended without being asked to: none, unless there is a bug."""
-        parts: list[Part] = [*self._vital, self.answers]
+        parts: list[Part] = [*self._vital, self._publisher, self.answers]
         if self.depth is not None:
             parts.append(self.depth)
         return [name for part in parts for name in part.dead()]

@@ -137,6 +137,11 @@ class Publisher:
                 self._doors.wrong_keys,
             )
 
+    def dead(self) -> list[str]:
+        """Its thread, where it has ended without being asked to."""
+        begun = self._thread.ident is not None
+        return [self._thread.name] if begun and not self._thread.is_alive() and not self._stopping.is_set() else []
+
     def stop(self, grace_s: float = 2.0) -> None:
         """Send what waits, go on answering until nobody has asked for half a second (at most `grace_s`), then close."""
         if self._stopping.is_set():
