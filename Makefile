@@ -24,11 +24,11 @@ check: setup ## lint, format, types, layers
 	@$(BIN)/lint-imports
 
 test-fast: setup
-	@$(BIN)/pytest -q --no-header -m "not slow" --durations=25
+	@$(BIN)/pytest -q --no-header -n auto --dist worksteal -m "not slow" --durations=25
 
 coverage: setup ## the default tests again, and which lines they reach (a third slower)
 	@$(BIN)/coverage erase
-	@$(BIN)/pytest -q --no-header -m "not slow" --cov --cov-report=term
+	@$(BIN)/pytest -q --no-header -n auto --dist worksteal -m "not slow" --cov --cov-report=term
 
 test-slow: setup ## the tests that take longer
 	@$(BIN)/pytest -q --no-header -m slow --durations=25
