@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import mmap
+import os
 import socket
+import stat
 import threading
 import time
 import weakref
@@ -20,7 +23,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.config.settings import PublishSettings
-from dappled.daemon import publisher, wire
+from dappled.daemon import doors, publisher, wire
 from dappled.daemon.publisher import UNREAD_STACKS, Publisher, Reply
 from dappled.daemon.subscriber import AsyncSubscriber, Subscriber, subscribe, subscribe_async
 from dappled.daemon.wire import Message, WireError
@@ -289,6 +292,28 @@ def test_readers_that_stop_at_different_times_keep_eight_of_all_together(endpoin
         publish()
         assert one.statistics().sent["slices"] == seen + 1
     one.stop(0.0)
+
+
+def test_a_reader_over_ipc_gets_more_room_than_the_kernel_s_default(started: Publisher, endpoint: str) -> None:
+    """The two ends would wait for each other all the time: a third of the speed is lost."""
+    default = Path("/proc/sys/net/core/wmem_default")
+    most = Path("/proc/sys/net/core/wmem_max")
+    wanted = min(2 * doors.ROOM_BYTES, 2 * int(most.read_text("ascii")))
+    assert wanted > int(default.read_text("ascii"))
+    with Subscriber(endpoint) as subscriber:
+        connected(started, subscriber)
+        eventually(lambda: wanted in rooms(), "the connection has it")
+
+
+def rooms() -> set[int]:
+    """Send buffers of this process' sockets."""
+    found = set()
+    for name in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            if stat.S_ISSOCK(os.fstat(int(name)).st_mode):
+                with socket.socket(fileno=os.dup(int(name))) as one:
+                    found.add(one.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF))
+    return found
 
 
 def test_what_follows_a_large_message_at_once_is_not_lost(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
+import socket
+import stat
 from collections.abc import Sequence
 from typing import Any
 
 import zmq
+from zmq.utils.monitor import recv_monitor_message
 
 from dappled.daemon import curve, endpoints
 from dappled.daemon.curve import ServerKeys
@@ -14,6 +19,9 @@ from dappled.daemon.wire import WireError
 
 log = logging.getLogger(__name__)
 QUESTION_BYTES = 4096
+ROOM_BYTES = (
+    1 << 20
+)  # in the kernel, for a reader over ipc: with its 208 kB the two ends wait for each other all the time
 _HEARTBEAT_MS, _DEAF_MS = 5_000, 30_000  # a peer that reads nothing for so long is cut off; it may come again
 
 
@@ -27,15 +35,16 @@ class Doors:
         self._bound: list[str] = []
         self._sockets: list[zmq.Socket[Any]] = []
         self.wrong_keys = 0
+        self._newcomers: list[zmq.Socket[Any]] = []
         self._judge: zmq.Socket[Any] | None = None
         if keys is not None:  # whoever judges keys is there before the first door is opened
             self._judge = self._context.socket(zmq.REP)
             self._judge.bind(curve.ZAP_ENDPOINT)
 
     @property
-    def judge_fd(self) -> int | None:
-        """What to wait on for `let_in`; None where no keys are asked for."""
-        return None if self._judge is None else int(self._judge.FD)
+    def fds(self) -> list[int]:
+        """What to wait on for `let_in`."""
+        return [int(one.FD) for one in (*self._newcomers, *([self._judge] if self._judge else []))]
 
     def open(self, kind: int, wanted: Sequence[str], high_water_mark: int) -> zmq.Socket[Any]:
         """A socket bound to all of the `wanted` endpoints that are not "". Raises WireError; then all are closed."""
@@ -49,6 +58,8 @@ class Doors:
         one.setsockopt(zmq.HEARTBEAT_TIMEOUT, _DEAF_MS)
         if kind == zmq.ROUTER:
             one.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        else:
+            self._newcomers.append(one.get_monitor_socket(zmq.EVENT_ACCEPTED))
         try:
             for endpoint in filter(None, wanted):
                 endpoints.prepare(endpoint, keyed=self._keys is not None)
@@ -60,7 +71,10 @@ class Doors:
         return one
 
     def let_in(self) -> None:
-        """Judge the keys of those who connect."""
+        """Judge the keys of those who connect, and give those who read room."""
+        for door in self._newcomers:
+            while door.poll(0):
+                _give_room(recv_monitor_message(door)["value"])
         while self._judge is not None:
             try:
                 request = self._judge.recv_multipart(flags=zmq.NOBLOCK)
@@ -80,7 +94,24 @@ class Doors:
         for endpoint in self._bound:
             endpoints.unlink(endpoint)
         for one in self._sockets:
+            one.disable_monitor()
+        for door in self._newcomers:
+            door.close(linger=0)
+        for one in self._sockets:
             one.close(linger=round(linger_s * 1000))
         if self._judge is not None:
             self._judge.close(linger=0)
         self._context.term()
+
+
+def _give_room(descriptor: int) -> None:
+    """More of the kernel's memory for a connection over ipc, as far as net.core.wmem_max lets it.
+
+    ZeroMQ's own option is for TCP alone. Where the peer is gone again, the number may be another socket's by now: then
+    that one has more room.
+    """
+    with contextlib.suppress(OSError):
+        if stat.S_ISSOCK(os.fstat(descriptor).st_mode):
+            with socket.socket(fileno=os.dup(descriptor)) as one:
+                if one.family == socket.AF_UNIX:
+                    one.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, ROOM_BYTES)

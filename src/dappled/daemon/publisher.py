@@ -174,8 +174,8 @@ class Publisher:
         poller.register(self._wake, select.POLLIN)
         if self._router is not None:
             poller.register(self._router.FD, select.POLLIN)
-        if (judge := self._doors.judge_fd) is not None:
-            poller.register(judge, select.POLLIN)
+        for descriptor in self._doors.fds:
+            poller.register(descriptor, select.POLLIN)
         quiet_rounds = 0
         while True:
             self._doors.let_in()
