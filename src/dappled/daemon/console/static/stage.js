@@ -75,7 +75,7 @@ export class Stage {
     const turn = ++this.turn, { frame, tab } = this;
     if (!frame) return;
     const index = frame.tag.frame, base = `/api/frames/${index}/`;
-    $("which").textContent = `frame ${index} is loading`;   // until then what is seen is the one before
+    $("which").textContent = `frame ${index} …`;   // loading: what is seen is the one before
     $("empty").textContent = `Waiting for the picture of frame ${index}.`;
     try {
       if (tab === "refocus") await this.loadViews(base, turn);
