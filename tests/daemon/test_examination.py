@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from dappled.daemon.examination import Finding, examine, sharpness, verdict
+from dappled.daemon.examination import Finding, examine, sharpness
+from dappled.daemon.preflight import verdict
 from dappled.drivers.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.mocks.masked_camera import reference_camera

@@ -141,7 +141,7 @@ def _shoot(
             facts["verdict"] = "no-go"
         elif arguments.test_shot and frame is not None:
             judged = _judged(frame, recipe)
-            facts |= {"test_shot": [asdict(one) for one in judged], "verdict": examination.verdict(judged)}
+            facts |= {"test_shot": [asdict(one) for one in judged], "verdict": preflight.verdict(judged)}
             lines += [f"{_WORDS[one.state]:8} {one.name:11} {one.text}" for one in judged]
     if arguments.latency and latencies:
         timed = _timed(latencies, None if truth is None else _true_latencies(truth, len(latencies)))

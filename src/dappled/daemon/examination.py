@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config import profiles
+from dappled.daemon.preflight import State
 from dappled.drivers import rawfile
 from dappled.drivers.darkroom import Darkroom, Development, Recipe
 from dappled.drivers.rawfile import RawFile
 from dappled.errors import DappledError
-
-State = Literal["go", "caution", "no-go"]
 
 CLIPPED_SHARE = 0.01
 DARK_SHARE = 0.01
@@ -50,12 +49,6 @@ def examine(frame: Path, recipe: Recipe | None) -> list[Finding]:
         return [*found, Finding("carriers", "no-go", f"it can't be decoded: {error}", {})]
     picture = np.abs(made.light_field.slices[0])
     return [*found, _carriers(made, recipe), *sharpness(picture)]
-
-
-def verdict(findings: list[Finding]) -> State:
-    """The worst of them."""
-    states = {finding.state for finding in findings}
-    return "no-go" if "no-go" in states else "caution" if "caution" in states else "go"
 
 
 def _focal_length(raw: RawFile) -> Finding:

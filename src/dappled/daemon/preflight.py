@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 State = Literal["go", "caution", "no-go"]
 _SURE_M, _SLOW_CLOCK_MS, _FRESH_MS = 5.0, 50.0, 3000.0
@@ -21,9 +21,17 @@ class Check:
     text: str
 
 
-def verdict(checks: Sequence[Check]) -> State:
+class Judged(Protocol):
+    """Whatever has been judged go, caution or no-go."""
+
+    @property
+    def state(self) -> State:
+        """Its own verdict."""
+
+
+def verdict(judged: Sequence[Judged]) -> State:
     """The worst of them."""
-    states = {check.state for check in checks}
+    states = {one.state for one in judged}
     return "no-go" if "no-go" in states else "caution" if "caution" in states else "go"
 
 
