@@ -39,34 +39,30 @@ def test_the_aperture_is_found_behind_a_rounded_f_number(kappa: float, off: floa
     assert 0 < found.sigma < 0.02
 
 
+def _is_told(kappa: float, true: Aperture, *, within: float) -> None:
+    """Slices through `true` give its shape and its side, whatever was thought of them."""
+    found = used_aperture(
+        _slices(kappa, 0.01, true, texture=0.01),
+        TRANSFERS,
+        ORDERS,
+        nominal_kappa=1.01 * kappa,
+        rotation_rad=0.01,
+        aperture=Aperture(5),
+    )
+    assert (found.fitted, found.aperture) == (True, true)
+    assert found.kappa == pytest.approx(kappa, abs=within)
+
+
 @pytest.mark.parametrize("kappa", [0.8, 0.9, 1.1])
 def test_beams_are_told_from_a_filled_aperture(kappa: float) -> None:
     for true in (Aperture(5), Aperture(5, "filled")):
-        found = used_aperture(
-            _slices(kappa, 0.01, true, texture=0.01),
-            TRANSFERS,
-            ORDERS,
-            nominal_kappa=1.01 * kappa,
-            rotation_rad=0.01,
-            aperture=Aperture(5),
-        )
-        assert (found.fitted, found.aperture) == (True, true)
-        assert found.kappa == pytest.approx(kappa, abs=0.002)
+        _is_told(kappa, true, within=0.002)
 
 
 @pytest.mark.parametrize("kappa", [0.5, 0.8, 1.0, 1.1])
 def test_a_round_stop_is_told_from_a_square_one(kappa: float) -> None:
     for true in (Aperture(5), Aperture(5, "round")):
-        found = used_aperture(
-            _slices(kappa, 0.01, true, texture=0.01),
-            TRANSFERS,
-            ORDERS,
-            nominal_kappa=1.01 * kappa,
-            rotation_rad=0.01,
-            aperture=Aperture(5),
-        )
-        assert (found.fitted, found.aperture) == (True, true)
-        assert found.kappa == pytest.approx(kappa, abs=0.003)
+        _is_told(kappa, true, within=0.003)
 
 
 def test_views_through_a_round_stop_are_those_of_its_cells() -> None:
