@@ -127,6 +127,8 @@ def test_offload_says_what_it_did(closed: Path, tmp_path: Path, capsys: pytest.C
     said = lines(["offload", str(disk), str(closed)], capsys)
     count = sum(path.is_file() for path in disk.rglob("*"))
     assert said == [f"{disk / closed.name}: {count} files copied and verified, 0 were there already"]
-    assert main(["flight", "offload", str(disk), str(closed), "--prune", "--json"]) == 0
+    assert main(["flight", "offload", str(disk), str(closed), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert (told["copied"], told["pruned"]) == (0, 1)
+    assert (told["copied"], told["there_already"]) == (0, count)
+    assert main(["flight", "offload", str(disk), str(closed), "--prune"]) == 1
+    assert "--prune is switched off" in capsys.readouterr().err

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import errno
 import os
 from pathlib import Path
 
 import pytest
 
 from dappled.cli import main
-from dappled.flight import durable, layout, offload, recording
+from dappled.flight import durable, layout, offload
 from dappled.flight.check import check
 from dappled.flight.errors import FlightError
+from dappled.flight.ledger import Ledger
 from dappled.flight.recording import Recording
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, flip, mavlink_2, wish
@@ -28,68 +28,47 @@ def closed(flight: Recording) -> Path:
 
 
 def go(flight: Path, there: Path, *, prune: bool = False) -> offload.Offloaded:
-    return offload.offload(flight, there, prune=prune, utc_ns=lambda: START_UTC_NS)
+    return offload.offload(flight, there, prune=prune)
 
 
 def test_a_flight_is_copied_and_verified(closed: Path, tmp_path: Path) -> None:
     done = go(closed, tmp_path / "disk")
     assert done.destination == tmp_path / "disk" / closed.name
-    assert (done.copied, done.there_already, done.pruned) == (6, 0, 0)
+    assert (done.copied, done.there_already) == (6, 0)
     assert check(done.destination).problems == check(closed).problems == ()
     again = go(closed, tmp_path / "disk")
     assert (again.copied, again.there_already) == (0, 6)
 
 
-def test_pruning_leaves_ledger_and_numbering(closed: Path, tmp_path: Path) -> None:
-    done = go(closed, tmp_path / "disk", prune=True)
-    assert done.pruned == 2
-    assert os.listdir(closed / "frames") == []
-    assert (done.destination / "frames" / "000001.cr2").read_bytes() == b"raw 1" * 1000
+def test_pruning_is_refused_before_anything_is_done(closed: Path, tmp_path: Path) -> None:
+    with pytest.raises(FlightError, match="--prune is switched off"):
+        go(closed, tmp_path / "disk", prune=True)
+    assert not (tmp_path / "disk").exists()
+    assert len(os.listdir(closed / "frames")) == 2
+
+
+def test_a_flight_pruned_by_an_earlier_version_is_not_copied_again(closed: Path, tmp_path: Path) -> None:
+    with Ledger(closed / "flight.sqlite", lambda: START_UTC_NS) as ledger:
+        ledger.set_fact("offloaded", {"destination": "/media/disk", "utc_ns": START_UTC_NS, "files": 2})
+    for name in os.listdir(closed / "frames"):
+        os.unlink(closed / "frames" / name)
     report = check(closed)
     assert report.problems == ()
-    assert "offloaded to" in report.notes[0]
-    os.unlink(closed.parent / "index.sqlite")
-    later = recording.begin(closed.parent, lambda: START_UTC_NS)
-    assert later.next_index == 2
-    later.close()
+    assert "offloaded to /media/disk" in report.notes[0]
     with pytest.raises(FlightError, match="pruned already"):
         go(closed, tmp_path / "disk")
 
 
-def test_a_prune_that_was_cut_short_is_finished(closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    there = tmp_path / "disk"
-
-    def cut(path: Path, missing_ok: bool = False) -> None:
-        raise OSError(errno.EIO, "the disk went away")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Path, "unlink", cut)
-        with pytest.raises(FlightError, match="cannot prune"):
-            go(closed, there, prune=True)
-    assert len(os.listdir(closed / "frames")) == 2
-    with pytest.raises(FlightError, match="--prune removes the 2 files that are left"):
-        go(closed, there)
-    flip(there / closed.name / "frames" / "000001.cr2", 3)
-    with pytest.raises(FlightError, match="nothing more was removed"):
-        go(closed, there, prune=True)
-    assert len(os.listdir(closed / "frames")) == 2
-    flip(there / closed.name / "frames" / "000001.cr2", 3)
-    assert go(closed, there, prune=True).pruned == 2
-    assert os.listdir(closed / "frames") == []
-    with pytest.raises(FlightError, match="pruned already"):
-        go(closed, there, prune=True)
-
-
 def test_a_flight_that_is_recorded_is_refused(flight: Recording, tmp_path: Path) -> None:
     with pytest.raises(FlightError, match="still recorded"):
-        go(flight.folder.path, tmp_path / "disk", prune=True)
+        go(flight.folder.path, tmp_path / "disk")
 
 
 @pytest.mark.parametrize("where", ["frames/000000.cr2", "telemetry.tlog"])
-def test_a_damaged_source_is_never_pruned(closed: Path, tmp_path: Path, where: str) -> None:
+def test_a_damaged_source_is_refused(closed: Path, tmp_path: Path, where: str) -> None:
     flip(closed / where, 5)
     with pytest.raises(FlightError, match="not intact"):
-        go(closed, tmp_path / "disk", prune=True)
+        go(closed, tmp_path / "disk")
     assert len(os.listdir(closed / "frames")) == 2
 
 
@@ -103,7 +82,7 @@ def test_a_disk_that_lies_is_found(closed: Path, tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(durable, "copy_in", lying)
     with pytest.raises(FlightError, match="reads back different"):
-        go(closed, tmp_path / "disk", prune=True)
+        go(closed, tmp_path / "disk")
     assert len(os.listdir(closed / "frames")) == 2
 
 
@@ -112,7 +91,7 @@ def test_another_file_of_that_name_is_not_overwritten(closed: Path, tmp_path: Pa
     there.parent.mkdir(parents=True)
     there.write_bytes(b"other")
     with pytest.raises(FlightError, match="differs from"):
-        go(closed, tmp_path / "disk", prune=True)
+        go(closed, tmp_path / "disk")
     assert there.read_bytes() == b"other"
 
 
@@ -124,12 +103,12 @@ def test_not_into_itself(closed: Path) -> None:
 
 
 def test_the_command(closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["flight", "offload", str(tmp_path / "disk"), str(closed), "--prune"]) == 0
+    assert main(["flight", "offload", str(tmp_path / "disk"), str(closed)]) == 0
     assert "6 files copied and verified" in capsys.readouterr().out
     assert layout.flights(tmp_path / "disk")[0].name == closed.name
 
 
 def test_a_flight_without_a_frame_is_brought_home_too(flight: Recording, tmp_path: Path) -> None:
     flight.close()
-    done = go(flight.folder.path, tmp_path / "disk", prune=True)
+    done = go(flight.folder.path, tmp_path / "disk")
     assert check(done.destination).problems == ()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -36,15 +35,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     away = actions.add(
         "offload",
-        "copy a flight to another disk and verify it by hash; prune on request",
-        f"dappled flight offload /media/disk {_FLIGHT} --prune",
+        "copy a flight to another disk and verify it by hash",
+        f"dappled flight offload /media/disk {_FLIGHT}",
     )
     bring = actions.add("pickup", flight_pickup.HELP, *flight_pickup.EXAMPLES)
     listing.add_argument(
         "folder", nargs="?", type=Path, metavar="FOLDER", help="flights folder (default: record.directory)"
     )
     away.add_argument("destination", type=Path, metavar="DEST", help="folder that will hold the flight's folder")
-    away.add_argument("--prune", action="store_true", help="afterwards remove the frames here; the ledger stays")
+    away.add_argument("--prune", action="store_true", help="refused: no proof yet that DEST is another disk")
     flight_pickup.configure(bring)
     for one in (show, intact, report, away, bring):
         one.add_argument("flight", nargs="?", type=Path, metavar="FLIGHT", help="flight folder (default: the last one)")
@@ -105,8 +104,8 @@ def _report(flight: Path, as_json: bool) -> int:
 def _offload(flight: Path, destination: Path, prune: bool, as_json: bool) -> int:
     total = sum(path.stat().st_size for path in flight.rglob("*") if path.is_file())
     with tqdm(total=total, unit="B", unit_scale=True, disable=None, delay=1.0) as bar:
-        done = offload.offload(flight, destination, prune=prune, utc_ns=time.time_ns, progress=bar.update)
-    return _said(_plain(done), flight_lines.of_offload(done, flight), as_json)
+        done = offload.offload(flight, destination, prune=prune, progress=bar.update)
+    return _said(_plain(done), flight_lines.of_offload(done), as_json)
 
 
 def _said(values: Any, lines: Iterable[str], as_json: bool) -> int:

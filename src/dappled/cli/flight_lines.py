@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 
 from dappled.flight.accounts import Account
 from dappled.flight.check import Report
@@ -94,11 +93,9 @@ def _table(books: Sequence[Account]) -> Iterator[str]:
         yield f"{one.source:24}" + "".join(f"{getattr(one, name):9d}" for name in names)
 
 
-def of_offload(done: Offloaded, flight: Path) -> Iterator[str]:
-    """What was copied, and what was removed."""
+def of_offload(done: Offloaded) -> Iterator[str]:
+    """How many files were copied and verified."""
     yield f"{done.destination}: {done.copied} files copied and verified, {done.there_already} were there already"
-    if done.pruned:
-        yield f"{done.pruned} frames removed from {flight}; its ledger stays"
 
 
 def _utc(utc_ns: int) -> str:

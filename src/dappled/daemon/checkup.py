@@ -179,7 +179,8 @@ def disk(settings: Settings, machine: Machine) -> list[Finding]:
     free = shutil.disk_usage(place).free
     text = f"{free / 1e9:.1f} GB free at {folder}, room for some {int(free / _FRAME_BYTES)} frames"
     if free < settings.record.min_free_mb * 1e6:
-        return [Finding("disk", "wrong", f"{text}: below record.min_free_mb", "`dappled flight offload`, with --prune")]
+        mend = "`dappled flight offload`, then remove frames by hand"
+        return [Finding("disk", "wrong", f"{text}: below record.min_free_mb", mend)]
     return [Finding("disk", "ok", text)]
 
 

@@ -1,16 +1,16 @@
-"""A flight is brought to another disk: copied, read back, compared; only then, and only if asked, pruned here."""
+"""Copy a flight to another disk, read it back and compare. Removing the source is refused for now."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.flight import check, durable, layout
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
-from dappled.flight.ledger import Ledger, LedgerReader
+from dappled.flight.ledger import LedgerReader
 
 FACT = "offloaded"
 _SHARED_MEMORY = "-shm"
@@ -25,7 +25,6 @@ class Offloaded:
     copied: int
     there_already: int
     size: int
-    pruned: int
 
 
 def offload(
@@ -33,23 +32,27 @@ def offload(
     destination: Path,
     *,
     prune: bool,
-    utc_ns: Callable[[], int],
     progress: Callable[[int], object] = lambda size: None,
 ) -> Offloaded:
     """Copy a closed flight to `destination/<its name>`; every file is read back from there and compared by SHA-256
     with its source, and the copy is checked whole against its own ledger. Doing so again finishes what was left.
 
-    `prune` then removes the frames (and strays) here; ledger, journal and telemetry stay, so that image indices go on
-    and can be answered. Raises FlightError: flight open or not intact, copy different, disk refuses. Nothing is
-    removed then. `progress` is told the bytes done.
+    Nothing is ever removed: `prune` is refused, because a destination that is the same disk under another name would
+    pass every comparison and hold the only copy. Raises FlightError: `prune` asked for, flight open or not intact, copy
+    different, disk refuses. `progress` is told the bytes done.
     """
+    if prune:
+        raise FlightError(
+            f"--prune is switched off: it cannot prove yet that {destination} is another disk than {flight}, and might "
+            "delete the only copy; offload without it, and remove frames by hand once you have seen them there"
+        )
     folder = layout.open_folder(flight)
     gone = _offloaded_before(folder)
     target = destination / flight.resolve().name
     if target.resolve().is_relative_to(flight.resolve()):
         raise FlightError(f"cannot offload {flight} into itself: {target}; give a folder on another disk")
     if gone is not None:
-        return _finish(folder, target, gone, prune=prune)
+        raise FlightError(f"{folder.path} was offloaded to {gone} and pruned already")
     copied = there = size = 0
     for source in _files(flight):
         goal = target / source.relative_to(flight)
@@ -63,8 +66,7 @@ def offload(
             f"the copy {target} is not intact ({found.problems[0]}): nothing was removed; "
             f"run `dappled flight check {flight}`"
         )
-    pruned = _prune(folder, target, utc_ns) if prune else 0
-    return Offloaded(folder.path.name, target, copied, there, size, pruned)
+    return Offloaded(folder.path.name, target, copied, there, size)
 
 
 def _offloaded_before(folder: FlightFolder) -> str | None:
@@ -76,24 +78,6 @@ def _offloaded_before(folder: FlightFolder) -> str | None:
             f"{folder.path} is still recorded, or was never closed: stop the daemon, or start it once to close it"
         )
     return facts[FACT]["destination"] if FACT in facts else None
-
-
-def _finish(folder: FlightFolder, target: Path, gone: str, *, prune: bool) -> Offloaded:
-    """Remove what a prune that was cut short left here, where the copy still holds it."""
-    with LedgerReader.open(folder.ledger) as ledger:
-        left = [row for row in ledger.files() if (folder.path / row.name).exists()]
-    if not (left and prune):
-        rest = f"; --prune removes the {len(left)} files that are left" if left else ""
-        raise FlightError(f"{folder.path} was offloaded to {gone} and pruned already{rest}")
-    for row in left:
-        try:
-            whole = _hash_on_disk(target / row.name) == row.sha256
-        except OSError as error:
-            raise disk_error("read the copy", target / row.name, error) from error
-        if not whole:
-            raise FlightError(f"{target / row.name} differs from what the ledger says: nothing more was removed")
-    _remove(folder, [row.name for row in left])
-    return Offloaded(folder.path.name, target, 0, len(left), sum(row.size for row in left), len(left))
 
 
 def _files(flight: Path) -> Iterator[Path]:
@@ -131,22 +115,3 @@ def _hash_on_disk(path: Path) -> str:
     with path.open("rb") as file:
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
         return durable.hash_descriptor(file.fileno(), os.fstat(file.fileno()).st_size)
-
-
-def _prune(folder: FlightFolder, target: Path, utc_ns: Callable[[], int]) -> int:
-    """Remove the frames and strays that the ledger acknowledges. The ledger says so before the first one goes."""
-    with Ledger(folder.ledger, utc_ns) as ledger:
-        names = [row.name for row in ledger.files()]
-        ledger.set_fact(FACT, {"destination": str(target.absolute()), "utc_ns": utc_ns(), "files": len(names)})
-        ledger.add_event(FACT, f"{len(names)} files were copied to {target}, verified, and removed here")
-    _remove(folder, names)
-    return len(names)
-
-
-def _remove(folder: FlightFolder, names: Sequence[str]) -> None:
-    try:
-        for name in names:
-            (folder.path / name).unlink(missing_ok=True)
-        durable.sync_folder(folder.frames)
-    except OSError as error:
-        raise disk_error("prune", folder.frames, error) from error
