@@ -27,16 +27,18 @@ from pathlib import Path
 import tomli_w
 
 from dappled.config import profiles
-from dappled.decode.calibration import CalibrationFrame, calibrate
-from dappled.decode.plane import to_plane
-from dappled.drivers import rawfile
-from dappled.drivers.darkroom import Recipe
-from dappled.flight.records import Frame, Pose, Tag
-from dappled.mocks.masked_camera import reference_camera
-from dappled.mocks.path import Path as FlightPath
-from dappled.products import batch, photographs, workers
-from dappled.products.batch import Done, Job
-from dappled.products.georeference import Options
+from dappled.decode.calibration.fit import CalibrationFrame, calibrate
+from dappled.decode.geometry.pose import Pose
+from dappled.decode.spectrum.plane import to_plane
+from dappled.drivers.raw import reading
+from dappled.drivers.raw.darkroom import Recipe
+from dappled.flight.records import Frame, Tag
+from dappled.mocks.autopilot.path import Path as FlightPath
+from dappled.mocks.scene.masked_camera import reference_camera
+from dappled.products.batch import batch, workers
+from dappled.products.batch.batch import Done, Job
+from dappled.products.maps import photographs
+from dappled.products.maps.georeference import Options
 
 CAMERA, MASK, F_NUMBER, SEED = "reference-36mm", "reference-5x5", 14.8, 5
 KINDS = ("npz", "cog")
@@ -48,7 +50,7 @@ def flight(folder: Path, count: int, scale: float) -> list[Job]:
     camera = reference_camera(SEED, scale=scale, path=path)
     exposures = [camera.expose(1.0 + 0.7 * k, k, f_number=F_NUMBER) for k in range(2)]
     bench = reference_camera(SEED, scale=scale, scene="white").bench_frame()
-    raw = rawfile.read(bench.file, "bench frame")
+    raw = reading.read(bench.file, "bench frame")
     plane = to_plane(raw.mosaic, black=raw.black, white=raw.white, cfa=raw.cfa)
     profile = profiles.camera(CAMERA)
     found = calibrate(

@@ -27,12 +27,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from dappled.daemon.clock import SystemClock
+from dappled.clock import SystemClock
 from dappled.drivers.camera import Arrival, Fired, ShotFailed, StateChanged
-from dappled.drivers.gphoto2 import GPhoto2Camera, open_camera
+from dappled.drivers.gphoto2.client import GPhoto2Camera, open_camera
 from dappled.flight import durable, recording
 from dappled.flight.records import Cause, Shot
-from dappled.mocks.body import Body, BodyOptions
+from dappled.mocks.body.body import Body, BodyOptions
 
 SIZE = 17_582_091  # of a real EOS 450D's CR2
 _BURN = """

@@ -25,16 +25,16 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from dappled.config import profiles
-from dappled.decode import plane as planes
-from dappled.decode.colours import coloured, local_colours
 from dappled.decode.decoder import MaskDecoder
-from dappled.decode.developer import Developer, developer
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
-from dappled.decode.noise import Noise
-from dappled.decode.plan import Plan
-from dappled.decode.slices import Slices
-from dappled.decode.spectrum import padded_shape
-from dappled.decode.views import Aperture, from_slices, transfer
+from dappled.decode.lightfield.views import Aperture, from_slices, transfer
+from dappled.decode.spectrum import plane as planes
+from dappled.decode.spectrum.colours import coloured, local_colours
+from dappled.decode.spectrum.developer import Developer, developer
+from dappled.decode.spectrum.noise import Noise
+from dappled.decode.spectrum.padded import padded_shape
+from dappled.decode.spectrum.plan import Plan
+from dappled.decode.spectrum.slices import Slices
 
 SHAPE = (2776, 3688)
 LENSLETS = (3280, 3280)

@@ -22,18 +22,18 @@ from dataclasses import dataclass
 from pathlib import Path as File
 from typing import TypeVar
 
-from dappled.daemon import telemetry_pose
-from dappled.daemon.camera_clock import CameraClock, exposure_from_camera
-from dappled.daemon.interpolation import metres_per_radian, turn_rad
-from dappled.daemon.tagger import BodyLatency, Exposure, mid_exposure
-from dappled.daemon.telemetry import Telemetry
-from dappled.daemon.telemetry_samples import AttitudeSample, PositionSample, attitude, position
-from dappled.daemon.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
-from dappled.drivers.mavlink import Decoder, Message, mavlink
+from dappled.daemon.navigation import pose as telemetry_pose
+from dappled.daemon.navigation.camera_clock import CameraClock, exposure_from_camera
+from dappled.daemon.navigation.samples import AttitudeSample, PositionSample, attitude, position
+from dappled.daemon.navigation.telemetry import Telemetry
+from dappled.daemon.navigation.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
+from dappled.daemon.pipeline.tagger import BodyLatency, Exposure, mid_exposure
+from dappled.decode.geometry.interpolation import metres_per_radian, turn_rad
+from dappled.decode.geometry.pose import Pose
+from dappled.drivers.mavlink.links import Decoder, Message, mavlink
 from dappled.flight import telemetry_log
-from dappled.flight.records import Pose
-from dappled.mocks.autopilot import BootTime, telemetry_message
-from dappled.mocks.path import Path
+from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
+from dappled.mocks.autopilot.path import Path
 
 START_NS = 1_790_000_000 * 10**9
 SPEED_M_S = 15.0

@@ -19,11 +19,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # the painted scenes are the
 
 from tests.decode.scenes import boards, paint
 
-from dappled.decode import depth, evidence
-from dappled.decode.depthmap import DepthMap
-from dappled.decode.fourier_refocus import Spectrum4D
-from dappled.decode.refocus import shift_and_add
-from dappled.decode.viewstack import ViewStack
+from dappled.decode.depth import estimate, evidence
+from dappled.decode.depth.depth_map import DepthMap
+from dappled.decode.lightfield.fourier_refocus import Spectrum4D
+from dappled.decode.lightfield.refocus import shift_and_add
+from dappled.decode.lightfield.view_stack import ViewStack
 
 ROUNDS, WORKERS = 5, 2
 BORDER, BAD = 15, 0.07
@@ -51,11 +51,11 @@ def figures(rounds: int, workers: int) -> dict[str, float]:
         "refocus_81_views_512_s": lambda: shift_and_add(wide, 0.37, workers=workers),
         "refocus_25_views_572x566_s": lambda: shift_and_add(narrow, 0.37, workers=workers),
         "fourier_slice_25_views_572x566_s": lambda: spectrum.refocused(0.37, workers=workers),
-        "depth_combined_81_views_512_s": lambda: depth.estimate(told_wide, workers=workers),
-        "depth_contrast_81_views_512_s": lambda: depth.estimate(told_wide, "contrast", workers=workers),
-        "depth_combined_25_views_572x566_s": lambda: depth.estimate(told_narrow, workers=workers),
-        "depth_contrast_25_views_572x566_s": lambda: depth.estimate(told_narrow, "contrast", workers=workers),
-        "depth_gradient_25_views_572x566_s": lambda: depth.estimate(
+        "depth_combined_81_views_512_s": lambda: estimate.estimate(told_wide, workers=workers),
+        "depth_contrast_81_views_512_s": lambda: estimate.estimate(told_wide, "contrast", workers=workers),
+        "depth_combined_25_views_572x566_s": lambda: estimate.estimate(told_narrow, workers=workers),
+        "depth_contrast_25_views_572x566_s": lambda: estimate.estimate(told_narrow, "contrast", workers=workers),
+        "depth_gradient_25_views_572x566_s": lambda: estimate.estimate(
             told_narrow, "gradient", between=between, workers=workers
         ),
     }
@@ -68,14 +68,14 @@ def figures(rounds: int, workers: int) -> dict[str, float]:
     found["refocus_81_views_over_plain_mean"] = found["refocus_81_views_512_s"] / found["plain_mean_81_views_512_s"]
     for method in ("combined", "contrast"):
         found[f"bad_pixels_{method}_81_views"] = bad_share(
-            depth.estimate(told_wide, method, workers=workers), wide_truth
+            estimate.estimate(told_wide, method, workers=workers), wide_truth
         )
-        made = depth.estimate(told_narrow, method, workers=workers)
+        made = estimate.estimate(told_narrow, method, workers=workers)
         found[f"bad_pixels_{method}_25_views"] = bad_share(made, narrow_truth)
     for rms in (0.01, 0.03, 0.1):
         noise = np.random.default_rng(0).normal(size=wide.views.shape).astype(np.float32)
         noisy = ViewStack(wide.views + np.float32(rms) * noise, wide.row_steps, wide.column_steps)
-        made = depth.estimate(evidence.of_views(noisy), workers=workers)
+        made = estimate.estimate(evidence.of_views(noisy), workers=workers)
         found[f"bad_pixels_combined_81_views_noise_{rms:g}"] = bad_share(made, wide_truth)
     return found
 

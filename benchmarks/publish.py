@@ -29,11 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config.settings import PublishSettings, RecordSettings, Settings
-from dappled.daemon import wire
-from dappled.daemon.memory import reuse_large_blocks
-from dappled.daemon.publisher import Publisher
-from dappled.daemon.subscriber import Subscriber
-from dappled.daemon.wire import Message
+from dappled.daemon.pipeline.memory import reuse_large_blocks
+from dappled.daemon.stream import wire
+from dappled.daemon.stream.publisher import Publisher
+from dappled.daemon.stream.subscriber import Subscriber
+from dappled.daemon.stream.wire import Message
 
 SHAPE = (13, 572, 566)
 HUNG = 3
@@ -258,9 +258,9 @@ def latency(root: Path, frames: int) -> dict[str, float]:
     """A simulated flight: from "safe on disk" to "received by a subscriber", less the decode; and what a subscriber
     that was killed and started again has at the end."""
     from dappled.config import settings as configuration  # noqa: PLC0415  # the subscribers' processes load none of it
+    from dappled.daemon.pipeline.capture_requests import Wish  # noqa: PLC0415  # as above
+    from dappled.daemon.pipeline.pending_shot import Watchers  # noqa: PLC0415  # as above
     from dappled.daemon.service import Service  # noqa: PLC0415  # as above
-    from dappled.daemon.story import Watchers  # noqa: PLC0415  # as above
-    from dappled.daemon.wishes import Wish  # noqa: PLC0415  # as above
     from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # as above
 
     ears = Ears(f"ipc://{root}/flight", frames)

@@ -28,7 +28,7 @@ import tomli_w
 
 from dappled.config import settings as configuration
 from dappled.mocks.simulation import Simulation, World
-from dappled.mocks.supervised import children_of
+from dappled.mocks.soak.supervised import children_of
 
 REPEATS = 5
 

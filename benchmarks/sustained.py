@@ -21,14 +21,15 @@ import time
 from collections import deque
 from pathlib import Path
 
-from dappled.daemon.books import LiveBook
-from dappled.daemon.clock import SystemClock
-from dappled.daemon.development import Developed
-from dappled.daemon.shutter import Shutter, Wish
-from dappled.daemon.story import Names, Story, Watchers
-from dappled.daemon.street import Street
-from dappled.daemon.tagger import BodyLatency, Exposure
-from dappled.daemon.telemetry_pose import nothing
+from dappled.clock import SystemClock
+from dappled.daemon.navigation.pose import nothing
+from dappled.daemon.pipeline.decode_process import Developed
+from dappled.daemon.pipeline.flight_writer import LiveBook
+from dappled.daemon.pipeline.pending_shot import Names, Story, Watchers
+from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.shutter import Shutter, Wish
+from dappled.daemon.pipeline.tagger import BodyLatency, Exposure
+from dappled.decode.geometry.pose import Pose
 from dappled.drivers.camera import (
     Arrival,
     Blob,
@@ -42,7 +43,7 @@ from dappled.drivers.camera import (
     check_change,
 )
 from dappled.flight import check, recording, summary
-from dappled.flight.records import Pose, Shot
+from dappled.flight.records import Shot
 
 QUEUE = 4
 

@@ -10,9 +10,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from dappled.mocks.bench import Bench, Plane
-from dappled.mocks.masked_camera import MaskedCamera, reference_camera
-from dappled.mocks.synthesis import PASS, Grid
+from dappled.mocks.scene.bench import Bench, Plane
+from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
+from dappled.mocks.scene.synthesis import PASS, Grid
 
 SEED, SCALE, FOCUS_M = 11, 0.5, 1.2
 HALF_MM = 6.94, 9.22  # of the chip, up and sideways

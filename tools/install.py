@@ -112,7 +112,7 @@ def environment(uv: str, python: str, home: Path) -> None:
     for tests in [path for path in home.glob("lib/python3*/site-packages/*/**/tests") if path.is_dir()]:
         shutil.rmtree(tests)
     # Bytecode for what a flight loads, not for every dialect of MAVLink: the service itself may not write here.
-    flown = "import dappled.cli.run, dappled.daemon.decode_worker, dappled.drivers.gphoto2_process"
+    flown = "import dappled.cli.run, dappled.daemon.pipeline.decode_worker, dappled.drivers.gphoto2.process"
     call(str(home / "bin/python"), "-c", flown)
 
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from dappled.cli import main
-from dappled.decode.calibrated import Calibration
-from dappled.drivers import calibration_files
-from dappled.drivers.darkroom import Darkroom, Recipe
-from dappled.mocks.masked_camera import MaskedCamera, reference_camera
+from dappled.decode.calibration.calibration import Calibration
+from dappled.drivers.raw import calibration_files
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 
 MASK = "reference-5x5"
 LENGTHS = (35.0, 50.0, 80.0)

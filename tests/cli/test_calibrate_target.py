@@ -12,8 +12,8 @@ import pytest
 
 from dappled.cli import main
 from dappled.cli.calibrate_target import from_frames
-from dappled.drivers.darkroom import Darkroom, DarkroomError, Development, Recipe
-from dappled.mocks.masked_camera import reference_camera
+from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Development, Recipe
+from dappled.mocks.scene.masked_camera import reference_camera
 from tests.system.test_depth import target
 
 SEED = 5

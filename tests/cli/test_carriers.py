@@ -15,9 +15,9 @@ from PIL import Image
 
 from dappled.cli import main
 from dappled.cli.calibrate import from_frames
-from dappled.drivers.darkroom import Darkroom, Recipe
-from dappled.mocks import dng
-from dappled.mocks.masked_camera import MaskedCamera, reference_camera
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.mocks.body import dng
+from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 
 MASK = "reference-5x5"
 SNR = 50

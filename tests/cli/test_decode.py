@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from dappled.cli import main
-from dappled.mocks.dng import Exif, encode
-from dappled.mocks.lens import Installation
-from dappled.mocks.masked_camera import reference_camera
-from dappled.products import lightfiles
+from dappled.mocks.body.dng import Exif, encode
+from dappled.mocks.scene.lens import Installation
+from dappled.mocks.scene.masked_camera import reference_camera
+from dappled.products.exports import light_files
 
 MASK = "reference-5x5"
 
@@ -157,7 +157,7 @@ def test_bands_fall_off_softly_where_that_is_asked_for(
         out = tmp_path / f"{taper}.npz"
         code, _, err = _told(capsys, stopped.parent, str(stopped), "--taper", taper, "-o", str(out))
         assert code == 0, err
-        made[taper] = lightfiles.load(out).slices
+        made[taper] = light_files.load(out).slices
     rough = {taper: float(np.abs(np.diff(slices[0].real)).mean()) for taper, slices in made.items()}
     assert rough["1"] < 0.95 * rough["0"]
     for words, said in ((["--taper", "2"], "from 0 to 1"), (["--taper", "0.5"], "printed mask")):

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from dappled.cli import main
-from dappled.daemon.publisher import Publisher
+from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers import usb_bus
 from dappled.drivers.usb_bus import CANON, UsbBody
-from tests.daemon.test_preflight import WELL
+from tests.daemon.health.test_go_no_go import WELL
 from tests.system.conftest import dappled
 
 

@@ -14,9 +14,9 @@ from dappled import cli
 from dappled.errors import DappledError
 
 INTERNAL = {  # caught where they arise, and told as another error or as an event
-    "dappled.drivers.camera_channel.ChannelError",
-    "dappled.drivers.gphoto2_protocol.SessionError",
-    "dappled.mocks.ptp.MalformedPacketError",
+    "dappled.drivers.gphoto2.channel.ChannelError",
+    "dappled.drivers.gphoto2.protocol.SessionError",
+    "dappled.mocks.body.ptp.MalformedPacketError",
 }
 
 

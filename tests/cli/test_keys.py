@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dappled.cli import main
-from dappled.daemon import curve
+from dappled.daemon.stream import curve
 
 
 def test_a_pair_is_made_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

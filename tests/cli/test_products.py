@@ -12,10 +12,12 @@ import pytest
 from PIL import Image
 
 from dappled.cli import main
-from dappled.decode.ranging import Ranging
+from dappled.decode.depth.ranging import Ranging
+from dappled.decode.geometry import camera_pose
 from dappled.flight import recording
-from dappled.products import camera_pose, lightfiles, opened
-from dappled.products.earth import Projection
+from dappled.products import opened
+from dappled.products.exports import light_files
+from dappled.products.maps.earth import Projection
 from tests.flight.makers import deliver, pose, tag, wish
 from tests.products.fields import DISPARITY, light_field
 
@@ -23,7 +25,7 @@ from tests.products.fields import DISPARITY, light_field
 @pytest.fixture(scope="module")
 def field(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("field") / "frame.npz"
-    lightfiles.save(path, light_field())
+    light_files.save(path, light_field())
     return str(path)
 
 
@@ -107,7 +109,7 @@ def test_a_full_disk_leaves_the_depth_map_of_before(
         raise OSError(28, "No space left on device")
 
     (tmp_path / name).write_bytes(b"of before")
-    monkeypatch.setattr("dappled.products.exports.write_pfm", torn)
+    monkeypatch.setattr("dappled.products.exports.exports.write_pfm", torn)
     monkeypatch.setattr("numpy.savez_compressed", torn)
     assert main(["depth", field, "--between", "0", "1", "-o", str(tmp_path / name)]) == 1
     assert "can't be written: No space left on device" in capsys.readouterr().err
@@ -146,7 +148,7 @@ def test_a_calibration_of_another_zoom_is_refused_or_told(
     assert main(["depth", field, "--calibration", str(tmp_path / "wide.toml")]) == 1
     assert "the frame's is 50 mm" in capsys.readouterr().err
     kept = opened.with_ranging(light_field(), Ranging.from_dict(tomllib.loads(table)["ranging"]))
-    lightfiles.save(tmp_path / "kept.npz", kept)
+    light_files.save(tmp_path / "kept.npz", kept)
     assert main(["depth", str(tmp_path / "kept.npz"), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert "the frame's is 50 mm" in told["no_distances"]

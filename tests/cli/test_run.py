@@ -13,7 +13,7 @@ import pytest
 
 from dappled.cli import main
 from dappled.cli import run as verb
-from dappled.daemon.ground_client import GroundClient, Outcome
+from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
 from dappled.flight import summary
 from dappled.mocks.simulation import free_port
 from tests.daemon.fakes import eventually

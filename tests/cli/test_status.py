@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from dappled.cli import main
-from dappled.daemon.publisher import Publisher
-from tests.daemon.test_metrics import HEALTH
+from dappled.daemon.stream.publisher import Publisher
+from tests.daemon.health.test_metrics import HEALTH
 
 
 @pytest.fixture

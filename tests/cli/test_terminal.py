@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from dappled.cli.terminal import CameraRemarks, Frames, ProblemRemarks
-from dappled.daemon import journal
-from dappled.daemon.story import Story
+from dappled.daemon.health import log_format
+from dappled.daemon.pipeline.pending_shot import Story
 from dappled.drivers.camera import State, StateChanged
-from tests.daemon.test_journal import read
+from tests.daemon.health.test_log_format import read
 from tests.flight.makers import shot
 
 
@@ -95,7 +95,7 @@ def test_in_the_journal_a_frame_can_be_asked_for(tmp_path: Path, capsys: pytest.
         listener.bind(str(tmp_path / "j"))
         listener.settimeout(30)
         root = logging.getLogger()
-        handler, before = journal.JournalHandler(str(tmp_path / "j")), root.level
+        handler, before = log_format.JournalHandler(str(tmp_path / "j")), root.level
         root.addHandler(handler)
         root.setLevel(logging.INFO)
         try:

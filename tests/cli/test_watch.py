@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from dappled.cli import main
-from dappled.daemon.publisher import Publisher
-from tests.daemon.test_watching import slices
+from dappled.daemon.stream.publisher import Publisher
+from tests.daemon.stream.test_watch import slices
 
 
 @pytest.fixture

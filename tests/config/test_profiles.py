@@ -8,7 +8,7 @@ import pytest
 
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
-from dappled.decode.carriers import LAWS
+from dappled.decode.optics.carriers import LAWS
 
 
 @pytest.mark.parametrize("name", profiles.shipped("cameras"))

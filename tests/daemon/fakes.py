@@ -11,13 +11,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dappled.daemon.books import LiveBook
-from dappled.daemon.clock import RecordedClock, SystemClock
-from dappled.daemon.development import Developed, DevelopmentError
-from dappled.daemon.shutter import Shutter, Verdict, Wish
-from dappled.daemon.story import Names, Story, Watchers
-from dappled.daemon.street import Street
-from dappled.daemon.tagger import BodyLatency
+from dappled.clock import RecordedClock, SystemClock
+from dappled.daemon.pipeline.decode_process import Developed, DevelopmentError
+from dappled.daemon.pipeline.flight_writer import LiveBook
+from dappled.daemon.pipeline.pending_shot import Names, Story, Watchers
+from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.shutter import Shutter, Verdict, Wish
+from dappled.daemon.pipeline.tagger import BodyLatency
+from dappled.decode.geometry.pose import Pose
 from dappled.drivers.camera import (
     Arrival,
     Blob,
@@ -33,7 +34,7 @@ from dappled.drivers.camera import (
     check_change,
 )
 from dappled.flight import recording
-from dappled.flight.records import Pose, Shot
+from dappled.flight.records import Shot
 
 
 def no_pose(utc_ns: int = 0) -> Pose:

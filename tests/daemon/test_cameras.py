@@ -11,7 +11,7 @@ from dappled.config.schema import ConfigError
 from dappled.config.settings import CameraSettings
 from dappled.daemon import cameras
 from dappled.drivers.camera import CameraError
-from dappled.drivers.gphoto2 import GPhoto2Camera
+from dappled.drivers.gphoto2.client import GPhoto2Camera
 
 
 def test_the_shipped_driver_is_found() -> None:

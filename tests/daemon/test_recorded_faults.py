@@ -10,19 +10,20 @@ from pathlib import Path
 
 import pytest
 
-from dappled.daemon import tagger
-from dappled.daemon.tagger import BodyLatency, Settings
-from dappled.daemon.telemetry import Telemetry
-from dappled.drivers.mavlink import Decoder, Message, mavlink
+from dappled.daemon.navigation.telemetry import Telemetry
+from dappled.daemon.pipeline import tagger
+from dappled.daemon.pipeline.tagger import BodyLatency, Settings
+from dappled.decode.geometry.pose import Pose
+from dappled.drivers.mavlink.links import Decoder, Message, mavlink
 from dappled.flight import recording
 from dappled.flight.check import check
 from dappled.flight.entries import Result
 from dappled.flight.ledger import LedgerReader
-from dappled.flight.records import Cause, Pose, Shot
-from dappled.mocks.autopilot import BootTime, flight
-from dappled.mocks.path import Path as FlightPath
+from dappled.flight.records import Cause, Shot
+from dappled.mocks.autopilot.autopilot import BootTime, flight
+from dappled.mocks.autopilot.path import Path as FlightPath
 from tests.daemon.fakes import rig
-from tests.daemon.test_replay import again
+from tests.daemon.replay.test_replay import again
 from tests.flight.makers import held
 
 START_NS = 1_790_000_000 * 10**9

@@ -14,11 +14,11 @@ from dappled.config import settings as configuration
 from dappled.config.settings import MaskSettings, PoseSettings, PublishSettings, RecordSettings, Settings
 from dappled.daemon import flight_parts
 from dappled.daemon import service as module
+from dappled.daemon.flight_handover import Succession
+from dappled.daemon.navigation.telemetry import UtcCorrection
+from dappled.daemon.pipeline.pending_shot import Story, Watchers
+from dappled.daemon.pipeline.shutter import Wish
 from dappled.daemon.service import Service
-from dappled.daemon.shutter import Wish
-from dappled.daemon.story import Story, Watchers
-from dappled.daemon.succession import Succession
-from dappled.daemon.telemetry import UtcCorrection
 from dappled.drivers.camera import CameraError, Setting, SettingsChanged
 from dappled.errors import DappledError
 from dappled.flight import check, layout

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.carriers import Lattice, Sensor, geometric
-from dappled.decode.masks import Mask
+from dappled.decode.optics.carriers import Lattice, Sensor, geometric
+from dappled.decode.optics.masks import Mask
 
 Plane = NDArray[np.float32]
 FULL_APERTURE_MM = 6.7

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from dappled.decode.viewstack import ViewStack, centred
+from dappled.decode.lightfield.view_stack import ViewStack, centred
 
 Floats = NDArray[np.float32]
 

@@ -3,11 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dappled.decode.calibrated import Calibration
-from dappled.decode.calibration import CalibrationFrame, calibrate
+from dappled.decode.calibration.calibration import Calibration
+from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.errors import DecodeError
-from dappled.decode.masks import Mask
+from dappled.decode.optics.masks import Mask
 from tests.decode.rays import (
     FOCAL_MM,
     FULL_F,

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from dappled.decode.decoder import MaskDecoder
-from dappled.decode.developer import developer
 from dappled.decode.errors import DecodeError
-from dappled.decode.exposure import Exposure
 from dappled.decode.lenslets import LensletDecoder
+from dappled.decode.spectrum.developer import developer
+from dappled.decode.spectrum.linear_rows import Exposure
 from tests.decode.rays import FOCAL_MM, MASK, SENSOR, STATED_DISTANCE_MM
 
 BAYER = np.array([[0, 1], [1, 2]])

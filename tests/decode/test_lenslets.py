@@ -8,7 +8,7 @@ from PIL import Image
 
 from dappled.decode.errors import DecodeError, NoLattice
 from dappled.decode.lenslets import LensletDecoder
-from dappled.decode.plane import to_plane
+from dappled.decode.spectrum.plane import to_plane
 
 PITCH = 10.4
 SHAPE = (420, 500)

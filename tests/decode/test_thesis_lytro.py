@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.lattice import find_lattice
 from dappled.decode.lenslets import carriers_within
-from dappled.decode.spectrum import Spectrum
+from dappled.decode.spectrum.lattice import find_lattice
+from dappled.decode.spectrum.padded import Spectrum
 from tests.decode.thesis_tables import LYTRO
 
 SIDE = 3280

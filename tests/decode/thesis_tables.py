@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dappled.decode.carriers import Sensor
-from dappled.decode.masks import Mask
+from dappled.decode.optics.carriers import Sensor
+from dappled.decode.optics.masks import Mask
 
 S5200 = Sensor((2776, 3688), (4.29 / 2776, 0.0), (0.0, 5.76 / 3688))
 MASK_1 = Mask(113.8 / 5, 2, "diagonal")

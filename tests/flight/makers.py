@@ -9,8 +9,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled.decode.geometry.pose import Pose
 from dappled.flight.recording import Recording
-from dappled.flight.records import Cause, Frame, Pose, Shot, Tag
+from dappled.flight.records import Cause, Frame, Shot, Tag
 
 
 @dataclass(frozen=True, slots=True)

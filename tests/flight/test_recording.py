@@ -12,7 +12,8 @@ from types import ModuleType
 
 import pytest
 
-from dappled.flight import layout, lock, recording, recovery, summary, wishes
+from dappled.flight import journal as wishes
+from dappled.flight import layout, lock, recording, recovery, summary
 from dappled.flight.check import check
 from dappled.flight.entries import Stray
 from dappled.flight.errors import FlightError

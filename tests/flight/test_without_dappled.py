@@ -12,9 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from dappled.decode.geometry.pose import Pose
 from dappled.flight import ledger_schema, recording
 from dappled.flight.ledger import LedgerReader
-from dappled.flight.records import Pose, Tag
+from dappled.flight.records import Tag
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, flip, pose, tag, wish
 

@@ -13,19 +13,20 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from dappled.daemon.interpolation import metres_per_radian
-from dappled.drivers.darkroom import Recipe
+from dappled.decode.geometry import camera_pose
+from dappled.decode.geometry.interpolation import metres_per_radian
+from dappled.decode.geometry.pose import Pose, Quaternion
+from dappled.drivers.raw.darkroom import Recipe
 from dappled.flight import recording
-from dappled.flight.records import Pose, Quaternion, Tag
-from dappled.mocks import bench_calibration, terrain
-from dappled.mocks.bench_calibration import CAMERA, MASK
-from dappled.mocks.flyover import Terrain
-from dappled.mocks.masked_camera import MaskedCamera, reference_camera
-from dappled.mocks.path import Path as FlightPath
-from dappled.mocks.path import TruePose
-from dappled.mocks.terrain import DETAIL_TEXEL_M, EXTENT_M, TEXEL_M
-from dappled.mocks.truth import Truth
-from dappled.products import camera_pose
+from dappled.flight.records import Tag
+from dappled.mocks.autopilot.path import Path as FlightPath
+from dappled.mocks.autopilot.path import TruePose
+from dappled.mocks.scene import bench_calibration, terrain
+from dappled.mocks.scene.bench_calibration import CAMERA, MASK
+from dappled.mocks.scene.flyover import Terrain
+from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
+from dappled.mocks.scene.terrain import DETAIL_TEXEL_M, EXTENT_M, TEXEL_M
+from dappled.mocks.scene.truth import Truth
 from tests.flight.makers import deliver, wish
 
 START_NS = 1_795_256_103_000_000_000

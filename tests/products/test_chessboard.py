@@ -13,9 +13,10 @@ from PIL import Image
 from dappled.cli import main
 from dappled.config import profiles
 from dappled.config.profiles import Lens
-from dappled.decode.carriers import Sensor
-from dappled.products import chessboard, eye
+from dappled.decode.optics.carriers import Sensor
+from dappled.products import chessboard
 from dappled.products.chessboard import ChessboardError
+from dappled.products.maps import eye
 
 SENSOR = Sensor((694, 922), (0.02, 0.0), (0.0, 0.02))  # half the reference camera's inner half, in every direction
 TRUE = Lens(50.0, 51.3, (0.11, -0.16), (-0.35, 1.5, 0.002, -0.003, 0.0))

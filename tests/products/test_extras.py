@@ -24,6 +24,7 @@ def test_maps_can_be_imported_without_the_extras() -> None:
     code = (
         "import sys\n"
         "for name in ('cv2', 'rasterio', 'laspy', 'h5py', 'distributed', 'rerun'): sys.modules[name] = None\n"
-        "import dappled.cli.georeference, dappled.cli.batch, dappled.products.refine, dappled.products.chessboard\n"
+        "import dappled.cli.georeference, dappled.cli.batch\n"
+        "import dappled.products.maps.refine, dappled.products.chessboard\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -8,18 +8,19 @@ import pytest
 from PIL import Image
 
 import dappled
+from dappled.decode.depth.ranging import Ranging
 from dappled.decode.errors import DecodeError
-from dappled.decode.ranging import Ranging
 from dappled.errors import DappledError
-from dappled.mocks.masked_camera import reference_camera
-from dappled.products import lightfiles, opened
+from dappled.mocks.scene.masked_camera import reference_camera
+from dappled.products import opened
+from dappled.products.exports import light_files
 from dappled.products.opened import OpenedFrame, OpenedLightField, OpenError
 from tests.products.fields import DISPARITY, light_field
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    lightfiles.save(tmp_path / "a.npz", light_field())
+    light_files.save(tmp_path / "a.npz", light_field())
     return tmp_path / "a.npz"
 
 

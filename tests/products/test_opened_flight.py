@@ -11,7 +11,7 @@ import pytest
 
 import dappled
 from dappled.cli import main
-from dappled.products import lightfiles
+from dappled.products.exports import light_files
 from dappled.products.opened import OpenedFlight, OpenError
 from tests.products.flown import Flown, fly
 
@@ -48,7 +48,7 @@ def test_points_lie_on_the_ground_below(flown: Flown, tmp_path: Path, capsys: py
     flight = dappled.open(flown.folder, **{k: v for k, v in asdict(flown.recipe).items() if v})
     assert isinstance(flight, OpenedFlight)
     (frame,) = flight
-    lightfiles.save(tmp_path / "f.npz", frame.light_field.field)
+    light_files.save(tmp_path / "f.npz", frame.light_field.field)
     words = ["depth", str(tmp_path / "f.npz"), "--focus", "inf", "--flight", str(flown.folder), "--most-sigma", "0.5"]
     words += ["--frame", str(frame.index), "--window", "25", "--method", "contrast", "--json"]
     assert main([*words, "-o", str(tmp_path / "p.ply"), str(tmp_path / "d.npz")]) == 0

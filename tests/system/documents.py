@@ -19,9 +19,9 @@ import tomli_w
 from PIL import Image
 
 from dappled.config import settings as configuration
-from dappled.daemon.ground_client import GroundClient, GroundError
-from dappled.mocks import lytro
-from dappled.mocks.masked_camera import reference_camera
+from dappled.daemon.camera_protocol.ground_client import GroundClient, GroundError
+from dappled.mocks.scene import lytro
+from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.mocks.simulation import Simulation, World
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,12 +58,12 @@ SUBSTITUTES = {
 ELSEWHERE = {
     "calibrate --lens": "tests/products/test_chessboard.py",  # pictures of a chessboard
     "--camera my-450d.toml": "tests/products/test_chessboard.py",  # what comes of them
-    "--refine orthophoto.tif": "tests/products/test_georeference.py",  # a map of the place
-    "--gcp points.csv": "tests/products/test_georeference.py",  # control points of the place
-    "--refine neighbours": "tests/products/test_georeference.py",  # frames that overlap
-    "--as terrain --gsd": "tests/products/test_georeference.py",  # as above
-    "maps/ground.tif": "tests/products/test_georeference.py",  # what comes of them
-    "--scheduler tcp:": "tests/products/test_batch.py",  # a Dask cluster
+    "--refine orthophoto.tif": "tests/products/maps/test_georeference.py",  # a map of the place
+    "--gcp points.csv": "tests/products/maps/test_georeference.py",  # control points of the place
+    "--refine neighbours": "tests/products/maps/test_georeference.py",  # frames that overlap
+    "--as terrain --gsd": "tests/products/maps/test_georeference.py",  # as above
+    "maps/ground.tif": "tests/products/maps/test_georeference.py",  # what comes of them
+    "--scheduler tcp:": "tests/products/batch/test_batch.py",  # a Dask cluster
 }
 """Commands that need more than this stage has, and the tests that give it to them."""
 

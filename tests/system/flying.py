@@ -12,9 +12,9 @@ from typing import Any
 from dappled.config import settings as configuration
 from dappled.config.schema import Source
 from dappled.config.settings import Settings
+from dappled.daemon.pipeline.pending_shot import Story, Watchers
+from dappled.daemon.pipeline.shutter import Verdict, Wish
 from dappled.daemon.service import Service
-from dappled.daemon.shutter import Verdict, Wish
-from dappled.daemon.story import Story, Watchers
 from dappled.flight import check, summary
 from dappled.flight.ledger import LedgerReader
 

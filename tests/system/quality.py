@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from dappled.decode.lightfield import LightField
-from dappled.mocks.truth import Truth
+from dappled.decode.lightfield.light_field import LightField
+from dappled.mocks.scene.truth import Truth
 
 GREEN = 1  # what a mosaic is balanced to
 BORDER = 12  # px of a view left out: the lens' blur of the truth wraps around there

@@ -20,12 +20,12 @@ import zmq
 from dappled.cli import main
 from dappled.config.settings import Settings
 from dappled.daemon.service import Service
-from dappled.drivers.mavlink import LinkError
+from dappled.drivers.mavlink.links import LinkError
 from dappled.errors import DappledError
 from dappled.flight import check, summary
 from dappled.flight.ledger import LedgerReader
-from dappled.mocks.body import Body, BodyOptions
-from dappled.mocks.masked_camera import reference_camera
+from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.scene.masked_camera import reference_camera
 from tests.system.flying import Flying, assert_whole, eventually, flying, settings_of, told
 
 FOCAL_LENGTH = b"\x0a\x92\x05\x00"  # EXIF tag 37386, a rational: as it stands in a little-endian folder
@@ -505,7 +505,7 @@ class Daemon:
     """`dappled run` in a process of its own, before a body, with an interval of shots asked for over MAVLink."""
 
     def __init__(self, body: Body, here: Path, **record: Any) -> None:
-        from dappled.daemon.ground_client import GroundClient  # noqa: PLC0415  # only these two tests fly by radio
+        from dappled.daemon.camera_protocol.ground_client import GroundClient  # noqa: PLC0415  # only these two tests fly by radio
         from dappled.mocks.simulation import free_port  # noqa: PLC0415  # as above
 
         port = free_port()
@@ -592,7 +592,7 @@ def decoders() -> list[int]:
             parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
         except (OSError, ValueError):  # it has just ended
             continue
-        if parent == os.getpid() and b"dappled.daemon.decode_worker" in words:
+        if parent == os.getpid() and b"dappled.daemon.pipeline.decode_worker" in words:
             found.append(int(entry.name))
     return found
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from dappled.daemon.shutter import Wish
+from dappled.daemon.pipeline.shutter import Wish
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.records import Frame
-from dappled.mocks.body import Body, BodyOptions
-from dappled.mocks.pictures import pattern
+from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.body.pictures import pattern
 from tests.system.flying import eventually, flying, settings_of
 
 SIZE, SHOTS = 1_000_001, 5

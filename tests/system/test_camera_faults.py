@@ -17,11 +17,11 @@ from typing import Any
 
 import pytest
 
-from dappled.daemon.story import Story
+from dappled.daemon.pipeline.pending_shot import Story
 from dappled.flight.ledger import LedgerReader
-from dappled.mocks.body import Body, BodyOptions
-from dappled.mocks.eos450d import thumbnail
-from dappled.mocks.pictures import pattern
+from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.body.eos450d import thumbnail
+from dappled.mocks.body.pictures import pattern
 from tests.system.flying import Flying, eventually, flying, settings_of, told
 
 SIZE = 2_000_001
@@ -308,6 +308,6 @@ def camera_process(body: Body) -> int:
                 words = (entry / "cmdline").read_bytes()
             except OSError:
                 continue
-            if b"gphoto2_process" in words and body.port.split(",")[0].encode() in words:
+            if b"dappled.drivers.gphoto2.process" in words and body.port.split(",")[0].encode() in words:
                 return int(entry.name)
     raise AssertionError("there is no camera process")

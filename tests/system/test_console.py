@@ -26,8 +26,8 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from dappled.daemon.console import pictures
 from dappled.daemon.console.pictures import Mosaic
-from dappled.products import lightfiles
 from dappled.products import opened as opening
+from dappled.products.exports import light_files
 from dappled.products.opened import OpenedFlight
 from tests.needs import without
 
@@ -249,7 +249,7 @@ def test_the_slider_s_alpha_is_the_command_s(chromium: Browser, daemon: Daemon, 
     (flight,) = (path for path in daemon.flights.iterdir() if path.is_dir())
     recorded = opening.open(flight)
     assert isinstance(recorded, OpenedFlight)
-    lightfiles.save(tmp_path / "frame.npz", recorded[frame].light_field.field)
+    light_files.save(tmp_path / "frame.npz", recorded[frame].light_field.field)
     pictures_of_the_command = []
     for alpha in alphas:
         out = tmp_path / f"{alpha}.npy"

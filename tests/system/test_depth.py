@@ -21,12 +21,12 @@ from scipy import ndimage
 import dappled
 from dappled.cli import calibrate_target
 from dappled.cli.calibrate import from_frames
-from dappled.decode.depthmap import DepthMap
-from dappled.drivers.darkroom import Darkroom, Recipe
-from dappled.mocks.bench import Bench, Plane
-from dappled.mocks.masked_camera import LEVEL, MaskedCamera, reference_camera
-from dappled.mocks.synthesis import PASS, Grid
-from dappled.mocks.truth import Truth
+from dappled.decode.depth.depth_map import DepthMap
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.mocks.scene.bench import Bench, Plane
+from dappled.mocks.scene.masked_camera import LEVEL, MaskedCamera, reference_camera
+from dappled.mocks.scene.synthesis import PASS, Grid
+from dappled.mocks.scene.truth import Truth
 from dappled.products.opened import OpenedFrame, OpenedLightField, with_ranging
 
 CAMERA, MASK = "reference-36mm", "reference-5x5"

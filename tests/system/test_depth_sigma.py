@@ -15,12 +15,12 @@ import tomli_w
 
 import dappled
 from dappled.cli.calibrate import from_frames
-from dappled.drivers.darkroom import Darkroom, Recipe
-from dappled.mocks.bench import Bench, Plane
-from dappled.mocks.masked_camera import MaskedCamera, reference_camera
-from dappled.mocks.path import Path as FlightPath
-from dappled.mocks.synthesis import PASS, Grid
-from dappled.mocks.terrain import noise
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.mocks.autopilot.path import Path as FlightPath
+from dappled.mocks.scene.bench import Bench, Plane
+from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
+from dappled.mocks.scene.synthesis import PASS, Grid
+from dappled.mocks.scene.terrain import noise
 from dappled.products.opened import OpenedFrame
 from tests.system.test_depth import BORDER, CAMERA, MASK, SCALE, sampled, say, with_snr
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import rawpy
 
-from dappled.daemon import wire
+from dappled.daemon.stream import wire
 from dappled.flight import check, summary
 from dappled.flight.ledger import LedgerReader
 from tests.system.conftest import FRAMES, Flown, dappled, flip

@@ -13,13 +13,14 @@ from typing import Any
 import pytest
 
 from dappled.cli import main
-from dappled.drivers import gphoto2, shutter_line
-from dappled.drivers.mavlink import mavlink
+from dappled.drivers.gphoto2 import client
+from dappled.drivers.mavlink.links import mavlink
+from dappled.drivers.wired import shutter_line
 from dappled.flight import check, summary
 from dappled.flight.ledger import LedgerReader
-from dappled.mocks.body import Body, BodyOptions
-from dappled.mocks.finepix import FinePix
-from dappled.mocks.pictures import pattern
+from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.body.finepix import FinePix
+from dappled.mocks.body.pictures import pattern
 from dappled.mocks.simulation import free_port
 from tests.drivers.contract import content, until_shot_ends, until_state
 from tests.system.flying import Flying, eventually, flying, settings_of
@@ -140,8 +141,8 @@ def test_a_wrong_wish_is_one_sentence(
 def test_a_card_that_appears_in_flight_brings_its_frames_into_the_flight(
     here: Path, body: FinePix, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dappled.drivers.pickup.MOUNTS", body.mounts)
-    monkeypatch.setattr("dappled.drivers.pickup.PLACES", body.places)
+    monkeypatch.setattr("dappled.drivers.wired.sources.MOUNTS", body.mounts)
+    monkeypatch.setattr("dappled.drivers.wired.sources.PLACES", body.places)
     with by_wire(here, body, monkeypatch, pickup="storage") as (daemon, flight):
         shoot(daemon, body, 3)
         body.plug()
@@ -211,7 +212,7 @@ def test_fired_by_the_autopilot_s_relay_and_the_ground_station_is_told(here: Pat
 @contextmanager
 def other_hand(body: Body) -> Iterator[Callable[[int], None]]:
     """Somebody else fires a body whose files lie on its card."""
-    camera = gphoto2.open_camera({"port": body.port})
+    camera = client.open_camera({"port": body.port})
     camera.start()
     until_state(camera, "ready")
 

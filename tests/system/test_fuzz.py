@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from dappled.mocks.body import Body, BodyOptions
-from dappled.mocks.masked_camera import reference_camera
-from dappled.mocks.ptp import init_command_ack
+from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.body.ptp import init_command_ack
+from dappled.mocks.scene.masked_camera import reference_camera
 from tests.system.flying import eventually, flying, settings_of
 
 

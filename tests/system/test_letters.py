@@ -11,7 +11,7 @@ import jsonschema
 import numpy as np
 import pytest
 
-from dappled.daemon import wire
+from dappled.daemon.stream import wire
 from tests.system.conftest import dappled
 
 

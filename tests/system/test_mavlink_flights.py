@@ -11,14 +11,14 @@ import pytest
 
 from dappled.cli import main
 from dappled.config.schema import ConfigError
-from dappled.daemon.knobs import code
-from dappled.drivers import mavlink_signing
-from dappled.drivers.mavlink import mavlink
-from dappled.drivers.mavlink_signing import EPOCH_UNIX_S, UNITS_PER_S
+from dappled.daemon.camera_protocol.camera_settings import code
+from dappled.drivers.mavlink import signing as mavlink_signing
+from dappled.drivers.mavlink.links import mavlink
+from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
 from dappled.flight.ledger import LedgerReader
-from dappled.mocks.body import Body, BodyOptions
+from dappled.mocks.body.body import Body, BodyOptions
 from dappled.mocks.simulation import Simulation, World, free_port
-from tests.daemon.mavlink_rig import Peer
+from tests.daemon.camera_protocol.rig import Peer
 from tests.system.conftest import dappled
 from tests.system.flying import Flying, eventually, flying, settings_of, told
 

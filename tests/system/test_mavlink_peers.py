@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from dappled.flight import summary
-from dappled.mocks.autopilot import Autopilot
-from dappled.mocks.body import Body, BodyOptions
+from dappled.mocks.autopilot.autopilot import Autopilot
+from dappled.mocks.body.body import Body, BodyOptions
 from tests.system.flying import Flying, eventually, flying, settings_of
 from tests.system.peers.mavproxy import MavProxy
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from dappled.mocks import soak
-from dappled.mocks.supervised import Resources
+from dappled.mocks.soak import soak
+from dappled.mocks.soak.supervised import Resources
 
 
 @pytest.mark.slow

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from dappled.clock import SystemClock
 from dappled.config.settings import Settings, resolve
-from dappled.daemon.clock import SystemClock
-from dappled.daemon.interpolation import metres_per_radian
 from dappled.daemon.service import Service
+from dappled.decode.geometry.interpolation import metres_per_radian
 from dappled.flight import summary
-from dappled.mocks.path import Path as FlightPath
+from dappled.mocks.autopilot.path import Path as FlightPath
 from dappled.mocks.simulation import Simulation, World
 
 SEED, FRAMES = 8, 3

@@ -9,8 +9,8 @@ import pytest
 import tomli_w
 
 from dappled.cli.calibrate import from_frames
-from dappled.drivers.darkroom import Darkroom, Recipe
-from dappled.mocks.masked_camera import MaskedCamera, reference_camera
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 from tests.system.quality import Score, score
 
 CAMERA, MASK = "reference-36mm", "reference-5x5"

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from dappled.cli import main
-from dappled.daemon import wire
-from dappled.daemon.subscriber import Subscriber
+from dappled.daemon.stream import wire
+from dappled.daemon.stream.subscriber import Subscriber
 from dappled.mocks.simulation import free_port
 from tests.system.conftest import dappled
 

@@ -6,13 +6,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+from dappled.clock import SystemClock
 from dappled.config.settings import Settings, resolve
-from dappled.daemon.clock import SystemClock
 from dappled.daemon.service import Service
 from dappled.flight import check, summary
 from dappled.flight.index import ImageIndex
 from dappled.mocks.simulation import Simulation, World
-from dappled.products import geotags
+from dappled.products.geotags import geotags
 from tests.system.conftest import dappled
 
 SECOND_NS = 10**9

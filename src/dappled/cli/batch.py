@@ -14,9 +14,9 @@ from tqdm import tqdm
 from dappled.cli import common, georeference
 from dappled.errors import DappledError
 from dappled.flight import layout
-from dappled.products import batch, workers
-from dappled.products.batch import KINDS, Job
-from dappled.products.manifest import Manifest
+from dappled.products.batch import batch, workers
+from dappled.products.batch.batch import KINDS, Job
+from dappled.products.batch.manifest import Manifest
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -13,12 +13,12 @@ from tqdm import tqdm
 from dappled.cli import calibrate_lens, calibrate_target, common
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
-from dappled.decode import calibration_report as report
-from dappled.decode.calibrated import Calibration
-from dappled.decode.calibration import CalibrationFrame, of_sights, sight_of
-from dappled.decode.sighting import Sight
-from dappled.drivers import calibration_files
-from dappled.drivers.darkroom import Darkroom, DarkroomError
+from dappled.decode.calibration import report
+from dappled.decode.calibration.calibration import Calibration
+from dappled.decode.calibration.fit import CalibrationFrame, of_sights, sight_of
+from dappled.decode.calibration.lattice_fit import Sight
+from dappled.drivers.raw import calibration_files
+from dappled.drivers.raw.darkroom import Darkroom, DarkroomError
 from dappled.errors import DappledError
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from dappled.config import profiles
-from dappled.drivers.darkroom import Darkroom, DarkroomError, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
 from dappled.errors import DappledError
 from dappled.products import chessboard
 

@@ -11,9 +11,9 @@ import tomli_w
 from tqdm import tqdm
 
 from dappled.config import profiles
-from dappled.decode.ranging import RANGING, Ranging, Target, fit_targets, target_shift
-from dappled.drivers import calibration_files
-from dappled.drivers.darkroom import Darkroom, DarkroomError, Recipe
+from dappled.decode.depth.ranging import RANGING, Ranging, Target, fit_targets, target_shift
+from dappled.drivers.raw import calibration_files
+from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
 from dappled.products import opened
 from dappled.products.opened import OpenedLightField
 

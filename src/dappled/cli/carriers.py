@@ -15,17 +15,17 @@ from PIL import Image
 from dappled.cli import common
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
-from dappled.decode.carriers import Carrier, Lattice
-from dappled.decode.lattice import FoundLattice, find_lattice
-from dappled.decode.masks import Mask, Order
-from dappled.decode.peaks import Measured, measure
-from dappled.decode.plane import Plane
-from dappled.decode.prediction import crossed_orders, lattice_rotation
+from dappled.decode.optics.carrier_tables import crossed_orders, lattice_rotation
+from dappled.decode.optics.carriers import Carrier, Lattice
+from dappled.decode.optics.masks import Mask, Order
 from dappled.decode.report import CarriersFrom, doubt
-from dappled.decode.slices import default_size
-from dappled.decode.spectrum import Spectrum, padded_shape
-from dappled.decode.spectrum_pictures import LOOKS, Look, around, spectrum_boxes
-from dappled.drivers.darkroom import Darkroom, DarkroomError, known_to
+from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
+from dappled.decode.spectrum.padded import Spectrum, padded_shape
+from dappled.decode.spectrum.peaks import Measured, measure
+from dappled.decode.spectrum.plane import Plane
+from dappled.decode.spectrum.slices import default_size
+from dappled.decode.spectrum.spectrum_pictures import LOOKS, Look, around, spectrum_boxes
+from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, known_to
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -9,9 +9,9 @@ import socket
 from pathlib import Path
 
 from dappled.config import settings
-from dappled.daemon.wire import WireError
-from dappled.decode.carriers import LAWS
-from dappled.drivers.darkroom import Recipe
+from dappled.daemon.stream.wire import WireError
+from dappled.decode.optics.carriers import LAWS
+from dappled.drivers.raw.darkroom import Recipe
 
 SERVICE_FOLDER = Path("/run/dappled")  # RuntimeDirectory= of systemd/dappled.service
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from tqdm import tqdm
 
 from dappled.cli import common
-from dappled.drivers.darkroom import Darkroom, Development
+from dappled.drivers.raw.darkroom import Darkroom, Development
 from dappled.errors import DappledError
-from dappled.products import lightfiles
+from dappled.products.exports import light_files
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
         target = arguments.output if single else arguments.output / f"{frame.stem}.zarr"
         try:
             made = darkroom.develop(frame, focal_length_mm=arguments.focal_length, f_number=arguments.f_number)
-            lightfiles.save(target, made.light_field, overwrite=arguments.overwrite)
+            light_files.save(target, made.light_field, overwrite=arguments.overwrite)
             print(f"{target}: {summary(made)}")
         except DappledError as error:
             if single:

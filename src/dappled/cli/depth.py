@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.cli import fields
-from dappled.decode import depth as depths
-from dappled.decode.depthmap import DepthMap
+from dappled.decode.depth import estimate as depths
+from dappled.decode.depth.depth_map import DepthMap
+from dappled.decode.depth.ranging import DistanceMap
 from dappled.decode.errors import DecodeError
-from dappled.decode.ranging import DistanceMap
 from dappled.flight import layout
-from dappled.products import exports, photographs, pointcloud, prints
+from dappled.products.exports import exports, point_cloud, prints
+from dappled.products.maps import photographs
+from dappled.products.maps.photographs import Mounting
 from dappled.products.opened import OpenedLightField, OpenError
-from dappled.products.photographs import Mounting
 
 _POINTS = (".ply", ".las", ".laz")
 
@@ -167,10 +168,10 @@ def _points(
             raise OpenError(f"{arguments.flight} has no frame {arguments.frame}")
         mounting = Mounting.of(layout.read_facts(layout.open_folder(arguments.flight)))
         station = photographs.station(chosen, tags.get(chosen.index), mounting)
-    cloud = pointcloud.of(
+    cloud = point_cloud.of(
         found.field, found.refocus(), distances, most_sigma=arguments.most_sigma, station=station, crs=arguments.crs
     )
-    pointcloud.write(path, cloud)
+    point_cloud.write(path, cloud)
     return {"points": len(cloud.points), "withheld": cloud.withheld, "coordinates": cloud.crs or "camera axes"}
 
 

@@ -20,9 +20,10 @@ from dappled.cli import status
 from dappled.cli.common import answers, stream, whole
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.daemon import checkup, examination, inputs, preflight, trial
-from dappled.daemon.checkup import Finding
-from dappled.daemon.trial import Latency
+from dappled.daemon.health import frame_checks, go_no_go, host_checks, test_shot
+from dappled.daemon.health.host_checks import Finding
+from dappled.daemon.health.test_shot import Latency
+from dappled.daemon.pipeline import recipes
 from dappled.drivers import usb_bus
 from dappled.errors import DappledError
 
@@ -61,10 +62,10 @@ def run(arguments: argparse.Namespace) -> int:
         truth = None
         if arguments.simulate:
             settings, truth = stack.enter_context(_simulated(settings, arguments.seed, folder))
-        findings = checkup.checkup(settings)
+        findings = host_checks.checkup(settings)
         told: dict[str, Any] = {"checks": [asdict(one) for one in findings]}
         ready = all(one.state != "wrong" for one in findings if one.name in ("camera", "disk"))
-        good = not checkup.next_step(findings)
+        good = not host_checks.next_step(findings)
         lines = _findings(findings)
         if (arguments.test_shot or arguments.latency) and ready:
             more, shot = _shoot(settings, arguments, folder, truth)
@@ -72,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
         elif arguments.test_shot or arguments.latency:
             lines.append("no shot was fired: the camera or the disk is not ready")
     lines.append(_last(findings, told.get("verdict")))
-    told["next"] = checkup.next_step(findings)
+    told["next"] = host_checks.next_step(findings)
     print(json.dumps(told, indent=2) if arguments.json else "\n".join(lines))
     return 0 if good else 1
 
@@ -85,12 +86,16 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
             "for a photograph (dappled trigger, the ground station, the console)"
         )
     told = status.health(endpoint, HEAR_S)
-    checks = preflight.checks(told)
+    checks = go_no_go.checks(told)
     looked: list[Finding] = []
     if told["camera"]["state"] not in ("ready", "busy", "starting"):  # then nobody but a stranger holds it
-        looked = [one for check in (checkup.bodies, checkup.grabbers) for one in check(settings, checkup.Machine())]
-    verdict = preflight.verdict(checks)
-    todo = checkup.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
+        looked = [
+            one
+            for check in (host_checks.bodies, host_checks.grabbers)
+            for one in check(settings, host_checks.Machine())
+        ]
+    verdict = go_no_go.verdict(checks)
+    todo = host_checks.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
     if arguments.json:
         facts = [*map(asdict, checks), *map(asdict, looked)]
         print(json.dumps({"flight": told["flight"], "checks": facts, "verdict": verdict, "next": todo}, indent=2))
@@ -106,7 +111,7 @@ def _findings(findings: Sequence[Finding]) -> list[str]:
 
 
 def _last(findings: Sequence[Finding], verdict: str | None) -> str:
-    todo = checkup.next_step(findings)
+    todo = host_checks.next_step(findings)
     if todo:
         return f"next: {todo}"
     if verdict is not None:
@@ -121,18 +126,18 @@ def _shoot(
     place = folder if arguments.keep is None else arguments.keep
     place.mkdir(parents=True, exist_ok=True)
     count = arguments.latency or 1
-    _, recipe = inputs.recipe(settings)
+    _, recipe = recipes.recipe(settings)
     ours = settings if arguments.test_shot else replace(settings, decode=replace(settings.decode, enabled=False))
     latencies: list[Latency] = []
     frame: Path | None = None
     problem = ""
-    with trial.daemon(ours, folder, place) as daemon, _hot_shoe(ours, truth):
+    with test_shot.daemon(ours, folder, place) as daemon, _hot_shoe(ours, truth):
         for _ in tqdm(range(count), unit="shot", disable=None, delay=1.0):
             story = daemon.shoot()
             if story.frame is None:
                 problem = story.problem or story.follows
                 break
-            latencies.append(trial.latency(story))
+            latencies.append(test_shot.latency(story))
             frame = frame or daemon.flight / story.frame.name
         lines: list[str] = []
         facts: dict[str, Any] = {"verdict": "go", "flight": str(daemon.flight) if arguments.keep else None}
@@ -141,7 +146,7 @@ def _shoot(
             facts["verdict"] = "no-go"
         elif arguments.test_shot and frame is not None:
             judged = _judged(frame, recipe)
-            facts |= {"test_shot": [asdict(one) for one in judged], "verdict": preflight.verdict(judged)}
+            facts |= {"test_shot": [asdict(one) for one in judged], "verdict": go_no_go.verdict(judged)}
             lines += [f"{_WORDS[one.state]:8} {one.name:11} {one.text}" for one in judged]
     if arguments.latency and latencies:
         timed = _timed(latencies, None if truth is None else _true_latencies(truth, len(latencies)))
@@ -150,11 +155,11 @@ def _shoot(
     return lines, facts
 
 
-def _judged(frame: Path, recipe: Any) -> list[examination.Finding]:
+def _judged(frame: Path, recipe: Any) -> list[frame_checks.Finding]:
     try:
-        return examination.examine(frame, recipe)
+        return frame_checks.examine(frame, recipe)
     except DappledError as error:
-        return [examination.Finding("picture", "no-go", f"it is no picture: {error}", {})]
+        return [frame_checks.Finding("picture", "no-go", f"it is no picture: {error}", {})]
 
 
 _SPANS = {
@@ -239,7 +244,7 @@ def _hot_shoe(settings: Settings, truth: Path | None) -> Iterator[None]:
     if truth is None:
         yield
         return
-    from dappled.mocks.hot_shoe import HotShoe  # noqa: PLC0415  # as above
+    from dappled.mocks.autopilot.hot_shoe import HotShoe  # noqa: PLC0415  # as above
 
     shoe = HotShoe(truth, settings.mavlink.url[0])
     try:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from dappled.cli import fields
-from dappled.products import exports, lightfiles, rerun_log
+from dappled.products.exports import exports, light_files, rerun_log
 from dappled.products.opened import OpenedLightField
 
 KINDS = {
@@ -55,5 +55,5 @@ def write(found: OpenedLightField, kind: str, path: Path, arguments: argparse.Na
         case _:
             if path.suffix != f".{kind}":
                 raise exports.ExportError(f"{path}: --as {kind} writes a .{kind} file; name it so")
-            lightfiles.save(path, found.field)
+            light_files.save(path, found.field)
     return path

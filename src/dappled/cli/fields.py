@@ -6,8 +6,8 @@ import argparse
 import math
 from pathlib import Path
 
-from dappled.decode.ranging import RANGING, Ranging
-from dappled.drivers import calibration_files
+from dappled.decode.depth.ranging import RANGING, Ranging
+from dappled.drivers.raw import calibration_files
 from dappled.products import opened
 from dappled.products.opened import OpenedLightField
 

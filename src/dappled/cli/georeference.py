@@ -14,16 +14,16 @@ from typing import Any
 from tqdm import tqdm
 
 from dappled.cli import common, fields
-from dappled.daemon import inputs
-from dappled.drivers.darkroom import Recipe
+from dappled.daemon.pipeline import recipes
+from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import layout
-from dappled.products import difference, drawings, earth, georeference, terrain
-from dappled.products.basemap import BaseMapError
-from dappled.products.georeference import Options, Progress, Survey
-from dappled.products.hyperstereo import HyperstereoError
-from dappled.products.photographs import Mounting
-from dappled.products.terrain import Terrain
+from dappled.products.maps import difference, drawings, earth, georeference, terrain
+from dappled.products.maps.basemap import BaseMapError
+from dappled.products.maps.georeference import Options, Progress, Survey
+from dappled.products.maps.hyperstereo import HyperstereoError
+from dappled.products.maps.photographs import Mounting
+from dappled.products.maps.terrain import Terrain
 
 KINDS = ("kmz", "cog", "footprints", "terrain", "difference")
 
@@ -215,7 +215,7 @@ def _draw(made: Survey, output: Path, arguments: argparse.Namespace) -> list[Pat
 def recipe(flight: Path, facts: Mapping[str, Any], arguments: argparse.Namespace) -> Recipe:
     """How the flight was decoded, with what the arguments say instead."""
     given = {name: getattr(arguments, name) for name in ("camera", "mask", "calibration")}
-    made = inputs.of_flight(flight, facts, given)
+    made = recipes.of_flight(flight, facts, given)
     if made is None:
         raise DappledError(f"{flight} names no mask: give --camera and --mask")
     return replace(made, workers=2, colour=not arguments.grey)

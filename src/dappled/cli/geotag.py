@@ -12,12 +12,14 @@ from typing import Any
 
 from tqdm import tqdm
 
-from dappled.daemon import late_tags
+from dappled.daemon.replay import late_tags
+from dappled.decode.geometry import camera_pose
 from dappled.errors import DappledError
 from dappled.flight import layout
-from dappled.products import camera_pose, earth, geotags
-from dappled.products.earth import EarthError, Geoid
-from dappled.products.geotags import Mounting
+from dappled.products.geotags import geotags
+from dappled.products.geotags.geotags import Mounting
+from dappled.products.maps import earth
+from dappled.products.maps.earth import EarthError, Geoid
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

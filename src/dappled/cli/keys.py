@@ -8,7 +8,7 @@ import secrets
 from pathlib import Path
 
 from dappled.cli.actions import Actions
-from dappled.daemon import curve
+from dappled.daemon.stream import curve
 
 HOME = Path("~/.config/dappled/keys")
 

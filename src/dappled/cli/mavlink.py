@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from dappled.cli.actions import Actions
-from dappled.drivers.mavlink_signing import SigningError, make_key
+from dappled.drivers.mavlink.signing import SigningError, make_key
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.cli import fields
-from dappled.decode.focal_stack import all_in_focus, focal_stack
-from dappled.decode.fourier_refocus import Spectrum4D, difference
-from dappled.decode.refocus import magnified
-from dappled.decode.stereo_pair import anaglyph, side_by_side
-from dappled.products import prints
+from dappled.decode.lightfield.focal_stack import all_in_focus, focal_stack
+from dappled.decode.lightfield.fourier_refocus import Spectrum4D, difference
+from dappled.decode.lightfield.refocus import magnified
+from dappled.decode.lightfield.stereo_pair import anaglyph, side_by_side
+from dappled.products.exports import prints
 from dappled.products.opened import OpenedLightField, OpenError
 
 _MOST_PICTURES = 500  # of a stack, all held in memory at once

@@ -11,21 +11,23 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from dappled.cli import story
+from dappled.cli import shot_line
 from dappled.cli.common import positive, seconds
 from dappled.config import settings as configuration
-from dappled.daemon import curve, headers, inputs, replay, runs
-from dappled.daemon.answers import Answers
-from dappled.daemon.books import ReplayBook
-from dappled.daemon.development import WorkerDeveloper
-from dappled.daemon.publisher import Publisher
-from dappled.daemon.replay import Progress, RecordedTelemetry, ReplayError
-from dappled.daemon.runs import Run, RunBook
-from dappled.daemon.story import Names, Story, Watchers
-from dappled.daemon.street import Street
-from dappled.daemon.tagger import BodyLatency
+from dappled.daemon.pipeline import recipes
+from dappled.daemon.pipeline.decode_process import WorkerDeveloper
+from dappled.daemon.pipeline.flight_writer import ReplayBook
+from dappled.daemon.pipeline.pending_shot import Names, Story, Watchers
+from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.tagger import BodyLatency
+from dappled.daemon.replay import replay, runs
+from dappled.daemon.replay.replay import Progress, RecordedTelemetry, ReplayError
+from dappled.daemon.replay.runs import Run, RunBook
+from dappled.daemon.stream import curve, headers
+from dappled.daemon.stream.answers import Answers
+from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import Identity
-from dappled.drivers.darkroom import Recipe
+from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.replay import ReplayCamera
 from dappled.flight import check, layout
 from dappled.flight.ledger import LIVE
@@ -140,7 +142,7 @@ def _play(
     telemetry = RecordedTelemetry.flown(recorded, recording.telemetry, recording.horizons, recording.vehicles)
 
     def finished(one: Story) -> None:
-        print(story.as_json(one) if arguments.json else story.line(one), flush=True)
+        print(shot_line.as_json(one) if arguments.json else shot_line.line(one), flush=True)
         progress.note(one)
 
     publisher = _publisher(settings, book, developer, stack) if arguments.publish else None
@@ -180,7 +182,7 @@ def _recipe(arguments: argparse.Namespace, facts: Mapping[str, Any], settings: c
             return runs.of_flight(arguments.flight, arguments.run_name).recipe
         if not facts.get("decode_in_flight") and not given["mask"]:
             return None
-        return inputs.of_flight(arguments.flight, facts, given)
+        return recipes.of_flight(arguments.flight, facts, given)
     if not given["mask"]:
         return None
     named = {name: value for name, value in given.items() if value is not None}
@@ -206,13 +208,13 @@ def _as_recorded(
 ) -> tuple[Names, BodyLatency, configuration.Settings]:
     """Names, body latency and settings of the flight; the frames of a folder begin to expose at their times."""
     if not facts:
-        return inputs.names(recipe), BodyLatency(0.0, 0.0, "given by --start and --interval"), configuration.Settings()
+        return recipes.names(recipe), BodyLatency(0.0, 0.0, "given by --start and --interval"), configuration.Settings()
     if "settings" not in facts or "names" not in facts:
         raise ReplayError(f"{arguments.flight}/flight.toml lacks its settings; replay its folder frames/ with --mask")
     recorded = configuration.of_tables(facts["settings"], "flight.toml")
     latency = BodyLatency.of(recorded.camera)
     changed = any(getattr(arguments, name) for name in ("camera", "mask"))
-    return inputs.names(recipe) if changed else Names(**facts["names"]), latency, recorded
+    return recipes.names(recipe) if changed else Names(**facts["names"]), latency, recorded
 
 
 def _publisher(

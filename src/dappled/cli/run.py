@@ -12,17 +12,17 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from dappled.cli import story
+from dappled.cli import shot_line
 from dappled.cli.common import seconds, whole
 from dappled.cli.terminal import CameraRemarks, Frames, ProblemRemarks, remark
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.daemon import health
-from dappled.daemon.goal import Asker, Goal, Tally
-from dappled.daemon.notify import Notifier
+from dappled.daemon.flight_handover import Succession, flights
+from dappled.daemon.health import record as health
+from dappled.daemon.health.notify import Notifier
+from dappled.daemon.pipeline.pending_shot import Story, Watchers
 from dappled.daemon.service import Service
-from dappled.daemon.story import Story, Watchers
-from dappled.daemon.succession import Succession, flights
+from dappled.daemon.stop_condition import Asker, Goal, Tally
 from dappled.errors import DappledError
 
 
@@ -71,7 +71,7 @@ def _run(arguments: argparse.Namespace) -> int:
 def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], Asker] | None) -> int:
     """Run the daemon, flight after flight, until it is told to end, or has had its frames or its time."""
     manager, camera, tally = Notifier(), CameraRemarks(), Tally()
-    frames = Frames(story.as_json if arguments.json else story.line, for_programs=arguments.json)
+    frames = Frames(shot_line.as_json if arguments.json else shot_line.line, for_programs=arguments.json)
     asked, hung_up = threading.Event(), threading.Event()
     goal = Goal(tally, arguments.frames, arguments.seconds, ask=ask, ready=lambda: camera.state == "ready")
 

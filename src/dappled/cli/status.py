@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled.cli.common import seconds, stream
-from dappled.daemon.subscriber import Subscriber
+from dappled.daemon.stream.subscriber import Subscriber
 from dappled.errors import DappledError
 
 

@@ -15,10 +15,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from dappled.daemon.journal import JournalHandler
-from dappled.daemon.stages import Stage
-from dappled.daemon.story import Story
+from dappled.daemon.health.log_format import JournalHandler
+from dappled.daemon.pipeline.pending_shot import Story
 from dappled.drivers.camera import StateChanged
+from dappled.workers import Stage
 
 log = logging.getLogger("dappled.run")
 _PROBLEMS_EVERY_S = 1.0

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from dappled.cli.common import seconds, whole
-from dappled.daemon.ground_client import GroundClient, Outcome
+from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from dappled.cli import fields
-from dappled.decode.depth_stereo import shifts_from_middle
-from dappled.decode.evidence import of_light_field
-from dappled.decode.pictures import slice_mosaic
-from dappled.decode.viewstack import ViewStack
-from dappled.products import prints
+from dappled.decode.depth.evidence import of_light_field
+from dappled.decode.depth.stereo import shifts_from_middle
+from dappled.decode.lightfield.pictures import slice_mosaic
+from dappled.decode.lightfield.view_stack import ViewStack
+from dappled.products.exports import prints
 from dappled.products.opened import OpenedLightField, OpenError
 
 _LONGEST = 2400  # px

@@ -7,11 +7,11 @@ import json
 from pathlib import Path
 
 from dappled.cli.common import seconds, stream, whole
-from dappled.daemon import watching
-from dappled.daemon.curve import ClientKeys, KeyFileError, load_own, load_public
-from dappled.daemon.memory import reuse_large_blocks
-from dappled.daemon.subscriber import Subscriber
-from dappled.daemon.wire import Message
+from dappled.daemon.pipeline.memory import reuse_large_blocks
+from dappled.daemon.stream import watch
+from dappled.daemon.stream.curve import ClientKeys, KeyFileError, load_own, load_public
+from dappled.daemon.stream.subscriber import Subscriber
+from dappled.daemon.stream.wire import Message
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -47,10 +47,10 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.save.mkdir(parents=True, exist_ok=True)
     reuse_large_blocks()
     with Subscriber(endpoint, ask, from_start=arguments.from_start, keys=keys) as subscriber:
-        seen = watching.watch(
+        seen = watch.watch(
             subscriber,
             heard=lambda message: _show(message, arguments.json),
-            new_frame=lambda message: watching.keep(message, arguments.save) if arguments.save else None,
+            new_frame=lambda message: watch.keep(message, arguments.save) if arguments.save else None,
             count=arguments.count,
             silence_s=arguments.timeout,
         )

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from dappled.config.schema import ConfigError, Source, build, read_toml, setting
-from dappled.decode.carriers import LAWS, Sensor
-from dappled.decode.masks import Mask
-from dappled.decode.stagger import spread_sensor
+from dappled.decode.optics.carriers import LAWS, Sensor
+from dappled.decode.optics.masks import Mask
+from dappled.decode.spectrum.stagger import spread_sensor
 
 LENSLET = "lenslet"  # not a profile: the lattice is found in the frame itself
 
@@ -43,7 +43,7 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class CameraProfile:
-    """What must be known of a body to predict carriers. `law` is a name in `dappled.decode.carriers.LAWS`."""
+    """What must be known of a body to predict carriers. `law` is a name in `dappled.decode.optics.carriers.LAWS`."""
 
     name: str
     description: str

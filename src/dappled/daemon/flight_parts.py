@@ -5,28 +5,30 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
+from dappled.clock import Clock
 from dappled.config.settings import Settings
-from dappled.daemon import distance_sensor, ground_facts, health, succession
-from dappled.daemon.answers import Answers
-from dappled.daemon.books import LiveBook
-from dappled.daemon.clock import Clock
-from dappled.daemon.component import Captured, Component
-from dappled.daemon.development import WorkerDeveloper
-from dappled.daemon.herald import Herald
-from dappled.daemon.knobs import Knobs, OwnKnob
-from dappled.daemon.live_depth import LiveDepth
-from dappled.daemon.logbook import Logbook
-from dappled.daemon.navigation import Navigation
-from dappled.daemon.pilot import Alarms
-from dappled.daemon.publisher import Publisher
-from dappled.daemon.shutter import Shutter, Wish
-from dappled.daemon.story import Names, Watchers
-from dappled.daemon.street import Street
-from dappled.daemon.succession import Succession
-from dappled.daemon.tagger import BodyLatency
+from dappled.daemon import flight_handover
+from dappled.daemon.camera_protocol import distance_sensor, ground_facts
+from dappled.daemon.camera_protocol.camera_settings import Knobs, OwnKnob
+from dappled.daemon.camera_protocol.component import Captured, Component
+from dappled.daemon.flight_handover import Succession
+from dappled.daemon.health import record
+from dappled.daemon.health.logbook import Logbook
+from dappled.daemon.health.status_text import Alarms
+from dappled.daemon.navigation.navigation import Navigation
+from dappled.daemon.pipeline.decode_process import WorkerDeveloper
+from dappled.daemon.pipeline.flight_writer import LiveBook
+from dappled.daemon.pipeline.live_depth import LiveDepth
+from dappled.daemon.pipeline.pending_shot import Names, Watchers
+from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.shot_events import Herald
+from dappled.daemon.pipeline.shutter import Shutter, Wish
+from dappled.daemon.pipeline.tagger import BodyLatency
+from dappled.daemon.stream.answers import Answers
+from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import Camera, CameraError
-from dappled.drivers.darkroom import Recipe
-from dappled.drivers.mavlink import MavlinkLinks, Packet
+from dappled.drivers.mavlink.links import MavlinkLinks, Packet
+from dappled.drivers.raw.darkroom import Recipe
 from dappled.flight.recording import Recording
 from dappled.flight.records import Shot
 
@@ -158,7 +160,7 @@ class FlightParts:
             ("on", "off"),
             self._decode_in_flight if self.developer else None,
         )
-        return Knobs(camera, (decoding, *succession.knobs(names, self._after, self._settings, self._hand_over)))
+        return Knobs(camera, (decoding, *flight_handover.knobs(names, self._after, self._settings, self._hand_over)))
 
     # the shutter asks
 
@@ -173,7 +175,7 @@ class FlightParts:
     def _obstacle(self) -> str | None:
         if self._after is not None and self._after.next is not None:
             return "the next flight begins in a moment, with what the ground station has set"
-        return health.obstacle(self.street, self._recording.folder.path, self._settings().record.min_free_mb)
+        return record.obstacle(self.street, self._recording.folder.path, self._settings().record.min_free_mb)
 
     def _changed(self) -> None:
         self.component.state_changed()

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
+from dappled.clock import Clock
 from dappled.config.schema import ConfigError
 from dappled.config.settings import Settings
-from dappled.daemon.clock import Clock
-from dappled.drivers.mavlink import MavlinkLinks, Packet
-from dappled.drivers.mavlink_signing import Signing, Unsigned, signing
+from dappled.drivers.mavlink.links import MavlinkLinks, Packet
+from dappled.drivers.mavlink.signing import Signing, Unsigned, signing
 
 TIME_FILE = ".mavlink-signing"
 

@@ -12,9 +12,9 @@ from typing import Any
 import dappled
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.daemon import inputs
-from dappled.daemon.story import Names
-from dappled.drivers.darkroom import Recipe
+from dappled.daemon.pipeline import recipes
+from dappled.daemon.pipeline.pending_shot import Names
+from dappled.drivers.raw.darkroom import Recipe
 from dappled.flight import recording as flights
 from dappled.flight.layout import FlightFolder
 from dappled.flight.recording import Recording
@@ -30,8 +30,8 @@ def begin(settings: Settings, utc_ns: Callable[[], int], names: Names, *, decode
 
 def keep_inputs(recording: Recording, recipe: Recipe) -> Recipe:
     """The same recipe from copies in the flight, which `flight check` compares from now on. Raises DappledError."""
-    kept = inputs.keep(recipe, recording.folder.path)
-    recording.note_inputs(inputs.FOLDER)
+    kept = recipes.keep(recipe, recording.folder.path)
+    recording.note_inputs(recipes.FOLDER)
     return kept
 
 
@@ -49,7 +49,7 @@ def remove_litter(folder: FlightFolder) -> None:
 
 def _facts(settings: Settings, names: Names, decodes: bool) -> Mapping[str, Any]:
     return {
-        "software": {"dappled": dappled.__version__, **inputs.versions()},
+        "software": {"dappled": dappled.__version__, **recipes.versions()},
         "settings": configuration.to_tables(settings),
         "names": asdict(names),
         "decode_in_flight": decodes,

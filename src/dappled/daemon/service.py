@@ -9,24 +9,28 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from dappled.clock import Clock, SystemClock
 from dappled.config.settings import Settings
-from dappled.daemon import curve, headers, health, inputs, links, live_record, utc
+from dappled.daemon import links, live_record
 from dappled.daemon.cameras import open_camera
-from dappled.daemon.chores import Chore
-from dappled.daemon.clock import Clock, SystemClock
-from dappled.daemon.console import acts
+from dappled.daemon.console import actions
 from dappled.daemon.console import process as console_process
+from dappled.daemon.flight_handover import Succession
 from dappled.daemon.flight_parts import FlightParts
-from dappled.daemon.logbook import Logbook
-from dappled.daemon.publisher import Publisher, Reply
+from dappled.daemon.health import record as health
+from dappled.daemon.health.logbook import Logbook
+from dappled.daemon.navigation import utc
+from dappled.daemon.periodic_tasks import Chore
+from dappled.daemon.pipeline import recipes
+from dappled.daemon.pipeline.pending_shot import Names, Watchers
+from dappled.daemon.pipeline.shutter import Verdict, Wish
 from dappled.daemon.reload import merge
-from dappled.daemon.shutter import Verdict, Wish
-from dappled.daemon.story import Names, Watchers
-from dappled.daemon.succession import Succession
+from dappled.daemon.stream import curve, headers
+from dappled.daemon.stream.publisher import Publisher, Reply
 from dappled.drivers.camera import Camera
-from dappled.drivers.darkroom import Recipe
-from dappled.drivers.mavlink import Packet
-from dappled.drivers.shutter_line import UsesAutopilot
+from dappled.drivers.mavlink.links import Packet
+from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.wired.shutter_line import UsesAutopilot
 from dappled.errors import DappledError, report
 
 log = logging.getLogger(__name__)
@@ -67,7 +71,7 @@ class Service:
     def start(self) -> None:
         """Open everything. Order: what may refuse first, the flight folder after it, the camera last."""
         with ExitStack() as stack:
-            names, recipe = inputs.recipe(self.settings)
+            names, recipe = recipes.recipe(self.settings)
             camera = open_camera(self.settings.camera)
             if isinstance(camera, UsesAutopilot):
                 camera.use_autopilot(self._order)
@@ -260,7 +264,7 @@ class Service:
     # what comes in by the doors that are open before the parts are made; nothing is heard there until `start` has them
 
     def _act(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        return acts.act(request, self._parts.shutter, self._logbook)
+        return actions.act(request, self._parts.shutter, self._logbook)
 
     def _answer(self, request: Mapping[str, Any], reply: Reply) -> None:
         self._parts.answers.answer(request, reply)

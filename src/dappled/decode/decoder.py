@@ -14,24 +14,24 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.aperture import used_aperture
-from dappled.decode.calibrated import Calibration, at_corner
-from dappled.decode.calibration import origin_of
-from dappled.decode.carriers import LAWS, Carrier, Lattice, Sensor
+from dappled.decode.calibration.calibration import Calibration, at_corner
+from dappled.decode.calibration.fit import origin_of
+from dappled.decode.calibration.lattice_fit import relative_transfer
 from dappled.decode.errors import DecodeError
-from dappled.decode.lightfield import LightField
-from dappled.decode.masks import Mask, Order
-from dappled.decode.noise import Noise
-from dappled.decode.ownlattice import STRONG, STRONGER, farther_lattice, own_lattice, turn_between
-from dappled.decode.peaks import Measured, measure
-from dappled.decode.plan import Plans
+from dappled.decode.lightfield.aperture import used_aperture
+from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.views import Aperture, Views, angular_frequencies, from_slices, kappa, transfer
+from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Sensor
+from dappled.decode.optics.masks import Mask, Order
 from dappled.decode.report import CarriersFrom, DecodeReport, ViewsFrom, light_field, no_views
-from dappled.decode.sighting import relative_transfer
-from dappled.decode.slices import Slices, default_size, extract
-from dappled.decode.spectrum import Spectrum, padded_shape
+from dappled.decode.spectrum.noise import Noise
+from dappled.decode.spectrum.own_lattice import STRONG, STRONGER, farther_lattice, own_lattice, turn_between
+from dappled.decode.spectrum.padded import Spectrum, padded_shape
+from dappled.decode.spectrum.peaks import Measured, measure
+from dappled.decode.spectrum.plan import Plans
+from dappled.decode.spectrum.slices import Slices, default_size, extract
+from dappled.decode.spectrum.transform import Source, Transform
 from dappled.decode.threads import each
-from dappled.decode.transform import Source, Transform
-from dappled.decode.views import Aperture, Views, angular_frequencies, from_slices, kappa, transfer
 
 _ROTATION = 0.04  # of a carrier's frequency: the search without a calibration allows for 2.3°
 _NOTHING_TOLD: Mapping[str, Any] = {"transfers": None, "aperture": None}

@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.calibrated import at_centre, at_corner
-from dappled.decode.carriers import Carrier, Lattice
+from dappled.decode.calibration.calibration import at_centre, at_corner
+from dappled.decode.calibration.lattice_fit import relative_transfer
 from dappled.decode.errors import DecodeError
-from dappled.decode.lattice import FoundLattice, find_lattice
-from dappled.decode.lightfield import LightField
-from dappled.decode.noise import noise_rms
-from dappled.decode.plan import Plan, Plans
-from dappled.decode.plane import size_text
+from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.views import Aperture, Views, from_lenslet_slices
+from dappled.decode.optics.carriers import Carrier, Lattice
 from dappled.decode.report import DecodeReport, light_field, no_views
-from dappled.decode.sighting import relative_transfer
-from dappled.decode.slices import Slices, default_size
-from dappled.decode.spectrum import Spectrum
-from dappled.decode.transform import Source
-from dappled.decode.views import Aperture, Views, from_lenslet_slices
+from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
+from dappled.decode.spectrum.noise import noise_rms
+from dappled.decode.spectrum.padded import Spectrum
+from dappled.decode.spectrum.plan import Plan, Plans
+from dappled.decode.spectrum.plane import size_text
+from dappled.decode.spectrum.slices import Slices, default_size
+from dappled.decode.spectrum.transform import Source
 
 _MOST_VIEWS = 15  # per axis
 MOSAIC_ROLLOFF = 0.3  # cycles/pixel: the chroma of a Bayer mosaic stands around 0.5, and what a pixel tells ends there

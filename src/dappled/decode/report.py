@@ -9,12 +9,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.carriers import Carrier
-from dappled.decode.lightfield import LightField
-from dappled.decode.ownlattice import stretch
-from dappled.decode.peaks import Measured
-from dappled.decode.slices import Slices
-from dappled.decode.views import Views
+from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.views import Views
+from dappled.decode.optics.carriers import Carrier
+from dappled.decode.spectrum.own_lattice import stretch
+from dappled.decode.spectrum.peaks import Measured
+from dappled.decode.spectrum.slices import Slices
 
 CarriersFrom = Literal["measured", "calibrated", "predicted", "found"]
 DOUBTED = 0.04  # of a carrier's frequency: so far off lies no mask that is where it is said to be

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.flight import durable, layout, lock, papers, telemetry_log, wishes
+from dappled.flight import durable, layout, lock, provenance, telemetry_log
+from dappled.flight import journal as wishes
 from dappled.flight.errors import FlightError
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
@@ -55,7 +56,7 @@ def check(path: Path) -> Report:
             for file_size, problem in _files(folder, ledger, pruned=gone is not None):
                 files, size = files + 1, size + file_size
                 problems += [problem] if problem else []
-            problems += papers.problems(folder, ledger)
+            problems += provenance.problems(folder, ledger)
             problems += _names(folder, ledger, closed)
             problems += _shots(folder, ledger, notes)
             problems += _records(ledger)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-from dappled.flight import layout, wishes
+from dappled.flight import journal, layout
 from dappled.flight.database import Database
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
@@ -182,7 +182,7 @@ def in_order(root: Path) -> list[FlightFolder]:
 
 def highest_in(folder: FlightFolder) -> int | None:
     """The highest image index that a flight's journal, ledger or frames mention; a damaged ledger is passed over."""
-    found = [shot.index for shot in wishes.read(folder.journal).shots]
+    found = [shot.index for shot in journal.read(folder.journal).shots]
     try:
         with LedgerReader.open(folder.ledger) as ledger:
             found += [row.shot.index for row in ledger.shots()]

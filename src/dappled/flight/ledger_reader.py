@@ -8,12 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
+from dappled.decode.geometry.pose import Pose
 from dappled.flight import ledger_schema
 from dappled.flight.database import Database
 from dappled.flight.entries import Event, Result, ShotRow, Stray
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger_schema import APPLICATION_ID, SCHEMA_VERSION
-from dappled.flight.records import Frame, Pose, Tag
+from dappled.flight.records import Frame, Tag
 
 _Record = TypeVar("_Record")
 _REASONS = {

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, cast
 
+from dappled.decode.geometry.pose import Gnss, Pose
 from dappled.flight.entries import Result, ShotRow
-from dappled.flight.records import Cause, Gnss, Pose, Shot, ShotState, Tag
+from dappled.flight.records import Cause, Shot, ShotState, Tag
 
 LIVE = "live"
 APPLICATION_ID = 0x4450504C  # "DPPL"

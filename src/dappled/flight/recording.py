@@ -10,15 +10,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dappled.flight import durable, layout, papers, recovery
+from dappled.flight import durable, layout, provenance, recovery
 from dappled.flight.errors import disk_error
 from dappled.flight.index import Entry, ImageIndex, open_or_rebuild
+from dappled.flight.journal import WishJournal
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger
 from dappled.flight.lock import FlightsLock
 from dappled.flight.recorder import Recorder
 from dappled.flight.telemetry_log import TelemetryLog
-from dappled.flight.wishes import WishJournal
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +54,12 @@ class Recording:
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
         """Add to flight.toml what was learnt since the start, such as the camera's identity. Raises FlightError."""
-        papers.write_facts(self.folder, self.ledger, {**layout.read_facts(self.folder), **facts})
+        provenance.write_facts(self.folder, self.ledger, {**layout.read_facts(self.folder), **facts})
 
     def note_inputs(self, folder: str) -> None:
         """What stands in this folder of the flight is what frames are decoded with: `flight check` compares it from
         now on. Raises FlightError."""
-        papers.note(self.folder, self.ledger, folder)
+        provenance.note(self.folder, self.ledger, folder)
 
     def learn_utc(self, correction_ns: int, sigma_ns: int, source: str) -> None:
         """UTC is known now: this is to be added to every stamp of this flight, those before it too. Nothing is renamed
@@ -112,7 +112,7 @@ def begin(
         stack.callback(ledger.close)
         ledger.set_fact("began_utc_ns", began_utc_ns)
         ledger.set_fact("utc_known", utc_known)
-        papers.note(folder, ledger, folder.settings.name)
+        provenance.note(folder, ledger, folder.settings.name)
         index.add_flight(folder.name, start_utc_ns)
         journal = WishJournal(folder.journal)
         stack.callback(journal.close)

@@ -11,14 +11,15 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from dappled.flight import durable, layout, telemetry_log, wishes
+from dappled.flight import durable, layout, telemetry_log
+from dappled.flight import journal as wishes
 from dappled.flight.entries import Stray
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.index import ImageIndex
+from dappled.flight.journal import WishJournal
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, ledger_damage
 from dappled.flight.records import Frame
-from dappled.flight.wishes import WishJournal
 
 SIDECAR = ".xmp"
 _JPEG = (".jpg", ".jpeg")

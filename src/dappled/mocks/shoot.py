@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dappled.mocks.masked_camera import reference_camera
+from dappled.mocks.scene.masked_camera import reference_camera
 
 
 def main(words: list[str] | None = None) -> int:

@@ -19,11 +19,11 @@ from typing import Any
 
 from dappled.config.schema import ConfigError, Source, build, setting
 from dappled.drivers.camera import CameraError, Identity
-from dappled.drivers.composed import ComposedCamera, Plan
 from dappled.drivers.options import only, seconds_of
-from dappled.drivers.pickup import FolderSource
-from dappled.mocks.body import BodyOptions
-from dappled.mocks.pictures import exposer
+from dappled.drivers.wired.composed import ComposedCamera, Plan
+from dappled.drivers.wired.sources import FolderSource
+from dappled.mocks.body.body import BodyOptions
+from dappled.mocks.body.pictures import exposer
 
 _HOLD_S = 0.02
 

@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dappled.config.settings import Settings
-from dappled.mocks import bench_calibration
-from dappled.mocks.autopilot import Autopilot
-from dappled.mocks.bench_calibration import CAMERA, MASK
-from dappled.mocks.body import Body, BodyOptions
-from dappled.mocks.ground import GroundStation
-from dappled.mocks.masked_camera import reference_camera
+from dappled.mocks.autopilot.autopilot import Autopilot
+from dappled.mocks.autopilot.ground_station import GroundStation
+from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.scene import bench_calibration
+from dappled.mocks.scene.bench_calibration import CAMERA, MASK
+from dappled.mocks.scene.masked_camera import reference_camera
 
 LATENCY_MS, LATENCY_SIGMA_MS = 60.0, 15.0 / 3**0.5  # the body's is spread evenly over 60 ± 15 ms
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config.profiles import Lens
-from dappled.decode.carriers import Sensor
+from dappled.decode.optics.carriers import Sensor
 from dappled.errors import DappledError
-from dappled.products import eye
 from dappled.products.extras import need
+from dappled.products.maps import eye
 
 Floats = NDArray[np.float64]
 LEAST_BOARDS = 5

@@ -21,24 +21,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config import profiles
-from dappled.decode import depth as depths
-from dappled.decode import evidence as evidences
-from dappled.decode import refocus as refocusing
-from dappled.decode import viewstack
-from dappled.decode.depthmap import DepthMap
+from dappled.decode.depth import estimate as depths
+from dappled.decode.depth import evidence as evidences
+from dappled.decode.depth.depth_map import DepthMap
+from dappled.decode.depth.evidence import Evidence
+from dappled.decode.depth.ranging import RANGING, DistanceMap, Ranging
 from dappled.decode.errors import DecodeError
-from dappled.decode.evidence import Evidence
-from dappled.decode.lightfield import LightField
-from dappled.decode.ranging import RANGING, DistanceMap, Ranging
-from dappled.decode.refocus import FocalPlane
-from dappled.decode.stereo_pair import StereoPair, eyes
-from dappled.decode.viewstack import ViewStack
-from dappled.drivers import kept_recipe
-from dappled.drivers.darkroom import Darkroom, Recipe
+from dappled.decode.lightfield import refocus as refocusing
+from dappled.decode.lightfield import view_stack
+from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.refocus import FocalPlane
+from dappled.decode.lightfield.stereo_pair import StereoPair, eyes
+from dappled.decode.lightfield.view_stack import ViewStack
+from dappled.drivers.raw import kept_recipe
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError
 from dappled.flight import layout, summary
 from dappled.flight.records import Tag
-from dappled.products import lightfiles, viewfolders
+from dappled.products.exports import light_files, view_folders
 
 _LIGHT_FIELDS = (".zarr", ".npz", ".h5")
 
@@ -77,7 +77,7 @@ class OpenedLightField:
     @cached_property
     def stack(self) -> ViewStack:
         """The views with their places. Raises DecodeError where there are none."""
-        return viewstack.of(self.field)
+        return view_stack.of(self.field)
 
     @cached_property
     def evidence(self) -> Evidence:
@@ -160,7 +160,7 @@ class OpenedLightField:
 
     def save(self, path: Path | str, *, overwrite: bool = False) -> None:
         """Write it as .zarr, .npz or .h5."""
-        lightfiles.save(Path(path), self.field, overwrite=overwrite)
+        light_files.save(Path(path), self.field, overwrite=overwrite)
 
 
 @dataclass(frozen=True)
@@ -238,7 +238,7 @@ def open(path: str | Path, *, focus_m: float | None = None, **recipe: Any) -> Op
         raise OpenError(f"there is no {found}; check the path")
     if found.suffix in _LIGHT_FIELDS:
         _refuse(recipe, found)
-        return OpenedLightField(lightfiles.load(found), found, focus_m)
+        return OpenedLightField(light_files.load(found), found, focus_m)
     if not found.is_dir():
         darkroom = Darkroom(_recipe(Recipe("auto", "", workers=2), recipe, found))
         return OpenedFrame(found, darkroom, focus_m=focus_m)
@@ -247,7 +247,7 @@ def open(path: str | Path, *, focus_m: float | None = None, **recipe: Any) -> Op
         own = kept_recipe.of_flight(found, record.settings, recipe)
         return OpenedFlight(found, record, None if own is None else Darkroom(own), focus_m)
     _refuse(recipe, found)
-    return OpenedLightField(viewfolders.read(found), found, focus_m)
+    return OpenedLightField(view_folders.read(found), found, focus_m)
 
 
 def light_field(path: str | Path, *, focus_m: float | None = None) -> OpenedLightField:

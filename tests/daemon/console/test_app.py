@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 import uvicorn
 
-from dappled.daemon import wire
 from dappled.daemon.console import app, hub
 from dappled.daemon.console.access import Access
 from dappled.daemon.console.control import Control
@@ -25,10 +24,11 @@ from dappled.daemon.console.feed import Feed
 from dappled.daemon.console.hub import Hub
 from dappled.daemon.console.parts import Parts
 from dappled.daemon.console.studio import Studio
-from dappled.daemon.publisher import Publisher, Reply
-from dappled.daemon.wire import Message
-from dappled.drivers.camera_channel import Channel, ChannelError
-from dappled.products import camera_pose
+from dappled.daemon.stream import wire
+from dappled.daemon.stream.publisher import Publisher, Reply
+from dappled.daemon.stream.wire import Message
+from dappled.decode.geometry import camera_pose
+from dappled.drivers.gphoto2.channel import Channel, ChannelError
 from tests import globe
 
 STACK = (np.random.default_rng(1).random((2, 30, 40)) + 0.1).astype(np.complex64)

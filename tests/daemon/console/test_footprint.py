@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dappled.daemon.console import footprint
 from dappled.daemon.console.footprint import Geometry
-from dappled.products import camera_pose
+from dappled.decode.geometry import camera_pose
 
 MOUNT = tuple(camera_pose.NADIR.ravel().tolist())
 METRE_DEG = 180 / math.pi / 6378137.0  # of longitude on the equator

@@ -14,10 +14,10 @@ from PIL import Image
 
 from dappled.daemon.console import pictures
 from dappled.daemon.console.pictures import Mosaic
-from dappled.decode.carriers import Lattice
-from dappled.decode.slices import extract
-from dappled.decode.spectrum import Spectrum
-from dappled.decode.viewstack import ViewStack, centred
+from dappled.decode.lightfield.view_stack import ViewStack, centred
+from dappled.decode.optics.carriers import Lattice
+from dappled.decode.spectrum.padded import Spectrum
+from dappled.decode.spectrum.slices import extract
 
 
 def test_srgb_bytes_come_back() -> None:

@@ -17,13 +17,13 @@ from typing import Any
 import httpx
 import pytest
 
+from dappled.clock import SystemClock
 from dappled.config.settings import ConsoleSettings, PublishSettings, Settings
-from dappled.daemon.clock import SystemClock
-from dappled.daemon.console import acts, process
+from dappled.daemon.console import actions, process
 from dappled.daemon.console.process import Console, ConsoleError
-from dappled.daemon.curve import KeyFileError
-from dappled.daemon.logbook import Logbook
-from dappled.daemon.shutter import Shutter
+from dappled.daemon.health.logbook import Logbook
+from dappled.daemon.pipeline.shutter import Shutter
+from dappled.daemon.stream.curve import KeyFileError
 from tests.daemon.fakes import Rig, rig
 
 TOKEN = "a-token-of-many-letters"  # noqa: S105  # it opens nothing
@@ -169,7 +169,7 @@ def street(tmp_path: Path) -> Any:
 
 
 def do(shutter: Shutter, **request: Any) -> dict[str, Any]:
-    return acts.act(request, shutter, Logbook(lambda: 0))
+    return actions.act(request, shutter, Logbook(lambda: 0))
 
 
 def test_a_number_that_comes_twice_is_one_wish(street: Rig) -> None:
@@ -204,6 +204,6 @@ def test_the_log_is_told_from_a_number_on(street: Rig) -> None:
     book = Logbook(lambda: 7)
     book.add("one")
     book.add("two", "warning")
-    told = acts.act({"do": "log", "after": 1}, street.shutter, book)
+    told = actions.act({"do": "log", "after": 1}, street.shutter, book)
     assert told["lines"] == [{"number": 2, "utc_ns": 7, "level": "warning", "text": "two"}]
-    assert acts.act({"do": "nothing"}, street.shutter, book) == {"ok": True}
+    assert actions.act({"do": "nothing"}, street.shutter, book) == {"ok": True}

@@ -16,7 +16,6 @@ from typing import Any
 import uvicorn
 from starlette.types import ASGIApp
 
-from dappled.daemon import journal
 from dappled.daemon.console import app, background
 from dappled.daemon.console.access import Access
 from dappled.daemon.console.connection import CONNECTIONS, Connection
@@ -25,9 +24,10 @@ from dappled.daemon.console.feed import Feed
 from dappled.daemon.console.hub import Hub
 from dappled.daemon.console.parts import Parts
 from dappled.daemon.console.studio import Studio
-from dappled.daemon.memory import CONSOLE_GOES, goes_first, reuse_large_blocks
-from dappled.drivers.camera_channel import Channel
-from dappled.drivers.darkroom import Recipe
+from dappled.daemon.health import log_format
+from dappled.daemon.pipeline.memory import CONSOLE_GOES, goes_first, reuse_large_blocks
+from dappled.drivers.gphoto2.channel import Channel
+from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
 
 NICENESS = 15  # below the decoder's 10: looking comes last
@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 def main() -> int:
     """Serve until the daemon ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C is the daemon's to act on
-    logging.basicConfig(level=logging.WARNING, handlers=[journal.handler()])
+    logging.basicConfig(level=logging.WARNING, handlers=[log_format.handler()])
     os.nice(NICENESS)
     goes_first(CONSOLE_GOES)
     reuse_large_blocks()

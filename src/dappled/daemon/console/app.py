@@ -16,7 +16,6 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
-from dappled.daemon import metrics
 from dappled.daemon.console import access, globe, pictures
 from dappled.daemon.console.access import Refusal
 from dappled.daemon.console.control import ControlError
@@ -24,6 +23,7 @@ from dappled.daemon.console.feed import FeedError
 from dappled.daemon.console.guard import Guard, refused
 from dappled.daemon.console.parts import Parts, file, make_picture, rectified_png
 from dappled.daemon.console.studio import StudioError
+from dappled.daemon.health import metrics
 from dappled.errors import DappledError
 
 _PICTURES = (

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
-from dappled.drivers.camera_channel import Channel, ChannelError
+from dappled.drivers.gphoto2.channel import Channel, ChannelError
 from dappled.errors import DappledError
 
 _ANSWER_S = 3.0

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.daemon import preflight, wire
-from dappled.daemon.subscriber import AsyncSubscriber
-from dappled.daemon.wire import Message
+from dappled.daemon.health import go_no_go
+from dappled.daemon.stream import wire
+from dappled.daemon.stream.subscriber import AsyncSubscriber
+from dappled.daemon.stream.wire import Message
 from dappled.errors import DappledError, report
 
 log = logging.getLogger(__name__)
@@ -118,12 +119,12 @@ class Feed:
         health = self.health
         if health is None:
             return {"is": "state", "health": None, "checks": [], "verdict": None}
-        checks = preflight.checks(health, frame_bytes=self.frame_bytes)
+        checks = go_no_go.checks(health, frame_bytes=self.frame_bytes)
         return {
             "is": "state",
             "health": health,
             "checks": [{"name": one.name, "state": one.state, "text": one.text} for one in checks],
-            "verdict": preflight.verdict(checks),
+            "verdict": go_no_go.verdict(checks),
         }
 
     def frame_event(self, index: int) -> Event:

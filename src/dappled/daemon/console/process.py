@@ -19,11 +19,11 @@ from typing import Any
 
 from dappled.config import settings as configuration
 from dappled.config.settings import ConsoleSettings, Settings
-from dappled.daemon.curve import read_private
-from dappled.daemon.endpoints import is_loopback
-from dappled.daemon.logbook import Logbook
-from dappled.drivers.camera_channel import Channel, ChannelError
-from dappled.drivers.darkroom import Recipe
+from dappled.daemon.health.logbook import Logbook
+from dappled.daemon.stream.curve import read_private
+from dappled.daemon.stream.endpoints import is_loopback
+from dappled.drivers.gphoto2.channel import Channel, ChannelError
+from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
 
 log = logging.getLogger(__name__)

@@ -13,14 +13,14 @@ from dappled.config import profiles
 from dappled.daemon.console import footprint, pictures
 from dappled.daemon.console.footprint import Rectified
 from dappled.daemon.console.pictures import Mosaic
-from dappled.daemon.wire import Message
-from dappled.decode import viewstack
-from dappled.decode.carriers import Carrier, Lattice
+from dappled.daemon.stream.wire import Message
 from dappled.decode.decoder import MaskDecoder
-from dappled.decode.lightfield import LightField
-from dappled.decode.pictures import slice_mosaic
-from dappled.decode.slices import Slices
-from dappled.drivers.darkroom import Darkroom, Recipe
+from dappled.decode.lightfield import view_stack
+from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.pictures import slice_mosaic
+from dappled.decode.optics.carriers import Carrier, Lattice
+from dappled.decode.spectrum.slices import Slices
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError
 
 Made = TypeVar("Made")
@@ -133,7 +133,7 @@ class Studio:
     def _mosaic(self, message: Message) -> tuple[Mosaic, str]:
         def make() -> tuple[Mosaic, str]:
             field = self._light_field(message)
-            return pictures.views_mosaic(viewstack.of(field)), str(field.attributes["views_from"])
+            return pictures.views_mosaic(view_stack.of(field)), str(field.attributes["views_from"])
 
         return self._once(message, "mosaic", make)
 

@@ -1,0 +1,122 @@
+"""`dappled flight list|show|check|report|offload|pickup`: recorded flights."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from dappled.cli.actions import Actions
+from dappled.cli.flight import lines as flight_lines
+from dappled.cli.flight import pickup
+from dappled.config import settings
+from dappled.flight import check, flight_report, index, offload, summary
+from dappled.flight.errors import FlightError
+
+_FLIGHT = "~/flights/20261121T101503Z-0a1b2c3d"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "examples:\n  dappled flight list\n  dappled flight report --config /etc/dappled/dappled.toml\n"
+        f"  dappled flight check {_FLIGHT}"
+    )
+    actions = Actions.of(parser)
+    listing = actions.add("list", "all flights in a folder", "dappled flight list ~/flights")
+    show = actions.add("show", "every shot of a flight", f"dappled flight show {_FLIGHT}")
+    intact = actions.add("check", "is every byte intact? exits 1 if not", f"dappled flight check {_FLIGHT}")
+    report = actions.add(
+        "report", "which wishes became frames; exits 1 if the books don't balance", "dappled flight report"
+    )
+    away = actions.add(
+        "offload",
+        "copy a flight to another disk and verify it by hash",
+        f"dappled flight offload /media/disk {_FLIGHT}",
+    )
+    bring = actions.add("pickup", pickup.HELP, *pickup.EXAMPLES)
+    listing.add_argument(
+        "folder", nargs="?", type=Path, metavar="FOLDER", help="flights folder (default: record.directory)"
+    )
+    away.add_argument("destination", type=Path, metavar="DEST", help="folder that will hold the flight's folder")
+    away.add_argument("--prune", action="store_true", help="refused: no proof yet that DEST is another disk")
+    pickup.configure(bring)
+    for one in (show, intact, report, away, bring):
+        one.add_argument("flight", nargs="?", type=Path, metavar="FLIGHT", help="flight folder (default: the last one)")
+    for one in actions.all:
+        one.add_argument("--config", type=Path, metavar="FILE", help="settings that say where flights are")
+        one.add_argument("--json", action="store_true", help="as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    if arguments.action == "list":
+        return _list(arguments.folder or _flights(arguments.config), arguments.json)
+    flight = arguments.flight or _last_flight(_flights(arguments.config))
+    if arguments.action == "pickup":
+        return pickup.run(flight, arguments)
+    if arguments.action == "offload":
+        return _offload(flight, arguments.destination, arguments.prune, arguments.json)
+    return {"show": _show, "check": _check, "report": _report}[arguments.action](flight, arguments.json)
+
+
+def _last_flight(flights: Path) -> Path:
+    """The newest flight in a folder. Raises FlightError when there is none."""
+    found = index.in_order(flights)
+    if not found:
+        raise FlightError(f"there is no flight in {flights} yet; name one, or record one with `dappled run`")
+    return found[-1].path
+
+
+def _flights(config: Path | None) -> Path:
+    return Path(settings.load(config).record.directory)
+
+
+def _list(folder: Path, as_json: bool) -> int:
+    found = summary.list_flights(folder)
+    if not found and not as_json:
+        print(f"no flights in {folder}", file=sys.stderr)
+    return _said([_plain(one) for one in found], map(flight_lines.of_list, found), as_json)
+
+
+def _show(flight: Path, as_json: bool) -> int:
+    found = summary.show(flight)
+    return _said(_plain(found), flight_lines.of_flight(found), as_json)
+
+
+def _check(flight: Path, as_json: bool) -> int:
+    found = check.check(flight)
+    _said({**_plain(found), "intact": found.intact}, flight_lines.of_check(found), as_json)
+    return 0 if found.intact else 1
+
+
+def _report(flight: Path, as_json: bool) -> int:
+    found, books = summary.report(flight), flight_report.accounts(flight)
+    sources = [asdict(one) for one in books]
+    values = {**_plain(found), "sources": sources, "balanced": found.balanced}
+    _said(values, flight_lines.of_report(found, books), as_json)
+    return 0 if found.balanced else 1
+
+
+def _offload(flight: Path, destination: Path, prune: bool, as_json: bool) -> int:
+    total = sum(path.stat().st_size for path in flight.rglob("*") if path.is_file())
+    with tqdm(total=total, unit="B", unit_scale=True, disable=None, delay=1.0) as bar:
+        done = offload.offload(flight, destination, prune=prune, progress=bar.update)
+    return _said(_plain(done), flight_lines.of_offload(done), as_json)
+
+
+def _said(values: Any, lines: Iterable[str], as_json: bool) -> int:
+    """The values as JSON, or the lines; an exit code of 0."""
+    for text in (json.dumps(values, indent=2),) if as_json else lines:
+        print(text)
+    return 0
+
+
+def _plain(value: Any) -> dict[str, Any]:
+    """A record as JSON values; paths become text."""
+    plain: dict[str, Any] = json.loads(json.dumps(asdict(value), default=str))
+    return plain

@@ -1,0 +1,103 @@
+"""`dappled flight pickup`: the files that stayed at the camera, brought into the flight."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+from tqdm import tqdm
+
+from dappled.daemon.pipeline import pickup
+from dappled.daemon.pipeline.pickup import Choice, Picked, Proposal
+from dappled.drivers.wired.ptp_source import PtpSource
+from dappled.drivers.wired.sources import parse_source
+
+HELP = "bring the files that stayed at the camera; exits 1 while shots lack theirs"
+EXAMPLES = (
+    "dappled flight pickup --from /media/card/DCIM --dry-run",
+    "dappled flight pickup ~/flights/20261121T101503Z-0a1b2c3d --from usb: --pair 17=DSCF0042.RAF",
+)
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--from", dest="source", required=True, metavar="SOURCE", help="folder, storage, usb: or a libgphoto2 port"
+    )
+    parser.add_argument("--offset", type=float, metavar="S", help="the camera's clock minus UTC, where you know it")
+    parser.add_argument("--any-clock", action="store_true", help="the camera's clock may be off by more than a day")
+    parser.add_argument("--by-order", action="store_true", help="as many files as shots: take them in order")
+    parser.add_argument(
+        "--pair", action="append", default=[], type=_pair, metavar="INDEX=NAME", help="this file is of this shot"
+    )
+    parser.add_argument("--dry-run", action="store_true", help="say what would be done, and do nothing")
+
+
+def run(flight: Path, arguments: argparse.Namespace) -> int:
+    source = parse_source(arguments.source, PtpSource)
+    choice = Choice(dict(arguments.pair), arguments.offset, arguments.any_clock, arguments.by_order)
+    try:
+        proposal = pickup.propose(flight, source, choice)
+        picked = None
+        if not arguments.dry_run:
+            total = sum(group.main.size for _, group in proposal.pairs)
+            with tqdm(total=total, unit="B", unit_scale=True, disable=None, delay=1.0) as bar:
+                picked = pickup.bring(flight, source, proposal, time.time_ns, bar.update)
+    finally:
+        source.close()
+    (_print_json if arguments.json else _print)(flight, proposal, picked)
+    return 1 if proposal.missing or proposal.doubts else 0
+
+
+def _print(flight: Path, proposal: Proposal, picked: Picked | None) -> None:
+    word = "would be" if picked is None else "is"
+    for index, group in proposal.pairs:
+        others = "".join(f" and {other.base}" for other in group.companions)
+        print(f"shot {index:6d}  {word} {group.main.name}{others}  {proposal.reasons[index]}")
+    for text in proposal.doubts:
+        print(f"in doubt:    {text}")
+    for index in proposal.missing:
+        print(f"shot {index:6d}  has no file")
+    if proposal.strangers:
+        print(f"{len(proposal.strangers)} files belong to no shot of this flight, the first {proposal.strangers[0]}")
+    for text in picked.zooms if picked else ():
+        print(f"zoom:        {text}")
+    done = f"{len(proposal.pairs)} frames {'would be brought' if picked is None else 'brought'}"
+    print(f"{flight.name}: {done}, {proposal.there_already} were there already, {len(proposal.missing)} missing")
+    if proposal.doubts:
+        print("settle what is in doubt with --pair INDEX=NAME, --offset S or --by-order; nothing was guessed")
+
+
+def _print_json(flight: Path, proposal: Proposal, picked: Picked | None) -> None:
+    print(
+        json.dumps(
+            {
+                "flight": flight.name,
+                "dry_run": picked is None,
+                "pairs": [
+                    {
+                        "index": index,
+                        "file": group.main.name,
+                        "companions": [other.name for other in group.companions],
+                        "reason": proposal.reasons[index],
+                    }
+                    for index, group in proposal.pairs
+                ],
+                "doubts": list(proposal.doubts),
+                "missing": list(proposal.missing),
+                "strangers": list(proposal.strangers),
+                "there_already": proposal.there_already,
+                "camera_clock_minus_utc_s": proposal.offset_s,
+                "zooms": list(picked.zooms) if picked else [],
+            },
+            indent=2,
+        )
+    )
+
+
+def _pair(text: str) -> tuple[int, str]:
+    index, equals, name = text.partition("=")
+    if not equals or not index.isdecimal() or not name:
+        raise argparse.ArgumentTypeError(f"{text!r} is not INDEX=NAME, as in 17=DSCF0042.RAF")
+    return int(index), name

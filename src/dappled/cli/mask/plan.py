@@ -1,0 +1,61 @@
+"""`dappled mask plan`: what a flight at an altitude asks of camera, pilot and disk."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+
+from dappled.cli.mask import arguments as mask_arguments
+from dappled.config import profiles
+from dappled.decode.optics import carrier_tables, lenses, survey
+
+HELP = "interval, blur, body and disk of a flight"
+EXAMPLE = "dappled mask plan --altitude 40 --speed 8 --camera fujifilm-s5200 --focal-length 13"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    mask_arguments.add_altitude(parser)
+    parser.add_argument("--speed", type=float, required=True, metavar="M/S", help="over ground")
+    parser.add_argument("--overlap", type=float, default=0.8, metavar="SHARE", help="along the line (default: 0.8)")
+    parser.add_argument("--sidelap", type=float, default=0.6, metavar="SHARE", help="between lines (default: 0.6)")
+    parser.add_argument("--exposure", type=float, default=0.001, metavar="S", help="exposure time (default: 0.001)")
+    parser.add_argument("--hours", type=float, default=1.0, metavar="H", help="flight time (default: 1)")
+    parser.add_argument("--frame-mb", type=float, default=18.0, metavar="MB", help="size of a raw file (default: 18)")
+    parser.add_argument("--mask", metavar="P", help="mask profile, for the views' own ground sample")
+    parser.add_argument("--sideways", action="store_true", help="the frame's columns lie along the flight")
+    parser.add_argument("--json", action="store_true", help="as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    camera, sensor, length = mask_arguments.camera_set(arguments)
+    columns = None
+    if arguments.mask:
+        mask = profiles.mask(arguments.mask).mask
+        lattice = carrier_tables.lattice_of(camera.law, mask, sensor, camera.mask_distance_mm, length)
+        size = carrier_tables.slice_size(lattice, sensor.shape)
+        columns = size[1] if size else None
+    made = survey.plan(
+        sensor,
+        focal_length_mm=length,
+        altitude_m=arguments.altitude,
+        speed_m_s=arguments.speed,
+        overlap=arguments.overlap,
+        sidelap=arguments.sidelap,
+        exposure_s=arguments.exposure,
+        hours=arguments.hours,
+        frame_bytes=round(lenses.within("size of a frame", arguments.frame_mb, "MB", 1e-3, 10_000) * 1e6),
+        view_columns=columns,
+        sideways=arguments.sideways,
+    )
+    if arguments.json:
+        print(json.dumps(asdict(made), indent=2))
+        return 0
+    views = "" if made.view_sample_m is None else f", {made.view_sample_m * 100:.1f} cm a pixel of a view"
+    print(f"footprint  {made.footprint_m[1]:.1f} m across, {made.footprint_m[0]:.1f} m along the flight")
+    print(f"ground     {made.ground_sample_m * 100:.2f} cm a pixel{views}")
+    print(f"interval   {made.interval_s:.2f} s, {made.spacing_m:.2f} m; lines {made.line_m:.1f} m apart")
+    print(f"body       must sustain {made.frames_per_minute:.1f} frames a minute")
+    print(f"blur       {made.blur_px:.2f} px; one pixel at {made.longest_exposure_s * 1e3:.2f} ms")
+    print(f"disk       {made.frames} frames, {made.disk_bytes / 1e9:.1f} GB; card and disk alike, without previews")
+    return 0

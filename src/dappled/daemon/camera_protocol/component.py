@@ -1,0 +1,285 @@
+"""The MAVLink camera (Camera Protocol v2): hears messages, answers at once, tells how shots ended.
+
+`on_packet` runs in a link's receiving thread and only answers from memory; what may touch a disk (an old image looked
+up by index) waits for `tick`, which the daemon's working loop calls: no working loop, no heartbeat.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+
+from dappled.clock import Clock
+from dappled.daemon.camera_protocol import messages
+from dappled.daemon.camera_protocol.autopilot import Links, OwnAutopilot
+from dappled.daemon.camera_protocol.camera_settings import Knobs
+from dappled.daemon.camera_protocol.camera_status import DOWN, Telling
+from dappled.daemon.camera_protocol.command import ACCEPTED, UNSUPPORTED, Answer, Command
+from dappled.daemon.camera_protocol.commands import CameraCommands
+from dappled.daemon.camera_protocol.ftp_server import FtpServer
+from dappled.daemon.camera_protocol.identity import Identity
+from dappled.daemon.camera_protocol.message_intervals import MessageIntervals
+from dappled.daemon.camera_protocol.messages import CameraFacts, Captured, Storage
+from dappled.daemon.camera_protocol.packet_dedup import Copies
+from dappled.daemon.camera_protocol.parameters import Parameters, Reply
+from dappled.daemon.health.status_text import Audience, PilotLines
+from dappled.daemon.pipeline.shutter import Shutter, Wish
+from dappled.decode.geometry.pose import Pose
+from dappled.drivers.mavlink.links import Message, Packet, mavlink
+
+__all__ = ["CameraFacts", "Captured", "Component", "Storage"]
+
+HEARTBEAT_NS = 10**9
+STATUS_NS = 100_000_000
+_OLD_IMAGES_A_TICK = 2
+
+
+class Component:
+    """One camera on all links. Give the shutter `on_change=component.state_changed`, so that 262 follows each change.
+
+    `facts()`, `storage()`, `pose()` and `healthy()` answer from memory; `lookup(index)` may read a disk and tells how
+    an old shot ended, None for one that never was. `healthy()` False: no heartbeat; `troubled()` True: one with
+    MAV_STATE_CRITICAL. `feedback_is_shot`: the autopilot fires the camera, and each of its CAMERA_FEEDBACK is a shot.
+    """
+
+    def __init__(
+        self,
+        links: Links,
+        shutter: Shutter,
+        clock: Clock,
+        knobs: Knobs,
+        *,
+        facts: Callable[[], CameraFacts],
+        storage: Callable[[], Storage | None],
+        lookup: Callable[[int], Captured | None],
+        healthy: Callable[[], bool] = lambda: True,
+        troubled: Callable[[], bool] = lambda: False,
+        pose: Callable[[], Pose | None] = lambda: None,
+        mount: tuple[float, ...] = DOWN,
+        feedback_is_shot: bool = False,
+    ) -> None:
+        self._links, self._shutter, self._clock = links, shutter, clock
+        self._lookup, self._feedback_is_shot = lookup, feedback_is_shot
+        self._healthy, self._troubled = healthy, troubled
+        self._telling = Telling(
+            shutter, clock, knobs, links.component_id, facts=facts, storage=storage, pose=pose, mount=mount
+        )
+        self._intervals = MessageIntervals()
+        self._commands = CameraCommands(shutter, clock, self._telling, knobs, self._intervals)
+        self._parameters = Parameters(knobs)
+        self._files = FtpServer(self._telling.files)
+        self._identity = Identity(links.system_id, clock.monotonic_ns())
+        self._autopilot = OwnAutopilot(links, self._identity, clock)
+        self._copies = Copies()
+        self._lines, self._audience = PilotLines(), Audience()
+        self._results: deque[tuple[Command, int]] = deque(maxlen=64)
+        self._heartbeat_due_ns = self._status_due_ns = 0
+        self._status_wanted = threading.Event()
+
+    @property
+    def system_id(self) -> int:
+        """The system that the camera belongs to, as far as decided."""
+        return self._identity.system_id
+
+    @property
+    def vehicle(self) -> int | None:
+        """The system whose telemetry counts (see `Identity.vehicle`)."""
+        return self._identity.vehicle()
+
+    def doubt(self) -> str | None:
+        """A sentence where the camera may belong to the wrong system (see `Identity.doubt`)."""
+        return self._identity.doubt()
+
+    # what comes in
+
+    def on_packet(self, packet: Packet) -> None:
+        """A packet was received (sent ones are ignored). Quick; never raises for what a message says."""
+        message = packet.message
+        if packet.sent or message.get_srcSystem() == 0:
+            return
+        if (message.get_srcSystem(), message.get_srcComponent()) == (self._links.system_id, self._links.component_id):
+            return  # our own packet, come back over another link
+        handler = _HANDLERS.get(message.get_type())
+        if handler is not None and packet.trusted:
+            handler(self, packet)
+        elif message.get_type() == "HEARTBEAT":
+            if packet.trusted:  # else anybody could say whose camera this is, and where orders to its autopilot go
+                now_ns = self._clock.monotonic_ns()
+                self._identity.heard(message, packet.link, now_ns)
+                self._audience.heard(message, now_ns)
+        elif message.get_srcSystem() == self._identity.system_id:
+            self._autopilot.heard(message)
+
+    def _command(self, packet: Packet) -> None:
+        if not self._is_for_us(packet.message):
+            return
+        command = Command.of(packet.message, packet.link)
+        if self._is_copy(packet):
+            self._acknowledge_again(command)
+            return
+        echo = self._commands.fires(command) and self._autopilot.is_echo(packet, str(command.name))
+        answer = Answer(ACCEPTED) if echo else self._commands.answer(command)
+        if not command.broadcast or answer.result == ACCEPTED:  # a broadcast is for whoever can: never refused
+            self._acknowledge(command, answer.result)
+            self._results.append((command, answer.result))
+        for message in answer.then:
+            self._links.send(message, command.link)
+        if answer.words is not None:
+            self.say(answer.words)
+        if answer.result not in (ACCEPTED, UNSUPPORTED):
+            self.state_changed()  # a ground station's button waits for it
+
+    def _acknowledge(self, command: Command, result: int) -> None:
+        self._links.send(
+            mavlink.MAVLink_command_ack_message(command.name, result, 0, 0, command.system, command.component),
+            command.link,
+        )
+
+    def _acknowledge_again(self, command: Command) -> None:
+        """A copy of a packet is not obeyed again. On another link its sender may wait for the answer there."""
+        for known, result in reversed(self._results):
+            if (known.source, known.name) == (command.source, command.name):
+                if not command.broadcast:
+                    self._acknowledge(command, result)
+                return
+
+    def _trigger(self, packet: Packet) -> None:
+        """CAMERA_TRIGGER (112), and CAMERA_FEEDBACK (180) where the autopilot fires: nobody acknowledges these."""
+        message = packet.message
+        name = message.get_type()
+        if message.get_srcSystem() != self._identity.system_id or self._is_copy(packet):
+            return
+        if name == "CAMERA_FEEDBACK" and not self._feedback_is_shot:
+            return  # the hot shoe's time of a shot that is known already: telemetry has it
+        if self._autopilot.is_echo(packet, name):
+            return
+        source = f"mavlink:{message.get_srcSystem()}/{message.get_srcComponent()}"
+        sequence = message.seq if name == "CAMERA_TRIGGER" else message.img_idx
+        verdict = self._shutter.wish(Wish(source, name, sequence, 0, packet.link, acknowledged=False))
+        if not verdict.accepted:
+            self.say(f"no photo: {verdict.reason}")
+            self.state_changed()
+
+    def _parameter(self, packet: Packet) -> None:
+        message = packet.message
+        if not self._is_for_us(message) or self._is_copy(packet):
+            return
+        name = message.get_type()
+        if name == "PARAM_EXT_REQUEST_LIST":
+            reply = self._parameters.listing()
+        elif name == "PARAM_EXT_REQUEST_READ":
+            reply = self._parameters.read(message)
+        else:
+            self._send_news()  # what changed before is told apart from what this changes
+            reply = self._parameters.set(message, packet.link, self._clock.monotonic_ns())
+        self._send_reply(reply, packet.link)
+        self._send_news()
+
+    def _file(self, packet: Packet) -> None:
+        if packet.message.target_component == self._links.component_id and self._is_for_us(packet.message):
+            for reply in self._files.answer(packet.message, self._clock.monotonic_ns()):
+                self._links.send(reply, packet.link)
+
+    def _is_for_us(self, message: Message) -> bool:
+        """Our system or all, our component or all."""
+        systems = (0, self._links.system_id, self._identity.system_id)
+        return message.target_system in systems and message.target_component in (0, self._links.component_id)
+
+    def _is_copy(self, packet: Packet) -> bool:
+        return self._copies.is_copy(packet, self._clock.monotonic_ns())
+
+    def _ordered_result(self, packet: Packet) -> None:
+        refusal = self._autopilot.refusal(packet.message)
+        if refusal is not None:
+            self.say(refusal)
+
+    # what goes out
+
+    def order(self, number: int, parameters: Sequence[float]) -> str | None:
+        """Give our autopilot a command (MAV_CMD, parameters from the first); a sentence where it can't be given."""
+        return self._autopilot.order(number, parameters)
+
+    def announce(self, captured: Captured) -> None:
+        """A shot ended, its frame safe or lost: tell everybody, once."""
+        self._links.send(messages.image_captured(captured, self._telling.boot_ms()))
+        self.state_changed()
+
+    def state_changed(self) -> None:
+        """What CAMERA_CAPTURE_STATUS says may have changed: push it with the next tick."""
+        self._status_wanted.set()
+
+    def settings_changed(self, refused: str = "") -> None:
+        """The body told its settings, with its sentence where it would not have a change."""
+        for link, reply in self._parameters.settled(self._clock.monotonic_ns(), refused):
+            self._send_reply(reply, link)
+        self._send_news()
+        self._links.send(self._telling.settings())
+
+    def say(self, text: str, severity: int = mavlink.MAV_SEVERITY_WARNING) -> None:
+        """A line for the pilot (STATUSTEXT)."""
+        for message in self._lines.messages(text, severity, self._clock.monotonic_ns()):
+            self._links.send(message)
+
+    def audience_has_grown(self) -> bool:
+        """Whether a ground station listens that missed what was said before; True once."""
+        return self._audience.has_grown(self._clock.monotonic_ns())
+
+    def tick(self) -> None:
+        """What is due by now: heartbeat, time requests, stream requests, status, periodic messages, old images."""
+        now_ns = self._clock.monotonic_ns()
+        if not self._identity.decide(now_ns):
+            return
+        self._links.system_id = self._identity.system_id
+        if now_ns >= self._heartbeat_due_ns and self._healthy():
+            on_time_ns = self._heartbeat_due_ns + HEARTBEAT_NS
+            self._heartbeat_due_ns = on_time_ns if on_time_ns > now_ns else now_ns + HEARTBEAT_NS
+            state = mavlink.MAV_STATE_CRITICAL if self._troubled() else mavlink.MAV_STATE_ACTIVE
+            self._links.send(
+                mavlink.MAVLink_heartbeat_message(
+                    mavlink.MAV_TYPE_CAMERA, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, state, 3
+                )
+            )
+        self._autopilot.ask()
+        if self._status_wanted.is_set() and now_ns >= self._status_due_ns:
+            self._status_wanted.clear()
+            self._status_due_ns = now_ns + STATUS_NS
+            self._links.send(self._telling.status())
+        for number in self._intervals.due(now_ns):
+            self._links.send(self._telling.about(number))
+        for link, reply in self._parameters.settled(now_ns):
+            self._send_reply(reply, link)
+        self._send_old_images()
+
+    def _send_reply(self, reply: Reply, link: int) -> None:
+        for message in reply.messages:
+            self._links.send(message, link)
+        if reply.words is not None:
+            self.say(reply.words)
+
+    def _send_news(self) -> None:
+        for message in self._parameters.news():
+            self._links.send(message)
+
+    def _send_old_images(self) -> None:
+        wanted = self._commands.wanted_images
+        for _ in range(min(_OLD_IMAGES_A_TICK, len(wanted))):  # each may open a ledger: heartbeats go on
+            index, link = wanted.popleft()
+            captured = self._lookup(index)
+            if captured is None:
+                self.say(f"image {index} is in none of the flights here, or has not ended yet")
+            else:
+                self._links.send(messages.image_captured(captured, self._telling.boot_ms()), link)
+
+
+_HANDLERS: dict[str, Callable[[Component, Packet], None]] = {
+    "COMMAND_LONG": Component._command,
+    "COMMAND_INT": Component._command,
+    "COMMAND_ACK": Component._ordered_result,
+    "CAMERA_TRIGGER": Component._trigger,
+    "CAMERA_FEEDBACK": Component._trigger,
+    "PARAM_EXT_REQUEST_LIST": Component._parameter,
+    "PARAM_EXT_REQUEST_READ": Component._parameter,
+    "PARAM_EXT_SET": Component._parameter,
+    "FILE_TRANSFER_PROTOCOL": Component._file,
+}

@@ -1,0 +1,218 @@
+"""The ground station's part: find the camera, ask for photographs, hear how each one ended."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from dappled.clock import SystemClock
+from dappled.drivers.mavlink.links import MavlinkLinks, Message, Packet, mavlink
+from dappled.drivers.mavlink.signing import signing
+from dappled.errors import DappledError
+
+ACK_S = 0.5
+ACK_TRIES = 4
+_ASK_AGAIN_S = 3.0
+_KEPT = 1000
+
+
+class GroundError(DappledError):
+    """The camera could not be reached: one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How one asked-for photograph ended. `index` and `captured` (the message 263) are None where none was reported;
+    `reason` is a sentence for a photograph that wasn't had. `ack_ms`: from asking to the acknowledgement."""
+
+    sequence: int
+    index: int | None
+    ok: bool
+    reason: str | None
+    ack_ms: float | None
+    captured: Message | None
+
+
+class GroundClient:
+    """One ground station on one link (a pymavlink connection string). Use as a context manager.
+
+    It sends heartbeats, each second, while open. `key_file` signs the link; the signing time is kept beside it. Raises
+    LinkError from `__enter__`, SigningError for a key that can't be used.
+    """
+
+    def __init__(
+        self, url: str, *, system_id: int = 255, component_id: int = 190, key_file: Path | None = None
+    ) -> None:
+        clock = SystemClock()
+        self._links = MavlinkLinks(
+            [url],
+            system_id=system_id,
+            component_id=component_id,
+            tap=lambda _stamp, _raw: 0,
+            on_packet=self._on_packet,
+            clock=clock,
+            signing=signing([key_file], key_file.with_name(f"{key_file.name}.time"), clock) if key_file else None,
+        )
+        self._changed = threading.Condition()
+        self._heard: deque[Message] = deque(maxlen=_KEPT)
+        self._camera: tuple[int, int] | None = None
+        self._stop = threading.Event()
+        self._heart = threading.Thread(target=self._beat, name="ground heartbeat", daemon=True)
+        self._sequence = time.time_ns() // 10**8 % 2**23  # another than that of a run just before; exact as a float
+
+    def __enter__(self) -> GroundClient:
+        self._links.start()
+        self._heart.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._heart.join(2.0)
+        self._links.stop()
+
+    @property
+    def port(self) -> int:
+        """The local port of the link."""
+        return self._links.port(0)
+
+    def find_camera(self, timeout_s: float = 10.0) -> tuple[int, int]:
+        """(system id, component id) of the first camera whose heartbeat is heard. Raises GroundError."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._camera is not None, timeout_s):
+                url = self._links.statistics()[0].url
+                raise GroundError(f"no camera was heard on {url} for {timeout_s:g} s; is the daemon running there?")
+            assert self._camera is not None
+            return self._camera
+
+    def request(self, message_id: int, parameter: float = 0.0, timeout_s: float = 2.0) -> Message | None:
+        """One message of the camera, by MAV_CMD_REQUEST_MESSAGE; None where it didn't come."""
+        with self._listening() as heard:
+            self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, float(message_id), parameter)
+            return heard(lambda m: m.get_msgId() == message_id, timeout_s)
+
+    def command(self, name: int, *parameters: float) -> tuple[int | None, float | None]:
+        """Send a command until it is acknowledged (4 times, each 0.5 s): (MAV_RESULT, milliseconds), or Nones."""
+        system, component = self.find_camera()
+        padded = (*parameters, *[0.0] * (7 - len(parameters)))
+        with self._listening() as heard:
+            for confirmation in range(ACK_TRIES):
+                asked = time.monotonic_ns()
+                self.send_command(mavlink.MAVLink_command_long_message(system, component, name, confirmation, *padded))
+                ack = heard(lambda m: m.get_type() == "COMMAND_ACK" and m.command == name and self._mine(m), ACK_S)
+                if ack is not None:
+                    return int(ack.result), (time.monotonic_ns() - asked) / 1e6
+        return None, None
+
+    def send_command(self, message: Message) -> None:
+        """One COMMAND_LONG goes out; here a ground station of other manners would begin."""
+        self._links.send(message)
+
+    def capture(
+        self,
+        count: int,
+        interval_s: float = 0.0,
+        *,
+        timeout_s: float = 60.0,
+        on_outcome: Callable[[Outcome], None] = lambda _: None,
+    ) -> list[Outcome]:
+        """Ask for `count` photographs, each after the last one ended, at least `interval_s` apart."""
+        outcomes: list[Outcome] = []
+        status = self.request(mavlink.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS)
+        if status is None:
+            raise GroundError("the camera answers no request for its capture status: which image is new can't be told")
+        expected = int(status.image_count)
+        for _ in range(count):
+            began = time.monotonic()
+            outcome = self._capture_one(expected, timeout_s)
+            if outcome.index is not None:
+                expected = outcome.index + 1
+            outcomes.append(outcome)
+            on_outcome(outcome)
+            if len(outcomes) < count:
+                self._stop.wait(max(0.0, began + interval_s - time.monotonic()))
+        return outcomes
+
+    def _capture_one(self, expected: int, timeout_s: float) -> Outcome:
+        self._sequence += 1
+        sequence = self._sequence
+        with self._listening() as heard:
+            result, ack_ms = self.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, sequence)
+            if result is None:
+                return Outcome(sequence, None, False, f"no answer to {ACK_TRIES} requests", None, None)
+            if result != mavlink.MAV_RESULT_ACCEPTED:
+                said = heard(lambda m: m.get_type() == "STATUSTEXT", 0.2)
+                words = f"refused with MAV_RESULT {result}" + (f": {said.text}" if said is not None else "")
+                return Outcome(sequence, None, False, words, ack_ms, None)
+            until = time.monotonic() + timeout_s
+            while time.monotonic() < until:
+                wait_s = min(_ASK_AGAIN_S, until - time.monotonic())
+                captured = heard(
+                    lambda m: m.get_type() == "CAMERA_IMAGE_CAPTURED" and m.image_index >= expected, max(0.0, wait_s)
+                )
+                if captured is not None:
+                    ok = captured.capture_result == 1
+                    reason = None if ok else "the camera reports that it failed"
+                    return Outcome(sequence, int(captured.image_index), ok, reason, ack_ms, captured)
+                self.command(
+                    mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED, float(expected)
+                )
+        return Outcome(sequence, None, False, f"nothing was heard of it for {timeout_s:g} s", ack_ms, None)
+
+    def _mine(self, message: Message) -> bool:
+        return message.target_system in (0, self._links.system_id) and message.target_component in (
+            0,
+            self._links.component_id,
+        )
+
+    def _listening(self) -> _Listening:
+        return _Listening(self._changed, self._heard)
+
+    def _on_packet(self, packet: Packet) -> None:
+        message = packet.message
+        if packet.sent:
+            return
+        with self._changed:
+            sender = (message.get_srcSystem(), message.get_srcComponent())
+            if message.get_type() == "HEARTBEAT" and message.type == mavlink.MAV_TYPE_CAMERA and self._camera is None:
+                self._camera = sender
+            if sender == self._camera:
+                self._heard.append(message)
+            self._changed.notify_all()
+
+    def _beat(self) -> None:
+        while not self._stop.is_set():
+            self._links.send(
+                mavlink.MAVLink_heartbeat_message(
+                    mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
+                )
+            )
+            self._stop.wait(1.0)
+
+
+class _Listening:
+    """From `with` on, no message is missed: those kept so far are known, newer ones are searched."""
+
+    def __init__(self, changed: threading.Condition, heard: deque[Message]) -> None:
+        self._changed = changed
+        self._heard = heard
+
+    def __enter__(self) -> Callable[[Callable[[Message], bool], float], Message | None]:
+        with self._changed:
+            self._known = {id(message) for message in self._heard}
+            self._keep = list(self._heard)  # so that no id is used twice
+        return self._wait
+
+    def __exit__(self, *_: object) -> None:
+        self._keep.clear()
+
+    def _wait(self, wanted: Callable[[Message], bool], timeout_s: float) -> Message | None:
+        def news() -> Iterator[Message]:
+            return (m for m in self._heard if id(m) not in self._known and wanted(m))
+
+        with self._changed:
+            self._changed.wait_for(lambda: next(news(), None) is not None, timeout_s)
+            return next(news(), None)

@@ -1,0 +1,1 @@
+"""How the daemon and its machine are: health record, checks before flight, status text, metrics."""

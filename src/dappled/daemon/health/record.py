@@ -1,0 +1,192 @@
+"""One record that says how everything is: for the stream, the log and whoever looks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from dappled.config.settings import Settings
+from dappled.daemon.navigation.boot_clock import BootClock
+from dappled.daemon.navigation.telemetry import TelemetryStatistics
+from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.shutter import ShutterStatistics
+from dappled.daemon.stream import wire
+from dappled.daemon.stream.publisher import PublisherStatistics
+from dappled.decode.geometry.pose import Pose
+from dappled.drivers.mavlink.links import LinkStatistics
+from dappled.errors import DappledError
+from dappled.flight import layout
+
+SILENT_NS = 5 * 10**9
+
+
+def record(
+    settings: Settings,
+    *,
+    utc_ns: int,
+    monotonic_ns: int,
+    began_monotonic_ns: int,
+    street: Street,
+    shutter: ShutterStatistics,
+    links: Sequence[LinkStatistics],
+    telemetry: TelemetryStatistics,
+    publisher: PublisherStatistics,
+    folder: Path,
+    clock: BootClock | None = None,
+    vehicle: Pose | None = None,
+    decoding: bool = False,
+    utc_known: bool = True,
+    dead: Sequence[str] = (),
+    doubts: Sequence[str] = (),
+) -> dict[str, Any]:
+    """The facts of a `health` message; `problems` are sentences, none when all is well. `doubts`: more of them,
+    of what is contradictory in the vehicle. `dead`: threads that have ended without being asked to."""
+    problems = [f"the {name} thread has ended: restart dappled" for name in dead]
+    if street.camera_state not in ("starting", "ready", "busy"):
+        problems.append(camera_sentence(street))
+    if not settings.mavlink.url:
+        problems.append("no MAVLink link is configured: frames are tagged without poses")
+    silent = 0
+    for link in links:
+        if link.error:
+            silent += 1
+            problems.append(link.error)
+        elif monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS:
+            silent += 1
+            problems.append(f"MAVLink link {link.url}: {_silence(link)}")
+    problems += doubts
+    if not utc_known:
+        problems.append(
+            "UTC is not known yet: the autopilot's satellites will tell it, and all stamps are put right then"
+        )
+    free = _free(folder)
+    if free is not None and free < settings.record.min_free_mb * 1_000_000:
+        problems.append(f"disk nearly full: {free // 1_000_000} MB left, new shots are refused")
+    elif free is not None and free < settings.record.warn_free_mb * 1_000_000:
+        problems.append(
+            f"the disk is filling up: {free // 10**6} MB left, below {settings.record.min_free_mb} MB shots are refused"
+        )
+    if not settings.mask.profile:
+        problems.append("no mask is configured: frames are kept, not decoded (set mask.profile)")
+    stages = [asdict(stage.statistics()) for stage in street.stages]
+    for stage in stages:
+        if stage["dropped"]:
+            problems.append(f"{stage['name']} fell behind: {stage['dropped']} frames are only in the record")
+    return {
+        "utc_ns": utc_ns,
+        "camera": {"state": street.camera_state, "reason": street.camera_reason},
+        "link": {
+            "urls": len(links),
+            "silent": silent,
+            "packets": telemetry.packets,
+            "positions": telemetry.positions,
+            "each": [_counters(link) for link in links],
+        },
+        "disk": {"free_bytes": free, "folder": str(folder)},
+        "shots": {
+            "wished": shutter.shots,
+            "safe": shutter.succeeded,
+            "failed": shutter.failed,
+            "pending": shutter.pending,
+            "refused": shutter.refused,
+        },
+        "stages": [*stages, _publish(publisher)],
+        "problems": problems,
+        "dead": list(dead),
+        "utc_known": utc_known,
+        "interval_s": shutter.interval_s,
+        "clock": None if clock is None else {"source": clock.source, "sigma_ms": clock.sigma_ns / 1e6},
+        "vehicle": None if vehicle is None or vehicle.latitude_rad is None else _place(vehicle),
+        "decode": {
+            "mask": settings.mask.profile,
+            "calibration": settings.decode.calibration,
+            "running": decoding,
+        },
+        "min_free_bytes": settings.record.min_free_mb * 1_000_000,
+    }
+
+
+def _silence(link: LinkStatistics) -> str:
+    """Why a link is of no use, as far as can be told from here."""
+    signing = link.signing
+    if signing is None or signing.refused == 0:
+        return "nobody was heard for 5 s"
+    return (
+        f"nobody was heard for 5 s whose signature counts ({signing.unsigned_refused} packets were unsigned, "
+        f"{signing.forged} forged, {signing.replayed} too old); give both sides the same key"
+    )
+
+
+def _counters(link: LinkStatistics) -> dict[str, Any]:
+    """What went over a link."""
+    return {
+        "url": link.url,
+        "in": link.packets_in,
+        "out": link.packets_out,
+        "bad": link.packets_bad,
+        "unsent": link.packets_unsent,
+        "unlogged": link.packets_unlogged,
+        "signing": None if link.signing is None else asdict(link.signing),
+    }
+
+
+def _publish(publisher: PublisherStatistics) -> dict[str, Any]:
+    return {
+        "name": "publish",
+        "sent": dict(publisher.sent),
+        "dropped": dict(publisher.dropped),
+        "questions": publisher.questions,
+        "refused": publisher.refused,
+        "wrong_keys": publisher.wrong_keys,
+    }
+
+
+def _place(pose: Pose) -> dict[str, float | None]:
+    """Where the vehicle is, for a map."""
+    speed = pose.velocity_ned_m_s
+    return {
+        "latitude_deg": wire.degrees(pose.latitude_rad),
+        "longitude_deg": wire.degrees(pose.longitude_rad),
+        "altitude_msl_m": pose.altitude_msl_m,
+        "height_above_home_m": pose.height_above_home_m,
+        "yaw_deg": wire.degrees(wire.euler(pose.attitude)[2]) if pose.attitude else None,
+        "speed_m_s": math.hypot(*speed) if speed else None,
+        "position_sigma_m": pose.position_sigma_m,
+        "age_ms": pose.age_ms,
+    }
+
+
+def line(told: Mapping[str, Any]) -> str:
+    """A health record in one line, for a status display."""
+    shots, problems = told["shots"], told["problems"]
+    counts = f"camera {told['camera']['state']}, {shots['safe']} of {shots['wished']} frames safe"
+    return f"{counts}; {'; '.join(problems)}" if problems else f"{counts}; all is well"
+
+
+def camera_sentence(street: Street) -> str:
+    """Why there is no camera to fire: "the camera is absent: …"."""
+    reason = f": {street.camera_reason}" if street.camera_reason else ""
+    return f"the camera is {street.camera_state}{reason}"
+
+
+def obstacle(street: Street, folder: Path, min_free_mb: int) -> str | None:
+    """Why no shot can be taken now; None where one can."""
+    if street.camera_state not in ("ready", "busy"):
+        return camera_sentence(street)
+    try:
+        free = layout.free_bytes(folder)
+    except DappledError as error:
+        return str(error)
+    if free < min_free_mb * 1_000_000:
+        return f"the disk is nearly full: {free // 1_000_000} MB left, record.min_free_mb asks for more"
+    return None
+
+
+def _free(folder: Path) -> int | None:
+    try:
+        return layout.free_bytes(folder)
+    except DappledError:
+        return None

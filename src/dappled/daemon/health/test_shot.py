@@ -1,0 +1,121 @@
+"""A few shots through the whole daemon, to be looked at: what `dappled doctor --test-shot` and `--latency` fly.
+
+A daemon that runs meanwhile is not disturbed, but two can't hold one camera.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from dappled.config.settings import Settings
+from dappled.daemon.pipeline import tagger
+from dappled.daemon.pipeline.pending_shot import Story, Watchers
+from dappled.daemon.pipeline.shutter import Wish
+from dappled.daemon.service import Service
+from dappled.errors import DappledError
+
+READY_S = 20.0
+END_S = 60.0
+_LOOK_S = 0.02
+
+
+class TrialError(DappledError):
+    """No shot can be taken; one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """One shot's times in milliseconds from the wish's way to the camera, None where nobody could see it.
+
+    `to_exposure` is from the trigger call to the opening of the shutter, by the hot shoe; `to_file` from the trigger
+    call to the whole file in memory; `recorded` from there to safe on disk.
+    """
+
+    wish_to_trigger: float | None
+    trigger_call: float | None
+    to_exposure: float | None
+    to_file: float | None
+    recorded: float | None
+
+
+@contextmanager
+def daemon(settings: Settings, sockets: Path, record: Path) -> Iterator[Trial]:
+    """A daemon of these settings at work: its sockets in one folder, its flight in another. Raises DappledError."""
+    ours = replace(
+        settings,
+        record=replace(settings.record, directory=str(record / "flights"), min_free_mb=0),
+        publish=replace(settings.publish, slices=f"ipc://{sockets}/s", ask=f"ipc://{sockets}/a"),
+        console=replace(settings.console, bind=""),
+    )
+    stories: list[Story] = []
+    ended = threading.Condition()
+
+    def finished(story: Story) -> None:
+        with ended:
+            stories.append(story)
+            ended.notify_all()
+
+    service = Service(ours, watchers=Watchers(finished=finished))
+    service.start()
+    loop = threading.Thread(target=service.run, name="trial")
+    loop.start()
+    try:
+        yield Trial(service, stories, ended)
+    finally:
+        service.ask_to_stop()
+        loop.join(5)
+        service.stop()
+
+
+class Trial:
+    """A running daemon to take shots with."""
+
+    def __init__(self, service: Service, stories: list[Story], ended: threading.Condition) -> None:
+        self._service, self._stories, self._ended = service, stories, ended
+        self._wishes = 0
+
+    @property
+    def flight(self) -> Path:
+        """Where it is recorded."""
+        return self._service.folder
+
+    def until_ready(self, timeout_s: float = READY_S) -> None:
+        """Wait for the camera. Raises TrialError with the camera's own reason."""
+        until = time.monotonic() + timeout_s
+        while (state := self._service.health()["camera"])["state"] != "ready":
+            if time.monotonic() >= until:
+                raise TrialError(f"the camera is not ready after {timeout_s:g} s: {state['state']} {state['reason']}")
+            time.sleep(_LOOK_S)
+
+    def shoot(self, timeout_s: float = END_S) -> Story:
+        """One shot to its end. Raises TrialError where it is refused, or does not end."""
+        self.until_ready()
+        self._wishes += 1
+        verdict = self._service.wish(Wish("doctor", "test shot", self._wishes, acknowledged=False))
+        if verdict.index is None or not verdict.accepted:
+            raise TrialError(f"the shot was refused: {verdict.reason}")
+        until = time.monotonic() + timeout_s
+        with self._ended:
+            while not (found := [one for one in self._stories if one.shot.index == verdict.index]):
+                if not self._ended.wait(until - time.monotonic()):
+                    raise TrialError(f"the shot did not come to an end within {timeout_s:g} s")
+        return found[0]
+
+
+def latency(story: Story) -> Latency:
+    """What one shot took."""
+    to_exposure = to_file = None
+    if story.fired is not None and story.tag is not None and story.tag.time_source.startswith("hot shoe"):
+        called_utc_ns = tagger.called_utc_ns(story.shot, story.fired.called_monotonic_ns)
+        opened_utc_ns = story.tag.utc_ns - round((story.tag.exposure_s or 0.0) / 2 * 1e9)
+        to_exposure = (opened_utc_ns - called_utc_ns) / 1e6
+    if "trigger to file" in story.ms and "trigger call" in story.ms:
+        to_file = story.ms["trigger call"] + story.ms["trigger to file"]
+    return Latency(
+        story.ms.get("wish to trigger"), story.ms.get("trigger call"), to_exposure, to_file, story.ms.get("record")
+    )

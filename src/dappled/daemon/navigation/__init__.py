@@ -1,0 +1,1 @@
+"""Where the vehicle was and how it pointed at a given time."""

@@ -1,0 +1,171 @@
+"""What single telemetry messages say of the vehicle, as samples. Messages that say nothing give None."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from dappled.decode.geometry.interpolation import from_euler, normalised
+from dappled.decode.geometry.pose import Quaternion, Vector3
+from dappled.drivers.mavlink.links import Message, mavlink
+
+HALF_MS_NS = 500_000  # time_boot_ms is cut to whole milliseconds: its middle is meant
+# A single-frequency receiver under open sky, where it reports a dilution only; GPS_FIX_TYPE → metres for each unit.
+METRES_PER_DOP = {2: 2.5, 3: 2.5, 4: 1.0, 5: 0.3, 6: 0.02, 7: 0.02, 8: 0.05}
+GIMBAL_COMPONENTS = frozenset({1, 154, 171, 172, 173, 174, 175})  # an autopilot speaks for a gimbal without MAVLink
+_EARTH = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
+_VEHICLE = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
+_LOCK = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK
+
+
+@dataclass(frozen=True, slots=True)
+class PositionSample:
+    """One GLOBAL_POSITION_INT."""
+
+    number: int
+    stamp_ns: int
+    boot_ns: int
+    latitude_rad: float
+    longitude_rad: float
+    altitude_msl_m: float
+    height_above_home_m: float
+    velocity_ned_m_s: Vector3
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeSample:
+    """One ATTITUDE_QUATERNION, ATTITUDE or ATTITUDE_QUATERNION_COV. Rates are of the body, None where the autopilot
+    gave none; `sigma_rad` is the whole turn's, None where it doesn't tell."""
+
+    number: int
+    stamp_ns: int
+    boot_ns: int
+    attitude: Quaternion
+    rates_rad_s: Vector3 | None
+    sigma_rad: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class GnssSample:
+    """One GPS_RAW_INT; what the receiver doesn't tell is None. Accuracies are one sigma."""
+
+    number: int
+    stamp_ns: int
+    fix_type: int
+    satellites: int | None
+    hdop: float | None
+    vdop: float | None
+    horizontal_accuracy_m: float | None
+    vertical_accuracy_m: float | None
+    velocity_accuracy_m_s: float | None
+
+    @property
+    def horizontal_sigma_m(self) -> float | None:
+        """The receiver's own accuracy, else what its dilution of precision lets expect."""
+        return self.horizontal_accuracy_m or self._expected_m(self.hdop)
+
+    @property
+    def vertical_sigma_m(self) -> float | None:
+        """As `horizontal_sigma_m`."""
+        return self.vertical_accuracy_m or self._expected_m(self.vdop)
+
+    def _expected_m(self, dilution: float | None) -> float | None:
+        each_m = METRES_PER_DOP.get(self.fix_type)
+        return None if dilution is None or each_m is None else dilution * each_m
+
+
+@dataclass(frozen=True, slots=True)
+class GimbalSample:
+    """One GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION: the head against the horizon.
+
+    `boot_ns` is on the clock of `component`: 1 is the autopilot's, others have their own, which began anew `epoch`
+    times. `follows_vehicle`: yaw counts from the vehicle's nose, not from north.
+    """
+
+    number: int
+    stamp_ns: int
+    boot_ns: int
+    component: int
+    epoch: int
+    attitude: Quaternion
+    follows_vehicle: bool
+    kind: str
+
+
+def boot_ns(message: Message) -> int:
+    """A message's time since boot, from time_boot_ms or time_usec."""
+    if message.get_type() == "ATTITUDE_QUATERNION_COV":
+        return int(message.time_usec) * 1000
+    return int(message.time_boot_ms) * 10**6 + HALF_MS_NS
+
+
+def position(number: int, stamp_ns: int, message: Message) -> PositionSample | None:
+    """A GLOBAL_POSITION_INT; None while the autopilot has no position."""
+    if message.lat == 0 and message.lon == 0:
+        return None
+    return PositionSample(
+        number,
+        stamp_ns,
+        boot_ns(message),
+        math.radians(message.lat / 1e7),
+        math.radians(message.lon / 1e7),
+        message.alt / 1e3,
+        message.relative_alt / 1e3,
+        (message.vx / 100, message.vy / 100, message.vz / 100),
+    )
+
+
+def attitude(number: int, stamp_ns: int, message: Message) -> AttitudeSample | None:
+    """An attitude message; None while the autopilot has no attitude (NaN or zeros)."""
+    kind, sigma_rad = message.get_type(), None
+    if kind == "ATTITUDE":
+        turned = from_euler(message.roll, message.pitch, message.yaw)
+    elif kind == "ATTITUDE_QUATERNION":
+        turned = (message.q1, message.q2, message.q3, message.q4)
+    else:
+        turned = tuple(message.q)
+        variance = message.covariance[0] + message.covariance[4] + message.covariance[8]
+        sigma_rad = math.sqrt(variance) if variance > 0 else None  # NaN: not known
+    try:
+        turned = normalised(*turned)
+    except ValueError:
+        return None
+    rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
+    known = all(math.isfinite(rate) for rate in rates)
+    return AttitudeSample(number, stamp_ns, boot_ns(message), turned, rates if known else None, sigma_rad)
+
+
+def gnss(number: int, stamp_ns: int, message: Message) -> GnssSample:
+    """A GPS_RAW_INT."""
+    return GnssSample(
+        number,
+        stamp_ns,
+        int(message.fix_type),
+        None if message.satellites_visible == 255 else int(message.satellites_visible),
+        _scaled(message.eph, 2**16 - 1, 100),
+        _scaled(message.epv, 2**16 - 1, 100),
+        _scaled(message.h_acc, 2**32 - 1, 1000),
+        _scaled(message.v_acc, 2**32 - 1, 1000),
+        _scaled(message.vel_acc, 2**32 - 1, 1000),
+    )
+
+
+def gimbal(number: int, stamp_ns: int, message: Message, epoch: int = 0) -> GimbalSample | None:
+    """A gimbal's attitude; None where it is none. Roll and pitch are against the horizon in both messages."""
+    kind = message.get_type()
+    if kind == "MOUNT_ORIENTATION":
+        angles = (math.radians(angle) for angle in (message.roll, message.pitch, message.yaw))
+        turned, follows = from_euler(*angles), True
+    else:
+        turned, flags = tuple(message.q), int(message.flags)
+        follows = not flags & (_EARTH if flags & (_EARTH | _VEHICLE) else _LOCK)
+    try:
+        turned = normalised(*turned)
+    except ValueError:
+        return None
+    return GimbalSample(number, stamp_ns, boot_ns(message), message.get_srcComponent(), epoch, turned, follows, kind)
+
+
+def _scaled(value: int, unknown: int, parts: int) -> float | None:
+    """A field in parts of its unit; 0 and the highest value stand for unknown."""
+    return value / parts if 0 < value < unknown else None

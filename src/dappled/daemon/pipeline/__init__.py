@@ -1,0 +1,1 @@
+"""The way of one shot: shutter, capture, recording, tagging, decoding."""

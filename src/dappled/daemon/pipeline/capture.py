@@ -1,0 +1,186 @@
+"""The camera's side of the street: its events in order, each file made safe, each shot without one given up."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+from dappled.daemon.pipeline.pending_shot import Book, Story, Watchers
+from dappled.daemon.pipeline.pending_shots import Stories
+from dappled.drivers.camera import (
+    Arrival,
+    Camera,
+    Companion,
+    Deferred,
+    Event,
+    Fired,
+    SettingsChanged,
+    ShotFailed,
+    State,
+    StateChanged,
+)
+from dappled.errors import report, sentence
+
+log = logging.getLogger(__name__)
+_LOOK_S = 0.1
+_LAST_EVENTS_S = 1.0
+
+
+class Capture:
+    """One thread that pulls the camera's events. `hand_on` takes the stories that are ready to be tagged: their frame
+    is safe, or its file stays at the camera."""
+
+    def __init__(
+        self, camera: Camera, book: Book, stories: Stories, watchers: Watchers, hand_on: Callable[[Story], object]
+    ) -> None:
+        self._camera, self._book, self._stories, self._watchers = camera, book, stories, watchers
+        self._hand_on = hand_on
+        self._unfired: deque[ShotFailed] = deque()
+        self._stopping, self._give_up_at = threading.Event(), 0.0
+        self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
+        self.state: State = "starting"
+        self.reason = ""
+
+    def dead(self) -> list[str]:
+        """The thread's name where it has ended without being asked to: never, unless there is a bug."""
+        return [] if self._stopping.is_set() or self._thread.is_alive() else [self._thread.name]
+
+    def start(self) -> None:
+        """Begin: the camera first."""
+        self._camera.start()
+        self._thread.start()
+
+    def fire(self, index: int) -> None:
+        """Hand an expected shot to the camera. Never raises: a shot that the driver won't take has failed."""
+        try:
+            self._camera.fire(index)
+        except Exception as error:  # noqa: BLE001  # any driver's; the shot is written down already and must come to an end
+            reason = f"the camera driver did not take the shot: {sentence(error)}"
+            self._unfired.append(ShotFailed(index, reason, time.monotonic_ns()))
+
+    def stop(self, timeout_s: float) -> None:
+        """Wait for what is with the camera, at most `timeout_s`; let go of it. Shots without a file have failed."""
+        self._give_up_at = time.monotonic() + timeout_s
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout_s + 1)
+        self._stories.tell(self._camera.stop)
+        if not self._thread.is_alive():
+            self._last_events()
+
+    def _run(self) -> None:
+        while not self._stopping.is_set() or self._worth_waiting():
+            self._take(_LOOK_S)
+
+    def _worth_waiting(self) -> bool:
+        return time.monotonic() < self._give_up_at and bool(self._stories.waiting())
+
+    def _last_events(self) -> None:
+        """What came while the camera was let go of; then every shot that is still open has failed."""
+        until = time.monotonic() + _LAST_EVENTS_S
+        while time.monotonic() < until and self._take(0.0):
+            pass
+        for index in self._stories.waiting():
+            self._handle(ShotFailed(index, "the flight ended before its file came", time.monotonic_ns()))
+
+    def _take(self, timeout_s: float) -> bool:
+        """Pull one event and act on it; False where none came in time."""
+        try:
+            event = self._unfired.popleft() if self._unfired else self._camera.next_event(timeout_s)
+        except Exception as error:  # noqa: BLE001  # any driver's; the capture goes on, at a pace that leaves others their time
+            report(log, "the camera driver", error)
+            time.sleep(_LOOK_S)
+            return True
+        if event is None:
+            return False
+        self._handle(event)
+        return True
+
+    def _handle(self, event: Event) -> None:
+        try:
+            if isinstance(event, StateChanged):
+                self._state_changed(event)
+            elif isinstance(event, Fired):
+                self._fired(event)
+            elif isinstance(event, ShotFailed):
+                self._shot_failed(event.shot, event.reason)
+            elif isinstance(event, Arrival):
+                self._arrived(event)
+            elif isinstance(event, Companion):
+                self._accompanied(event)
+            elif isinstance(event, Deferred):
+                self._deferred(event)
+            elif isinstance(event, SettingsChanged):
+                self._stories.tell(self._watchers.settings, event)
+        except Exception as error:  # noqa: BLE001  # one event that goes wrong must not end the capture
+            report(log, "capture", error)
+
+    def _state_changed(self, change: StateChanged) -> None:
+        self.state, self.reason = change.state, change.reason
+        if not self._stopping.is_set():
+            self._stories.tell(self._watchers.camera, change)
+
+    def _fired(self, event: Fired) -> None:
+        self._book.fired(event)  # raises for a second time, or one after the file: the first word counts
+        if story := self._stories.in_hand(event.shot):
+            story.fired = event
+            story.ms["wish to trigger"] = (event.called_monotonic_ns - story.shot.wished_monotonic_ns) / 1e6
+            story.ms["trigger call"] = (event.returned_monotonic_ns - event.called_monotonic_ns) / 1e6
+
+    def _shot_failed(self, index: int, reason: str) -> None:
+        story = self._stories.in_hand(index)
+        if story is not None and story.frame is not None:
+            self._stories.note("contradiction", f"its file is safe, and then the driver says: {reason}", index)
+            return
+        try:
+            self._book.failed(index, reason)
+        finally:
+            if story is not None:
+                self._stories.fail(story, reason)
+
+    def _arrived(self, arrival: Arrival) -> None:
+        began = time.monotonic_ns()
+        index = arrival.shot
+        story = None if index is None else self._stories.of_file(index)
+        try:
+            frame = self._book.record(index, arrival.name, arrival.blob)
+        except Exception as error:
+            # The recorder has noted it as far as the disk lets it. A second file doesn't undo the first one.
+            if story is not None and story.frame is None and not story.over:
+                self._stories.fail(story, sentence(error))
+            raise
+        finally:
+            arrival.blob.close()
+        self._stories.tell(self._camera.release, arrival)
+        if story is None or story.frame is not None:
+            return
+        story = self._stories.safe(story, frame)
+        if doubt := arrival.facts.get("doubt"):
+            story.doubt = str(doubt)
+            self._stories.note("doubt", story.doubt, frame.index)
+        if story.fired:
+            story.ms["trigger to file"] = (arrival.monotonic_ns - story.fired.returned_monotonic_ns) / 1e6
+        story.ms["record"] = (time.monotonic_ns() - began) / 1e6
+        self._stories.welcome(story, frame.index, arrival.name)
+        self._stories.tell(self._watchers.settled, frame.index, True)
+        self._hand_on(story)
+
+    def _accompanied(self, companion: Companion) -> None:
+        try:
+            self._book.companion(companion.shot, companion.name, companion.blob)
+        finally:
+            companion.blob.close()
+        self._stories.tell(self._camera.release, companion)
+
+    def _deferred(self, event: Deferred) -> None:
+        """The end of a shot whose file comes later: where it was exposed can be told now."""
+        try:
+            self._book.follows(event.shot, event.reason)
+        finally:
+            story = self._stories.in_hand(event.shot)
+            if story is not None and story.frame is None:
+                self._stories.follow(story, event.reason)
+                self._hand_on(story)

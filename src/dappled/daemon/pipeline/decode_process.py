@@ -1,0 +1,270 @@
+"""Decoding in a process of its own: a frame that LibRaw chokes on, or a slow decode, never touches the capture side.
+
+The worker (`dappled.daemon.pipeline.decode_worker`) runs at low priority and hands its arrays back in a memfd,
+without a copy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import mmap
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Protocol
+
+from dappled.drivers.gphoto2.channel import Channel, ChannelError, Message
+from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.restart_budget import RestartBudget
+from dappled.errors import DappledError
+from dappled.flight.entries import Result
+
+log = logging.getLogger(__name__)
+NICENESS = 10
+_LOOK_S = 0.1
+
+
+class DevelopmentError(DappledError):
+    """A frame can't be decoded; one sentence. The frame stays in the record."""
+
+
+@dataclass(frozen=True, slots=True)
+class Developed:
+    """What came out of a frame. `body` holds the arrays of `arrays` end to end, `sha256` is the body's.
+
+    `carriers` are rows [ky, kx, fy, fx]; `grid` (2, 3) leads from (y, x, 1) of a slice to sensor (row, column).
+    `preview` is a JPEG of `preview_size` (width, height). `ms` names what took how long. `seen` is what viewers need
+    besides, in the words of the `slices` schema.
+    """
+
+    body: mmap.mmap
+    sha256: str
+    arrays: list[dict[str, Any]]
+    carriers: list[list[float]]
+    carriers_from: str
+    carriers_found: int
+    carriers_predicted: int
+    law: str
+    grid: list[list[float]]
+    preview: bytes
+    preview_size: tuple[int, int]
+    ms: Mapping[str, float] = field(default_factory=dict)
+    seen: Mapping[str, Any] = field(default_factory=dict)
+
+    def result(self, index: int, decode_ms: float | None, run: str = "live") -> Result:
+        """The row of the ledger."""
+        return Result(
+            index,
+            self.sha256,
+            self.carriers_found,
+            self.carriers_predicted,
+            self.law,
+            self.carriers_from,
+            decode_ms,
+            run,
+            {"ms": dict(self.ms)},
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class DepthFound:
+    """Depth of one frame. `body` holds disparity and sigma, float32 (h, w) each, as `arrays` says; `range_px` the 2nd
+    and 98th percentile of the known disparities, None where none is known; `grid` as in Developed. `nearest_m` is the
+    nearest distance and its standard error, None where no calibration leads to metres or too little is known."""
+
+    body: mmap.mmap
+    arrays: list[dict[str, Any]]
+    range_px: list[float] | None
+    grid: list[list[float]]
+    law: str
+    nearest_m: tuple[float, float] | None = None
+
+
+class Developer(Protocol):
+    """What the street and the answers need."""
+
+    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> Developed:
+        """Decode the raw file at `path`. Raises DevelopmentError."""
+
+
+class WorkerDeveloper:
+    """Decodes in a worker process, one frame at a time; a worker that dies or hangs is replaced.
+
+    `timeout_s` bounds one frame. Threads may share it: they take turns. A worker that keeps dying is started six times
+    a minute at most; frames in between are not decoded, and say why.
+    """
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        *,
+        timeout_s: float = 60.0,
+        preview_px: int = 1024,
+        budget: RestartBudget | None = None,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._recipe, self._timeout_s, self._preview_px = recipe, timeout_s, preview_px
+        self._budget, self._clock_ns = budget or RestartBudget(limit=6, window_s=60.0), clock_ns
+        self._turn = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._channel: Channel | None = None
+        self._closed = False
+        self.restarts = 0
+
+    def warm_up(self) -> None:
+        """Start the worker now, so that the first frame doesn't wait for it. Raises DevelopmentError for a recipe
+        that can't work."""
+        with self._turn:
+            self._ask({"do": "warm up"})
+
+    def begin_warm_up(self) -> None:
+        """The same in a thread of its own; what goes wrong is told in the log."""
+        threading.Thread(target=self._warm_up, name="decoder warm-up", daemon=True).start()
+
+    def _warm_up(self) -> None:
+        try:
+            self.warm_up()
+        except DevelopmentError as error:
+            log.warning("decoding will fail: %s", error)
+
+    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> Developed:
+        """See Developer."""
+        with self._turn:
+            return _developed(
+                self._ask({"do": "develop", "path": path, "focal_length_mm": focal_length_mm, "f_number": f_number})
+            )
+
+    def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> DepthFound:
+        """Decode a frame with its views, and estimate its depth. Raises DevelopmentError."""
+        facts = {"path": path, "focal_length_mm": focal_length_mm, "f_number": f_number, "method": method}
+        with self._turn:
+            answer = self._ask({"do": "depth", **facts})
+        (body_fd,) = answer.fds
+        try:
+            body = mmap.mmap(body_fd, 0, prot=mmap.PROT_READ)
+        finally:
+            os.close(body_fd)
+        told = answer.body
+        nearest = told["nearest_m"]
+        pair = None if nearest is None else (float(nearest[0]), float(nearest[1]))
+        return DepthFound(body, told["arrays"], told["range_px"], told["grid"], told["law"], pair)
+
+    def close(self) -> None:
+        """End the worker, also in the middle of a frame, which then is not decoded."""
+        self._closed = True
+        if not self._turn.acquire(timeout=0):
+            while not self._turn.acquire(timeout=_LOOK_S):
+                if process := self._process:
+                    process.kill()
+        self._end()
+        self._turn.release()
+
+    def _ask(self, question: Mapping[str, Any]) -> Message:
+        if self._closed:
+            raise DevelopmentError(f"{question.get('path', 'the recipe')} was not decoded: the decoder was stopped")
+        if self._process is not None and self._process.poll() is not None:
+            self._end()  # it died between two frames: neither is to blame
+            self.restarts += 1
+        try:
+            channel = self._channel or self._begin()
+            channel.send(question, timeout_s=5.0)
+            answer = channel.receive(self._timeout_s)
+        except ChannelError:
+            code = self._end()
+            self.restarts += 1
+            raise DevelopmentError(f"the decoder died ({_manner(code)}) on {question.get('path', 'start')}") from None
+        except OSError as error:
+            self._end()
+            raise DevelopmentError(f"the decoder's process can't be started: {error.strerror}") from None
+        if answer is None:
+            self._end()
+            self.restarts += 1
+            raise DevelopmentError(f"decoding {question.get('path', '')} took over {self._timeout_s:g} s: given up")
+        if "error" in answer.body:
+            raise DevelopmentError(str(answer.body["error"]))
+        return answer
+
+    def _begin(self) -> Channel:
+        if wait_ns := self._budget.wait_ns(self._clock_ns()):
+            raise DevelopmentError(
+                f"the decoder keeps dying: it starts again in {wait_ns / 1e9:.0f} s; frames stay in the record"
+            )
+        self._budget.spend(self._clock_ns())
+        self._channel, there = Channel.pair()
+        with there:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "dappled.daemon.pipeline.decode_worker", str(there.fileno()), str(os.getpid())],
+                pass_fds=[there.fileno()],
+                stdin=subprocess.DEVNULL,
+            )
+        self._channel.send({"do": "set up", "recipe": asdict(self._recipe), "preview_px": self._preview_px})
+        return self._channel
+
+    def _end(self) -> int | None:
+        if self._channel is not None:
+            self._channel.close()
+        process, self._process, self._channel = self._process, None, None
+        if process is None:
+            return None
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return process.wait(0.5)
+        process.kill()
+        with contextlib.suppress(subprocess.TimeoutExpired):  # the kernel holds it; it ends when that lets go
+            return process.wait(5)
+        return None
+
+
+def _manner(code: int | None) -> str:
+    return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
+
+
+def _developed(answer: Message) -> Developed:
+    facts = dict(answer.body)
+    body_fd, preview_fd = answer.fds
+    try:
+        body = mmap.mmap(body_fd, 0, prot=mmap.PROT_READ)
+        preview = os.pread(preview_fd, os.fstat(preview_fd).st_size, 0)
+    finally:
+        os.close(body_fd)
+        os.close(preview_fd)
+    return Developed(
+        body=body,
+        sha256=facts["sha256"],
+        arrays=facts["arrays"],
+        carriers=facts["carriers"],
+        carriers_from=facts["carriers_from"],
+        carriers_found=facts["carriers_found"],
+        carriers_predicted=facts["carriers_predicted"],
+        law=facts["law"],
+        grid=facts["grid"],
+        preview=preview,
+        preview_size=(facts["preview_size"][0], facts["preview_size"][1]),
+        ms=facts["ms"],
+        seen=facts["seen"],
+    )
+
+
+Serve = Callable[[Message], tuple[Mapping[str, Any], tuple[int, ...]]]
+
+
+def serve(end: socket.socket, answer: Serve) -> None:
+    """The worker's loop: one answer a question, until the other end closes."""
+    channel = Channel(end)
+    while True:
+        try:
+            question = channel.receive(3600)
+            if question is None:
+                continue
+            body, fds = answer(question)
+            if body:
+                channel.send(body, fds, timeout_s=5.0)
+        except ChannelError:
+            return
+        for fd in fds:
+            os.close(fd)

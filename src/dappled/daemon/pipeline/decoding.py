@@ -1,0 +1,55 @@
+"""The decode stage: a tagged frame becomes slices, and those and their picture are published."""
+
+from __future__ import annotations
+
+import time
+
+from dappled.daemon.pipeline.decode_process import Developed, Developer
+from dappled.daemon.pipeline.pending_shot import Book, Story
+from dappled.daemon.pipeline.pending_shots import Stories
+from dappled.daemon.stream import wire
+from dappled.daemon.stream.headers import slices_header
+from dappled.daemon.stream.publisher import Publisher
+from dappled.flight.records import Tag
+
+
+class Decoding:
+    """Decodes one story's frame after the other, in one thread. Of the pictures at most one in `preview_interval_s` is
+    published."""
+
+    def __init__(
+        self,
+        book: Book,
+        stories: Stories,
+        developer: Developer,
+        publisher: Publisher | None,
+        preview_interval_s: float,
+    ) -> None:
+        self._book, self._stories, self._developer, self._publisher = book, stories, developer, publisher
+        self._preview_interval_s, self._last_preview_s = preview_interval_s, -1e9
+
+    def work(self, story: Story) -> None:
+        """Decode a tagged frame, enter the result, publish it: the end of its story. Raises DevelopmentError."""
+        frame, tag = story.frame, story.tag
+        assert frame is not None
+        assert tag is not None
+        began = time.monotonic_ns()
+        developed = self._developer.develop(self._book.path(frame), tag.focal_length_mm, tag.f_number)
+        story.developed = developed
+        self._book.decoded(developed.result(frame.index, (time.monotonic_ns() - began) / 1e6))
+        story.ms["decode"] = (time.monotonic_ns() - began) / 1e6
+        began = time.monotonic_ns()
+        self._publish(tag, developed)
+        story.ms["publish"] = (time.monotonic_ns() - began) / 1e6
+        self._stories.finish(story)
+
+    def _publish(self, tag: Tag, developed: Developed) -> None:
+        if self._publisher is None:
+            return
+        self._publisher.publish("slices", slices_header(tag, developed), developed.body)
+        now_s = time.monotonic()
+        if developed.preview and now_s - self._last_preview_s >= self._preview_interval_s:
+            self._last_preview_s = now_s
+            facts = wire.frame_facts(tag, developed.law)
+            size = {"width": developed.preview_size[0], "height": developed.preview_size[1]}
+            self._publisher.publish("preview", {**facts, "media_type": "image/jpeg", **size}, developed.preview)

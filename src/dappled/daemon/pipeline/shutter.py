@@ -1,0 +1,278 @@
+"""The shutter: every wish becomes exactly one shot, or is refused in words. Nothing here waits for the camera."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from dappled.clock import Clock
+from dappled.daemon.pipeline.capture_requests import Recent, Wish
+from dappled.errors import report
+from dappled.flight.errors import FlightError
+from dappled.flight.records import Cause, Shot
+
+__all__ = ["Shutter", "ShutterStatistics", "Verdict", "Wish"]
+
+log = logging.getLogger(__name__)
+_IDLE_S = 3600.0
+_SHORTEST_S = 0.05
+_AGAIN_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of a wish: a new shot, a message more of a known shot, or nothing. `reason` is a sentence."""
+
+    outcome: Literal["shot", "duplicate", "refused"]
+    index: int | None = None
+    reason: str | None = None
+
+    @property
+    def accepted(self) -> bool:
+        """Whether there is a shot for the wish."""
+        return self.outcome != "refused"
+
+
+@dataclass(frozen=True, slots=True)
+class ShutterStatistics:
+    """Counters of this flight. wishes = shots + duplicates + refused; shots = pending + succeeded + failed.
+
+    An interval's shots each count as a wish. `interval_s` is None while no interval runs.
+    """
+
+    wishes: int
+    shots: int
+    duplicates: int
+    refused: int
+    pending: int
+    succeeded: int
+    failed: int
+    next_index: int
+    interval_s: float | None
+
+
+@dataclass(slots=True)
+class _Interval:
+    source: str
+    interval_ns: int
+    left: int | None
+    due_ns: int
+    command: Wish
+    taken: int = 1
+
+
+class Shutter:
+    """Wishes in, shots out.
+
+    `next_index`: the image index of the next shot. `note(shot)` writes the shot down before the camera is touched; a
+    FlightError or OSError from it refuses the wish, and its sentence is the reason. `fire(index)` is the driver's
+    call, which returns at once. `obstacle()` says in a sentence why no shot can be taken now (no camera, disk full),
+    else None. At most `capacity` shots may be pending (fired, not yet settled). `on_change` is called, without a lock
+    held, when what a ground station may be shown has changed.
+
+    All methods may be called from any thread, and return within a millisecond as long as `note`, `fire` and
+    `obstacle` do.
+    """
+
+    def __init__(
+        self,
+        *,
+        next_index: int,
+        note: Callable[[Shot], None],
+        fire: Callable[[int], None],
+        clock: Clock,
+        capacity: int = 8,
+        obstacle: Callable[[], str | None] = lambda: None,
+        on_change: Callable[[], None] = lambda: None,
+        on_refused: Callable[[tuple[Wish, str]], None] = lambda refused: None,
+    ) -> None:
+        self._next_index = next_index
+        self._note = note
+        self._fire = fire
+        self._clock = clock
+        self._capacity = capacity
+        self._obstacle = obstacle
+        self._on_change = on_change
+        self._on_refused = on_refused
+        self._lock = threading.Lock()
+        self._recent = Recent()
+        self._pending: set[int] = set()
+        self._interval: _Interval | None = None
+        self._wishes = self._shots = self._duplicates = self._refused = self._succeeded = self._failed = 0
+        self._wake = threading.Event()
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, name="shutter intervals", daemon=True)
+
+    def start(self) -> None:
+        """Begin to serve intervals. Single shots need no thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End intervals and refuse from now on."""
+        with self._lock:
+            self._stopped = True
+            self._interval = None
+        self._wake.set()
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
+            self._thread.join(2.0)
+
+    def dead(self) -> list[str]:
+        """The thread's name where it has ended without being asked to: never, unless there is a bug."""
+        return [] if self._stopped or self._thread.is_alive() else [self._thread.name]
+
+    def wish(self, wish: Wish) -> Verdict:
+        """One message that asks for one shot."""
+        with self._lock:
+            verdict = self._judge(wish)
+        self._on_change()
+        return verdict
+
+    def start_interval(self, wish: Wish, interval_s: float, count: int) -> Verdict:
+        """A shot now and then every `interval_s` (0: as soon as the last one is settled, or a second after one that was
+        refused), `count` in all, 0 for ever.
+
+        Takes the place of a running interval, unless it is a retry of the command that started it; ends at `count`
+        shots taken or missed, or at `stop_interval`. A shot that can't be taken when it is due is counted as refused,
+        and not made up for.
+        """
+        if not (math.isfinite(interval_s) and 0 <= interval_s <= 86400) or count < 0:
+            with self._lock:
+                self._wishes += 1
+                return self._refuse(wish, "an interval is 0 to 86400 s, and a count 0 or more")
+        wish = replace(wish, series=(interval_s, float(count)))
+        with self._lock:
+            verdict = self._judge(wish)
+            if verdict.outcome == "shot" and count != 1:
+                step_ns = round(max(interval_s, _SHORTEST_S if interval_s > 0 else 0.0) * 1e9)
+                left = None if count == 0 else count - 1
+                self._end_interval(wish.source)
+                self._interval = _Interval(wish.source, step_ns, left, self._clock.monotonic_ns() + step_ns, wish)
+                self._wake.set()
+        self._on_change()
+        return verdict
+
+    def stop_interval(self, source: str | None = None) -> bool:
+        """End a running interval, whoever started it; the same command from the same `source` then starts it again.
+        False where none ran."""
+        with self._lock:
+            ran = self._interval is not None
+            self._end_interval(source)
+        self._on_change()
+        return ran
+
+    def settled(self, index: int, ok: bool) -> None:
+        """A shot's outcome is known: its frame is safe, or there will be none. A second call for a shot is ignored."""
+        with self._lock:
+            if index not in self._pending:
+                return
+            self._pending.discard(index)
+            self._succeeded += ok
+            self._failed += not ok
+            if self._interval is not None and self._interval.interval_ns == 0:
+                self._wake.set()
+        self._on_change()
+
+    def serve(self) -> float:
+        """Take the interval's shot if one is due; seconds until there is something to do. The thread's work."""
+        taken = False
+        with self._lock:
+            now_ns = self._clock.monotonic_ns()
+            interval = self._interval
+            if interval is None or (interval.interval_ns == 0 and self._pending):
+                return _IDLE_S
+            if now_ns >= interval.due_ns:
+                verdict = self._judge(Wish(interval.source, "interval", interval.taken, acknowledged=False))
+                taken = True
+                interval.taken += 1
+                if interval.left is not None:
+                    interval.left -= 1
+                if interval.left == 0:
+                    self._interval = interval = None
+                elif interval.interval_ns:
+                    behind = (now_ns - interval.due_ns) // interval.interval_ns
+                    interval.due_ns += (1 + behind) * interval.interval_ns  # late ticks are missed, not bunched
+                else:
+                    interval.due_ns = now_ns + round((_SHORTEST_S if verdict.accepted else _AGAIN_S) * 1e9)
+            wait_s = _IDLE_S if interval is None else max(0, interval.due_ns - now_ns) / 1e9
+        if taken:
+            self._on_change()
+        return wait_s
+
+    def statistics(self) -> ShutterStatistics:
+        """Counters."""
+        with self._lock:
+            return ShutterStatistics(
+                self._wishes,
+                self._shots,
+                self._duplicates,
+                self._refused,
+                len(self._pending),
+                self._succeeded,
+                self._failed,
+                self._next_index,
+                None if self._interval is None else self._interval.interval_ns / 1e9,
+            )
+
+    def _end_interval(self, source: str | None) -> None:
+        """What a sender ended itself it may start again at once; after another's stop its message is a retry."""
+        if self._interval is not None and self._interval.command.source == source:
+            self._recent.forget(self._interval.command)
+        self._interval = None
+
+    def _judge(self, wish: Wish) -> Verdict:
+        self._wishes += 1
+        now_ns = self._clock.monotonic_ns()
+        if wish.kind != "interval":
+            known = self._recent.same(wish, now_ns)
+            if known is not None:
+                self._duplicates += 1
+                return Verdict("duplicate", index=known)
+        reason = self._why_not()
+        if reason is None:
+            shot = Shot(self._next_index, Cause(wish.source, wish.kind, wish.sequence), self._clock.utc_ns(), now_ns)
+            try:
+                self._note(shot)
+            except (OSError, FlightError) as error:
+                reason = f"the wish could not be written down: {error}"
+        if reason is not None:
+            return self._refuse(wish, reason)
+        self._next_index += 1
+        self._shots += 1
+        self._pending.add(shot.index)
+        if wish.kind != "interval":
+            self._recent.add(wish, now_ns, shot.index)
+        try:
+            self._fire(shot.index)
+        except Exception:
+            # The shot is noted, so it exists; whoever owns the driver sees the exception and the failed count.
+            self._pending.discard(shot.index)
+            self._failed += 1
+            raise
+        return Verdict("shot", index=shot.index)
+
+    def _refuse(self, wish: Wish, reason: str) -> Verdict:
+        self._refused += 1
+        self._on_refused((wish, reason))
+        log.warning("A shot was refused (%s, %s): %s", wish.source, wish.kind, reason)
+        return Verdict("refused", reason=reason)
+
+    def _why_not(self) -> str | None:
+        if self._stopped:
+            return "the daemon is stopping"
+        if len(self._pending) >= self._capacity:
+            return f"{len(self._pending)} shots are waiting for the camera already"
+        return self._obstacle()
+
+    def _run(self) -> None:
+        while not self._stopped:
+            self._wake.clear()
+            try:
+                wait_s = self.serve()
+            except Exception as error:  # noqa: BLE001  # of whoever notes or fires: the interval goes on
+                report(log, "interval", error)
+                wait_s = _AGAIN_S
+            self._clock.wait(self._wake, wait_s)

@@ -1,0 +1,102 @@
+"""The tag stage: when and where a frame was exposed, from its file, its trigger call and the telemetry."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from dappled.daemon.navigation import camera_clock
+from dappled.daemon.navigation.camera_clock import CameraClock
+from dappled.daemon.pipeline import tagger
+from dappled.daemon.pipeline.pending_shot import Book, Names, PoseSource, Story, Watchers
+from dappled.daemon.pipeline.pending_shots import Stories
+from dappled.daemon.pipeline.tagger import BodyLatency, Exposure, Zoom
+from dappled.daemon.stream.headers import frame_header
+from dappled.daemon.stream.publisher import Publisher
+from dappled.drivers.raw import reading
+from dappled.drivers.raw.darkroom import camera_name
+from dappled.errors import DappledError
+from dappled.flight.records import Frame
+
+log = logging.getLogger(__name__)
+
+
+class Tagging:
+    """Tags one story after the other, in one thread. `hand_on` takes those with a frame, tagged and published."""
+
+    def __init__(
+        self,
+        book: Book,
+        stories: Stories,
+        watchers: Watchers,
+        publisher: Publisher | None,
+        *,
+        poses: PoseSource,
+        latency: BodyLatency,
+        names: Names,
+        hand_on: Callable[[Story], object],
+    ) -> None:
+        self._book, self._stories, self._watchers, self._publisher = book, stories, watchers, publisher
+        self._poses, self._latency, self._names, self._hand_on = poses, latency, names, hand_on
+        self._zoom = Zoom()
+        self._camera_clock = CameraClock()
+
+    def work(self, story: Story) -> None:
+        """Tag a story's frame. Where its file stays at the camera, tell where it was exposed, and end it."""
+        if story.frame is None:
+            story.where = self._poses(story.shot.index, self._expected(story, tagger.Settings()))
+            self._stories.tell(self._watchers.tagged, story)
+            self._stories.finish(story)
+            return
+        self._tag(story, story.frame)
+        self._hand_on(story)
+
+    def failed(self, story: Story, why: str) -> None:
+        """A frame that can't be tagged."""
+        self._stories.tell(self._watchers.tagged, story)
+        self._stories.leave(story, "not tagged", why)
+
+    def _tag(self, story: Story, frame: Frame) -> None:
+        began = time.monotonic_ns()
+        settings = self._settings(frame)
+        if zoomed := self._zoom.look(frame.index, settings.focal_length_mm):
+            log.warning("zoom: %s", zoomed)
+            self._stories.note("zoom", zoomed, frame.index)
+        exposure, pose = self._poses(frame.index, self._expected(story, settings))
+        # A file that may be another shot's would teach another shot's time.
+        if story.fired and not story.doubt and (told := camera_clock.shown(settings.taken)):
+            self._camera_clock = self._camera_clock.learnt(*told, exposure)
+        if story.doubt:
+            exposure = replace(exposure, source=f"{exposure.source}; in doubt: {story.doubt}")
+        camera = camera_name(self._names.camera, settings.model)
+        story.tag = tagger.tag(frame, exposure, settings, camera=camera, mask=self._names.mask, pose=pose)
+        self._book.tagged(story.tag)
+        story.ms["tag"] = (time.monotonic_ns() - began) / 1e6
+        self._stories.tell(self._watchers.tagged, story)
+        if self._publisher:
+            self._publisher.publish("frame", frame_header(story.tag, frame, self._names.law or None))
+
+    def _settings(self, frame: Frame) -> tagger.Settings:
+        try:
+            return tagger.Settings.of(reading.read_metadata(self._book.path(frame)))
+        except DappledError as error:
+            self._stories.note("unreadable", str(error), frame.index)
+            return tagger.Settings()
+
+    def _expected(self, story: Story, settings: tagger.Settings) -> Exposure:
+        """When the frame was exposed, as far as trigger call and file tell: by the trigger call and the body's latency;
+        by the camera's own clock, where the driver never said when it fired; else by the wish."""
+        shot = story.shot
+        if story.fired is not None:
+            called_utc_ns = tagger.called_utc_ns(shot, story.fired.called_monotonic_ns)
+            return tagger.mid_exposure(called_utc_ns, self._latency, settings.exposure_s)
+        told = camera_clock.shown(settings.taken)
+        by_camera = told and camera_clock.exposure_from_camera(self._camera_clock, *told, settings.exposure_s)
+        if by_camera:
+            self._stories.note("untimed", "the driver never said when it fired: the camera's clock is used", shot.index)
+            return by_camera
+        self._stories.note("untimed", "the driver never said when it fired: the wish's time is used", shot.index)
+        arrived_utc_ns = story.frame.arrived_utc_ns if story.frame else None
+        return tagger.by_wish(shot.wished_utc_ns, arrived_utc_ns, self._latency, settings.exposure_s)

@@ -1,0 +1,1 @@
+"""Recorded flights through the same pipeline again: replay, late tags, later decoding."""

@@ -1,0 +1,101 @@
+"""Frames that a crash left safe but without a tag get theirs: the flight goes down the street once more, undecoded.
+
+Trigger calls, telemetry and frames are all in the record, so the tag is what a replay would make of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from dappled.config import settings as configuration
+from dappled.daemon.pipeline.flight_writer import ReplayBook
+from dappled.daemon.pipeline.pending_shot import Names, Watchers
+from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.tagger import BodyLatency
+from dappled.daemon.replay import replay
+from dappled.daemon.replay.replay import Progress, RecordedTelemetry, Recording
+from dappled.drivers.camera import Blob, Identity
+from dappled.drivers.replay import ReplayCamera
+from dappled.errors import DappledError
+from dappled.flight import layout
+from dappled.flight.ledger import Ledger, LedgerReader
+from dappled.flight.lock import FlightsLock
+from dappled.flight.records import Frame, Tag
+
+
+class TagBook(ReplayBook):
+    """Enters the tags that the ledger lacks, and what is told of their frames; all others stay as they are."""
+
+    def __init__(self, recording: Recording, ledger: Ledger) -> None:
+        super().__init__(recording.root, recording.expected)
+        self._ledger = ledger
+        self.added: list[int] = []
+
+    def record(self, index: int | None, name: str, blob: Blob) -> Frame:
+        """See Book: bytes are the business of `flight check`."""
+        frame = None if index is None else self.frame(index)
+        if frame is None:
+            raise DappledError(f"{name} belongs to no recorded frame")
+        return frame
+
+    def tagged(self, tag: Tag) -> None:
+        """See Book."""
+        super().tagged(tag)
+        if self._lacks(tag.index):
+            self._ledger.add_tag(tag)
+            self.added.append(tag.index)
+
+    def event(self, kind: str, text: str, index: int | None = None) -> None:
+        """See Book."""
+        if index is not None and self._lacks(index) and kind not in self._expected[index].told:
+            self._ledger.add_event(kind, text, index)
+
+    def _lacks(self, index: int) -> bool:
+        one = self._expected[index]
+        return one.frame is not None and one.tag_sha256 is None
+
+
+def add_missing(flight: Path, utc_ns: Callable[[], int]) -> list[int]:
+    """Tag the frames of a closed flight that have no tag; their image indices.
+
+    Raises DappledError where that can't be done now: a flight that is still recorded, a record that can't be written.
+    """
+    folder = layout.open_folder(flight)
+    with LedgerReader.open(folder.ledger) as reader:
+        missing = {frame.index for frame in reader.frames()} - reader.tags().keys()
+        closed = "closed_utc_ns" in reader.facts()
+    if not missing:
+        return []
+    if not closed:
+        raise DappledError(f"{flight} is still recorded, or was never closed: the next `dappled run` puts it in order")
+    facts = layout.read_facts(folder)
+    if "settings" not in facts or "names" not in facts:
+        raise DappledError(f"{folder.settings} lacks the settings that the flight was flown with")
+    settings = configuration.of_tables(facts["settings"], str(folder.settings))
+    recording = replay.of_flight(flight)
+    recording = replace(recording, shots=[shot for shot in recording.shots if shot.index <= max(missing)])
+    progress, time = Progress.begin(), replay.clock(recording)
+    with ExitStack() as stack:
+        stack.enter_context(FlightsLock(flight.absolute().parent))
+        ledger = stack.enter_context(Ledger(folder.ledger, utc_ns))
+        book = TagBook(recording, ledger)
+        street = Street(
+            camera=ReplayCamera(recording.files, Identity("dappled", "recording", "", str(flight)), time.monotonic_ns),
+            book=book,
+            poses=RecordedTelemetry.flown(settings, recording.telemetry, recording.horizons, recording.vehicles).pose,
+            developer=None,
+            publisher=None,
+            latency=BodyLatency.of(settings.camera),
+            names=Names(**facts["names"]),
+            watchers=Watchers(finished=progress.note),
+            decode_queue=1,
+        )
+        street.start()
+        stack.callback(street.stop, 5.0)
+        replay.play(recording, street, progress, time=time, pace=None)
+        for index in book.added:
+            ledger.add_event("tagged late", "the recording ended before its tag was made; it is made now", index)
+    return book.added

@@ -1,0 +1,272 @@
+"""A recorded flight, or a folder of frames, down the same street: what was, again."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import sleep
+from typing import Self
+
+from dappled.clock import RecordedClock
+from dappled.config.settings import Settings
+from dappled.daemon.navigation import vehicles
+from dappled.daemon.navigation.telemetry import Telemetry, first_position_utc_ns
+from dappled.daemon.pipeline.flight_writer import Expected, ReplayBook
+from dappled.daemon.pipeline.pending_shot import Story
+from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.tagger import Exposure
+from dappled.decode.geometry.pose import Pose
+from dappled.drivers.mavlink.framing import Decoder, Message
+from dappled.drivers.replay import Recorded
+from dappled.errors import DappledError
+from dappled.flight import durable, layout, telemetry_log
+from dappled.flight.entries import Result, ShotRow
+from dappled.flight.ledger import LIVE, LedgerReader
+from dappled.flight.records import Cause, Frame, Shot
+
+FRAME_SUFFIXES = (".raf", ".cr2", ".dng", ".tif", ".tiff", ".png", ".npy", ".nef", ".arw", ".jpg", ".jpeg")
+
+
+class ReplayError(DappledError):
+    """There is nothing to replay, or not like this; one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """What is to be replayed: shots in order with their files, the telemetry beside them, and what was recorded of
+    each. `horizons` says how many telemetry packets a frame's pose was made from; `vehicles` whose they were (see
+    `Telemetry`)."""
+
+    root: Path
+    shots: Sequence[Shot]
+    files: Sequence[Recorded]
+    expected: Sequence[Expected]
+    telemetry: Path | None
+    horizons: dict[int, int]
+    vehicles: Sequence[tuple[int, int]] = ()
+
+
+def of_flight(folder: Path, run: str = LIVE) -> Recording:
+    """A recorded flight, with the slices of one run. Raises FlightError when it is none."""
+    flight = layout.open_folder(folder)
+    with LedgerReader.open(flight.ledger) as ledger:
+        rows = ledger.shots()
+        frames = {frame.index: frame for frame in ledger.frames()}
+        poses = ledger.poses()
+        digests = {table: ledger.digests(table) for table in ("poses", "tags")}
+        results = ledger.results(run)
+        events = [event for event in ledger.events() if event.index is not None]
+        turns = vehicles.of_flight(ledger)
+    told: dict[int | None, dict[str, str]] = defaultdict(dict)
+    for event in events:
+        told[event.index][event.kind] = event.text
+    expected, files = [], []
+    for row in rows:
+        index = row.shot.index
+        frame = frames.get(index)
+        result = results.get(index)
+        expected.append(
+            Expected(
+                row,
+                frame,
+                _recorded(digests["poses"], index),
+                _recorded(digests["tags"], index),
+                None if result is None else result.slices_sha256,
+                frozenset(told[index]),
+            )
+        )
+        files.append(_file(folder, row, frame, told[index].get("doubt")))
+    if not frames:
+        raise ReplayError(f"{folder} holds no frames: there is nothing to replay")
+    telemetry = flight.telemetry if flight.telemetry.is_file() else None
+    horizons = {index: pose.telemetry_packets for index, pose in poses.items()}
+    return Recording(folder, [row.shot for row in rows], files, expected, telemetry, horizons, turns)
+
+
+def of_folder(
+    folder: Path, match: str, telemetry: Path | None, start_utc_ns: int | None, interval_s: float
+) -> Recording:
+    """Frames in a folder, in the order of their names; the first at `start_utc_ns` (None: the telemetry's first
+    position, or 1970 without telemetry), the others at `interval_s` after each other. A single .tlog in the folder is
+    the telemetry, where none is named."""
+    if telemetry is not None and not telemetry.is_file():
+        raise ReplayError(f"{telemetry}: there is no such telemetry file; check --telemetry")
+    telemetry = telemetry or _only_log(folder)
+    paths = [path for path in sorted(folder.glob(match)) if path.suffix.lower() in FRAME_SUFFIXES and path.is_file()]
+    if not paths:
+        raise ReplayError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
+    if start_utc_ns is None:
+        start_utc_ns = _first_position_utc_ns(telemetry) if telemetry else 0
+    shots, files, expected = [], [], []
+    for index, path in enumerate(paths):
+        utc_ns = start_utc_ns + round(index * interval_s * 1e9)
+        shot = Shot(index, Cause("replay", path.name), utc_ns, utc_ns)
+        try:
+            frame = Frame(index, path.name, path.name, path.stat().st_size, durable.hash_file(path), utc_ns)
+        except OSError as error:
+            raise ReplayError(f"{path} can't be read: {error.strerror}") from None
+        shots.append(shot)
+        files.append(Recorded(index, path, path.name, (utc_ns, utc_ns), utc_ns))
+        expected.append(Expected(ShotRow(shot, "safe", None, utc_ns, utc_ns), frame))
+    return Recording(folder, shots, files, expected, telemetry, {})
+
+
+def _only_log(folder: Path) -> Path | None:
+    logs = sorted(folder.glob("*.tlog"))
+    if len(logs) > 1:
+        raise ReplayError(f"{folder} holds {len(logs)} .tlog files: say which with --telemetry")
+    return logs[0] if logs else None
+
+
+class RecordedTelemetry:
+    """Poses from a telemetry file, fed packet by packet just as far as each frame's pose was made from."""
+
+    def __init__(
+        self,
+        path: Path | None,
+        horizons: dict[int, int],
+        *,
+        wait_s: float,
+        vehicles: Sequence[tuple[int, int]] = (),
+        component_id: int = 100,
+        attitude_sigma_rad: float = 0.0,
+    ) -> None:
+        """`vehicles`, `component_id` and `attitude_sigma_rad` are those that the recording daemon had."""
+        self._horizons, self._wait_ns = horizons, round(wait_s * 1e9)
+        self._telemetry = Telemetry(vehicles=vehicles, component_id=component_id, attitude_sigma_rad=attitude_sigma_rad)
+        self._packets = _packets(path) if path else iter(())
+        self._fed = 0
+
+    @classmethod
+    def flown(
+        cls, settings: Settings, path: Path | None, horizons: dict[int, int], vehicles: Sequence[tuple[int, int]]
+    ) -> Self:
+        """As the daemon of these settings had it."""
+        return cls(
+            path,
+            horizons,
+            wait_s=settings.pose.wait_ms / 1e3,
+            vehicles=vehicles,
+            component_id=settings.mavlink.component_id,
+            attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
+        )
+
+    def pose(self, index: int, exposure: Exposure) -> tuple[Exposure, Pose]:
+        """When and where a frame was exposed (see `Street`); frames come in the order of their exposure."""
+        horizon = self._horizons.get(index)
+        while horizon is None or self._fed < horizon:
+            if horizon is None and self._telemetry.settled(exposure):
+                break
+            packet = next(self._packets, None)
+            if packet is None:
+                break
+            number, stamp_us, message = packet
+            self._telemetry.feed(number, stamp_us, message)
+            self._fed = number + 1
+            if horizon is None and stamp_us * 1000 > exposure.utc_ns + self._wait_ns:
+                break
+        return self._telemetry.locate(exposure, upto_packet=horizon)
+
+
+@dataclass(slots=True)
+class Progress:
+    """Hands the shots to the street one by one, and knows when each has come to its end."""
+
+    finished: threading.Semaphore
+    frames: int = 0
+    bad: int = 0
+
+    @classmethod
+    def begin(cls) -> Progress:
+        return cls(threading.Semaphore(0))
+
+    def note(self, story: Story) -> None:
+        """For `Watchers.finished`: counts, and keeps nothing of the story."""
+        self.frames += story.frame is not None
+        self.bad += bool(story.problem) and story.frame is not None
+        self.finished.release()
+
+
+Pace = Callable[[Shot, Shot | None], None]  # waits between the shot before (None for the first) and this one
+
+
+def as_recorded(rate: float, sleep: Callable[[float], None] = sleep) -> Pace:
+    """The intervals of the flight, `rate` times as fast."""
+
+    def wait(shot: Shot, before: Shot | None) -> None:
+        if before is not None:
+            sleep(max(0, shot.wished_utc_ns - before.wished_utc_ns) / 1e9 / rate)
+
+    return wait
+
+
+def clock(recording: Recording) -> RecordedClock:
+    """The recording's clock, at its first wish."""
+    first = recording.shots[0]
+    return RecordedClock(first.wished_utc_ns, first.wished_utc_ns - first.wished_monotonic_ns)
+
+
+def play(
+    recording: Recording,
+    street: Street,
+    progress: Progress,
+    *,
+    time: RecordedClock,
+    pace: Pace | None,
+    timeout_s: float = 120.0,
+) -> None:
+    """Play every shot, at its recorded time. Without a pace each waits for the one before, so that nothing is ever
+    dropped."""
+    before: Shot | None = None
+    for shot in recording.shots:
+        if pace:
+            pace(shot, before)
+        time.advance_to(shot.wished_utc_ns)
+        street.expect(shot)
+        street.fire(shot.index)
+        if pace is None and not progress.finished.acquire(timeout=timeout_s):
+            raise ReplayError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
+        before = shot
+    if pace:
+        for shot in recording.shots:
+            if not progress.finished.acquire(timeout=timeout_s):
+                raise ReplayError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
+
+
+def book(recording: Recording, keep: Callable[[Result], object] | None = None) -> ReplayBook:
+    """The book that compares this recording with what comes down the street, but for results that `keep` takes."""
+    return ReplayBook(recording.root, recording.expected, keep)
+
+
+def _file(folder: Path, row: ShotRow, frame: Frame | None, doubt: str | None) -> Recorded:
+    called, returned = row.fired_called_monotonic_ns, row.fired_returned_monotonic_ns
+    fired = None if called is None or returned is None else (called, returned)
+    if frame is None:
+        return Recorded(row.shot.index, None, "", fired, reason=row.reason or "no frame was recorded")
+    arrived_ns = frame.arrived_utc_ns - row.shot.wished_utc_ns + row.shot.wished_monotonic_ns
+    facts = {} if doubt is None else {"doubt": doubt}
+    return Recorded(row.shot.index, folder / frame.name, frame.camera_name, fired, arrived_ns, facts=facts)
+
+
+def _recorded(digests: dict[int, tuple[str, str]], index: int) -> str | None:
+    found = digests.get(index)
+    return None if found is None else found[0]
+
+
+def _packets(path: Path) -> Iterator[tuple[int, int, Message]]:
+    decoder = Decoder()
+    for number, stamp_us, raw in telemetry_log.read(path):
+        message = decoder(raw)
+        if message is not None:  # a packet with a wrong checksum was never acted on either
+            yield number, stamp_us, message
+
+
+def _first_position_utc_ns(path: Path) -> int:
+    utc_ns = first_position_utc_ns(_packets(path))
+    if utc_ns is None:
+        raise ReplayError(f"{path} holds no position: give --start, the time of the first frame")
+    return utc_ns

@@ -1,0 +1,94 @@
+"""Decoding an old flight again, by another recipe: a named run, whose results stand beside those of the flight.
+
+A run's name, recipe and versions are a fact of the ledger ("run:NAME"); its files are kept in `inputs/NAME/`, so that
+it can be verified and repeated. What was recorded, and what other runs found, is never touched.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+from dappled.daemon.pipeline import recipes
+from dappled.daemon.pipeline.pending_shot import Names
+from dappled.drivers.raw.darkroom import Recipe
+from dappled.errors import DappledError
+from dappled.flight import layout, lock, provenance
+from dappled.flight.entries import Result
+from dappled.flight.ledger import LIVE, Ledger, LedgerReader
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What a run was made with. Paths of the recipe lead into the flight."""
+
+    name: str
+    recipe: Recipe
+    names: Names
+
+
+class RunBook:
+    """Writes one run's results into a closed flight's ledger."""
+
+    def __init__(self, flight: Path, run: Run, utc_ns: Callable[[], int]) -> None:
+        """Begin a run: its inputs are copied, and the ledger says what it is. Raises DappledError: no such name, one
+        that is there already, a flight that is still recorded, a disk that refuses."""
+        folder = layout.open_folder(flight)
+        if not _NAME.fullmatch(run.name) or run.name == LIVE:
+            raise DappledError(f"{run.name!r} can't name a run: use letters, digits, dots and dashes, not {LIVE!r}")
+        with LedgerReader.open(folder.ledger) as ledger:
+            facts, runs = ledger.facts(), ledger.runs()
+        if "closed_utc_ns" not in facts:
+            held = lock.is_held(flight.absolute().parent)
+            what = "is still recorded: wait for its end" if held else "was never closed: the next `dappled run` does it"
+            raise DappledError(f"{flight} {what}, or replay it without another recipe")
+        if run.name in runs or _fact(run.name) in facts:
+            raise DappledError(f"{flight} has a run {run.name!r} already: give another name with --run")
+        kept = recipes.keep(run.recipe, flight, run.name)
+        self.run = replace(run, recipe=kept)
+        self._ledger = Ledger(folder.ledger, utc_ns)
+        provenance.note(folder, self._ledger, f"{recipes.FOLDER}/{run.name}")
+        told = {"recipe": _relative(kept, flight), "names": asdict(run.names), "software": recipes.versions()}
+        self._ledger.set_fact(_fact(run.name), {**told, "utc_ns": utc_ns()})
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ledger.close()
+
+    def decoded(self, result: Result) -> None:
+        """What came out of one frame."""
+        self._ledger.add_result(replace(result, run=self.run.name))
+
+
+def of_flight(flight: Path, name: str) -> Run:
+    """A run that was made. Raises DappledError where there is none of this name."""
+    with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
+        facts = ledger.facts()
+    told = facts.get(_fact(name))
+    if told is None:
+        runs = sorted(key.removeprefix("run:") for key in facts if key.startswith("run:"))
+        raise DappledError(f"{flight} has no run {name!r}; it has {', '.join(runs) or 'none but the flight itself'}")
+    return Run(name, Recipe(**{**told["recipe"], **_absolute(told["recipe"], flight)}), Names(**told["names"]))
+
+
+def _fact(name: str) -> str:
+    return f"run:{name}"
+
+
+def _relative(recipe: Recipe, flight: Path) -> dict[str, Any]:
+    """The recipe as JSON values; its files relative to the flight, which may be copied elsewhere."""
+    top = f"{flight}/"
+    values = asdict(recipe)
+    return {k: v.removeprefix(top) if isinstance(v, str) and v.startswith(top) else v for k, v in values.items()}
+
+
+def _absolute(values: Mapping[str, Any], flight: Path) -> dict[str, str]:
+    inside = f"{recipes.FOLDER}/"
+    return {k: str(flight / v) for k, v in values.items() if isinstance(v, str) and v.startswith(inside)}

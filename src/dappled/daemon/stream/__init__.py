@@ -1,0 +1,1 @@
+"""What is published over ZeroMQ, and the subscriber at the other end."""

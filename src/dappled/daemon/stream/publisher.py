@@ -1,0 +1,332 @@
+"""The one thread that owns the sockets: PUB for the stream, ROUTER for questions. It never makes anybody wait.
+
+Messages wait in one bounded queue. When it is full the oldest preview goes first, then the oldest slices, and the
+header's `dropped` says how many; `start`, `frame` and `end` are small and always sent. `seq` counts what was really
+sent, topic by topic, so a gap at a subscriber is that subscriber's own loss, and it can ask for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import select
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import zmq
+
+from dappled.daemon.stream import questions, wire
+from dappled.daemon.stream.curve import ServerKeys
+from dappled.daemon.stream.in_flight_limit import Kept
+from dappled.daemon.stream.sockets import Doors
+from dappled.daemon.stream.wire import Message, WireError
+from dappled.errors import report
+
+log = logging.getLogger(__name__)
+
+Reply = Callable[[Message], None]
+Answer = Callable[[Mapping[str, Any], Reply], None]
+DROP_ORDER = ("preview", "health", "depth", "slices")
+REMEMBERED = 65536  # slices whose frame number is known by sequence
+UNREAD_ANSWERS = 4  # with a body, of all askers together
+UNREAD_STACKS = 8  # of all subscribers together: those who hang at different times hold different ones
+_LARGE_BYTES = 1_000_000
+_PATIENCE_S, _LARGE_PATIENCE_S = 0.02, 0.1  # after a message, while its bytes are on their way to those who read
+_GIVE_WAY_S = 0.25  # how long a large message waits while a frame is made safe
+
+
+@dataclass(frozen=True, slots=True)
+class PublisherStatistics:
+    """Counters so far, by topic; `questions` and `refused` of the ROUTER; peers that came with a wrong key."""
+
+    sent: Mapping[str, int]
+    dropped: Mapping[str, int]
+    waiting: int
+    questions: int
+    refused: int
+    wrong_keys: int = 0
+
+
+class Publisher:
+    """Publishes messages and hands questions to `answer(request, reply)`, which replies from any thread, once.
+
+    `slices` and `ask` are the endpoints; `ask` "" answers nobody. `keys` turn CURVE on for those that are tcp, `mode`
+    is that of ipc sockets. `private` is one more endpoint, ipc, for processes of the daemon itself, its questions on
+    "`private`.ask". Raises WireError when an endpoint can't be bound.
+    """
+
+    def __init__(
+        self,
+        slices: str,
+        ask: str,
+        *,
+        answer: Answer,
+        flight: str = "",
+        high_water_mark: int = 12,
+        capacity: int = 8,
+        keys: ServerKeys | None = None,
+        mode: int = 0o660,
+        private: str = "",
+    ) -> None:
+        self._flight = flight
+        self._answer = answer
+        self._capacity = capacity
+        self._lock = threading.Lock()
+        self._waiting: deque[tuple[bytes, Message]] = deque()  # (peer of a reply, or b"" for everybody; message)
+        self._sent = dict.fromkeys(wire.TOPICS, 0)
+        self._dropped = dict.fromkeys(wire.TOPICS, 0)
+        self._frame_of: dict[int, int] = {}
+        self._questions = self._refused = self._open_questions = 0
+        self._grace_s = self._patient_until_s = 0.0
+        self._start: Message | None = None
+        self._unread_stacks, self._unread_answers = Kept(UNREAD_STACKS), Kept(UNREAD_ANSWERS)
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._stopping = threading.Event()
+        self._way_is_free = threading.Event()
+        self._way_is_free.set()
+        self._closed = False
+        self._doors = Doors(keys, mode)
+        try:
+            self._pub = self._doors.open(zmq.PUB, [private, slices], high_water_mark)
+            asked_at = [private and f"{private}.ask", ask]
+            self._router = self._doors.open(zmq.ROUTER, asked_at, high_water_mark) if any(asked_at) else None
+        except WireError:
+            os.close(self._wake)
+            raise
+        self._thread = threading.Thread(target=self._run, name="publisher", daemon=True)
+
+    def start(self, flight: str = "") -> None:
+        """Begin to send and to listen; headers name the flight."""
+        self._flight = flight or self._flight
+        self._thread.start()
+
+    def publish(self, topic: str, facts: Mapping[str, Any], body: Any = None) -> None:
+        """Hand over a message; `seq`, `dropped` and the envelope are added when it is sent. Never waits.
+
+        `body` must not be changed afterwards: it is sent without a copy.
+        """
+        with self._lock:
+            self._waiting.append((b"", Message(topic, facts, body)))
+            if sum(not peer for peer, _ in self._waiting) > self._capacity:
+                self._drop_one()
+        self._ring()
+
+    @contextlib.contextmanager
+    def giving_way(self) -> Iterator[None]:
+        """While a frame is made safe: large messages wait, each at most a quarter of a second. One thread calls it."""
+        self._way_is_free.clear()
+        try:
+            yield
+        finally:
+            self._way_is_free.set()
+
+    def statistics(self) -> PublisherStatistics:
+        """Counters, taken together."""
+        with self._lock:
+            return PublisherStatistics(
+                dict(self._sent),
+                dict(self._dropped),
+                len(self._waiting),
+                self._questions,
+                self._refused,
+                self._doors.wrong_keys,
+            )
+
+    def dead(self) -> list[str]:
+        """Its thread, where it has ended without being asked to."""
+        begun = self._thread.ident is not None
+        return [self._thread.name] if begun and not self._thread.is_alive() and not self._stopping.is_set() else []
+
+    def stop(self, grace_s: float = 2.0) -> None:
+        """Send what waits, go on answering until nobody has asked for half a second (at most `grace_s`), then close."""
+        if self._stopping.is_set():
+            return
+        self._grace_s = grace_s
+        self._stopping.set()
+        self._ring()
+        if self._thread.is_alive():
+            self._thread.join(grace_s + 3)
+        self._doors.close(grace_s)
+        with self._lock:
+            self._closed = True  # an answer may still be on its way: it must not ring a descriptor that is another's
+            os.close(self._wake)
+
+    def _ring(self) -> None:
+        with self._lock:
+            if not self._closed:
+                os.eventfd_write(self._wake, 1)
+
+    def _drop_one(self) -> None:
+        for topic in DROP_ORDER:
+            for place, (peer, message) in enumerate(self._waiting):
+                if not peer and message.topic == topic:
+                    del self._waiting[place]
+                    self._dropped[topic] += 1
+                    return
+
+    def _run(self) -> None:
+        poller = select.poll()
+        poller.register(self._wake, select.POLLIN)
+        if self._router is not None:
+            poller.register(self._router.FD, select.POLLIN)
+        for descriptor in self._doors.fds:
+            poller.register(descriptor, select.POLLIN)
+        quiet_rounds = 0
+        while True:
+            self._doors.let_in()
+            self._send_waiting()
+            self._hear_questions()
+            if self._stopping.is_set():
+                quiet_rounds = 0 if self._open_questions or self._waiting else quiet_rounds + 1
+                if quiet_rounds > 5 or self._grace_s <= 0:
+                    return
+                self._grace_s -= 0.1
+            poller.poll(100)
+            with contextlib.suppress(BlockingIOError):
+                os.eventfd_read(self._wake)
+
+    def _send_waiting(self) -> None:
+        while True:
+            with self._lock:
+                if not self._waiting:
+                    return
+                peer, message = self._waiting.popleft()
+            try:
+                self._send_reply(peer, message) if peer else self._send(message)
+            except Exception as error:  # noqa: BLE001  # one message that can't be sent must not end the stream
+                report(log, f"{message.topic} was not sent", error)
+                if peer:  # the stream itself lost nothing
+                    self._say_so(peer)
+                    continue
+                with self._lock:
+                    self._dropped[message.topic] = self._dropped.get(message.topic, 0) + 1
+
+    def _send(self, message: Message) -> None:
+        header = self._envelope(message, self._sent[message.topic])
+        if message.topic == "end":
+            header["sent"] = dict(self._sent)  # so that a subscriber can tell what it missed last
+        body = None if message.body is None else memoryview(message.body)
+        patience_s = _PATIENCE_S
+        if body is not None and body.nbytes >= _LARGE_BYTES:
+            patience_s = _LARGE_PATIENCE_S
+            self._way_is_free.wait(_GIVE_WAY_S)
+            if not self._unread_stacks.take(body):
+                with self._lock:
+                    self._dropped[message.topic] += 1
+                return
+        self._give_out(_parts(message.topic, header, body))
+        self._patient_until_s = max(self._patient_until_s, time.monotonic() + patience_s)
+        with self._lock:
+            self._sent[message.topic] += 1
+            self._remember(message, header)
+
+    def _give_out(self, parts: list[Any]) -> None:
+        """Wait a little for a reader whose queue is full because of what came just before, then go on without it.
+
+        So queues can be short, in stacks of slices, and what follows at once is not lost.
+        """
+        while (left_s := self._patient_until_s - time.monotonic()) > 0:
+            self._pub.setsockopt(zmq.XPUB_NODROP, 1)
+            try:
+                self._pub.send_multipart(parts, flags=zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                time.sleep(min(left_s, 0.002))
+            else:
+                return
+        self._pub.setsockopt(zmq.XPUB_NODROP, 0)
+        self._pub.send_multipart(parts, copy=False)
+
+    def _send_reply(self, peer: bytes, message: Message) -> None:
+        assert self._router is not None  # a reply can only be to a question
+        self._open_questions -= 1
+        header, body = message.header, None if message.body is None else memoryview(message.body)
+        if body is not None and not self._unread_answers.take(body):
+            self._refused += 1
+            text = f"{UNREAD_ANSWERS} answers wait to be read already: ask again later"
+            message, body = Message("error", {}), None
+            header = {**self._envelope(Message("error", {"error": text}), None), "asked": header["asked"]}
+        parts = [peer, *_parts(message.topic, header, body)]
+        try:
+            self._router.send_multipart(parts, flags=zmq.NOBLOCK, copy=False)
+        except zmq.ZMQError as error:  # the asker is gone or does not read: its loss
+            log.info("an answer found nobody: %s", error)
+
+    def _say_so(self, peer: bytes) -> None:
+        assert self._router is not None
+        self._refused += 1
+        header = self._envelope(Message("error", {"error": "the answer can't be sent: see the daemon's log"}), None)
+        with contextlib.suppress(zmq.ZMQError):  # the asker is gone or does not read: its loss
+            self._router.send_multipart([peer, b"error", wire.encode({**header, "asked": None})], flags=zmq.NOBLOCK)
+
+    def _envelope(self, message: Message, seq: int | None) -> dict[str, Any]:
+        return {
+            "schema": f"dappled/{message.topic}",
+            "version": wire.VERSION,
+            "flight": self._flight,
+            "seq": seq,
+            "dropped": self._dropped.get(message.topic, 0),
+            **message.header,
+        }
+
+    def _remember(self, message: Message, header: Mapping[str, Any]) -> None:
+        if message.topic == "slices":
+            self._frame_of[header["seq"]] = header["frame"]
+            self._frame_of.pop(header["seq"] - REMEMBERED, None)
+        elif message.topic == "start":
+            self._start = Message("start", header)
+
+    def _hear_questions(self) -> None:
+        if self._router is None:
+            return
+        for _ in range(100):  # a flood is taken in portions, so that sending goes on
+            try:
+                parts = self._router.recv_multipart(flags=zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            peer = parts[0]
+            payload = [part for part in parts[1:] if part]
+            self._questions += 1
+            self._open_questions += 1
+            try:
+                request = questions.parse(payload)
+            except WireError as error:
+                self._refused += 1
+                self._reply_to(peer, None)(Message("error", {"error": str(error)}))
+                continue
+            reply = self._reply_to(peer, request)
+            try:
+                if request["get"] == "start" and self._start is not None:
+                    reply(self._start)
+                else:
+                    self._answer(self._resolved(request), reply)
+            except WireError as error:
+                self._refused += 1
+                reply(Message("error", {"error": str(error)}))
+
+    def _resolved(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        if request.get("flight") not in (None, self._flight):
+            raise WireError(f"flight {request['flight']} is over, this is {self._flight}: replay its folder instead")
+        if "frame" in request or "seq" not in request:
+            return request
+        frame = self._frame_of.get(request["seq"])
+        if frame is None:
+            raise WireError(f"seq {request['seq']} of slices was not sent, or too long ago: ask by frame")
+        return {**request, "frame": frame}
+
+    def _reply_to(self, peer: bytes, asked: Mapping[str, Any] | None) -> Reply:
+        def reply(message: Message) -> None:
+            header = {**self._envelope(message, None), "asked": asked}
+            with self._lock:
+                self._waiting.append((peer, Message(message.topic, header, message.body)))
+            self._ring()
+
+        return reply
+
+
+def _parts(topic: str, header: Mapping[str, Any], body: memoryview | None) -> list[Any]:
+    return [topic.encode(), wire.encode(header), *([] if body is None else [body])]

@@ -1,0 +1,232 @@
+"""What a masked camera turned out to be: lattice, mask distance, phases and transfer, fitted to stopped-down frames.
+
+At a mask's ideal frequency and full aperture the carriers of anything flat average out, so calibration takes frames
+at a small aperture, where every carrier stands; the frame's f-number says how much of it the aperture took away.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.decode.calibration.calibration import Calibration, LatticeFit, at_centre
+from dappled.decode.calibration.lattice_fit import Sight, look
+from dappled.decode.calibration.law_choice import PLAUSIBLE, judge, steps_bins
+from dappled.decode.errors import DecodeError
+from dappled.decode.lightfield.views import Aperture, angular_frequencies, kappa, transfer
+from dappled.decode.optics.carrier_tables import lattice_rotation
+from dappled.decode.optics.carriers import LAWS, Lattice, Sensor
+from dappled.decode.optics.masks import Mask, Order
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationFrame:
+    """A stopped-down frame: its plane float32 (H, W), focal length and f-number."""
+
+    plane: NDArray[np.float32]
+    focal_length_mm: float
+    f_number: float
+
+
+def calibrate(
+    frames: Sequence[CalibrationFrame],
+    *,
+    sensor: Sensor,
+    mask: Mask,
+    law: str,
+    mask_distance_mm: float,
+    aperture: Aperture | None = None,
+    choose_law: bool = False,
+    workers: int = 1,
+) -> Calibration:
+    """The calibration that stopped-down frames show; frames of one focal length are averaged.
+
+    `mask_distance_mm` is the stated one; the fitted one follows from the lattice and the law. With `choose_law` frames
+    at several focal lengths may show that the other law is right. Raises DecodeError where the carriers can't be found.
+    """
+    if not frames:
+        raise DecodeError("a calibration needs at least one frame")
+    if law not in LAWS:
+        raise DecodeError(f"unknown law {law!r}; known are {', '.join(LAWS)}")
+    aperture = aperture or Aperture(mask.views_per_axis)
+    return of_sights(
+        [sight_of(frame, sensor, mask, law, mask_distance_mm, workers=workers) for frame in frames],
+        sensor=sensor,
+        mask=mask,
+        law=law,
+        mask_distance_mm=mask_distance_mm,
+        aperture=aperture,
+        choose_law=choose_law,
+    )
+
+
+def of_sights(
+    sights: Sequence[Sight],
+    *,
+    sensor: Sensor,
+    mask: Mask,
+    law: str,
+    mask_distance_mm: float,
+    aperture: Aperture | None = None,
+    choose_law: bool = False,
+) -> Calibration:
+    """`calibrate` from what was seen in each frame, which is little to keep."""
+    aperture = aperture or Aperture(mask.views_per_axis)
+    steps = [(sight.focal_length_mm, steps_bins(sight.lattice, sensor)) for sight in sights]
+    verdict = judge(steps, sensor=sensor, mask=mask, stated_mm=mask_distance_mm, asked=law)
+    if choose_law and verdict.law is not None:
+        law = verdict.law
+    fitted = next(fit for fit in verdict.fits if fit.law == law)
+    several = fitted.explains and (fitted.pupil_mm is not None or fitted.offset_bins is not None)
+    pupil = fitted.pupil_mm or 0.0 if several else 0.0
+    fits = []
+    for length in sorted({sight.focal_length_mm for sight in sights}):
+        seen = [
+            _fit_of(
+                sight,
+                sensor,
+                mask,
+                law,
+                stated_mm=mask_distance_mm,
+                known_mm=fitted.mask_distance_mm if several else None,
+                aperture=aperture,
+            )
+            for sight in sights
+            if sight.focal_length_mm == length
+        ]
+        fits.append(_mean(seen))
+    return Calibration(sensor.shape, law, mask, sensor, tuple(fits), pupil, verdict.sentence)
+
+
+def sight_of(
+    frame: CalibrationFrame, sensor: Sensor, mask: Mask, law: str, mask_distance_mm: float, *, workers: int = 1
+) -> Sight:
+    """What a frame shows. Raises DecodeError where it shows too little."""
+    return look(
+        frame.plane,
+        focal_length_mm=frame.focal_length_mm,
+        f_number=frame.f_number,
+        sensor=sensor,
+        mask=mask,
+        law=law,
+        mask_distance_mm=mask_distance_mm,
+        workers=workers,
+    )
+
+
+def origin_of(orders: Sequence[Order], phases: NDArray[np.complex128]) -> tuple[tuple[float, float], float]:
+    """(x0, rms phase residual) for complex transfers (K,) that may be negative: phase_k = 2π k·x0, or that plus π.
+
+    Each weighs by its magnitude. Which of the four origins half a period apart is meant is told by the sign of (0, 1)
+    and (1, 0), or else of the innermost orders: those are positive.
+    """
+    k = np.asarray(orders, dtype=np.float64)
+    weights = np.abs(phases) ** 2
+    squares = phases**2 / np.maximum(np.abs(phases), 1e-30) ** 2
+    best, best_score = np.zeros(2), -math.inf
+    steps = np.arange(0, 1, 1 / 48)
+    inner = np.argsort(np.hypot(*k.T), kind="stable")
+    inner = inner[weights[inner] > 1e-4 * weights.max()][:4]
+    for y, x in itertools.product(steps, steps):
+        turn = np.exp(-2j * np.pi * (k @ (y, x)))
+        score = float((weights * (squares * turn**2).real).sum())
+        score += 1e-3 * float((weights[inner] * (phases[inner] / np.abs(phases[inner]) * turn[inner]).real).sum())
+        if score > best_score:
+            best, best_score = np.array([y, x]), score
+    for _ in range(20):  # Gauss–Newton on the doubled phases
+        residual = np.angle(squares * np.exp(-4j * np.pi * (k @ best))) / (4 * np.pi)
+        root = np.sqrt(weights)[:, None]
+        best = best + np.linalg.lstsq(k * root, residual[:, None] * root, rcond=None)[0][:, 0]
+    residual = np.angle(squares * np.exp(-4j * np.pi * (k @ best))) / 2
+    rms = float(np.sqrt((weights * residual**2).sum() / weights.sum()))
+    return (float(best[0]), float(best[1])), rms
+
+
+def _fit_of(
+    sight: Sight,
+    sensor: Sensor,
+    mask: Mask,
+    law: str,
+    *,
+    stated_mm: float,
+    known_mm: float | None,
+    aperture: Aperture,
+) -> LatticeFit:
+    """`known_mm` is the distance that a law fitted to several focal lengths found; None: this one's own."""
+    distance, fitted = (
+        (known_mm, True)
+        if known_mm is not None
+        else _distance(sight.lattice, sight.focal_length_mm, sensor=sensor, mask=mask, law=law, stated_mm=stated_mm)
+    )
+    rotation = lattice_rotation(sight.lattice, sensor)
+    cycles = kappa(mask.frequency_per_mm, distance, sight.focal_length_mm, sight.f_number)
+    through = aperture.transform(angular_frequencies(sight.orders, cycles, rotation)).real
+    measured = sight.relative / np.where(np.abs(through) < 0.05, np.nan, through)
+    usable = np.isfinite(measured)
+    usable[0] = False
+    orders = [order for order, use in zip(sight.orders, usable, strict=True) if use]
+    if np.linalg.matrix_rank(orders) < 2:
+        raise DecodeError("too few carriers show at this aperture: calibrate on a frame at an eighth of the widest")
+    origin, phase_residual = origin_of(orders, measured[usable])
+    magnitudes = (measured * np.conj(transfer(sight.orders, np.ones(len(sight.orders)), origin))).real
+    known = dict(zip(sight.orders, np.nan_to_num(magnitudes), strict=True))
+    return LatticeFit(
+        focal_length_mm=sight.focal_length_mm,
+        f_number=sight.f_number,
+        lattice=sight.lattice,
+        rotation_rad=rotation,
+        mask_distance_mm=distance,
+        distance_fitted=fitted,
+        origin=at_centre(origin, sight.lattice, sensor.shape),
+        transfer=tuple(float(known.get(order, 0.0)) if order != (0, 0) else 1.0 for order in mask.half_orders()),
+        residual_bins=sight.residual_bins,
+        phase_residual_rad=phase_residual,
+        found=len(sight.found) + 1,
+        seen=tuple((c.ky, c.kx, m.fy, m.fx, m.strength) for c, m in sight.found),
+    )
+
+
+def _distance(
+    lattice: Lattice, focal_length_mm: float, *, sensor: Sensor, mask: Mask, law: str, stated_mm: float
+) -> tuple[float, bool]:
+    """(mask distance in mm, whether it was fitted): from the lattice's size on the chip, by the law.
+
+    A distance far from the stated one means a mask whose printed frequency isn't the stated one: the stated distance
+    is kept then.
+    """
+    to_sensor = np.array([sensor.row_mm, sensor.column_mm])  # (row, column) steps as (y, x) mm
+    per_mm = lattice.matrix() @ np.linalg.inv(to_sensor).T  # rows: cycles/mm along y and x
+    size = math.sqrt(abs(float(np.linalg.det(per_mm))))
+    if law == "geometric":
+        distance = (1 - size / mask.frequency_per_mm) * focal_length_mm
+    else:
+        expected = LAWS[law](mask, sensor, stated_mm, focal_length_mm).matrix() @ np.linalg.inv(to_sensor).T
+        distance = stated_mm * size / math.sqrt(abs(float(np.linalg.det(expected))))
+    believed = abs(distance / stated_mm - 1) <= PLAUSIBLE
+    return (distance if believed else stated_mm), believed
+
+
+def _mean(fits: list[LatticeFit]) -> LatticeFit:
+    """One fit of several at the same focal length; origins are averaged as angles."""
+    if len(fits) == 1:
+        return fits[0]
+    matrix = np.mean([f.lattice.matrix() for f in fits], axis=0)
+    (ay, ax), (by, bx) = matrix
+    turns = np.exp(2j * np.pi * np.array([f.origin for f in fits])).mean(axis=0)
+    return replace(
+        fits[0],
+        lattice=Lattice((float(ay), float(ax)), (float(by), float(bx))),
+        rotation_rad=float(np.mean([f.rotation_rad for f in fits])),
+        mask_distance_mm=float(np.mean([f.mask_distance_mm for f in fits])),
+        distance_fitted=all(f.distance_fitted for f in fits),
+        origin=(float(np.angle(turns[0]) / (2 * np.pi)), float(np.angle(turns[1]) / (2 * np.pi))),
+        transfer=tuple(float(m) for m in np.mean([f.transfer for f in fits], axis=0)),
+        residual_bins=float(np.sqrt(np.mean([f.residual_bins**2 for f in fits]))),
+        phase_residual_rad=float(np.sqrt(np.mean([f.phase_residual_rad**2 for f in fits]))),
+        found=min(f.found for f in fits),
+    )

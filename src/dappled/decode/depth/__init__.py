@@ -1,0 +1,1 @@
+"""Depth from a light field: evidence, methods, ranging, depth maps."""

@@ -1,0 +1,85 @@
+"""Depth from views: one interface over several methods, each pixel with its uncertainty, or unknown.
+
+`contrast` asks which refocused picture explains the measurements best (bears noise), `gradient` solves a least-squares
+problem (fast for small disparities), `stereo` matches pairs of views with OpenCV (clean views), `combined` joins
+contrast, photo-consistency and what the neighbours say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy import ndimage
+
+from dappled.decode.depth import combined, contrast, gradient, stereo
+from dappled.decode.depth.depth_map import DepthMap, Search, peaked, windowed
+from dappled.decode.depth.evidence import Evidence
+from dappled.decode.errors import DecodeError
+from dappled.decode.lightfield.view_stack import ViewStack
+
+METHODS: Mapping[str, Callable[[Evidence, Search], DepthMap]] = {
+    "combined": combined.depth,
+    "contrast": contrast.depth,
+    "gradient": gradient.depth,
+    "stereo": stereo.depth,
+}
+WINDOW = 13
+_FINEST, _MOST_LEVELS = 0.15, 64  # a step moves the outermost view by so much; no more disparities than these
+_COARSE_SIDE = 160  # px: pictures are made smaller than this to look for the range
+_WIDEST = 4.0  # px/view
+_SURE = 0.6  # the share of pixels, those with most texture, that the range is read off
+
+
+def estimate(
+    evidence: Evidence, method: str = "combined", *, between: tuple[float, float] | None = None, window: int = WINDOW,
+    workers: int = 1,
+) -> DepthMap:  # fmt: skip
+    """The depth map by one of `METHODS`, at disparities `between` two (None: where a coarse look finds the scene).
+
+    Raises DecodeError for an unknown method or a range that is none.
+    """
+    if method not in METHODS:
+        raise DecodeError(f"unknown depth method {method!r}; known are {', '.join(METHODS)}")
+    low, high = between or disparity_range(evidence, workers=workers)
+    return METHODS[method](evidence, search(evidence.stack, low, high, window=window, workers=workers))
+
+
+def search(stack: ViewStack, low: float, high: float, *, window: int = WINDOW, workers: int = 1) -> Search:
+    """Disparities fine enough for this stack's outermost views, unless they become too many."""
+    step = max(_FINEST / max(stack.reach, 1e-9), (high - low) / _MOST_LEVELS)
+    return Search(low, high, step, window, workers)
+
+
+def disparity_range(evidence: Evidence, *, workers: int = 1) -> tuple[float, float]:
+    """The disparities between which the scene lies, with a margin: contrast on pictures made smaller."""
+    stack = evidence.stack
+    height, width = stack.views.shape[2:]
+    factor = max(1, math.ceil(max(height, width) / _COARSE_SIDE))
+    rows, columns = height // factor * factor, width // factor * factor
+    v, u = stack.views.shape[:2]
+    images, views = (
+        a[:, :, :rows, :columns].reshape(v, u, rows // factor, factor, columns // factor, factor).mean(axis=(3, 5))
+        for a in (evidence.images, stack.views)
+    )
+    coarse = replace(
+        evidence,
+        stack=ViewStack(views, stack.row_steps / factor, stack.column_steps / factor),
+        images=images,
+    )
+    widest = min(_WIDEST, 0.25 * width / max(stack.reach, 1e-9))
+    looked = Search(-widest, widest, max(0.35 * factor / stack.reach, widest / 40), 9, workers)
+    disparities = looked.disparities()
+    likelihood, _ = windowed(contrast.explained(coarse, disparities, workers=workers), looked.window)
+    margin = likelihood.max(axis=0) - likelihood.mean(axis=0)
+    textured = margin >= np.quantile(margin, 1 - _SURE)
+    edge = max(3, min(margin.shape) // 10)
+    textured[:edge] = textured[-edge or None :] = False
+    peaks, _ = peaked(likelihood, disparities, likelihood.argmax(axis=0))
+    best = ndimage.median_filter(peaks, 3)
+    found = best[textured] if textured.any() else best.ravel()
+    low, high = (float(x) for x in np.quantile(found, [0.002, 0.998]))
+    margin_px = 0.5 * (disparities[1] - disparities[0])
+    return max(low - margin_px, -1.2 * widest), min(high + margin_px, 1.2 * widest)

@@ -1,0 +1,118 @@
+"""What a frame says about its light field, with how well it says so: what depth is estimated from.
+
+Everything measured is linear in the light field: B = K·L + noise of variance n, L being the views that a perfect
+camera had seen. Of plain views K is the identity. Of a masked frame B are its slices over their transfers: angular
+Fourier coefficients. The views of a noisy masked frame must not be used in their place: they are drawn towards their
+mean where the noise is strong, and parallax shrinks with them.
+
+For any shear of the light field the best picture and its likelihood follow from two things only: the back-projected
+views Q = Kᵀ B/n and the weights W = Kᵀ K/n.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.decode.errors import DecodeError
+from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.view_stack import Image, ViewStack, needs_parallax, of
+from dappled.decode.lightfield.views import Aperture, finest_detail
+
+_LEAST_NOISE = 1e-9  # variance: float32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """`images` Q float32 (V, U, h, w) and `weights` W (V·U, V·U) of the views in `stack` (grey).
+
+    `stack.views` are the views without any shrinking: unbiased, and noisier than those for the eye. `white` says that
+    n is the frame's own white noise and each sample a measurement of its own; else it is a guess from the views.
+    """
+
+    stack: ViewStack
+    images: NDArray[np.float32]
+    weights: NDArray[np.float64]
+    white: bool
+
+    def lags(self) -> NDArray[np.float64]:
+        """(2V−1, 2U−1) sums of W over pairs of views that stand equally far apart."""
+        v, u = self.stack.views.shape[:2]
+        total = np.zeros((2 * v - 1, 2 * u - 1))
+        rows, columns = np.divmod(np.arange(v * u), u)
+        np.add.at(
+            total, (rows[:, None] - rows[None, :] + v - 1, columns[:, None] - columns[None, :] + u - 1), self.weights
+        )
+        return total
+
+    def picture(self) -> Image:
+        """The grey picture as the aperture's middle sees it, with the noise of all views averaged out."""
+        made: Image = self.stack.views.mean(axis=(0, 1), dtype=np.float32)
+        return made
+
+
+def of_views(stack: ViewStack, noise_rms: float | None = None) -> Evidence:
+    """Evidence of plain views. `noise_rms` of a view's pixel; None: what the views' finest detail has.
+
+    Raises DecodeError where all views stand on one spot, or hold values that are no numbers.
+    """
+    needs_parallax(stack, "depth")
+    grey = stack.grey()
+    if not np.isfinite(grey.views).all():
+        raise DecodeError("the views hold values that are no numbers: decode the frame again")
+    variance = _LEAST_NOISE + (noise_rms**2 if noise_rms is not None else view_noise(grey.views))
+    count = grey.views.shape[0] * grey.views.shape[1]
+    return Evidence(grey, grey.views / np.float32(variance), np.eye(count) / variance, white=noise_rms is not None)
+
+
+def of_light_field(field: LightField) -> Evidence:
+    """Evidence of a masked frame's slices, where their transfers and noise are known; else of the views.
+
+    Raises DecodeError where there are no views.
+    """
+    stack = of(field)
+    rows, noise = field.attributes.get("transfers"), field.attributes.get("noise_rms")
+    if rows is None or not noise:
+        return of_views(stack)
+    needs_parallax(stack, "depth")
+    table = np.asarray(rows, dtype=np.float64)
+    transfers = table[:, 2] + 1j * table[:, 3]
+    used = transfers != 0
+    if table.shape != (len(field.slices), 4) or not used.any():
+        raise DecodeError("the light field's transfers don't fit its slices: decode the frame again")
+    angular, transfers = table[used, :2], transfers[used]
+    kernel = Aperture(field.views.shape[0], field.attributes.get("aperture") or "beams").cells(angular)
+    # The band that a slice takes of the frame's spectrum holds that share of the frame's white noise.
+    band = 1 / float(np.hypot(*field.grid[:, 0]) * np.hypot(*field.grid[:, 1]))
+    variance = max(float(noise) ** 2 * band, _LEAST_NOISE)
+    twice = np.where(np.all(angular == 0, axis=1), 1.0, 2.0)  # a carrier stands for its conjugate too
+    back = (kernel.conj() * (twice * transfers.conj() / variance)[:, None]).T
+    slices = field.slices if used.all() else field.slices[used]
+    flat = slices.reshape(len(slices), -1)
+    images = back.real.astype(np.float32) @ flat.real - back.imag.astype(np.float32) @ flat.imag
+    weights = ((kernel.conj().T * (twice * np.abs(transfers) ** 2 / variance)) @ kernel).real
+    shape = field.views.shape[:4]
+    plain = _plain_views(images, weights).reshape(shape)
+    return Evidence(
+        ViewStack(plain, stack.row_steps, stack.column_steps, stack.sensor_px_per_disparity),
+        np.ascontiguousarray(images.reshape(shape), dtype=np.float32),
+        weights,
+        white=True,
+    )
+
+
+def view_noise(views: NDArray[np.float32]) -> float:
+    """Variance of a view's noise: the least that any view's finest detail allows for (it holds texture too)."""
+    flat = views.reshape(-1, *views.shape[2:4])
+    return min(finest_detail(view.astype(np.complex64)) for view in flat[:: max(1, len(flat) // 9)])
+
+
+def _plain_views(images: NDArray[np.float32], weights: NDArray[np.float64]) -> NDArray[np.float32]:
+    """(J, pixels) the least-squares views W⁻¹Q; what no measurement tells stays at the mean of the views."""
+    values, vectors = np.linalg.eigh(weights)
+    kept = values > 1e-9 * values[-1]
+    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
+    made: NDArray[np.float32] = inverse.astype(np.float32) @ images
+    return made

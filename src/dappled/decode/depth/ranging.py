@@ -1,0 +1,217 @@
+"""From disparity to metres and back (Eq 5), by focus and focal length or by targets at known distances.
+
+A point at Z moves over the sensor by S = gain/Z + offset pixels (columns) from one end of the aperture to the other:
+by Eq 5, gain = A·f/pitch and offset = −gain/(distance in focus), A the aperture's side, f the lens' distance from the
+sensor. A disparity of 1 is `ViewStack.sensor_px_per_disparity` of these.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.decode.depth.depth_map import DepthMap, Map
+from dappled.decode.depth.estimate import WINDOW
+from dappled.decode.errors import DecodeError
+from dappled.decode.lightfield.view_stack import ViewStack
+
+RANGING = "ranging"  # the attribute of light fields, and the table of calibrations
+_FARTHEST_SIGMAS = 2.0  # a shift that is not clear of infinity by so many standard errors has no distance
+_ROUNDED_MM = 0.5  # files and bodies may round focal lengths to whole millimetres
+_NOMINAL = 0.02  # f-numbers and focal lengths are rounded, and nominal
+_FRESH_DISTANCES = 1.01  # targets whose distances differ by less tell the offset only
+
+
+@dataclass(frozen=True, slots=True)
+class Ranging:
+    """S = `gain_px_m`/Z + `offset_px`, for a lens at `f_number` (None: the scale doesn't depend on it, as under
+    lenslets) and one focal length (None: unknown). `source` says in words where it is from, `gain_sigma_share` how
+    well the gain is known, as a share of it: all distances are off together by as much."""
+
+    gain_px_m: float
+    offset_px: float
+    f_number: float | None = None
+    source: str = "calibration"
+    gain_sigma_share: float = 0.0
+    focal_length_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        """Raises DecodeError for numbers that are no lens."""
+        if not (math.isfinite(self.gain_px_m) and self.gain_px_m > 0 and math.isfinite(self.offset_px)):
+            raise DecodeError(f"a gain of {self.gain_px_m:g} px·m and an offset of {self.offset_px:g} px are no lens")
+
+    @classmethod
+    def of_lens(cls, focal_length_mm: float, f_number: float, pixel_mm: float, focus_m: float = math.inf) -> Ranging:
+        """By Eq 5 for a lens focused at `focus_m`, f-number and focal length as the frame says them."""
+        if not (focal_length_mm > 0 and f_number > 0 and pixel_mm > 0 and focus_m > focal_length_mm * 1e-3):
+            raise DecodeError(
+                f"focal length {focal_length_mm:g} mm, f/{f_number:g}, pixels of {pixel_mm:g} mm and a focus at "
+                f"{focus_m:g} m are no camera"
+            )
+        sensor_m = 1e-3 / (1 / focal_length_mm - 1e-3 / focus_m)  # Eq 3
+        gain = focal_length_mm / f_number * sensor_m / pixel_mm
+        return cls(gain, -gain / focus_m, f_number, "focal length, f-number and focus", _NOMINAL, focal_length_mm)
+
+    def at(self, f_number: float | None, focal_length_mm: float | None) -> Ranging:
+        """The same lens at another f-number.
+
+        Raises DecodeError for another focal length, or where only one of the two is known: a zoom changes gain and
+        offset in ways that Eq 5 alone doesn't tell. What rounding may hide (half a millimetre) goes into the gain's σ.
+        """
+        made = replace(self, gain_sigma_share=math.hypot(self.gain_sigma_share, self._zoom_share(focal_length_mm)))
+        if self.f_number is None or f_number is None:
+            return made
+        scale = self.f_number / f_number
+        return replace(made, gain_px_m=self.gain_px_m * scale, offset_px=self.offset_px * scale, f_number=f_number)
+
+    def _zoom_share(self, focal_length_mm: float | None) -> float:
+        """What a focal length this far from the calibrated one may change of the gain, which grows as its square."""
+        ours = self.focal_length_mm
+        if ours is None and focal_length_mm is None:
+            return 0.0
+        if ours is None or focal_length_mm is None or abs(focal_length_mm - ours) > _ROUNDED_MM + 1e-9:
+            known = "an unknown focal length" if ours is None else f"a focal length of {ours:g} mm"
+            frame = "unknown" if focal_length_mm is None else f"{focal_length_mm:g} mm"
+            raise DecodeError(
+                f"distances were calibrated at {known}, the frame's is {frame}: calibrate with targets at the frame's"
+            )
+        return 2 * abs(focal_length_mm - ours) / ours
+
+    def disparity(self, distance_m: float, stack: ViewStack) -> float:
+        """The disparity of what is so far away, inf allowed. Raises DecodeError for a distance of 0 or less."""
+        if not distance_m > 0:
+            raise DecodeError(f"a distance of {distance_m:g} m is none: it must be above 0")
+        return (self.gain_px_m / distance_m + self.offset_px) / _scale(stack)
+
+    def distances(self, depth: DepthMap, stack: ViewStack) -> DistanceMap:
+        """The map in metres. Unknown where the disparity is, and where it can't be told from infinity's."""
+        beyond = depth.disparity * np.float32(_scale(stack)) - np.float32(self.offset_px)
+        error = depth.sigma * np.float32(_scale(stack))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            known = beyond > _FARTHEST_SIGMAS * error
+            distance = np.where(known, np.float32(self.gain_px_m) / beyond, np.float32(np.nan))
+            # Eq 5: σ_Z = Z²·σ_S/gain, and a gain that is a share off makes all distances as much
+            sigma = np.hypot(distance**2 * error / np.float32(self.gain_px_m), self.gain_sigma_share * distance)
+        return DistanceMap(distance.astype(np.float32), sigma.astype(np.float32))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for a file."""
+        return {
+            "gain_px_m": self.gain_px_m,
+            "offset_px": self.offset_px,
+            "f_number": self.f_number,
+            "source": self.source,
+            "gain_sigma_share": self.gain_sigma_share,
+            "focal_length_mm": self.focal_length_mm,
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Ranging:
+        """The inverse of `to_dict`. Raises DecodeError."""
+        try:
+            f_number, length = (
+                None if values.get(name) is None else float(values[name]) for name in ("f_number", "focal_length_mm")
+            )
+            return cls(
+                float(values["gain_px_m"]), float(values["offset_px"]), f_number,
+                str(values.get("source", "calibration")), float(values.get("gain_sigma_share", 0.0)), length,
+            )  # fmt: skip
+        except (KeyError, TypeError, ValueError) as error:
+            raise DecodeError(f"the ranging is incomplete or wrong ({error}): calibrate with targets anew") from error
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DistanceMap:
+    """Distances from the lens along its axis and their standard errors, float32 (h, w), m; NaN where unknown."""
+
+    distance_m: Map
+    sigma_m: Map
+
+    def nearest(self, share: float = 0.01) -> tuple[float, float] | None:
+        """(m, σ in m): the distance that `share` of the known pixels are nearer than, and how well such pixels are
+        known; None where fewer than a tenth are known at all."""
+        known = np.isfinite(self.distance_m)
+        if known.mean() < 0.1:
+            return None
+        distance = float(np.quantile(self.distance_m[known], share))
+        return distance, float(np.median(self.sigma_m[known & (self.distance_m <= distance)]))
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A target at a known distance and the shift S that it was seen at, with its standard error."""
+
+    distance_m: float
+    shift_px: float
+    sigma_px: float = 0.0
+
+
+def fit_targets(
+    targets: Sequence[Target],
+    *,
+    f_number: float | None,
+    focal_length_mm: float | None = None,
+    lens: Ranging | None = None,
+) -> Ranging:
+    """The ranging that targets at known distances show, least squares in 1/Z.
+
+    The gain's σ is what the targets' own leave of it, or what their misfit shows where that is more. One distance
+    alone tells the offset (the focus); the gain is then that of `lens`. Raises DecodeError without it.
+    """
+    if not targets:
+        raise DecodeError("no target was seen")
+    inverse = np.array([1 / t.distance_m for t in targets])
+    shifts = np.array([t.shift_px for t in targets])
+    if not np.all(np.isfinite(inverse) & (inverse > 0)):
+        raise DecodeError("targets must stand at distances above 0 m")
+    if inverse.max() / inverse.min() < _FRESH_DISTANCES:
+        if lens is None:
+            raise DecodeError(
+                "targets at one distance tell where the focus is, not the scale: add one at another distance"
+            )
+        gain = lens.gain_px_m
+        offset = float(np.mean(shifts - gain * inverse))
+        source = f"{len(targets)} target(s) and the lens"
+        return Ranging(gain, offset, f_number, source, lens.gain_sigma_share, focal_length_mm)
+    design = np.column_stack([inverse, np.ones_like(inverse)])
+    gain, offset = np.linalg.lstsq(design, shifts, rcond=None)[0]
+    if gain <= 0:
+        raise DecodeError("nearer targets were seen with smaller shifts: are the distances in the order of the frames?")
+    by_target = np.linalg.pinv(design)[0]  # how each shift moves the gain
+    sigma = float(np.hypot.reduce(by_target * [t.sigma_px for t in targets]))
+    if len(targets) > 2:
+        misfit = shifts - design @ [gain, offset]
+        sigma = max(sigma, float(np.sqrt(misfit @ misfit / (len(targets) - 2) * (by_target @ by_target))))
+    source = f"{len(targets)} targets"
+    return Ranging(float(gain), float(offset), f_number, source, sigma / float(gain), focal_length_mm)
+
+
+def target_shift(depth: DepthMap, stack: ViewStack, share: float = 0.25, window: int = WINDOW) -> tuple[float, float]:
+    """The shift S of what fills the picture's middle (`share` of its height and width), and its standard error.
+
+    The median, each pixel counting by its variance, with one free measurement a `window`. Raises DecodeError where less
+    than a tenth of it is known.
+    """
+    height, width = depth.disparity.shape
+    cut = tuple(slice(round(n * (1 - share) / 2), max(round(n * (1 + share) / 2), 1)) for n in (height, width))
+    values, sigma = depth.disparity[cut].ravel(), depth.sigma[cut].ravel()
+    known = np.isfinite(values)
+    if known.mean() < 0.1:
+        raise DecodeError("the target in the picture's middle has too little texture: hang a printed page there")
+    order = np.argsort(values[known])
+    weight: NDArray[np.float64] = np.cumsum(1 / sigma[known][order].astype(np.float64) ** 2)
+    middle = values[known][order][int(np.searchsorted(weight, weight[-1] / 2))]
+    free = max(float(known.sum()) / window**2, 1.0)
+    error = math.sqrt(math.pi / 2 / free) * float(np.median(sigma[known]))  # a median's, of normal errors
+    return float(middle) * _scale(stack), error * _scale(stack)
+
+
+def _scale(stack: ViewStack) -> float:
+    if stack.sensor_px_per_disparity is None:
+        raise DecodeError("views from a folder have no sensor: only relative depth is to be had from them")
+    return stack.sensor_px_per_disparity

@@ -1,0 +1,1 @@
+"""Rays, poses and footprints, for daemon and products."""

@@ -1,0 +1,1 @@
+"""The light field, its views, and pictures focused anew."""

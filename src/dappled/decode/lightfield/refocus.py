@@ -1,0 +1,249 @@
+"""Refocusing by shift and add (Eq 28 and 29): any α, any disparity, any part of the aperture, any plane.
+
+Eq 29 sums L(u(1 − 1/α) + x/α, v(1 − 1/α) + y/α, u, v) over the views. u and v count views from the middle, x and y
+pixels of a view from the picture's middle, as in the thesis. α > 1 moves the focus into the background, α < 1 into
+the foreground; the plane in focus is that of disparity 1/α − 1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from dappled.decode.errors import DecodeError
+from dappled.decode.lightfield.view_stack import Image, ViewStack
+from dappled.decode.threads import each
+
+_LEAST_WEIGHT = 1e-6  # of all views: a pixel that less is seen of is unknown
+
+
+def disparity_of_alpha(alpha: float) -> float:
+    """The disparity 1/α − 1 that Eq 29 brings into focus. Raises DecodeError for an α that is no image plane."""
+    if not (math.isfinite(alpha) and alpha > 0):
+        raise DecodeError(f"α = {alpha:g} is no image plane: it must be above 0 (1 leaves the focus where it was)")
+    return 1 / alpha - 1
+
+
+def alpha_of_disparity(disparity: float) -> float:
+    """The inverse. Raises DecodeError for disparities of −1 and below, which no α reaches."""
+    if not disparity > -1:
+        raise DecodeError(
+            f"no α brings a disparity of {disparity:g} into focus: it must be above −1; use the disparity"
+        )
+    return 1 / (1 + disparity)
+
+
+def by_alpha(
+    stack: ViewStack, alpha: float, *, magnify: bool = False, weights: NDArray[np.floating] | None = None,
+    workers: int = 1,
+) -> Image:  # fmt: skip
+    """Eq 29 at α, float32 (h, w(, 3)), the mean of the views instead of their sum.
+
+    Eq 29's x/α makes the picture α times as large. That is done with `magnify`, cut to the views' size (pixels beyond
+    the views are NaN); without it the image plane is sampled α times as coarsely, and all α show the same scene.
+    """
+    made = shift_and_add(stack, disparity_of_alpha(alpha), weights=weights, workers=workers)
+    return magnified(made, alpha) if magnify else made
+
+
+def shift_and_add(
+    stack: ViewStack, disparity: float, *, weights: NDArray[np.floating] | None = None, workers: int = 1
+) -> Image:
+    """The picture focused on one disparity, float32 (h, w) or (h, w, 3): mean of L_vu(p + D·step) over views.
+
+    `weights` (V, U) are the views' shares of the aperture. Between pixels views are interpolated by cubic convolution
+    (Keys 1981). A pixel's mean is over the views that have it; pixels that none has are NaN.
+    """
+    if not math.isfinite(disparity):
+        raise DecodeError(f"a disparity of {disparity} is no plane: give a finite one, in pixels from view to view")
+    share = _checked(stack, weights)
+    if stack.colour:
+        made = np.stack(
+            [_summed(stack, stack.views[..., c], disparity, share, workers) for c in range(stack.views.shape[4])],
+            axis=-1,
+        )
+    else:
+        made = _summed(stack, stack.views, disparity, share, workers)
+    return made
+
+
+def along(
+    stack: ViewStack, disparity: NDArray[np.floating], *, weights: NDArray[np.floating] | None = None, workers: int = 1
+) -> Image:
+    """The picture focused on a surface: `disparity` (h, w) for each of its pixels, NaN where it is unknown.
+
+    The same mean as `shift_and_add`, with spline interpolation; NaN where the disparity is.
+    """
+    share = _checked(stack, weights)
+    height, width = stack.views.shape[2:4]
+    if disparity.shape != (height, width):
+        raise DecodeError(f"the surface is {disparity.shape}, the views are {(height, width)}")
+    known = np.isfinite(disparity)
+    surface = np.where(known, disparity, 0).astype(np.float32)
+    rows, columns = np.meshgrid(np.arange(height, dtype=np.float32), np.arange(width, dtype=np.float32), indexing="ij")
+    channels = np.moveaxis(stack.views, 4, 2) if stack.colour else stack.views[:, :, None]
+    sums = np.zeros((len(stack.row_steps), channels.shape[2] + 1, height, width), dtype=np.float32)
+
+    def one(v: int) -> None:
+        for u, column_step in enumerate(stack.column_steps):
+            if not share[v, u]:
+                continue
+            at = np.stack(
+                [rows + surface * np.float32(stack.row_steps[v]), columns + surface * np.float32(column_step)]
+            )
+            inside = (at[0] >= 0) & (at[0] <= height - 1) & (at[1] >= 0) & (at[1] <= width - 1)
+            weight = np.float32(share[v, u]) * inside
+            for c, view in enumerate(channels[v, u]):
+                sums[v, c] += weight * ndimage.map_coordinates(view, at, order=3, mode="nearest")
+            sums[v, -1] += weight
+
+    each(one, range(len(stack.row_steps)), workers)
+    total = sums.sum(axis=0)
+    seen = known & (total[-1] > _LEAST_WEIGHT)
+    made = np.where(seen, total[:-1] / np.where(seen, total[-1], 1), np.float32(np.nan)).astype(np.float32)
+    return np.moveaxis(made, 0, -1) if stack.colour else made[0]
+
+
+@dataclass(frozen=True, slots=True)
+class FocalPlane:
+    """A plane of disparities over the picture: at its middle, and how it changes over its full height and width."""
+
+    disparity: float
+    over_height: float = 0.0
+    over_width: float = 0.0
+
+    def over(self, shape: tuple[int, int]) -> NDArray[np.float32]:
+        """(h, w) disparities. (1/Z is linear over the picture of a plane, and so is disparity.)"""
+        y, x = (np.linspace(-0.5, 0.5, side, dtype=np.float32) for side in shape)
+        plane: NDArray[np.float32] = (
+            np.float32(self.disparity)
+            + np.float32(self.over_height) * y[:, None]
+            + np.float32(self.over_width) * x[None, :]
+        )
+        return plane
+
+
+def tilted(
+    stack: ViewStack, plane: FocalPlane, *, weights: NDArray[np.floating] | None = None, workers: int = 1
+) -> Image:
+    """The picture focused on a tilted plane, such as ground that is seen obliquely; `weights` as `shift_and_add`."""
+    height, width = stack.views.shape[2:4]
+    if plane.over_height == 0 and plane.over_width == 0:
+        return shift_and_add(stack, plane.disparity, weights=weights, workers=workers)
+    return along(stack, plane.over((height, width)), weights=weights, workers=workers)
+
+
+def disc(stack: ViewStack, diameter: float, centre: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
+    """(V, U) weights of a round synthetic aperture: `diameter` and `centre` (v, u) as shares of the whole aperture.
+
+    The rim is one view wide. The view nearest to the centre always counts. Raises DecodeError for a diameter of 0.
+    """
+    if not diameter > 0:
+        raise DecodeError(f"a synthetic aperture of {diameter:g} lets no light through: its diameter must be above 0")
+    count = max(stack.views.shape[:2])
+    rows, columns = (np.arange(n) - (n - 1) / 2 for n in stack.views.shape[:2])
+    away = np.hypot(rows[:, None] - centre[0] * count, columns[None, :] - centre[1] * count)
+    weights: NDArray[np.float64] = np.clip(diameter * count / 2 - away + 0.5, 0, 1)
+    weights[np.unravel_index(np.argmin(away), away.shape)] = 1.0
+    return weights
+
+
+def magnified(image: Image, factor: float) -> Image:
+    """The picture `factor` times as large about its middle, on the same pixels; NaN beyond its edges."""
+    middle = [(side - 1) / 2 for side in image.shape[:2]]
+    offset = [m - m / factor for m in middle]
+    channels = np.moveaxis(image, 2, 0) if image.ndim == 3 else image[None]
+    made = np.stack(
+        [
+            ndimage.affine_transform(c, [1 / factor, 1 / factor], offset, order=3, mode="constant", cval=np.nan)
+            for c in channels
+        ]
+    ).astype(np.float32)
+    return np.moveaxis(made, 0, 2) if image.ndim == 3 else made[0]
+
+
+def _checked(stack: ViewStack, weights: NDArray[np.floating] | None) -> NDArray[np.float64]:
+    """(V, U) weights whose sum is 1."""
+    share = np.ones(stack.views.shape[:2]) if weights is None else np.asarray(weights, dtype=np.float64)
+    if share.shape != stack.views.shape[:2]:
+        raise DecodeError(f"weights of shape {share.shape} for {stack.views.shape[0]} × {stack.views.shape[1]} views")
+    if not (np.all(np.isfinite(share)) and np.all(share >= 0) and share.sum() > 0):
+        raise DecodeError("the views' weights must be 0 or more, and not all 0")
+    normal: NDArray[np.float64] = share / share.sum()
+    return normal
+
+
+def _summed(
+    stack: ViewStack, views: NDArray[np.float32], disparity: float, share: NDArray[np.float64], workers: int
+) -> Image:
+    """Columns are shifted view by view, rows once for each row of views: Σ_v shift_y(Σ_u shift_x(L_vu))."""
+    height, width = views.shape[2:]
+    rows = np.zeros((len(stack.row_steps), height, width), dtype=np.float32)
+    down = np.zeros((len(stack.row_steps), height))
+    across = np.zeros((len(stack.column_steps), width))
+    for u, step in enumerate(stack.column_steps):
+        across[u, slice(*_taps(disparity * step, width).span)] = 1
+
+    def one(v: int) -> None:
+        line = np.zeros((height, width), dtype=np.float32)
+        for u, step in enumerate(stack.column_steps):
+            if share[v, u]:
+                _add_shifted(line, views[v, u], _taps(disparity * step, width), share[v, u], by_columns=True)
+        taps = _taps(disparity * stack.row_steps[v], height)
+        _add_shifted(rows[v], line, taps, 1.0, by_columns=False)
+        down[v, slice(*taps.span)] = 1
+
+    each(one, range(len(stack.row_steps)), workers)
+    seen = (down.T @ share @ across).astype(np.float32)
+    total: Image = rows.sum(axis=0)
+    if seen.min() > _LEAST_WEIGHT:
+        total /= seen
+        return total
+    known = seen > _LEAST_WEIGHT
+    made: Image = np.where(known, total / np.where(known, seen, 1), np.float32(np.nan)).astype(np.float32)
+    return made
+
+
+@dataclass(frozen=True, slots=True)
+class _Taps:
+    """What a shift along an axis does: pixel i becomes Σ weight·pixel[i + offset], for i in `span`."""
+
+    offsets: tuple[int, ...]
+    weights: tuple[float, ...]
+    span: tuple[int, int]
+
+
+def _taps(shift: float, side: int) -> _Taps:
+    """Cubic convolution with a = −1/2 at a fractional shift; one tap at a whole one."""
+    whole = math.floor(shift)
+    t = shift - whole
+    if t < 1e-6 or t > 1 - 1e-6:
+        offsets: tuple[int, ...] = (round(shift),)
+        weights: tuple[float, ...] = (1.0,)
+    else:
+        offsets = tuple(whole + k for k in (-1, 0, 1, 2))
+        weights = (
+            ((-0.5 * t + 1) * t - 0.5) * t,
+            (1.5 * t - 2.5) * t * t + 1,
+            ((-1.5 * t + 2) * t + 0.5) * t,
+            (0.5 * t - 0.5) * t * t,
+        )
+    first, last = max(0, -offsets[0]), min(side, side - offsets[-1])
+    return _Taps(offsets, weights, (first, max(first, last)))
+
+
+def _add_shifted(out: Image, image: Image, taps: _Taps, share: float, *, by_columns: bool) -> None:
+    """Add `share` times the shifted image to `out`, as far as all taps lie inside."""
+    first, last = taps.span
+    if first >= last:
+        return
+    target = out[:, first:last] if by_columns else out[first:last]
+    scratch = np.empty_like(target)
+    for offset, weight in zip(taps.offsets, taps.weights, strict=True):
+        here = slice(first + offset, last + offset)
+        np.multiply(image[:, here] if by_columns else image[here], np.float32(share * weight), out=scratch)
+        target += scratch

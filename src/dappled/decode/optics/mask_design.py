@@ -1,0 +1,217 @@
+"""Which mask, and where, for a sensor, a lens and an altitude; or the sentence why none does it.
+
+Both laws are answered, each by its own rules (`DESIGNS`, by the law's name):
+  - `geometric`: N = 2p + 1 views are separated at f_m = v / (d·A), A the aperture's diameter, so the ideal f-number
+    of a mask is f_m·d, whatever the lens. Three conditions bound d from below: the slices stay under the sensor's
+    Nyquist frequency, the film draws the highest harmonic with two pixels, and diffraction stays at
+    λ·d·(p·f_m)² ≤ 0.25. The least d that meets them all gives the views the most pixels.
+  - `fd`: the outer slices reach the edge of the spectrum at f_m·d = side·f / (2p + 1) (Eq 30 with the law's 1 mm²),
+    with the same conditions on film and diffraction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from dappled.decode.errors import DecodeError
+from dappled.decode.optics.carrier_tables import fresnel_number, lattice_of
+from dappled.decode.optics.carriers import Sensor
+from dappled.decode.optics.film import FILMS, Film
+from dappled.decode.optics.lenses import depth_sigma_m, ground_sample_m, image_distance_mm, within
+from dappled.decode.optics.masks import Mask
+
+FRESNEL_LIMIT = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What a mask is designed for.
+
+    `shift_sigma_px` is how well a shift from view to view will be known, in pixels of a view (0.02 is a good matcher).
+    `mask_distance_mm` is fixed where the camera leaves no choice, None where it may be chosen up to
+    `largest_distance_mm`. `views` is N an axis, odd.
+    """
+
+    sensor: Sensor
+    focal_length_mm: float
+    f_number: float
+    altitude_m: float
+    film: Film
+    views: int = 5
+    wavelength_nm: float = 550.0
+    shift_sigma_px: float = 0.02
+    mask_distance_mm: float | None = None
+    largest_distance_mm: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Raises DecodeError for nonsense in any value."""
+        image_distance_mm(self.focal_length_mm, self.altitude_m)
+        within("f-number", self.f_number, "", 0.5, 128)
+        within("views", self.views, "", 3, 41, hint="an odd number of views an axis")
+        if self.views % 2 == 0:
+            raise DecodeError(f"views = {self.views} must be odd: a mask of p harmonics makes 2p + 1")
+        within("wavelength", self.wavelength_nm, "nm", 200, 2000)
+        within("error of a shift", self.shift_sigma_px, "px", 1e-6, 10)
+        within("largest mask distance", self.largest_distance_mm, "mm", 1e-3, self.focal_length_mm)
+        if self.mask_distance_mm is not None:
+            within("mask distance", self.mask_distance_mm, "mm", 1e-3, 0.99 * self.focal_length_mm)
+
+    @property
+    def p(self) -> int:
+        """Harmonics of the mask."""
+        return (self.views - 1) // 2
+
+    @property
+    def aperture_mm(self) -> float:
+        """Diameter of the aperture, F / N."""
+        return self.focal_length_mm / self.f_number
+
+    @property
+    def image_mm(self) -> float:
+        """v: lens to sensor, focused on the ground (Eq 3)."""
+        return image_distance_mm(self.focal_length_mm, self.altitude_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """One condition on the design: what it needs, what is there, and whether that is enough."""
+
+    name: str
+    value: float
+    limit: float
+    unit: str
+
+    @property
+    def met(self) -> bool:
+        """Whether `value` stays at or under `limit`."""
+        return self.value <= self.limit * (1 + 1e-9)
+
+    @property
+    def sentence(self) -> str:
+        """The condition in words."""
+        return f"{self.name}: {self.value:.4g} of at most {self.limit:.4g} {self.unit}".rstrip()
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """A mask for a wish. `problem` is None where it works, else the sentence why it does not.
+
+    `view_shape` (rows, columns) of one view, `bandwidth_per_mm` (±, on the sensor) of one view, `spectrum_used` the
+    share of the frame's spectrum that slices cover, `baseline_mm` between neighbouring views on the aperture,
+    `depth_sigma_m` at the altitude (Eq 5), `ground_sample_m` of a view,
+    `films` the formats of Table 2 that can print it.
+    """
+
+    wish: Wish
+    law: str
+    mask: Mask
+    mask_distance_mm: float
+    conditions: tuple[Condition, ...]
+    view_shape: tuple[int, int]
+    bandwidth_per_mm: float
+    spectrum_used: float
+    baseline_mm: float
+    depth_sigma_m: float
+    ground_sample_m: float
+    film_period_px: float
+    films: tuple[str, ...]
+    problem: str | None
+
+    @property
+    def works(self) -> bool:
+        """Whether every condition is met."""
+        return self.problem is None
+
+
+def design_geometric(wish: Wish) -> Design:
+    """The mask at the least distance that meets every condition, or at the wish's own distance."""
+    v, aperture, p = wish.image_mm, wish.aperture_mm, wish.p
+    nyquist = min(1 / math.hypot(*wish.sensor.row_mm), 1 / math.hypot(*wish.sensor.column_mm)) / 2
+    if wish.mask_distance_mm is None:
+        by_sensor = v / (1 + nyquist * aperture / (p + 0.5))  # (p + 1/2)·f_m·(1 − d/v) ≤ nyquist
+        by_film = p * v / (aperture * wish.film.nyquist_per_mm)
+        by_light = wish.wavelength_nm * 1e-6 / FRESNEL_LIMIT * (p * v / aperture) ** 2  # λ·d·(p·f_m)² ≤ 0.25
+        distance_mm = max(by_sensor, by_film, by_light)
+    else:
+        distance_mm = wish.mask_distance_mm
+    if distance_mm > min(wish.largest_distance_mm, 0.99 * v) and wish.mask_distance_mm is None:
+        distance_mm = min(wish.largest_distance_mm, 0.99 * v)
+    mask = Mask(v / (distance_mm * aperture), p)
+    step = mask.frequency_per_mm * (1 - distance_mm / v)
+    sensor = Condition("slices under the sensor's Nyquist frequency", (p + 0.5) * step, nyquist, "cycles/mm")
+    return _finish(wish, "geometric", mask, distance_mm, sensor)
+
+
+def design_fd(wish: Wish) -> Design:
+    """The mask whose outer slices just reach the edge of the spectrum, as high in frequency as film and light allow."""
+    p, (height_mm, width_mm) = wish.p, wish.sensor.size_mm
+    product = min(height_mm, width_mm) * wish.focal_length_mm / wish.views  # f_m·d
+    if wish.mask_distance_mm is None:
+        by_film = product * p / wish.film.nyquist_per_mm
+        by_light = wish.wavelength_nm * 1e-6 / FRESNEL_LIMIT * (product * p) ** 2
+        distance_mm = min(max(by_film, by_light), wish.largest_distance_mm, 0.99 * wish.focal_length_mm)
+    else:
+        distance_mm = wish.mask_distance_mm
+    mask = Mask(product / distance_mm, p)
+    outer = (p + 0.5) * product / wish.focal_length_mm
+    sensor = Condition("outer slices from the middle of the spectrum", outer, min(height_mm, width_mm) / 2, "mm")
+    return _finish(wish, "fd", mask, distance_mm, sensor)
+
+
+DESIGNS: dict[str, Callable[[Wish], Design]] = {"fd": design_fd, "geometric": design_geometric}
+
+
+def _finish(wish: Wish, law: str, mask: Mask, distance_mm: float, sensor: Condition) -> Design:
+    p = wish.p
+    lattice = lattice_of(
+        law, mask, wish.sensor, distance_mm, wish.image_mm if law == "geometric" else wish.focal_length_mm
+    )
+    steps = abs(lattice.ky[0]), abs(lattice.kx[1])
+    shape = math.floor(steps[0] * wish.sensor.shape[0]), math.floor(steps[1] * wish.sensor.shape[1])
+    conditions = (
+        sensor,
+        Condition("highest harmonic on film", p * mask.frequency_per_mm, wish.film.nyquist_per_mm, "cycles/mm"),
+        Condition(
+            "diffraction λ·d·(p·f_m)²",
+            fresnel_number(distance_mm, p * mask.frequency_per_mm, wish.wavelength_nm),
+            FRESNEL_LIMIT,
+            "",
+        ),
+        Condition("height of the mask on film", wish.sensor.size_mm[0], wish.film.vertical.length_mm, "mm"),
+        Condition("width of the mask on film", wish.sensor.size_mm[1], wish.film.horizontal.length_mm, "mm"),
+    )
+    failed = [c.sentence for c in conditions if not c.met]
+    if min(shape) < 8:
+        failed.append(f"views of {shape[0]} × {shape[1]} px, fewer than 8 a side")
+    problem = None
+    if failed:
+        problem = (
+            f"no mask of {wish.views} × {wish.views} views does it at {distance_mm:.3g} mm from the sensor: "
+            f"{'; '.join(failed)}. Take fewer views, a smaller f-number, finer film, or more room for the mask"
+        )
+    pitch_mm = wish.sensor.size_mm[1] / max(shape[1], 1)
+    baseline = wish.aperture_mm / wish.views
+    return Design(
+        wish=wish,
+        law=law,
+        mask=mask,
+        mask_distance_mm=distance_mm,
+        conditions=conditions,
+        view_shape=shape,
+        bandwidth_per_mm=min(shape[0] / wish.sensor.size_mm[0], shape[1] / wish.sensor.size_mm[1]) / 2,
+        spectrum_used=min(1.0, steps[0] * wish.views) * min(1.0, steps[1] * wish.views),
+        baseline_mm=baseline,
+        depth_sigma_m=depth_sigma_m(wish.altitude_m, wish.image_mm, baseline, wish.shift_sigma_px * pitch_mm),
+        ground_sample_m=ground_sample_m(pitch_mm, wish.focal_length_mm, wish.altitude_m),
+        film_period_px=min(wish.film.px_per_mm) / mask.frequency_per_mm,
+        films=tuple(name for name, film in FILMS.items() if _prints(film, wish, mask)),
+        problem=problem,
+    )
+
+
+def _prints(film: Film, wish: Wish, mask: Mask) -> bool:
+    height_mm, width_mm = wish.sensor.size_mm
+    fits = height_mm <= film.vertical.length_mm and width_mm <= film.horizontal.length_mm
+    return fits and mask.p * mask.frequency_per_mm <= film.nyquist_per_mm

@@ -1,0 +1,1 @@
+"""From a raw plane to its spectrum, its carriers and its slices."""

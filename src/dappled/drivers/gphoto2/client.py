@@ -1,0 +1,252 @@
+"""A camera over USB or PTP/IP through libgphoto2, which lives in a process of its own.
+
+This side never blocks: it passes commands to the process, hands its events on, kills it when it stops answering and
+starts it again, at most five times a minute.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from dappled.drivers import usb_bus
+from dappled.drivers.camera import (
+    Arrival,
+    CameraError,
+    Companion,
+    Event,
+    Fired,
+    Identity,
+    Setting,
+    SettingName,
+    SettingsChanged,
+    ShotFailed,
+    StateChanged,
+    check_change,
+)
+from dappled.drivers.camera_base import QueuedCamera
+from dappled.drivers.gphoto2 import spawn as camera_child
+from dappled.drivers.gphoto2.before import LATE, Before
+from dappled.drivers.gphoto2.channel import Channel, ChannelError, message_event
+from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
+from dappled.drivers.restart_budget import RestartBudget
+from dappled.drivers.wired.attribution import Claim
+
+_PING_S = 1.0
+_STOP_S = 1.2
+_KILL_S = 0.6
+_SPAWN_S = 1.0
+
+Spawn = Callable[[GPhoto2Settings, Before], tuple["subprocess.Popen[bytes]", Channel]]
+
+
+def open_camera(settings: Mapping[str, Any]) -> GPhoto2Camera:
+    """The driver for these settings (see `GPhoto2Settings`); `start` it. Raises CameraError for a wrong setting."""
+    return GPhoto2Camera(parse_settings(settings))
+
+
+def spawn_process(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
+    """Start the camera's process; it dies with the calling thread. Raises OSError."""
+    return camera_child.spawn(
+        "dappled.drivers.gphoto2.process", json.dumps(settings.to_json()), json.dumps(before.to_json())
+    )
+
+
+class GPhoto2Camera(QueuedCamera):
+    """The driver (`drivers.camera.Camera`). `fire`, `release`, `next_event` and `stop` from any thread."""
+
+    def __init__(
+        self,
+        settings: GPhoto2Settings,
+        *,
+        spawn: Spawn = spawn_process,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        budget: RestartBudget | None = None,
+        reset: Callable[[str], None] = usb_bus.reset,
+    ) -> None:
+        super().__init__()
+        self._settings = settings
+        self._spawn = spawn
+        self._clock_ns = clock_ns
+        self._reset = reset
+        self._budget = budget or RestartBudget(limit=5, window_s=60.0)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._supervise, name="gphoto2", daemon=True)
+        self._lock = threading.Lock()  # guards the three below
+        self._channel: Channel | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._pending: dict[int, int | None] = {}  # the shots that the process has, in order, and when it fired them
+        self._before = Before()  # the supervising thread's
+        self._identity: Identity | None = None
+        self._known_settings: tuple[Setting, ...] = ()
+
+    def start(self) -> None:
+        """Start the camera's process. Raises CameraError when called twice."""
+        if self._thread.ident is not None:
+            raise CameraError("this camera was started before: open another one")
+        self._thread.start()
+
+    def fire(self, shot: int) -> None:
+        """Pass the shot to the process; one socket write in the caller's own thread."""
+        with self._lock:
+            if shot in self._pending:
+                raise CameraError(f"shot {shot} was fired before and has not ended")
+            if self._channel is not None:
+                try:
+                    self._channel.send({"do": "fire", "shot": shot})
+                except ChannelError as error:
+                    reason = f"the camera's process did not take the shot: {error}"
+                else:
+                    self._pending[shot] = None  # not fired yet
+                    return
+            else:
+                reason = "the camera's process is not running"
+        self._events.put(ShotFailed(shot, reason, self._clock_ns()))
+
+    @property
+    def identity(self) -> Identity | None:
+        """The body that was opened last."""
+        return self._identity
+
+    def settings(self) -> tuple[Setting, ...]:
+        """As the process read them last."""
+        return self._known_settings
+
+    def change(self, name: SettingName, value: str) -> None:
+        """Pass the wish to the process."""
+        check_change(self._known_settings, name, value)
+        with self._lock:
+            if self._channel is None:
+                raise CameraError("the camera's process is not running: nothing can be set now")
+            try:
+                self._channel.send({"do": "change", "name": name, "value": value})
+            except ChannelError as error:
+                raise CameraError(f"{name} was not set: {error}") from None
+
+    def release(self, arrival: Arrival | Companion) -> None:
+        """Delete the file from the card where the settings say so."""
+        folder = arrival.facts.get("folder")
+        if not self._settings.delete_after_download or folder in (None, "/"):
+            return
+        with self._lock, contextlib.suppress(ChannelError):  # the file then stays on the card, which harms nobody
+            if self._channel is not None:
+                self._channel.send({"do": "delete", "folder": folder, "name": arrival.facts["name"]})
+
+    def stop(self) -> None:
+        """End the process, politely for 1.2 s. What had not ended ends as failed."""
+        self._stopping.set()
+        with self._lock, contextlib.suppress(ChannelError):  # then it is ended below
+            if self._channel is not None:
+                self._channel.send({"do": "stop"})
+        if self._thread.ident is None:
+            return
+        self._thread.join(_STOP_S)
+        with self._lock:
+            if self._process is not None:
+                self._process.kill()
+        self._thread.join(_KILL_S)
+
+    # --- the supervising thread
+
+    def _supervise(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                process, channel = self._spawn(self._settings, self._before)
+            except OSError as error:  # no memory, no descriptors: that may pass
+                reason = f"the camera's process can't be started: {error.strerror}"
+                self._events.put(StateChanged("faulted", reason, self._clock_ns()))
+                self._stopping.wait(_SPAWN_S)
+                continue
+            with self._lock:
+                self._process, self._channel = process, channel
+            reason = self._serve(process, channel)
+            with self._lock:
+                self._process = self._channel = None
+                pending, self._pending = self._pending, {}
+            fired = [Claim(shot, fired_ns) for shot, fired_ns in pending.items() if fired_ns is not None]
+            self._before = replace(self._before, late=(*self._before.late, *fired)[-LATE:])
+            channel.close()
+            camera_child.end(process)
+            stopped = self._stopping.is_set()
+            for shot in pending:
+                self._events.put(ShotFailed(shot, "the camera was stopped" if stopped else reason, self._clock_ns()))
+            if not stopped:
+                self._events.put(StateChanged("faulted", reason, self._clock_ns()))
+                self._await_budget()
+        self._events.put(StateChanged("absent", "the camera was stopped", self._clock_ns()))
+
+    def _serve(self, process: subprocess.Popen[bytes], channel: Channel) -> str:
+        """Hand events on until the process ends; returns why, as a sentence."""
+        heard_ns = asked_ns = self._clock_ns()
+        answer_s = self._settings.timeouts.answer_s
+        try:
+            while True:
+                if self._stopping.is_set():
+                    channel.send({"do": "stop"})  # again: the process may have begun after `stop` spoke
+                message = channel.receive(_PING_S)
+                now_ns = self._clock_ns()
+                if message is not None:
+                    heard_ns = now_ns
+                    if message.body.get("is") != "pong":
+                        self._pass_on(message_event(message))
+                elif now_ns - heard_ns > answer_s * 1e9:
+                    camera_child.end(process, 0.0)
+                    done = self._reset_port()
+                    return (
+                        f"the camera's process did not answer for {answer_s:g} s and was killed{done}; it starts again"
+                    )
+                if now_ns - asked_ns > _PING_S * 1e9:
+                    asked_ns = now_ns
+                    channel.send({"do": "ping"})
+        except ChannelError as error:
+            return f"the camera's process ended unexpectedly ({error}); it starts again"
+
+    def _reset_port(self) -> str:
+        """A body that went silent on USB is reset, as if its cable had been pulled; what is to be said of it."""
+        if self._identity is None or not self._identity.port.startswith("usb:"):
+            return ""
+        try:
+            self._reset(self._identity.port)
+        except CameraError as error:
+            return f" ({error})"
+        return ", the camera's USB port reset"
+
+    def _pass_on(self, event: Event) -> None:
+        if isinstance(event, Fired):
+            with self._lock:
+                self._pending[event.shot] = event.called_monotonic_ns
+        elif isinstance(event, ShotFailed) or (isinstance(event, Arrival) and event.shot is not None):
+            with self._lock:
+                self._pending.pop(event.shot, None)  # type: ignore[arg-type]  # an Arrival's None is excluded above
+        elif isinstance(event, StateChanged):
+            self._identity = event.identity or self._identity
+            if event.identity is not None:
+                self._before = replace(self._before, serial=event.identity.serial)
+        elif isinstance(event, SettingsChanged):
+            self._known_settings = event.settings
+        if isinstance(event, Arrival | Companion):
+            self._learn(event)
+        self._events.put(event)
+
+    def _learn(self, event: Arrival | Companion) -> None:
+        """What the next process should know, should this one die."""
+        before, facts = self._before, event.facts
+        late = tuple(claim for claim in before.late if claim.shot != event.shot)
+        seen = (*before.seen, (str(facts.get("folder")), str(facts.get("name"))))[-2 * LATE :]
+        offsets_s = tuple(facts.get("body_offsets_s", before.offsets_s))
+        self._before = replace(before, late=late, offsets_s=offsets_s, seen=seen)
+
+    def _await_budget(self) -> None:
+        now_ns = self._clock_ns()
+        wait_ns = self._budget.wait_ns(now_ns)
+        if wait_ns:
+            reason = f"the camera's process ended too often; the next attempt is in {wait_ns / 1e9:.0f} s"
+            self._events.put(StateChanged("faulted", reason, now_ns))
+            self._stopping.wait(wait_ns / 1e9)
+        self._budget.spend(self._clock_ns())

@@ -1,0 +1,1 @@
+"""MAVLink links: addresses, channels, framing, signing."""

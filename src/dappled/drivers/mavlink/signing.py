@@ -1,0 +1,278 @@
+"""Signed MAVLink (message signing of MAVLink 2): keys in files, which packets count, and a time that never goes back.
+
+A signature is the first 6 bytes of SHA-256 over key, packet, link id and a timestamp of 10 µs since 2015. A packet
+counts once: its timestamp must be later than the last one of its stream (system, component, link id), and that of a
+stream heard for the first time at most a minute behind the latest good one. Only good packets move the time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import os
+import secrets
+import stat
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+from dappled.drivers.mavlink.framing import mavlink
+from dappled.errors import DappledError
+
+Unsigned = Literal["refuse", "listen", "allow"]
+Trust = Literal["obey", "hear", "refuse"]
+EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01
+UNITS_PER_S = 100_000
+NEW_STREAM_UNITS = 60 * UNITS_PER_S
+AHEAD_UNITS = 10 * UNITS_PER_S
+KEY_BYTES = 32
+_BLOCK = 13
+_SIGNED_FLAG = 0x01
+_STREAMS = 256
+_LATEST = 2**48 - 1
+
+
+class SigningError(DappledError):
+    """A key or the signing time can't be had: one sentence with the file and what to do."""
+
+
+class Clock(Protocol):
+    """UTC as this machine believes it."""
+
+    def utc_ns(self) -> int: ...
+
+
+def make_key(path: Path, passphrase: str | None = None) -> None:
+    """A new key file (64 hexadecimal digits, mode 0600): random, or SHA-256 of a passphrase as QGroundControl,
+    Mission Planner and MAVProxy make it. Raises SigningError, also where the file is there already."""
+    key = secrets.token_bytes(KEY_BYTES) if passphrase is None else hashlib.sha256(passphrase.encode()).digest()
+    try:
+        fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    except FileExistsError:
+        raise SigningError(f"{path} exists already; keys are not overwritten: name another file") from None
+    except OSError as error:
+        raise SigningError(f"cannot write the key {path}: {error.strerror or error}; check its folder") from error
+    try:
+        with os.fdopen(fd, "w", encoding="ascii") as file:
+            file.write(key.hex() + "\n")
+            file.flush()
+            os.fsync(fd)
+        _sync_folder(path.parent)
+    except OSError as error:
+        path.unlink(missing_ok=True)  # half a key would be in the way of the next attempt
+        raise SigningError(f"cannot write the key {path}: {error.strerror or error}; check its folder") from error
+
+
+def read_key(path: Path) -> bytes:
+    """The key in a file that nobody else can read or change. Raises SigningError."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe must not hold us
+        with os.fdopen(fd, "rb") as file:
+            facts = os.fstat(fd)
+            text = file.read(1024)
+    except OSError as error:
+        raise SigningError(
+            f"cannot read the signing key {path}: {error.strerror or error}; make one with dappled mavlink key"
+        ) from error
+    if not stat.S_ISREG(facts.st_mode) or facts.st_uid not in (0, os.geteuid()):
+        raise SigningError(f"the signing key {path} belongs to somebody else; make it a file of this user: chown")
+    if facts.st_mode & 0o077:
+        raise SigningError(f"the signing key {path} can be used by others; run: chmod 600 {path}")
+    try:
+        key = bytes.fromhex(text.decode("ascii").strip())
+    except ValueError:
+        key = b""
+    if len(key) != KEY_BYTES:
+        raise SigningError(
+            f"the signing key {path} is not {2 * KEY_BYTES} hexadecimal digits; make one with dappled mavlink key"
+        )
+    return key
+
+
+class SigningTime:
+    """The signing times of all links of this machine, kept over restarts.
+
+    The file holds two times: one later than any that was signed with, one later than any that was accepted. So no
+    packet from before a restart is accepted after it. After a crash they are up to ten seconds ahead, for which long
+    genuine packets are refused; after an orderly end they are exact. `keep` may wait for the disk; all else answers
+    from memory.
+    """
+
+    def __init__(self, path: Path, clock: Clock) -> None:
+        """Raises SigningError where the file can't be read or written."""
+        self._path = path
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._used, self._accepted = self._kept = self._stored()
+        self._floor = self._accepted
+        self.keep()
+
+    def oldest(self) -> int:
+        """What a stream that is heard for the first time must be later than."""
+        with self._lock:
+            return max(self._floor, max(self._used, self._accepted, self._now()) - NEW_STREAM_UNITS)
+
+    def next(self) -> int:
+        """A timestamp to sign with: later than every one before."""
+        with self._lock:
+            self._used = min(_LATEST, max(self._used + 1, self._accepted, self._now()))
+            return self._used
+
+    def accepted(self, timestamp: int) -> None:
+        """A packet with this time was good."""
+        with self._lock:
+            self._accepted = max(self._accepted, timestamp)
+
+    def keep(self, *, ending: bool = False) -> None:
+        """Write the times down, ahead of what is to come; at the end exactly. Raises SigningError."""
+        with self._lock:
+            times = (self._used, self._accepted)
+        margin = 0 if ending else AHEAD_UNITS
+        if not ending and all(now + margin // 2 <= kept for now, kept in zip(times, self._kept, strict=True)):
+            return
+        used, accepted = (min(_LATEST, each + margin) for each in times)
+        fresh = self._path.with_name(self._path.name + ".new")
+        try:
+            fd = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+            with os.fdopen(fd, "w", encoding="ascii") as file:
+                file.write(f"{used} {accepted}\n")
+                file.flush()
+                os.fsync(fd)
+            os.replace(fresh, self._path)
+            _sync_folder(self._path.parent)
+        except OSError as error:
+            raise SigningError(
+                f"cannot keep the signing times in {self._path}: {error.strerror or error}; check its folder"
+            ) from error
+        self._kept = (used, accepted)
+
+    def _now(self) -> int:
+        return max(0, self._clock.utc_ns() // 10_000 - EPOCH_UNIX_S * UNITS_PER_S)
+
+    def _stored(self) -> tuple[int, int]:
+        try:
+            used, accepted = (int(word) for word in self._path.read_text("ascii").split())
+        except FileNotFoundError:
+            return 0, 0
+        except (OSError, ValueError) as error:
+            raise SigningError(
+                f"cannot read the signing times in {self._path} ({error}): old packets could be sent again; change the "
+                "keys and remove the file"
+            ) from error
+        return min(max(used, 0), _LATEST), min(max(accepted, 0), _LATEST)
+
+
+def _sync_folder(path: Path) -> None:
+    """The names in a folder are on the disk afterwards: else a power cut could bring back older times."""
+    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+@dataclass(frozen=True, slots=True)
+class SigningStatistics:
+    """Packets of a link with a key: by what became of them."""
+
+    good: int
+    forged: int
+    replayed: int
+    unsigned_taken: int
+    unsigned_refused: int
+
+    @property
+    def refused(self) -> int:
+        """Packets that were dropped."""
+        return self.forged + self.replayed + self.unsigned_refused
+
+
+class Guard:
+    """Signing on one link: signs what goes out, judges what comes in. Used under the link's lock.
+
+    `unsigned`: packets without a signature are refused, or heard but not obeyed ("listen"), or taken as good
+    ("allow"). RADIO_STATUS, which radios put in by themselves, is always heard.
+    """
+
+    def __init__(self, key: bytes, link_id: int, time: SigningTime, unsigned: Unsigned = "refuse") -> None:
+        self._key = key
+        self._link_id = link_id
+        self._time = time
+        self._unsigned = unsigned
+        self._streams: dict[tuple[int, int, int], int] = {}
+        self._good = self._forged = self._replayed = self._taken = self._refused = 0
+
+    def judge(self, raw: bytes, system: int, component: int, message_id: int) -> Trust:
+        """What to do with a sound packet: obey it, only hear it, or refuse it."""
+        if raw[0] != mavlink.PROTOCOL_MARKER_V2 or not raw[2] & _SIGNED_FLAG:
+            return self._judge_unsigned(message_id)
+        if not hmac.compare_digest(self._signature(raw[:-6]), raw[-6:]):
+            self._forged += 1
+            return "refuse"
+        timestamp = timestamp_of(raw)
+        stream = (system, component, raw[-_BLOCK])
+        last = self._streams.get(stream)
+        if timestamp <= (self._time.oldest() if last is None else last):
+            self._replayed += 1
+            return "refuse"
+        self._streams.pop(stream, None)
+        self._streams[stream] = timestamp
+        if len(self._streams) > _STREAMS:
+            self._streams.pop(next(iter(self._streams)))
+        self._time.accepted(timestamp)
+        self._good += 1
+        return "obey"
+
+    def sign(self, pack: Callable[[], bytes], packer: mavlink.MAVLink) -> bytes:
+        """What `pack` packs with this packer, signed."""
+        signing = packer.signing
+        signing.sign_outgoing, signing.secret_key, signing.link_id = True, self._key, self._link_id
+        signing.timestamp = self._time.next()
+        return pack()
+
+    def statistics(self) -> SigningStatistics:
+        """Counters."""
+        return SigningStatistics(self._good, self._forged, self._replayed, self._taken, self._refused)
+
+    def _judge_unsigned(self, message_id: int) -> Trust:
+        if self._unsigned == "refuse" and message_id != mavlink.MAVLINK_MSG_ID_RADIO_STATUS:
+            self._refused += 1
+            return "refuse"
+        self._taken += 1
+        return "obey" if self._unsigned == "allow" else "hear"
+
+    def _signature(self, signed: bytes) -> bytes:
+        return hashlib.sha256(self._key + signed).digest()[:6]
+
+
+def timestamp_of(raw: bytes) -> int:
+    """The timestamp of a signed packet, in 10 µs since 2015."""
+    return int.from_bytes(raw[-12:-6], "little")
+
+
+@dataclass(frozen=True, slots=True)
+class Signing:
+    """Which links of `MavlinkLinks` are signed: a guard or None for each, and the time that they share."""
+
+    guards: Sequence[Guard | None]
+    time: SigningTime
+
+
+def signing(
+    key_files: Sequence[Path | None], time_file: Path, clock: Clock, unsigned: Unsigned = "refuse"
+) -> Signing | None:
+    """Guards for links with a key file each, or none; None where no link has one. Raises SigningError."""
+    keys = [None if path is None else read_key(path) for path in key_files]
+    if not any(keys):
+        return None
+    try:
+        time_file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SigningError(f"cannot make the folder {time_file.parent}: {error.strerror or error}") from error
+    time = SigningTime(time_file, clock)
+    return Signing(
+        tuple(None if key is None else Guard(key, number % 256, time, unsigned) for number, key in enumerate(keys)),
+        time,
+    )

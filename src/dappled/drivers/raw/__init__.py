@@ -1,0 +1,1 @@
+"""Raw files: read, made linear, and decoded by a recipe."""

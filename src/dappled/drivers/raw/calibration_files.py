@@ -1,0 +1,57 @@
+"""Calibrations in files: TOML for people, NPZ with the same in arrays, each enough by itself."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import tomli_w
+
+from dappled.config.schema import ConfigError, read_toml
+from dappled.decode.calibration.calibration import Calibration
+from dappled.decode.errors import DecodeError
+
+_TEXT = "calibration_toml"
+
+
+def save(path: Path, found: Calibration, more: dict[str, Any] | None = None) -> tuple[Path, Path]:
+    """Write the pair; `path` names either. `more` are tables beside the calibration. Returns both paths."""
+    text = tomli_w.dumps({**found.to_dict(), **(more or {})})
+    toml, npz = path.with_suffix(".toml"), path.with_suffix(".npz")
+    toml.write_text(text, encoding="utf-8")
+    arrays = {
+        _TEXT: np.array(text),
+        "orders": np.array(found.mask.half_orders()),
+        "focal_length_mm": np.array([fit.focal_length_mm for fit in found.fits]),
+        "lattice": np.array([fit.lattice.matrix() for fit in found.fits]),
+        "origin": np.array([fit.origin for fit in found.fits]),
+        "rotation_rad": np.array([fit.rotation_rad for fit in found.fits]),
+        "mask_distance_mm": np.array([fit.mask_distance_mm for fit in found.fits]),
+        "transfer": np.array([fit.transfer for fit in found.fits]),
+    }
+    np.savez(npz, **arrays)  # type: ignore[arg-type]  # savez takes whatever asarray takes
+    return toml, npz
+
+
+def tables(path: Path) -> dict[str, Any]:
+    """All tables of a calibration's file, TOML or NPZ. Raises ConfigError where it can't be read."""
+    if path.suffix.lower() != ".npz":
+        return read_toml(path)[0]
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return tomllib.loads(str(arrays[_TEXT]))
+    except FileNotFoundError as error:
+        raise ConfigError(f"no calibration at {path}: check the path") from error
+    except (OSError, ValueError, KeyError, BadZipFile, EOFError) as error:
+        raise ConfigError(f"{path} is no calibration: make one with dappled calibrate ({error})") from error
+
+
+def load(path: Path) -> Calibration:
+    """The calibration of a file. Raises ConfigError where it is none."""
+    try:
+        return Calibration.from_dict(tables(path))
+    except DecodeError as error:
+        raise ConfigError(f"{path}: {error}") from error

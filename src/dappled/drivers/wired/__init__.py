@@ -1,0 +1,1 @@
+"""Cameras made of a shutter line and a place where their files appear."""

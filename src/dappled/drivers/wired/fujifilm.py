@@ -1,0 +1,50 @@
+"""Fujifilm FinePix S5200 and its relatives: no USB command fires them, so a shutter line does, and their files are
+picked up. Nothing of such a shot can be decoded in flight unless its file can be reached in flight.
+
+`camera.shutter` is required (see `shutter_line`); `camera.pickup` is "later" (the default: `dappled flight pickup`
+after landing), "storage" (a card or the body as USB mass storage, as soon as it is mounted), a libgphoto2 port such as
+"usb:" (the body in PTP mode), or a folder that is filled in flight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dappled.drivers.camera import CameraError, Identity
+from dappled.drivers.options import only, seconds_of, text_of
+from dappled.drivers.wired.composed import ComposedCamera, Plan
+from dappled.drivers.wired.ptp_source import PtpSource
+from dappled.drivers.wired.shutter_line import KINDS, hold_s, parse_line
+from dappled.drivers.wired.sources import FolderSource, Source, parse_source
+
+BRING = "bring it with `dappled flight pickup` after landing"
+_KNOWN = ("shutter", "pickup", "timeouts", "model", "hold_ms")
+_SLOW_POLL_S = 2.0
+
+
+def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
+    """The driver for these settings; `start` it. Raises CameraError for a wrong or a missing one."""
+    only(settings, _KNOWN)
+    shutter = text_of(settings, "shutter")
+    if not shutter:
+        raise CameraError(f"this camera can't be fired over USB: set camera.shutter to one of {KINDS}")
+    pickup = text_of(settings, "pickup") or "later"
+    source = None if pickup == "later" else parse_source(pickup, PtpSource)
+    identity = Identity("FUJIFILM", text_of(settings, "model") or "FinePix S5200", "", shutter)
+    follows = _follows(pickup, source)
+    plan = Plan(
+        file_s=seconds_of(settings, "file_s", 30.0),
+        follows=follows,
+        hold_s=hold_s(settings),
+        poll_s=_SLOW_POLL_S if isinstance(source, PtpSource) else 0.2,
+    )
+    return ComposedCamera(identity, parse_line(shutter), source, plan)
+
+
+def _follows(pickup: str, source: Source | None) -> str | None:
+    if source is None:
+        return f"it was fired; its file is on the camera's card: {BRING}"
+    if type(source) is FolderSource:
+        return None
+    return f"it was fired; its file follows when {pickup} can be reached, or {BRING}"

@@ -1,0 +1,156 @@
+"""Files of a camera in PTP mode, through libgphoto2 in a process of its own that only lists and fetches.
+
+A body that sleeps or is pulled out costs this process and no other; the next call starts another one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from dappled.drivers.camera import Blob, CameraError
+from dappled.drivers.gphoto2 import spawn
+from dappled.drivers.gphoto2.channel import Channel, ChannelError, Message
+from dappled.drivers.gphoto2.protocol import CameraFile, Session, SessionError
+from dappled.drivers.gphoto2.settings import GPhoto2Settings
+from dappled.drivers.wired.sources import SUFFIXES, Found
+
+_ANSWER_S = 60.0
+_SEND_S = 5.0
+_REST_S = 0.5
+"""A camera that nobody asks anything is let go, so that others may have it."""
+
+
+class PtpSource:
+    """See `pickup.Source`. One thread calls it."""
+
+    def __init__(self, port: str) -> None:
+        self._port = port
+        self._child: tuple[subprocess.Popen[bytes], Channel] | None = None
+        self._taken_s: dict[str, int | None] = {}
+
+    def list(self) -> list[Found]:
+        """See Source. Each call opens the camera anew: libgphoto2 remembers what it listed."""
+        (fd,) = self._ask({"do": "list"}).fds
+        with os.fdopen(fd, "rb") as file:
+            file.seek(0)
+            rows = json.load(file)
+        self._taken_s = {name: taken_s for name, _, taken_s in rows}
+        return [Found(name, size) for name, size, _ in rows]
+
+    def taken_s(self, found: Found) -> float | None:
+        """See Source: the body's own note of when the file was made."""
+        return self._taken_s.get(found.name)
+
+    def open(self, found: Found) -> Blob:
+        """See Source."""
+        answer = self._ask({"do": "fetch", "name": found.name})
+        return Blob(answer.fds[0], answer.body["size"])
+
+    def close(self) -> None:
+        """See Source."""
+        child, self._child = self._child, None
+        if child is None:
+            return
+        process, channel = child
+        channel.close()
+        spawn.end(process)
+
+    def _ask(self, question: Mapping[str, Any]) -> Message:
+        try:
+            _, channel = self._child = self._child or spawn.spawn(
+                "dappled.drivers.wired.ptp_source", self._port, quiet=True
+            )
+        except OSError as error:  # no memory, no descriptors
+            raise CameraError(
+                f"no process can be started for the camera at {self._port}: {error.strerror}; try again"
+            ) from None
+        try:
+            channel.send(question, timeout_s=_SEND_S)
+            answer = channel.receive(_ANSWER_S)
+        except ChannelError as error:
+            self.close()
+            raise CameraError(f"the camera at {self._port} was lost ({error}): connect it again") from None
+        if answer is None:
+            self.close()
+            raise CameraError(f"the camera at {self._port} did not answer for {_ANSWER_S:g} s: switch it off and on")
+        if "error" in answer.body:
+            raise CameraError(str(answer.body["error"]))
+        return answer
+
+
+# --- the process ----------------------------------------------------------------------------------------------------
+
+
+class _Files:
+    """The files of the camera at a port. libgphoto2 is imported here, in the child, and nowhere else."""
+
+    def __init__(self, port: str) -> None:
+        from dappled.drivers.gphoto2.finding import open_session  # noqa: PLC0415  # reason above
+
+        self._open = open_session
+        self._settings = GPhoto2Settings(port=None if port == "usb:" else port)
+        self._session: Session | None = None
+
+    def answer(self, question: Mapping[str, Any]) -> Blob | str:
+        """What was asked for, or a sentence why it can't be had."""
+        try:
+            return self._list() if question["do"] == "list" else self._fetch(question["name"])
+        except SessionError as error:
+            self.rest()  # the next question opens it anew
+            return str(error)
+
+    def rest(self) -> None:
+        """Let go of the camera."""
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def _list(self) -> Blob:
+        self.rest()
+        session = self._session = self._open(self._settings)
+        rows = [
+            (f"{file.folder}/{file.name}", *session.about(file))
+            for file in sorted(session.files(), key=lambda file: (file.folder, file.name))
+            if file.name.lower().endswith(SUFFIXES)
+        ]
+        return Blob.of(json.dumps(rows).encode(), "listing")
+
+    def _fetch(self, path: str) -> Blob:
+        session = self._session = self._session or self._open(self._settings)
+        folder, _, name = path.rpartition("/")
+        return session.fetch(CameraFile(folder, name)).blob
+
+
+def _serve(channel: Channel, files: _Files) -> None:
+    while True:
+        question = channel.receive(_REST_S)
+        if question is None:
+            files.rest()
+            continue
+        answer = files.answer(question.body)
+        if isinstance(answer, str):
+            channel.send({"error": answer}, timeout_s=_SEND_S)
+            continue
+        channel.send({"size": answer.size}, (answer.fd,), timeout_s=_SEND_S)
+        answer.close()
+
+
+def main() -> None:
+    """Arguments: the socket's descriptor, the parent's process id, the port."""
+    from dappled.drivers.child_process import die_with_parent  # noqa: PLC0415  # the parent doesn't need it
+
+    fd, parent, port = sys.argv[1:]
+    die_with_parent(int(parent))
+    with contextlib.suppress(ChannelError):  # the parent is gone, or has closed
+        _serve(Channel(socket.socket(fileno=int(fd))), _Files(port))
+
+
+if __name__ == "__main__":
+    main()

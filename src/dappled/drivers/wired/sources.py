@@ -1,0 +1,184 @@
+"""Where files are picked up that a camera keeps: a folder, a card, mass storage when it appears, a camera in PTP mode.
+
+A source lists and opens; it never writes. Named in settings and commands as a folder's path or `folder:DIR`, `storage`
+(the first removable disk with a DCIM folder), or a libgphoto2 port (`usb:`, `ptpip:…`).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from dappled.drivers.camera import Blob, CameraError
+from dappled.drivers.raw import exif
+from dappled.drivers.wired.matching import seconds
+
+RAW_SUFFIXES = (".raf", ".cr2", ".dng", ".nef", ".arw", ".crw", ".tif", ".tiff", ".npy", ".png")
+SUFFIXES = (*RAW_SUFFIXES, ".jpg", ".jpeg")
+MOUNTS = Path("/proc/self/mounts")
+PLACES = ("/media/", "/run/media/", "/mnt")
+_MANY = 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A file at a source: its name there (with folders), and its size in bytes."""
+
+    name: str
+    size: int
+
+    @property
+    def base(self) -> str:
+        """The camera's own name for it."""
+        return self.name.rpartition("/")[2]
+
+    @property
+    def stem(self) -> str:
+        """What raw file and JPEG of one exposure have in common."""
+        return self.name.rpartition(".")[0]
+
+    @property
+    def raw(self) -> bool:
+        """Whether it is a raw file, by its name."""
+        return self.name.lower().endswith(RAW_SUFFIXES)
+
+
+class Source(Protocol):
+    """Files that may be picked up. All calls may block for as long as a disk or a bus does, but not for ever."""
+
+    def list(self) -> list[Found]:
+        """All pictures, in the order of their names. Raises CameraError with a sentence where nothing is there."""
+
+    def taken_s(self, found: Found) -> float | None:
+        """The camera's time of a file, as if it were UTC; None where it says none. Raises CameraError."""
+
+    def open(self, found: Found) -> Blob:
+        """Its bytes. Raises CameraError."""
+
+    def close(self) -> None:
+        """Let go of the source."""
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """The files of one exposure: the frame, and what stands beside it."""
+
+    main: Found
+    companions: tuple[Found, ...] = ()
+
+
+def groups(found: list[Found]) -> list[Group]:
+    """Files with one stem are of one exposure; the raw file is the frame."""
+    by_stem: dict[str, list[Found]] = {}
+    for one in found:
+        by_stem.setdefault(one.stem, []).append(one)
+    made = []
+    for files in by_stem.values():
+        main, *others = sorted(files, key=lambda one: (not one.raw, one.name))
+        made.append(Group(main, tuple(others)))
+    return sorted(made, key=lambda group: group.main.name)
+
+
+class FolderSource:
+    """All pictures under a folder, hidden ones left out."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def list(self) -> list[Found]:
+        """See Source."""
+        try:
+            if not self.folder.is_dir():
+                raise CameraError(f"{self.folder} is not there: check the path, or mount the card")
+            return sorted(self._walk(), key=lambda one: one.name)
+        except OSError as error:
+            raise CameraError(f"{self.folder} can't be read: {error.strerror}") from None
+
+    def _walk(self) -> Iterator[Found]:
+        count = 0
+        for place, folders, names in os.walk(self.folder, onerror=self._unreadable):
+            folders[:] = [name for name in folders if not name.startswith(".")]
+            for name in names:
+                path = Path(place) / name
+                if name.startswith(".") or not name.lower().endswith(SUFFIXES):
+                    continue
+                count += 1
+                if count > _MANY:
+                    raise CameraError(f"{self.folder} holds more than {_MANY} pictures: give the folder of the flight")
+                try:
+                    yield Found(path.relative_to(self.folder).as_posix(), path.stat().st_size)
+                except OSError:
+                    continue  # gone again
+
+    def _unreadable(self, error: OSError) -> None:
+        """A card that is pulled must not look like one with fewer files; a folder inside that is not ours may be."""
+        if not isinstance(error, PermissionError) or error.filename == str(self.folder):
+            raise error
+
+    def taken_s(self, found: Found) -> float | None:
+        """See Source: from EXIF."""
+        try:
+            with (self.folder / found.name).open("rb") as file:
+                return seconds(exif.read(file).taken)
+        except OSError as error:
+            raise self._lost(found, error) from None
+
+    def open(self, found: Found) -> Blob:
+        """See Source."""
+        try:
+            fd = os.open(self.folder / found.name, os.O_RDONLY | os.O_CLOEXEC)
+        except OSError as error:
+            raise self._lost(found, error) from None
+        try:
+            return Blob(fd, os.fstat(fd).st_size)
+        except OSError as error:
+            os.close(fd)
+            raise self._lost(found, error) from None
+
+    def _lost(self, found: Found, error: OSError) -> CameraError:
+        return CameraError(f"{self.folder / found.name} can't be read: {error.strerror}")
+
+    def close(self) -> None:
+        """See Source."""
+
+
+class StorageSource(FolderSource):
+    """The DCIM folder of a removable disk, wherever it is mounted, as soon as it is."""
+
+    def __init__(self, mounts: Path | None = None, places: tuple[str, ...] | None = None) -> None:
+        super().__init__(Path("/nonexistent"))
+        self._mounts, self._places = mounts or MOUNTS, places or PLACES
+
+    def list(self) -> list[Found]:
+        """See Source."""
+        unreadable = ""
+        for where in self._mounted():
+            try:
+                there = (where / "DCIM").is_dir()
+            except OSError as error:
+                unreadable = f"; {where} can't be read: {error.strerror}"
+                continue
+            if there:
+                self.folder = where / "DCIM"
+                return super().list()
+        raise CameraError(f"no card and no camera as mass storage is mounted: connect it{unreadable}")
+
+    def _mounted(self) -> Iterator[Path]:
+        try:
+            lines = self._mounts.read_text(errors="surrogateescape").splitlines()
+        except OSError as error:
+            raise CameraError(f"{self._mounts} can't be read: {error.strerror}") from None
+        places = [line.split(" ")[1].replace("\\040", " ") for line in lines if " " in line]
+        return (Path(place) for place in places if place.startswith(self._places))
+
+
+def parse_source(text: str, ptp: Callable[[str], Source]) -> Source:
+    """The source that a setting or an argument names; `ptp` opens a libgphoto2 port."""
+    if text == "storage":
+        return StorageSource()
+    if text.startswith(("usb:", "ptpip:")):
+        return ptp(text)
+    return FolderSource(Path(text.removeprefix("folder:")).expanduser())

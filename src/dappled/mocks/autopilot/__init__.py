@@ -1,0 +1,1 @@
+"""A simulated autopilot, its flight path, its radio, and a ground station."""

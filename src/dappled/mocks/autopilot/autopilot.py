@@ -1,0 +1,264 @@
+"""A simulated autopilot that flies `Path`, with a boot clock of its own, over real MAVLink.
+
+`python -m dappled.mocks.autopilot.autopilot --url udpout:127.0.0.1:14550 --seed 1 --start-monotonic-ns N`
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import random
+import select
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from dappled.clock import SystemClock
+from dappled.drivers.mavlink.links import LinkError, MavlinkLinks, Message, Packet, mavlink
+from dappled.mocks.autopilot.path import Path, TruePose
+
+RATES_HZ: dict[int, float] = {
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10.0,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: 50.0,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
+}
+_FASTEST_HZ = 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class BootTime:
+    """The autopilot's clock: it was booted `offset_s` before the simulation began, and runs fast by `drift`."""
+
+    offset_s: float = 41.7
+    drift: float = 50e-6
+
+    def ns(self, t_s: float) -> int:
+        """Time since boot at simulation time `t_s`."""
+        return round((self.offset_s + t_s) * (1 + self.drift) * 1e9)
+
+
+def telemetry_message(message_id: int, pose: TruePose, boot_ns: int, unix_us: int = 0) -> Message:
+    """One message of the vehicle's state, in the units, steps and whole milliseconds of MAVLink."""
+    boot_ms, v = boot_ns // 10**6, pose.velocity_ned_m_s
+    latitude, longitude = round(pose.latitude_deg * 1e7), round(pose.longitude_deg * 1e7)
+    altitude = round(pose.altitude_msl_m * 1e3)
+    if message_id == mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT:
+        vn, ve, vd = (round(part * 100) for part in v)
+        height = round(-pose.position_ned_m[2] * 1e3)
+        heading = round(math.degrees(_euler(pose)[2]) * 100) % 36000
+        return mavlink.MAVLink_global_position_int_message(
+            boot_ms, latitude, longitude, altitude, height, vn, ve, vd, heading
+        )
+    if message_id == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
+        return mavlink.MAVLink_attitude_quaternion_message(boot_ms, *pose.attitude, *pose.rates_body_rad_s)
+    if message_id == mavlink.MAVLINK_MSG_ID_ATTITUDE:
+        return mavlink.MAVLink_attitude_message(boot_ms, *_euler(pose), *pose.rates_body_rad_s)
+    if message_id == mavlink.MAVLINK_MSG_ID_GPS_RAW_INT:
+        speed = round(math.hypot(v[0], v[1]) * 100)
+        course = round(math.degrees(math.atan2(v[1], v[0])) * 100) % 36000
+        return mavlink.MAVLink_gps_raw_int_message(
+            boot_ns // 1000, 6, latitude, longitude, altitude, 70, 110, speed, course, 17, 0, 20, 30, 50, 0, 0
+        )
+    if message_id == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME:
+        return mavlink.MAVLink_system_time_message(unix_us, boot_ms)
+    if message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+        return mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 81, 3, mavlink.MAV_STATE_ACTIVE, 3
+        )
+    raise ValueError(f"the simulated autopilot has no message {message_id}")
+
+
+def flight(path: Path, boot: BootTime, start_s: float, stop_s: float) -> Iterator[tuple[float, Message]]:
+    """All telemetry of a stretch of flight, (simulation time, message) in order, without a link."""
+    events = sorted(
+        (start_s + step / rate, message_id)
+        for message_id, rate in RATES_HZ.items()
+        for step in range(int((stop_s - start_s) * rate))
+    )
+    for t_s, message_id in events:
+        yield t_s, telemetry_message(message_id, path.pose(t_s), boot.ns(t_s))
+
+
+@dataclass(slots=True)
+class Flyer:
+    """The running autopilot: what is due, answers to TIMESYNC and to message interval requests, a slow link."""
+
+    path: Path
+    start_monotonic_ns: int
+    boot: BootTime
+    send: Callable[[Message], object]
+    jitter_s: float = 0.0
+    system_id: int = 1
+    due_ns: dict[int, int] = field(default_factory=dict)
+    interval_ns: dict[int, int] = field(default_factory=dict)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    delayed: deque[tuple[int, Message]] = field(default_factory=deque)
+    random: random.Random = field(default_factory=lambda: random.Random(0))  # noqa: S311 (a simulation)
+
+    def __post_init__(self) -> None:
+        for message_id, rate in RATES_HZ.items():
+            self.interval_ns[message_id] = round(1e9 / rate)
+            self.due_ns[message_id] = 0
+
+    def boot_ns(self, monotonic_ns: int) -> int:
+        """The boot clock at a moment of this machine's."""
+        return self.boot.ns((monotonic_ns - self.start_monotonic_ns) / 1e9)
+
+    def step(self, now_ns: int) -> float:
+        """Send what is due; seconds until the next."""
+        pose: TruePose | None = None
+        with self.lock:
+            due = [number for number, at_ns in self.due_ns.items() if now_ns >= at_ns]
+            for number in due:
+                on_time_ns = self.due_ns[number] + self.interval_ns[number]
+                self.due_ns[number] = on_time_ns if on_time_ns > now_ns else now_ns + self.interval_ns[number]
+        for number in due:
+            if pose is None:
+                pose = self.path.pose((now_ns - self.start_monotonic_ns) / 1e9)
+            self._later(telemetry_message(number, pose, self.boot_ns(now_ns), time.time_ns() // 1000), now_ns)
+        while self.delayed and self.delayed[0][0] <= now_ns:
+            self.send(self.delayed.popleft()[1])
+        with self.lock:
+            next_ns = min(self.due_ns.values())
+        if self.delayed:
+            next_ns = min(next_ns, self.delayed[0][0])
+        return max(0.0, (next_ns - time.monotonic_ns()) / 1e9)
+
+    def heard(self, message: Message) -> None:
+        """A message came in."""
+        if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+            self.send(mavlink.MAVLink_timesync_message(self.boot_ns(time.monotonic_ns()), message.ts1))
+        if message.get_type() == "COMMAND_LONG" and message.target_system in (0, self.system_id):
+            if message.command != mavlink.MAV_CMD_SET_MESSAGE_INTERVAL or message.target_component not in (0, 1):
+                return
+            result = self._set_interval(message.param1, message.param2)
+            sender = (message.get_srcSystem(), message.get_srcComponent())
+            self.send(mavlink.MAVLink_command_ack_message(message.command, result, 0, 0, *sender))
+
+    def _set_interval(self, number: float, interval_us: float) -> int:
+        if number not in RATES_HZ:
+            return int(mavlink.MAV_RESULT_UNSUPPORTED)
+        if not (math.isfinite(interval_us) and interval_us > 0):
+            return int(mavlink.MAV_RESULT_DENIED)
+        with self.lock:
+            self.interval_ns[int(number)] = max(round(interval_us * 1e3), round(1e9 / _FASTEST_HZ))
+        return int(mavlink.MAV_RESULT_ACCEPTED)
+
+    def _later(self, message: Message, now_ns: int) -> None:
+        if self.jitter_s <= 0 and not self.delayed:
+            self.send(message)
+            return
+        at_ns = now_ns + round(self.random.uniform(0, self.jitter_s) * 1e9)
+        if self.delayed:
+            at_ns = max(at_ns, self.delayed[-1][0])
+        self.delayed.append((at_ns, message))
+
+
+class Autopilot:
+    """The autopilot as a process of its own, which ends with this one."""
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self._process = process
+
+    @classmethod
+    def start(
+        cls,
+        url: str,
+        *,
+        seed: int,
+        start_monotonic_ns: int,
+        jitter_s: float = 0.0,
+        booted_s: float = BootTime().offset_s,
+    ) -> Autopilot:
+        """Start one that flies `Path(seed)` since `start_monotonic_ns` and speaks on `url` (udpout:HOST:PORT). It was
+        booted `booted_s` before the flight began; less than zero: in flight."""
+        command = [
+            sys.executable,
+            "-m",
+            "dappled.mocks.autopilot.autopilot",
+            "--with-parent",
+            "--url",
+            url,
+            "--seed",
+            str(seed),
+        ]
+        command += ["--start-monotonic-ns", str(start_monotonic_ns), "--jitter", str(jitter_s)]
+        command += [f"--booted={booted_s}"]
+        return cls(subprocess.Popen(command, stdin=subprocess.PIPE))
+
+    def running(self) -> bool:
+        """Whether the process lives."""
+        return self._process.poll() is None
+
+    def stop(self) -> None:
+        """End it."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        try:
+            self._process.wait(3)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait(3)
+
+
+def _euler(pose: TruePose) -> tuple[float, float, float]:
+    w, x, y, z = pose.attitude
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The process."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--url", required=True)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--start-monotonic-ns", type=int, default=None, help="when the flight began; default now")
+    parser.add_argument("--system-id", type=int, default=1)
+    parser.add_argument("--jitter", type=float, default=0.0, help="seconds that telemetry may be late")
+    parser.add_argument("--booted", type=float, default=BootTime().offset_s, help="seconds before the flight began")
+    parser.add_argument("--with-parent", action="store_true", help="end when standard input is closed")
+    wanted = parser.parse_args(arguments)
+    start_ns = time.monotonic_ns() if wanted.start_monotonic_ns is None else wanted.start_monotonic_ns
+    flyer = Flyer(Path(wanted.seed), start_ns, BootTime(wanted.booted), lambda _: None, wanted.jitter, wanted.system_id)
+
+    def received(packet: Packet) -> None:
+        if not packet.sent:
+            flyer.heard(packet.message)
+
+    links = MavlinkLinks(
+        [wanted.url],
+        system_id=wanted.system_id,
+        component_id=1,
+        tap=lambda _stamp, _raw: 0,
+        on_packet=received,
+        clock=SystemClock(),
+    )
+    flyer.send = links.send
+    try:
+        links.start()
+    except LinkError as error:
+        print(f"autopilot: {error}", file=sys.stderr)  # noqa: T201 (a process that speaks to a person)
+        return 1
+    watched = [sys.stdin] if wanted.with_parent else []
+    try:
+        while True:
+            wait_s = flyer.step(time.monotonic_ns())
+            readable, _, _ = select.select(watched, [], [], wait_s)
+            if readable and not sys.stdin.buffer.read(1):
+                return 0
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        links.stop()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

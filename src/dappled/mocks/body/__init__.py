@@ -1,0 +1,1 @@
+"""Simulated camera bodies: PTP/IP, cards, raw files, USB devices."""

@@ -1,0 +1,219 @@
+"""A Canon EOS 450D, transaction by transaction: its identity, its session, its captures.
+
+No sockets here: `mocks.ptpip` carries the transactions. `eos_card` answers for its card, `eos_properties` for its
+properties. Operation and event lists are those of a real body (PTP device info published with libgphoto2); its quirks
+kept here are the ones that drivers meet: RemoteRelease without RemoteReleaseOn, busy while it works on a capture, room
+on the computer to be announced before it shoots to memory.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import threading
+import time
+from collections.abc import Callable
+from typing import TypeAlias
+
+from PIL import Image
+
+from dappled.mocks.body import ptp_data
+from dappled.mocks.body.eos_card import CARD_BYTES, FOLDER, STORAGE, Card, StoredObject
+from dappled.mocks.body.eos_properties import Prop, Properties
+from dappled.mocks.body.faults import Faults
+from dappled.mocks.body.ptp import Answer, Code, EosEvent, Format, Handler, Op, Request
+
+Expose: TypeAlias = Callable[[int, int], tuple[bytes, str]]
+"""(trigger_monotonic_ns, shot_number) -> (the file's bytes, its extension without a dot)."""
+
+MODEL = "Canon EOS 450D"
+SERIAL = "0830412345"
+_HUNT_S = 0.3
+
+_OPERATIONS = sorted(
+    set(Op) - {Op.EOS_AF_CANCEL, Op.GET_THUMB}
+    | {0x100A, 0x100C, 0x100D, 0x100F, 0x9103, 0x9106, 0x910A, 0x910B, 0x910C, 0x910E, 0x9113, 0x9118}
+    | {0x911E, 0x911F, 0x9120, 0x9121, 0x9125, 0x9126, 0x9153, 0x9154, 0x9155, 0x9157, 0x9158, 0x9159}
+)
+_EVENTS = (0x4009, 0x4004, 0x4005, 0x4003, 0x4002, 0x4007, 0xC101)
+
+
+class Eos450d:
+    """The body's insides. `answer` may be called from any thread; captures are rendered in a thread of their own."""
+
+    def __init__(
+        self,
+        expose: Expose,
+        faults: Faults,
+        *,
+        serial: str = SERIAL,
+        card_bytes: int = CARD_BYTES,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        wall_s: Callable[[], float] = time.time,
+        pairs: bool = False,
+    ) -> None:
+        self._expose = expose
+        self._faults = faults
+        self._serial = serial
+        self._clock_ns = clock_ns
+        self._wall_s = wall_s
+        self._lock = threading.Lock()  # held around all that follows
+        self._session = self._working = False
+        self._releases = 0
+        self._card = Card(card_bytes, faults, int(wall_s()))
+        self._properties = Properties(serial, pairs=pairs)
+        self._handlers: dict[int, Handler] = {
+            Op.GET_DEVICE_INFO: self._device_info,
+            Op.OPEN_SESSION: self._open,
+            Op.CLOSE_SESSION: self._close,
+            Op.GET_DEVICE_PROP_DESC: self._prop_desc,
+            Op.EOS_GET_DEVICE_INFO_EX: self._eos_device_info,
+            Op.EOS_REMOTE_RELEASE: self._release,
+            Op.EOS_SET_REMOTE_MODE: self._nothing,
+            Op.EOS_SET_UI_LOCK: self._nothing,
+            Op.EOS_RESET_UI_LOCK: self._nothing,
+            Op.EOS_KEEP_DEVICE_ON: self._nothing,
+            **self._card.handlers,
+            **self._properties.handlers,
+        }
+
+    @property
+    def releases(self) -> int:
+        """How many exposures were begun."""
+        with self._lock:
+            return self._releases
+
+    @property
+    def names(self) -> list[str]:
+        """The files on the card, in order."""
+        with self._lock:
+            return self._card.names
+
+    def contact(self) -> bool:
+        """The contact of its remote socket closes: an exposure, whoever is connected. False where it makes none."""
+        with self._lock:
+            return self._release(Request(Op.EOS_REMOTE_RELEASE, 0, ()), b"").code == Code.OK
+
+    def disconnected(self) -> None:
+        """The link is gone: the session with it; the card, and what the body works on, stay."""
+        with self._lock:
+            self._session = False
+            self._properties.forget_events()
+
+    def answer(self, request: Request, data: bytes) -> Answer:
+        """The body's answer to one transaction; `data` is what came with it."""
+        handler = self._handlers.get(request.code)
+        if handler is None:
+            return Answer(Code.OPERATION_NOT_SUPPORTED)
+        with self._lock:
+            if not self._session and request.code not in (Op.GET_DEVICE_INFO, Op.OPEN_SESSION):
+                return Answer(Code.SESSION_NOT_OPEN)
+            return handler(request, data)
+
+    # --- identity and session
+
+    def _device_info(self, _request: Request, _data: bytes) -> Answer:
+        return Answer(
+            data=ptp_data.device_info(
+                model=MODEL,
+                version="3-1.0.4",
+                serial=self._serial.rjust(32, "0"),
+                operations=_OPERATIONS,
+                events=_EVENTS,
+                properties=(0xD402, 0xD407, 0xD406),
+                formats=(Format.FOLDER, Format.JPEG, Format.RAW),
+            )
+        )
+
+    def _eos_device_info(self, _request: Request, _data: bytes) -> Answer:
+        return Answer(data=ptp_data.eos_device_info(tuple(EosEvent), tuple(Prop)))
+
+    def _prop_desc(self, request: Request, _data: bytes) -> Answer:
+        prop = request.parameter(0)
+        texts = {0xD402: MODEL, 0xD406: "Unknown Initiator"}
+        if prop in texts:
+            value = ptp_data.string(texts[prop])
+            return Answer(data=struct.pack("<HHB", prop, 0xFFFF, 0) + value + value + b"\0")
+        if prop == 0xD407:
+            return Answer(data=struct.pack("<HHBIIB", prop, 6, 0, 1, 1, 0))
+        return Answer(Code.DEVICE_PROP_NOT_SUPPORTED)
+
+    def _open(self, _request: Request, _data: bytes) -> Answer:
+        if self._session:
+            return Answer(Code.SESSION_ALREADY_OPEN)
+        self._session = True
+        return Answer()
+
+    def _close(self, _request: Request, _data: bytes) -> Answer:
+        self._session = False
+        return Answer()
+
+    def _nothing(self, _request: Request, _data: bytes) -> Answer:
+        return Answer()
+
+    # --- captures
+
+    def _release(self, _request: Request, _data: bytes) -> Answer:
+        triggered_ns = self._clock_ns()
+        if self._working or self._faults.lasts("busy"):
+            return Answer(Code.DEVICE_BUSY)
+        if self._faults.take("error"):
+            return Answer(Code.GENERAL_ERROR)
+        to_memory = self._properties.to_memory
+        full = not to_memory and (self._card.full or self._faults.lasts("full"))
+        if full or not self._properties.shots_left:
+            # A real body says OK and parameter 7, which libgphoto2 reads over USB only: its PTP/IP drops parameters.
+            return Answer(Code.STORE_FULL)
+        self._working = True
+        self._releases += 1
+        self._properties.announce(ptp_data.eos_status(1))
+        work = (triggered_ns, self._releases, to_memory)
+        capture = self._hunt if self._faults.take("no-focus") else self._capture
+        threading.Thread(target=capture, args=work, name="capture", daemon=True).start()
+        return Answer(parameters=(0,))
+
+    def _hunt(self, _triggered_ns: int, _number: int, _to_memory: bool) -> None:
+        """The autofocus finds nothing, and no picture is taken."""
+        time.sleep(_HUNT_S)
+        self._done()
+
+    def _capture(self, triggered_ns: int, number: int, to_memory: bool) -> None:
+        try:
+            data, extension = self._expose(triggered_ns, number)
+            with self._lock:
+                self._store(data, extension, number, to_memory)
+        finally:
+            self._done()
+
+    def _done(self) -> None:
+        with self._lock:
+            self._working = False
+            self._properties.announce(ptp_data.eos_status(0))
+
+    def _store(self, data: bytes, extension: str, number: int, to_memory: bool) -> None:
+        stem = f"IMG_{number % 10000:04d}"
+        handle, parent = (2 * number, 0) if to_memory else (FOLDER + 2 * number, FOLDER)
+        code = Format.JPEG if extension.lower() in ("jpg", "jpeg") else Format.RAW
+        taken_s = int(self._wall_s())
+        made = [StoredObject(handle, parent, f"{stem}.{extension.upper()}", code, data, taken_s)]
+        if self._properties.pairs:
+            made.append(StoredObject(handle + 1, parent, f"{stem}.JPG", Format.JPEG, thumbnail(number), taken_s))
+        self._card.keep(made)
+        if not self._faults.take("no-event"):
+            self._properties.announce(*(_announced(each, to_memory) for each in made))
+
+
+def _announced(made: StoredObject, to_memory: bool) -> bytes:
+    size = len(made.data)
+    if to_memory:
+        return ptp_data.eos_object_transfer(handle=made.handle, code=made.code, size=size, name=made.name)
+    return ptp_data.eos_object_added(
+        handle=made.handle, storage=STORAGE, code=made.code, size=size, parent=FOLDER, name=made.name
+    )
+
+
+def thumbnail(number: int) -> bytes:
+    """The JPEG beside the raw file of the shot with this number: a small grey picture, its own for each."""
+    file = io.BytesIO()
+    Image.new("L", (64, 48), number % 256).save(file, "JPEG", comment=f"shot {number}")
+    return file.getvalue()

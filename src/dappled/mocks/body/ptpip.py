@@ -1,0 +1,199 @@
+"""A PTP/IP responder on a TCP port: carries transactions to a body, and the link's own faults.
+
+One initiator at a time, as with a real body: a second one is turned away while the first is connected.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import threading
+from typing import Protocol
+
+from dappled.mocks.body import ptp
+from dappled.mocks.body.eos450d import MODEL
+from dappled.mocks.body.faults import Faults
+from dappled.mocks.body.ptp import Answer, Packet
+
+_SILENCE_STEP_S = 0.02
+_SLOW_BYTES = 40_000  # at a time, 50 times a second
+
+
+class Transactions(Protocol):
+    """What a responder needs of a body."""
+
+    def answer(self, request: ptp.Request, data: bytes) -> Answer:
+        """The answer to one transaction."""
+
+    def disconnected(self) -> None:
+        """The link is gone."""
+
+
+class Responder:
+    """Serves a body on ports of its own choosing; `close` ends all its threads. The body answers at the first of its
+    `addresses`, at the others nobody is there; `move` takes it to the next one."""
+
+    def __init__(self, body: Transactions, faults: Faults, host: str = "127.0.0.1", addresses: int = 1) -> None:
+        self._body = body
+        self._faults = faults
+        faults.drop = self.drop
+        self._closed = threading.Event()
+        self._lock = threading.Lock()
+        self._links: set[socket.socket] = set()
+        self._event: socket.socket | None = None
+        self._taken = False  # by an initiator; until its last transaction has ended
+        self._guid = os.urandom(16)
+        self._listeners = [socket.create_server((host, 0)) for _ in range(addresses)]
+        self.ports: list[int] = [each.getsockname()[1] for each in self._listeners]
+        self._at = 0
+        self._threads = [
+            threading.Thread(target=self._accept, args=[number], name="ptpip", daemon=True)
+            for number in range(addresses)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def port(self) -> int:
+        """Where the body answers."""
+        return self.ports[self._at]
+
+    def move(self) -> None:
+        """The body comes back at its next address, as USB bodies do when they are plugged in again."""
+        self._at = (self._at + 1) % len(self.ports)
+        self.drop()
+
+    def close(self) -> None:
+        """Stop listening and cut the links."""
+        self._closed.set()
+        for listener in self._listeners:
+            with contextlib.suppress(OSError):
+                listener.shutdown(socket.SHUT_RDWR)
+            listener.close()
+        self.drop()
+        for thread in self._threads:
+            thread.join(5)
+
+    def drop(self) -> None:
+        """Cut the links, as a pulled cable does."""
+        with self._lock:
+            for link in self._links:
+                with contextlib.suppress(OSError):
+                    link.shutdown(socket.SHUT_RDWR)
+
+    def _accept(self, number: int) -> None:
+        while not self._closed.is_set():
+            try:
+                link, _address = self._listeners[number].accept()
+            except OSError:
+                return  # closed
+            if number != self._at or self._faults.lasts("unplug"):
+                link.close()
+                continue
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            threading.Thread(target=self._greet, args=(link,), name="ptpip-link", daemon=True).start()
+
+    def _greet(self, link: socket.socket) -> None:
+        with self._lock:
+            self._links.add(link)
+        try:
+            kind, _payload = _read(link)
+            if kind == Packet.INIT_COMMAND_REQUEST:
+                self._serve(link)
+            elif kind == Packet.INIT_EVENT_REQUEST:
+                self._hold(link)
+        except (OSError, ptp.MalformedPacketError):
+            pass  # the initiator is gone, or was none; the link ends below
+        finally:
+            with self._lock:
+                self._links.discard(link)
+            link.close()
+
+    def _serve(self, link: socket.socket) -> None:
+        with self._lock:
+            taken = self._taken or self._faults.lasts("refuse")
+            self._taken = self._taken or not taken
+        if taken:
+            link.sendall(ptp.packet(Packet.INIT_FAIL, b"\2\0\0\0"))  # 2: busy
+            return
+        try:
+            self._wait_out_silence()
+            link.sendall(ptp.init_command_ack(1, self._guid, MODEL))
+            while not self._closed.is_set():
+                self._transact(link)
+        finally:
+            self._body.disconnected()
+            with self._lock:
+                event, self._event, self._taken = self._event, None, False
+            if event is not None:
+                with contextlib.suppress(OSError):
+                    event.shutdown(socket.SHUT_RDWR)
+
+    def _hold(self, link: socket.socket) -> None:
+        """The event connection: acknowledged, probes answered, otherwise silent (EOS events are polled)."""
+        with self._lock:
+            self._event = link
+        link.sendall(ptp.packet(Packet.INIT_EVENT_ACK))
+        while True:
+            kind, _payload = _read(link)
+            if kind == Packet.PROBE_REQUEST:
+                link.sendall(ptp.packet(Packet.PROBE_RESPONSE))
+
+    def _transact(self, link: socket.socket) -> None:
+        kind, payload = _read(link)
+        if kind != Packet.REQUEST:
+            return  # a cancel, or data that nobody asked for
+        request = ptp.parse_request(payload)
+        data = _read_data(link) if request.code in ptp.WITH_DATA_OUT else b""
+        self._wait_out_silence()
+        answer = self._body.answer(request, data)
+        if answer.data is not None:
+            size = len(answer.data)
+            link.sendall(ptp.start_data(request.transaction, size) + ptp.end_data_header(request.transaction, size))
+            big = size > 65536
+            unplugs = big and self._faults.take("unplug-transfer")
+            if unplugs or (big and self._faults.take("drop-transfer")):
+                link.sendall(answer.data[: size // 2])
+                self._faults.command("unplug" if unplugs else "drop")
+                return
+            self._send(link, memoryview(answer.data))
+        link.sendall(ptp.response(answer.code, request.transaction, answer.parameters))
+
+    def _send(self, link: socket.socket, data: memoryview) -> None:
+        while data and self._faults.lasts("slow"):
+            link.sendall(data[:_SLOW_BYTES])
+            data = data[_SLOW_BYTES:]
+            self._closed.wait(_SILENCE_STEP_S)
+        link.sendall(data)
+
+    def _wait_out_silence(self) -> None:
+        while self._faults.lasts("silence") and not self._closed.wait(_SILENCE_STEP_S):
+            pass
+
+
+def _read(link: socket.socket) -> tuple[int, bytes]:
+    kind, size = ptp.header(_exactly(link, 8))
+    if size > 1 << 20:
+        raise ptp.MalformedPacketError(f"a packet of {size} bytes is more than an initiator ever sends here")
+    return kind, _exactly(link, size)
+
+
+def _read_data(link: socket.socket) -> bytes:
+    pieces: list[bytes] = []
+    while True:
+        kind, payload = _read(link)
+        if kind in (Packet.DATA, Packet.END_DATA):
+            pieces.append(payload[4:])
+        if kind == Packet.END_DATA:
+            return b"".join(pieces)
+
+
+def _exactly(link: socket.socket, size: int) -> bytes:
+    pieces = bytearray()
+    while len(pieces) < size:
+        piece = link.recv(size - len(pieces))
+        if not piece:
+            raise ConnectionResetError("the initiator hung up")
+        pieces += piece
+    return bytes(pieces)

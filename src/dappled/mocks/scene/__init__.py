@@ -1,0 +1,1 @@
+"""Simulated scenes and the masked camera that photographs them."""

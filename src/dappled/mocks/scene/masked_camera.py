@@ -1,0 +1,243 @@
+"""The simulated masked camera: a shot in, a raw file and the truth about it out.
+
+The file is what a daemon may see. The truth (views, depth, pose, how the mask really sits, when the shutter was open)
+is for tests and pictures only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path as FilePath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.decode.optics.carriers import Lattice
+from dappled.decode.optics.masks import Mask
+from dappled.mocks.autopilot.path import Path, TruePose
+from dappled.mocks.body import dng
+from dappled.mocks.scene import lens, synthesis
+from dappled.mocks.scene.bench import RealViews, WhiteCard, boards
+from dappled.mocks.scene.chip import SensorModel
+from dappled.mocks.scene.flyover import Terrain, finest_period_m
+from dappled.mocks.scene.lens import Floats, Installation, Optics, Rays, Rendering, Scene
+from dappled.mocks.scene.synthesis import PASS, Grid
+from dappled.mocks.scene.truth import Truth
+
+MAKE, MODEL = "dappled", "Simulated Masked Camera"
+ISO = 100
+EXPOSURE_S = 1 / 1000  # metered, in ordinary light at full aperture
+LEVEL = 0.4  # of white, where a scene's mean is metered
+BRIGHTEST = 0.92  # of white, where the brightest pixel is kept
+LATENCY_S, LATENCY_SPREAD_S = 0.060, 0.015
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """One shot's outcome. `latency_s` is from the trigger to the opening of the shutter."""
+
+    file: bytes
+    mid_exposure_t_s: float
+    latency_s: float
+    raw: NDArray[np.uint16]
+    _truth: Callable[[], Truth] = field(repr=False)
+    name_suffix: str = ".dng"
+
+    @property
+    def truth(self) -> Truth:
+        """The truth, worked out anew each time it is asked for (the file is ready long before)."""
+        return self._truth()
+
+
+@dataclass(frozen=True, slots=True)
+class MaskedCamera:
+    """A camera body with a mask inside, before a scene. Everything drawn at random comes from `seed`.
+
+    `path` says where the vehicle is, None on a bench. `installation` is drawn from the seed unless it is given.
+    `epoch_utc_s` is what the body's own clock shows at the simulation's start.
+    """
+
+    seed: int
+    scene: Scene
+    optics: Optics
+    sensor: SensorModel
+    path: Path | None = None
+    installation: Installation | None = None
+    epoch_utc_s: float = 1_781_517_600.0
+
+    @property
+    def installed(self) -> Installation:
+        """How the mask really sits."""
+        return self.installation or Installation.drawn(self.seed, self.optics)
+
+    @property
+    def lattice(self) -> Lattice:
+        """Where the carriers really lie, in cycles/pixel."""
+        return lens.carrier_lattice(self.optics, self.installed, self.sensor.chip)
+
+    def latency_s(self, shot_number: int) -> float:
+        """From trigger to the opening of the shutter: within 60 ± 15 ms, its own for each shot."""
+        rng = np.random.default_rng([self.seed, 2, shot_number])
+        return float(LATENCY_S + LATENCY_SPREAD_S * rng.uniform(-1, 1))
+
+    def metered(self, f_number: float) -> tuple[float, float]:
+        """(exposure time in s, where it puts the scene's mean as a share of white) at an f-number.
+
+        Stopped down, a mask is no longer averaged over the aperture and its clear spots are far brighter than the mean:
+        the mean is then held lower, so that they stay below white.
+        """
+        points = self.optics.aperture_points_mm(f_number).reshape(-1, 2)
+        peak = lens.peak_over_mean(self.optics, self.installed, points)
+        level = min(LEVEL, BRIGHTEST / (peak * self.scene.headroom))
+        return EXPOSURE_S * (f_number / self.optics.f_number) ** 2 * level / LEVEL, level
+
+    def expose(
+        self,
+        trigger_t_s: float,
+        shot_number: int,
+        *,
+        f_number: float | None = None,
+        exposure_s: float | None = None,
+    ) -> Exposure:
+        """Take a picture: triggered at `trigger_t_s` (seconds on the path's clock).
+
+        Without `f_number` the lens is open, without `exposure_s` the exposure is metered. Raises ValueError for an
+        aperture that the lens has not, an exposure that is not positive, and what the scene can't show.
+        """
+        n_stop = self.optics.f_number if f_number is None else f_number
+        points = self.optics.aperture_points_mm(n_stop)
+        metered_s, level = self.metered(n_stop)
+        if exposure_s is not None:
+            if not exposure_s > 0:
+                raise ValueError(f"exposure must be positive, not {exposure_s:g} s")
+            level *= exposure_s / metered_s
+        open_s = metered_s if exposure_s is None else exposure_s
+        latency_s = self.latency_s(shot_number)
+        middle_t_s = trigger_t_s + latency_s + open_s / 2
+        pose = None if self.path is None else self.path.pose(middle_t_s)
+
+        lattice = self.lattice
+        grid = Grid.of(self.sensor.shape, lattice)
+        rendering = self.scene.render(self._rays(grid, points.reshape(-1, 2)), pose)
+        radiance = rendering.radiance
+        radiance *= np.float32(level / self.scene.mean_radiance)
+        plane = self._masked(radiance, grid, lattice, points.reshape(-1, 2))
+        raw = self.sensor.develop(plane, np.random.default_rng([self.seed, 3, shot_number]))
+        exif = dng.Exif(
+            make=MAKE,
+            model=MODEL,
+            serial=f"SIM{self.seed:08d}",
+            focal_length_mm=self.optics.focal_length_mm,
+            f_number=n_stop,
+            exposure_s=open_s,
+            iso=ISO,
+            taken_utc_ns=round((self.epoch_utc_s + middle_t_s) * 1e9),
+        )
+        return Exposure(
+            file=dng.encode(raw, black=self.sensor.black, white=self.sensor.white, exif=exif, mono=self.sensor.mono),
+            mid_exposure_t_s=middle_t_s,
+            latency_s=latency_s,
+            raw=raw,
+            _truth=partial(self._truth, rendering, grid=grid, points_mm=points, pose=pose, middle_t_s=middle_t_s),
+        )
+
+    def bench_frame(self, *, f_number: float | None = None, shot_number: int = 0) -> Exposure:
+        """A white card through the stopped-down lens, for calibration: 1/8 of the aperture unless told otherwise."""
+        bench = replace(self, scene=WhiteCard(), path=None)
+        return bench.expose(0.0, shot_number, f_number=8 * self.optics.f_number if f_number is None else f_number)
+
+    def _rays(self, grid: Grid, points_mm: NDArray[np.float64]) -> Rays:
+        places = grid.places()
+        y, x = (
+            (place - (side - 1) / 2) * self.sensor.pitch_mm
+            for place, side in zip(places, self.sensor.shape, strict=True)
+        )
+        return Rays(y, x, points_mm, self.optics.focal_length_mm, self.optics.focus_m)
+
+    def _masked(self, radiance: Floats, grid: Grid, lattice: Lattice, points_mm: NDArray[np.float64]) -> Floats:
+        weights = lens.modulation(self.optics.mask)
+        orders = list(weights)
+        k = np.array(orders, dtype=np.float64)
+        centre = (np.array(self.sensor.shape) - 1) / 2
+        shift = np.array(self.installed.shift_mm) * self.optics.mask.frequency_per_mm
+        origin = 2 * np.pi * (k @ shift - k @ lattice.matrix() @ centre)
+        angular = lens.angular_phases(self.optics, self.installed, orders, points_mm)
+        sites = synthesis.GREY if self.sensor.mono else synthesis.SITES
+        return synthesis.mosaic(
+            radiance, grid, lattice, angular=angular, weights=weights, origin_phase=origin, sites=sites
+        )
+
+    def _truth(
+        self,
+        rendering: Rendering,
+        *,
+        grid: Grid,
+        points_mm: NDArray[np.float64],
+        pose: TruePose | None,
+        middle_t_s: float,
+    ) -> Truth:
+        n = self.optics.aperture_samples
+        views = synthesis.band_limited(rendering.radiance, grid)
+        depth = None if rendering.depth_m is None else rendering.depth_m[grid.inner]
+        installed, optics = self.installed, self.optics
+        angular = optics.mask.frequency_per_mm * installed.distance_mm / optics.focal_length_mm
+        return Truth(
+            views=np.ascontiguousarray(np.moveaxis(views, 1, -1)).reshape(n, n, *views.shape[2:], 3),
+            aperture_points_mm=points_mm,
+            depth_m=depth,
+            disparity_mm_per_mm=None if depth is None else optics.disparity_mm_per_mm(depth).astype(np.float32),
+            pose=pose,
+            mid_exposure_t_s=middle_t_s,
+            kappa=angular * float(points_mm[-1, -1, 0] - points_mm[0, 0, 0]) * n / max(n - 1, 1),
+            mask=optics.mask,
+            mask_rotation_rad=installed.rotation_rad,
+            mask_shift_mm=installed.shift_mm,
+            mask_distance_mm=installed.distance_mm,
+            angular_frequency_per_mm=angular,
+            lattice=self.lattice,
+            grid=np.array([[grid.step, 0, 0], [0, grid.step, 0]], dtype=np.float64),
+        )
+
+
+def reference_optics(law: str) -> Optics:
+    """`geometric`: the reference camera, whose 25 carriers are physical. `fd`: an S5200 at 13 mm with Mask 2 (full)."""
+    if law == "geometric":
+        return Optics(50.0, 7.4, 6.7, Mask(15.5, 2), 0.48)
+    if law == "fd":
+        return Optics(13.0, 11.5, 1.13, Mask(11.38, 2), 1.01, law="fd")
+    raise ValueError(f"no reference camera for the law {law!r}: there are geometric and fd")
+
+
+def reference_camera(
+    seed: int,
+    *,
+    scale: float = 1.0,
+    scene: str | FilePath = "terrain",
+    law: str = "geometric",
+    path: Path | None = None,
+    epoch_utc_s: float = 1_781_517_600.0,
+) -> MaskedCamera:
+    """The camera of the demo and of the tests.
+
+    `scale` is the sensor's side over 2776 × 3688. Under the geometric law the pitch stays 10 µm (a smaller chip); under
+    `fd`, which counts bins on a chip, the chip stays 4.29 × 5.76 mm (larger pixels). `scene` is "terrain" (flown along
+    `path`, by default the path of the same seed), "bench", "white", or a folder of n × n views.
+    """
+    optics = reference_optics(law)
+    shape = round(2776 * scale / 2) * 2, round(3688 * scale / 2) * 2
+    sensor = SensorModel(shape, 0.01 if law == "geometric" else 5.76 / shape[1])
+    size_mm = shape[0] * sensor.pitch_mm, shape[1] * sensor.pitch_mm
+    camera = MaskedCamera(seed, WhiteCard(), optics, sensor, None, epoch_utc_s=epoch_utc_s)
+    finest = PASS * min(Grid.of(shape, camera.lattice).half_band)  # cycles/pixel
+    if scene == "white":
+        return camera
+    if scene == "bench":
+        return replace(camera, scene=boards(seed, optics, size_mm, sensor.pitch_mm, sensor.pitch_mm / finest))
+    if scene == "terrain":
+        flown = path or Path(seed)
+        period_m = finest_period_m(flown.height_m, sensor.pitch_mm, optics.focal_length_mm, finest)
+        return replace(camera, scene=Terrain.of(seed, period_m), path=flown)
+    views = RealViews.read(FilePath(scene), size_mm)
+    return replace(camera, scene=views, optics=replace(optics, aperture_samples=len(views.views)))

@@ -1,0 +1,1 @@
+"""A long flight in which something goes wrong every few seconds."""

@@ -1,0 +1,232 @@
+"""A long flight in which something goes wrong every few seconds, and the books that must balance at its end.
+
+    python -m dappled.mocks.soak.soak --minutes 30 --seed 1
+
+The daemon runs in a process of its own as a service manager would run it (restarted when it dies), in front of the
+simulated body, autopilot and ground station. At the end every wish that was acknowledged is exactly one shot, every
+shot a frame or failed with a reason, each flight intact, and the daemon's memory, files and threads where they were.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import signal
+import socket
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tomli_w
+
+from dappled.config import settings as configuration
+from dappled.daemon.camera_protocol.ground_client import GroundClient
+from dappled.drivers.mavlink.links import mavlink
+from dappled.flight import check, summary
+from dappled.flight.errors import FlightError
+from dappled.mocks.simulation import Simulation, World, free_port
+from dappled.mocks.soak.supervised import Resources, Supervised
+from dappled.mocks.soak.troubles import Troubles
+
+SETTLE_S = 8.0
+START_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A soak: how long, how often a wish, how often a fault. `scale` is that of the simulated sensor."""
+
+    seconds: float = 1800.0
+    seed: int = 1
+    interval_s: float = 1.0
+    fault_every_s: float = 4.0
+    scale: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Account:
+    """What came of it. `problems` are sentences, none when all is well; wishes are counted by what the ground heard."""
+
+    asked: int
+    accepted: int
+    refused: int
+    unanswered: int
+    shots: int
+    safe: int
+    failed: int
+    flights: int
+    lives: int
+    faults: dict[str, int]
+    before: Resources | None
+    after: Resources | None
+    problems: list[str] = field(default_factory=list)
+
+
+def soak(plan: Plan, folder: Path, tell: Callable[[str], None] = lambda _: None) -> Account:
+    """Fly the plan in `folder` and settle the account."""
+    chance = random.Random(plan.seed)  # noqa: S311  # which fault comes when: no secret
+    root = folder / "flights"
+    settings = configuration.load(None)
+    config = folder / "dappled.toml"
+    answers: dict[int, int | None] = {}
+    with ExitStack() as stack:
+        simulation = Simulation(World(seed=plan.seed, scale=plan.scale), settings, folder)
+        simulated = stack.enter_context(simulation)
+        tables = configuration.to_tables(simulated)
+        tables["record"]["directory"] = str(root)
+        tables["publish"] |= {"slices": f"ipc://{folder}/s", "ask": f"ipc://{folder}/a"}
+        tables["console"]["bind"] = f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+        config.write_text(tomli_w.dumps(tables), encoding="utf-8")
+        daemon = stack.enter_context(Supervised(config, folder / "daemon.log"))
+        ground = stack.enter_context(GroundClient(simulation.ground_url))
+        ground.find_camera(START_S)
+        troubles = stack.enter_context(Troubles(simulation, daemon, config, chance))
+        wisher = _Wisher(ground, plan.interval_s, answers)
+        stack.callback(wisher.stop)
+        wisher.start()
+        began = time.monotonic()
+        end, next_fault = began + plan.seconds, began + SETTLE_S
+        # The daemon dies in the first half only; then it lives itself warm (a minute of telemetry, the heap's largest
+        # need), and is measured.
+        last_life, warm = began + plan.seconds / 2, began + plan.seconds * 2 / 3
+        before: Resources | None = None
+        while time.monotonic() < end:
+            time.sleep(0.1)
+            daemon.keep_alive()
+            if before is None and time.monotonic() > max(warm, last_life + SETTLE_S):
+                troubles.clear()
+                before = _calm(daemon, SETTLE_S)
+            if time.monotonic() > next_fault:
+                next_fault += plan.fault_every_s * chance.uniform(0.5, 1.5)
+                tell(troubles.strike(daemon_may_die=time.monotonic() < last_life))
+        troubles.clear()
+        wisher.stop()
+        after = _calm(daemon, 2 * SETTLE_S)
+        code = daemon.end()
+    problems = [] if code == 0 else [f"the daemon ended with {code}: see {folder / 'daemon.log'}"]
+    return _settle(root, answers, problems, resources=(before, after), lives=daemon.lives, faults=troubles.counts)
+
+
+def _calm(daemon: Supervised, seconds: float) -> Resources:
+    """The daemon's resources once nothing has gone wrong for a while."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        time.sleep(0.1)
+        daemon.keep_alive()
+    return daemon.resources()
+
+
+def _settle(
+    root: Path,
+    answers: dict[int, int | None],
+    problems: list[str],
+    *,
+    resources: tuple[Resources | None, Resources | None],
+    lives: int,
+    faults: Counter[str],
+) -> Account:
+    """Compare what the ground was told with what stands in the flights."""
+    shots: Counter[int] = Counter()
+    safe = failed = flights = 0
+    for listed in summary.list_flights(root):
+        flights += 1
+        problems += [f"{listed.name}: {text}" for text in check.check(listed.path).problems]
+        if listed.balance is None:
+            problems.append(f"{listed.name}: {listed.problem}")
+            continue
+        safe, failed = safe + listed.balance.safe, failed + listed.balance.failed
+        if not listed.balance.balanced or listed.balance.open:
+            problems.append(f"{listed.name}: the books do not balance: {listed.balance}")
+        for line in summary.show(listed.path).lines:
+            shots[line.row.shot.cause.sequence or 0] += 1
+            if line.row.state == "failed" and not line.row.reason:
+                problems.append(f"{listed.name}: shot {line.row.shot.index} failed without a reason")
+    results = Counter(answers.values())
+    accepted = mavlink.MAV_RESULT_ACCEPTED
+    problems += [
+        f"wish {n} was acknowledged and is no shot" for n, r in answers.items() if r == accepted and not shots[n]
+    ]
+    problems += [f"wish {n} became {count} shots" for n, count in shots.items() if count > 1]
+    problems += [f"shot of wish {n}, which nobody made" for n in shots if n not in answers]
+    before, after = resources
+    if before is not None and after is not None:
+        problems += before.grown(after)
+    return Account(
+        asked=len(answers),
+        accepted=results[accepted],
+        refused=len(answers) - results[accepted] - results[None],
+        unanswered=results[None],
+        shots=shots.total(),
+        safe=safe,
+        failed=failed,
+        flights=flights,
+        lives=lives,
+        faults=dict(sorted(faults.items())),
+        before=before,
+        after=after,
+        problems=problems,
+    )
+
+
+class _Wisher:
+    """Asks for a photograph every `interval_s`, and keeps what was answered: MAV_RESULT, or None."""
+
+    def __init__(self, ground: GroundClient, interval_s: float, answers: dict[int, int | None]) -> None:
+        self._ground, self._interval_s, self._answers = ground, interval_s, answers
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="wishes", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask no more; the wish in hand is finished."""
+        self._stop.set()
+        self._thread.join(10.0)
+
+    def _run(self) -> None:
+        sequence = 0
+        due = time.monotonic()
+        while not self._stop.wait(max(0.0, due - time.monotonic())):
+            due = max(due + self._interval_s, time.monotonic())
+            sequence += 1
+            self._answers[sequence] = None
+            result, _ = self._ground.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, sequence)
+            self._answers[sequence] = result
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The process' entry point: exit 1 when a book doesn't balance or something has grown."""
+    parser = argparse.ArgumentParser(prog="python -m dappled.mocks.soak.soak", description=__doc__.partition("\n")[0])
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--keep", type=Path, help="folder for flights and the daemon's log (default: a temporary one)")
+    wanted = parser.parse_args(arguments)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with tempfile.TemporaryDirectory(prefix="soak-") as temporary:
+        folder = wanted.keep or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        began = time.monotonic()
+        account = soak(
+            Plan(wanted.minutes * 60, wanted.seed),
+            folder.absolute(),
+            lambda text: print(f"{time.monotonic() - began:7.1f} s  {text}", file=sys.stderr),  # noqa: T201  # a tool that prints
+        )
+    told = {name: getattr(account, name) for name in Account.__slots__ if name not in ("before", "after")}
+    told |= {"before": account.before and account.before.told(), "after": account.after and account.after.told()}
+    print(json.dumps(told, indent=1))  # noqa: T201  # as above
+    return 1 if account.problems else 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except FlightError as error:
+        sys.exit(f"soak: {error}")

@@ -1,0 +1,1 @@
+"""Whole flights, frame by frame, on many processes."""

@@ -1,0 +1,261 @@
+"""Whole flights frame by frame: what is to be made of each frame, made in any process, with the same bytes everywhere.
+
+A job is a value that says everything; `make` needs nothing else, writes under temporary names and renames. So a job may
+be done twice, or on another machine that sees the same folders, and the outcome is the same.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+
+from dappled import __version__
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.errors import DappledError, sentence
+from dappled.flight import durable
+from dappled.flight.records import Frame, Tag, canonical
+from dappled.products.exports import light_files
+from dappled.products.maps import cog, drawings, georeference, photographs
+from dappled.products.maps.earth import Projection, utm
+from dappled.products.maps.georeference import Options
+from dappled.products.maps.photographs import Station
+
+KINDS = {"npz": ".npz", "zarr": ".zarr", "h5": ".h5", "cog": ".tif", "kmz": ".kmz"}
+MAPS = ("cog", "kmz")
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # mallopt(3)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One frame and all that is to be made of it. `station` is None where its place isn't known, `why` the reason;
+    `level_m` is the flight's flat ground. `key` names the job by everything that its outcome depends on."""
+
+    flight: str
+    frame: Frame
+    tag: Tag | None
+    station: Station | None
+    why: str
+    level_m: float | None
+    recipe: Recipe
+    options: Options
+    kinds: tuple[str, ...]
+    output: str
+    key: str
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """A file that was made: its name in the batch's folder, size and SHA-256."""
+
+    name: str
+    size: int
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """What became of a job. `error` is a sentence, or None; `cpu_seconds` and `peak_mb` (so far) are the process'."""
+
+    key: str
+    flight: str
+    frame: str
+    outputs: tuple[Output, ...]
+    error: str | None
+    seconds: float
+    cpu_seconds: float
+    peak_mb: float
+
+
+def plan(flight: Path, recipe: Recipe, options: Options, kinds: Sequence[str], output: Path) -> list[Job]:
+    """The jobs of one flight. Raises DappledError where the flight or the recipe can't be read."""
+    for kind in kinds:
+        if kind not in KINDS:
+            raise DappledError(f"a batch makes {', '.join(KINDS)}, not {kind}")
+    Darkroom(recipe).check()
+    recipe = _anywhere(recipe)
+    if options.terrain is not None:
+        options = replace(options, terrain=options.terrain.absolute())
+    frames, tags = photographs.recorded(flight)
+    if options.frames is not None:
+        frames = [frame for frame in frames if frame.index in options.frames]
+    stations: dict[int, Station] = {}
+    reasons: dict[int, str] = {}
+    for frame in frames:
+        try:
+            stations[frame.index] = photographs.station(frame, tags.get(frame.index), options.mounting)
+        except DappledError as error:
+            reasons[frame.index] = str(error)
+    level = None
+    if set(kinds) & set(MAPS) and stations:
+        level = georeference.level_of(list(stations.values()), options)
+        first = next(iter(stations.values())).camera
+        options = replace(options, crs=options.crs or utm(first.latitude_deg, first.longitude_deg))
+    common = {
+        "version": __version__,
+        "recipe": {**asdict(recipe), **_digests(recipe)},
+        "options": _plain(options),
+        "terrain": None if options.terrain is None else durable.hash_file(options.terrain),
+        "level_m": level,
+        "kinds": sorted(kinds),
+    }
+    jobs = []
+    for frame in frames:
+        tag = tags.get(frame.index)
+        said = {**common, "flight": flight.name, "name": frame.name, "frame": frame.sha256,
+                "tag": None if tag is None else asdict(tag)}  # fmt: skip
+        key = hashlib.sha256(canonical(said)).hexdigest()
+        jobs.append(
+            Job(
+                str(flight.absolute()), frame, tag, stations.get(frame.index), reasons.get(frame.index, ""), level,
+                recipe, options, tuple(kinds), str(output.absolute()), key,
+            )
+        )  # fmt: skip
+    return jobs
+
+
+def make(job: Job) -> Done:
+    """Do a job. What is wrong with this frame is an error in the answer: it never stops the others."""
+    _settle_memory()
+    began, cpu = time.monotonic(), time.process_time()
+    outputs: tuple[Output, ...] = ()
+    error = None
+    try:
+        outputs = tuple(_made(job))
+    except (DappledError, OSError) as caught:
+        error = sentence(caught) if isinstance(caught, DappledError) else f"{job.frame.name}: {caught}"
+    except Exception as caught:  # noqa: BLE001  one bad frame must not end the flight: its words go into the manifest
+        error = f"{job.frame.name}: {sentence(caught)}"
+    seconds, cpu = round(time.monotonic() - began, 3), round(time.process_time() - cpu, 3)
+    return Done(job.key, Path(job.flight).name, job.frame.name, outputs, error, seconds, cpu, _peak_mb())
+
+
+def _made(job: Job) -> list[Output]:
+    flight = Path(job.flight)
+    folder = Path(job.output) / flight.name
+    durable.make_folder(folder)
+    beside = folder / Path(job.frame.name).stem
+    fields = [kind for kind in job.kinds if kind not in MAPS]
+    drawn = [kind for kind in job.kinds if kind in MAPS]
+    if drawn and job.station is None:
+        raise DappledError(job.why)
+    darkroom = _darkroom(job.recipe)
+    made = georeference.develop(darkroom, flight, job.frame, job.tag, job.options)
+    outputs = []
+    for kind in fields:
+        path = beside.with_suffix(KINDS[kind])
+        pose = {} if job.tag is None else {"pose": asdict(job.tag.pose)}
+        field = replace(made.light_field, attributes={**made.light_field.attributes, **pose})
+        light_files.save(path, field, overwrite=True)
+        outputs.append(_output(path, job))
+    if drawn:
+        assert job.station is not None
+        assert job.level_m is not None
+        assert job.options.crs is not None
+        projection = _projection(job.options.crs)
+        one = georeference.place(job.station, made, darkroom, projection, job.options)
+        survey = georeference.on_ground(
+            flight.name, [one], [], projection=projection, level_m=job.level_m, options=job.options
+        )
+        gain = cog.gain_of([one.image])
+        for kind in drawn:
+            path = beside.with_suffix(KINDS[kind])
+            if kind == "cog":
+                drawings.frame_cog(survey, one, path, gain)
+            else:
+                drawings.frame_kmz(survey, one, path, gain)
+            outputs.append(_output(path, job))
+    return outputs
+
+
+def _output(path: Path, job: Job) -> Output:
+    """A finished file or folder, with one hash over all that is in it."""
+    name = str(path.relative_to(job.output))
+    if path.is_file():
+        return Output(name, path.stat().st_size, durable.hash_file(path))
+    whole = hashlib.sha256()
+    size = 0
+    for inner in sorted(path.rglob("*")):
+        if inner.is_file():
+            size += inner.stat().st_size
+            whole.update(f"{inner.relative_to(path)} {durable.hash_file(inner)}\n".encode())
+    return Output(name, size, whole.hexdigest())
+
+
+def _digests(recipe: Recipe) -> dict[str, str]:
+    """What the recipe's files hold: another calibration under the same name is another job."""
+    named = {"calibration": recipe.calibration, "white": recipe.white, "dark": recipe.dark}
+    named |= {
+        name: value for name, value in (("camera", recipe.camera), ("mask", recipe.mask)) if value.endswith(".toml")
+    }
+    return {name: durable.hash_file(Path(path)) for name, path in named.items() if path}
+
+
+def _anywhere(recipe: Recipe) -> Recipe:
+    """The recipe for a worker in whatever folder: full paths; frames are the unit of parallel work."""
+
+    def full(path: str, is_file: bool) -> str:
+        return str(Path(path).absolute()) if is_file else path
+
+    return replace(
+        recipe,
+        camera=full(recipe.camera, recipe.camera.endswith(".toml")),
+        mask=full(recipe.mask, recipe.mask.endswith(".toml")),
+        calibration=full(recipe.calibration, bool(recipe.calibration)),
+        white=full(recipe.white, bool(recipe.white)),
+        dark=full(recipe.dark, bool(recipe.dark)),
+        workers=1,
+    )
+
+
+def _plain(options: Options) -> dict[str, object]:
+    """The options as JSON can hold them; which frames were chosen is no part of a job."""
+    values = asdict(replace(options, frames=None, terrain=None))
+    return {name: value if isinstance(value, str | None) else repr(value) for name, value in values.items()}
+
+
+_here = threading.local()  # a decoder keeps buffers: one for each thread that works
+
+
+def _darkroom(recipe: Recipe) -> Darkroom:
+    """This thread's darkroom for a recipe, kept from job to job."""
+    kept: dict[Recipe, Darkroom] = _here.__dict__.setdefault("darkrooms", {})
+    if recipe not in kept:
+        kept.clear()
+        kept[recipe] = Darkroom(recipe)
+    return kept[recipe]
+
+
+def _projection(name: str) -> Projection:
+    kept: dict[str, Projection] = _here.__dict__.setdefault("projections", {})
+    if name not in kept:
+        kept[name] = Projection(name)
+    return kept[name]
+
+
+def _peak_mb() -> float:
+    """The most memory that this process ever held. (getrusage counts its parent's, from before it began.)"""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return round(int(line.split()[1]) / 1024, 1)
+    return 0.0
+
+
+@cache
+def _settle_memory() -> None:
+    """Keep freed memory in this process for the next frame.
+
+    glibc gives it back and fetches it anew, page by page, for every array; a Dask worker is told to do so even from
+    64 KiB on (MALLOC_TRIM_THRESHOLD_), which doubles a frame's time. Elsewhere than on glibc nothing happens.
+    """
+    try:
+        mallopt = ctypes.CDLL("libc.so.6").mallopt
+    except (OSError, AttributeError):
+        return
+    mallopt(_TRIM_THRESHOLD, 1 << 30)
+    mallopt(_MMAP_THRESHOLD, 1 << 25)

@@ -1,0 +1,190 @@
+"""Jobs done by processes of this machine, or by a Dask cluster. A worker that dies takes no job with it.
+
+Answers come in the order in which they are ready.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+from dappled.errors import DappledError
+from dappled.products.batch.batch import Done, Job
+from dappled.products.extras import need
+
+ATTEMPTS = 3  # a frame that kills so many workers is given up
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "GDAL_NUM_THREADS"), "1")
+_PATIENCE_S = 10.0  # for the scheduler to answer
+_WORKERS_S = 60.0  # for its first worker to be there
+JOB_S = 900.0  # a frame takes seconds: a worker that is silent so long hangs
+
+Make = Callable[[Job], Done]
+
+
+class ClusterError(DappledError):
+    """A Dask cluster that can't be used; one sentence."""
+
+
+@dataclass(slots=True)
+class _Worker:
+    process: BaseProcess
+    door: Connection
+    job: Job | None = None
+    until_s: float = 0.0  # when its job is overdue
+
+
+def in_processes(
+    jobs: Sequence[Job], make: Make, workers: int, *, job_s: float = JOB_S, now_s: Callable[[], float] = time.monotonic
+) -> Iterator[Done]:
+    """Answers of jobs done by so many processes, each with one thread.
+
+    A process that dies, or is silent for `job_s`, is replaced, and its job done again, three times in all.
+    """
+    waiting = deque(jobs)
+    deaths: dict[str, int] = {}
+    crew: list[_Worker] = []
+    try:
+        while waiting or any(worker.job is not None for worker in crew):
+            while waiting and len(crew) < workers:
+                crew.append(_hired(make))
+            for worker in crew:
+                if worker.job is None and waiting:
+                    worker.job, worker.until_s = waiting.popleft(), now_s() + job_s
+                    _hand(worker, worker.job)
+            busy = [w for w in crew if w.job is not None]
+            ready = wait([w.door for w in busy], max(0.0, min(w.until_s for w in busy) - now_s()))
+            for worker in [w for w in busy if w.door in ready or now_s() >= w.until_s]:
+                job = worker.job
+                assert job is not None
+                try:
+                    answer = _answer(worker)
+                except (EOFError, OSError):
+                    crew.remove(worker)
+                    _dismiss(worker)
+                    deaths[job.key] = deaths.get(job.key, 0) + 1
+                    if deaths[job.key] < ATTEMPTS:
+                        waiting.appendleft(job)
+                        continue
+                    answer = given_up(
+                        job, f"{job.frame.name} ended or held up {ATTEMPTS} workers: out of memory, or damaged?"
+                    )
+                worker.job = None
+                yield answer
+    finally:
+        for worker in crew:
+            _dismiss(worker)
+
+
+def on_cluster(jobs: Sequence[Job], make: Make, scheduler: str) -> Iterator[Done]:
+    """Answers of jobs done by the workers of a Dask scheduler, which must see the same folders under the same names.
+
+    Raises ClusterError where nobody answers, or where no worker is there within a minute.
+    """
+    distributed = need("distributed")
+    try:
+        client = distributed.Client(scheduler, timeout=_PATIENCE_S, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise ClusterError(
+            f"no Dask scheduler answers at {scheduler} ({error}): start one with dask scheduler"
+        ) from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_WORKERS_S)
+        except TimeoutError:
+            raise ClusterError(
+                f"the Dask scheduler at {scheduler} has no workers: start some with dask worker {scheduler}"
+            ) from None
+        named = {job.key: job for job in jobs}
+        futures = [client.submit(make, job, key=f"dappled-{job.key}", pure=False) for job in named.values()]
+        for future in distributed.as_completed(futures, loop=client.loop):
+            key = future.key.removeprefix("dappled-")
+            if future.status == "finished":
+                yield future.result()
+            else:
+                yield given_up(named[key], f"{named[key].frame.name}: the cluster gave it up: {future.exception()}")
+            future.release()
+
+
+def given_up(job: Job, why: str) -> Done:
+    """The answer for a job that no worker could end."""
+    return Done(job.key, Path(job.flight).name, job.frame.name, (), why, 0.0, 0.0, 0.0)
+
+
+def _hired(make: Make) -> _Worker:
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe()
+    process = context.Process(target=_work, args=(there, make), daemon=True)
+    with _environment(_ONE_THREAD):
+        process.start()
+    there.close()
+    return _Worker(process, here)
+
+
+def _hand(worker: _Worker, job: Job) -> None:
+    try:
+        worker.door.send(job)
+    except OSError:
+        return  # it died at once: reading from it will say so
+
+
+def _answer(worker: _Worker) -> Done:
+    """What a worker has to say. Raises EOFError or OSError where it never will."""
+    if not worker.door.poll():
+        raise TimeoutError("overdue")
+    answer: Done = worker.door.recv()
+    return answer
+
+
+def _dismiss(worker: _Worker) -> None:
+    worker.door.close()
+    worker.process.terminate()
+    worker.process.join(5.0)
+    if worker.process.is_alive():
+        worker.process.kill()
+        worker.process.join()
+
+
+def _work(door: Connection, make: Make) -> None:
+    """A worker's life: a job in, an answer out, until nobody is there any more."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a person's Ctrl-C is for the one who hands out the jobs
+    single_threaded()
+    while True:
+        try:
+            job: Job = door.recv()
+        except (EOFError, OSError):
+            return
+        door.send(make(job))
+
+
+def single_threaded() -> None:
+    """OpenCV's own threads off: the frames are what runs side by side."""
+    try:
+        import cv2  # noqa: PLC0415  an extra; light fields are made without it
+    except ImportError:
+        return
+    cv2.setNumThreads(1)
+
+
+@contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """These variables for the processes that are started meanwhile."""
+    before: dict[str, Any] = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value

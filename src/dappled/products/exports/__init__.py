@@ -1,0 +1,1 @@
+"""Light fields, pictures and point clouds as files."""

@@ -1,0 +1,232 @@
+"""Light fields in the forms that other tools read: HCI's folder, ESLF, LFToolbox' .mat, quilts.
+
+Views are turned so that a camera further right sees near things further left, and one further down further up, as those
+tools expect. Values become 8 or 16 bits with `white` (of the sensor's, 1.0) as the brightest; it is told beside them.
+"""
+
+from __future__ import annotations
+
+import configparser
+import math
+import secrets
+import shutil
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import io
+
+from dappled.decode.depth.depth_map import DepthMap
+from dappled.decode.lightfield import view_stack
+from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.refocus import shift_and_add
+from dappled.decode.lightfield.view_stack import ViewStack
+from dappled.errors import DappledError
+from dappled.products.exports import prints
+
+ESLF_LENSLET_PX = 14  # what LFToolbox' and LiFF's readers take for granted
+_LARGEST_MAT = 2**31 - 1  # bytes of one variable in a version 5 file
+
+
+class ExportError(DappledError):
+    """A light field can't be written in a form; one sentence."""
+
+
+def as_cameras(stack: ViewStack) -> NDArray[np.float32]:
+    """The views (V, U, h, w(, 3)) in the order of cameras: rows from the top one, columns from the left one."""
+    views = stack.views
+    if stack.row_steps[-1] > stack.row_steps[0]:
+        views = views[::-1]
+    if stack.column_steps[-1] > stack.column_steps[0]:
+        views = views[:, ::-1]
+    return views
+
+
+def hci(path: Path, field: LightField, depth: DepthMap | None = None) -> None:
+    """HCI's 4D light field benchmark: a folder of input_Cam000.png …, parameters.cfg and, with a depth map,
+    disp_estimate.pfm (NaN where unknown). Raises ExportError."""
+    stack = view_stack.of(field)
+    views = as_cameras(stack)
+    white = prints.white_of([views])
+
+    def write(folder: Path) -> None:
+        folder.mkdir()
+        for number, view in enumerate(views.reshape(-1, *views.shape[2:])):
+            picture = prints.toned(view, white)
+            rgb = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
+            Image.fromarray(rgb).save(folder / f"input_Cam{number:03d}.png")
+        with (folder / "parameters.cfg").open("w", encoding="utf-8") as file:
+            _parameters(field, stack, white, depth).write(file)
+        if depth is not None:
+            write_pfm(folder / "disp_estimate.pfm", depth.disparity)
+
+    _whole(path, write)
+
+
+def eslf(path: Path, field: LightField, lenslet_px: int = 0) -> None:
+    """An ESLF image: 16-bit PNG in which each pixel of the views is a lenslet of `lenslet_px`² pixels, one a view.
+
+    0 takes the number of views an axis; more leave black pixels around them. The size and the white are written beside
+    it, in a .txt of the same name. Raises ExportError, also where either of them stands already.
+    """
+    views = as_cameras(view_stack.of(field))
+    side = lenslet_px or max(views.shape[:2])
+    if side < max(views.shape[:2]):
+        raise ExportError(f"{views.shape[0]} × {views.shape[1]} views don't fit into lenslets of {side} px")
+    values, white = _sixteen_bits(views)
+    count_v, count_u, height, width = values.shape[:4]
+    colours = values.shape[4:]
+    sheet = np.zeros((height, side, width, side, *colours), dtype=np.uint16)
+    top, left = (side - count_v) // 2, (side - count_u) // 2
+    order = (2, 0, 3, 1, *range(4, values.ndim))
+    sheet[:, top : top + count_v, :, left : left + count_u] = values.transpose(order)
+    flat = sheet.reshape(height * side, width * side, *colours)
+
+    def write(part: Path) -> None:
+        _png16(part, flat)
+
+    beside = path.with_suffix(".txt")
+    if beside.exists():
+        raise ExportError(f"{beside} exists already; choose another name")
+    _whole(path, write)
+    note = f"lenslet_px = {side}\nviews = {count_v} x {count_u}\nwhite = {white:.6g}\n"
+    _whole(beside, lambda part: part.write_text(note, encoding="utf-8"))
+
+
+def mat(path: Path, field: LightField) -> None:
+    """A MATLAB version 5 file as LFToolbox' LFUtilDecodeLytroFolder leaves it: `LF` uint16 [t, s, v, u, c], c red,
+    green, blue and weight. Raises ExportError."""
+    values, white = _sixteen_bits(as_cameras(view_stack.of(field)))
+    rgb = values if values.ndim == 5 else np.repeat(values[..., None], 3, axis=4)
+    weight = np.full((*rgb.shape[:4], 1), 65535, dtype=np.uint16)
+    lf = np.concatenate([rgb, weight], axis=4)
+    if lf.nbytes > _LARGEST_MAT:
+        raise ExportError(
+            f"{path}: {lf.nbytes / 1e9:.1f} GB don't fit into a version 5 .mat file; export as h5 instead"
+        )
+    told = {
+        "LF": lf,
+        "DecodeOptions": {"NColChans": 3, "NWeightChans": 1, "Precision": "single", "White": white},
+        "GeneratedByInfo": {"mfilename": "dappled"},
+        "LFMetadata": {key: value for key, value in field.attributes.items() if isinstance(value, str | int | float)},
+    }
+
+    def write(part: Path) -> None:
+        with part.open("wb") as file:
+            io.savemat(file, told, format="5", do_compression=True)
+
+    _whole(path, write)
+
+
+def quilt(path: Path, field: LightField, *, disparity: float = 0.0) -> Path:
+    """A quilt for a light-field display: the views of the middle row from the left one (bottom left) to the right one,
+    converging on a disparity. Returns the path, whose name tells `_qs<columns>x<rows>a<aspect>`. Raises ExportError."""
+    stack = view_stack.of(field)
+    middle = int(np.argmin(np.abs(stack.row_steps)))
+    order = np.argsort(-stack.column_steps)  # the left camera has the largest step
+    pictures = []
+    for u in order:
+        weights = np.zeros(stack.views.shape[:2])
+        weights[middle, u] = 1
+        pictures.append(np.nan_to_num(shift_and_add(stack, disparity, weights=weights)))
+    white = prints.white_of(pictures)
+    count = len(pictures)
+    rows = max(r for r in range(1, math.isqrt(count) + 1) if count % r == 0)
+    columns = count // rows
+    eight = [prints.toned(p, white) for p in pictures]
+    lines = [np.concatenate(eight[r * columns : (r + 1) * columns], axis=1) for r in range(rows)]
+    sheet = np.concatenate(lines[::-1], axis=0)  # the first row is the lowest
+    height, width = pictures[0].shape[:2]
+    named = path.with_name(f"{path.stem}_qs{columns}x{rows}a{width / height:.3f}.png")
+
+    def write(part: Path) -> None:
+        Image.fromarray(sheet).save(part, format="PNG")
+
+    _whole(named, write)
+    return named
+
+
+def write_pfm(path: Path, values: NDArray[np.float32]) -> None:
+    """A PFM of one channel, little endian, rows from the bottom, as HCI's tools have it."""
+    height, width = values.shape
+    with path.open("wb") as file:
+        file.write(f"Pf\n{width} {height}\n-1.0\n".encode())
+        file.write(np.ascontiguousarray(values[::-1], dtype="<f4").tobytes())
+
+
+def _parameters(field: LightField, stack: ViewStack, white: float, depth: DepthMap | None) -> configparser.ConfigParser:
+    said = field.attributes
+    height, width = stack.views.shape[2:4]
+    length, stop = said.get("focal_length_mm"), said.get("f_number")
+    baseline_mm = length / stop / max(stack.views.shape[:2]) if length and stop else 0.0
+    known = depth is not None and depth.known.any()
+    low, high = np.nanquantile(depth.disparity, [0, 1]) if known and depth is not None else (0.0, 0.0)
+    parser = configparser.ConfigParser()
+    parser["intrinsics"] = {
+        "focal_length_mm": f"{length or 0:g}",
+        "image_resolution_x_px": str(width),
+        "image_resolution_y_px": str(height),
+        "sensor_size_mm": "0",
+        "fstop": f"{stop or 0:g}",
+    }
+    parser["extrinsics"] = {
+        "num_cams_x": str(stack.views.shape[1]),
+        "num_cams_y": str(stack.views.shape[0]),
+        "baseline_mm": f"{baseline_mm:.6g}",
+        "focus_distance_m": "0",
+        **{f"center_cam_{axis}_m": "0" for axis in "xyz"},
+        **{f"center_cam_r{axis}_rad": "0" for axis in "xyz"},
+    }
+    parser["meta"] = {
+        "scene": str(said.get("source", "dappled")),
+        "category": "recorded",
+        "disp_min": f"{float(low):.3f}",
+        "disp_max": f"{float(high):.3f}",
+        "version": "1",
+    }
+    parser["dappled"] = {"white": f"{white:.6g}", "note": "0 where the light field does not say"}
+    return parser
+
+
+def _sixteen_bits(views: NDArray[np.float32]) -> tuple[NDArray[np.uint16], float]:
+    white = prints.white_of([views])
+    made = np.rint(65535 * np.clip(np.nan_to_num(views) / white, 0, 1)).astype(np.uint16)
+    return made, white
+
+
+def _png16(path: Path, values: NDArray[np.uint16]) -> None:
+    """A 16-bit PNG, grey or RGB."""
+    height, width = values.shape[:2]
+    kind = 2 if values.ndim == 3 else 0
+    lines = values.astype(">u2").reshape(height, -1).view(np.uint8)
+    raw = np.concatenate([np.zeros((height, 1), np.uint8), lines], axis=1).tobytes()
+    with path.open("wb") as file:
+        file.write(b"\x89PNG\r\n\x1a\n")
+        for name, data in (
+            (b"IHDR", struct.pack(">IIBBBBB", width, height, 16, kind, 0, 0, 0)),
+            (b"IDAT", zlib.compress(raw, 4)),
+            (b"IEND", b""),
+        ):
+            file.write(struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)))
+
+
+def _whole(path: Path, write: Callable[[Path], Any]) -> None:
+    """`write` under another name, then rename. Raises ExportError where something stands there, or the disk refuses."""
+    if path.exists():
+        raise ExportError(f"{path} exists already; choose another name")
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        write(part)
+        part.rename(path)
+    except OSError as error:
+        raise ExportError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
+    finally:
+        if part.is_dir():
+            shutil.rmtree(part)
+        else:
+            part.unlink(missing_ok=True)

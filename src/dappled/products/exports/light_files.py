@@ -1,0 +1,217 @@
+"""Light fields as files: a Zarr v3 group, .npz or .h5, all laid out in the words of `LightField`.
+
+`slices`, `carriers`, `views`, `view_offsets` and `grid` are arrays of these names. The attributes are the group's own
+in Zarr; in .npz they are the JSON text of the array `attributes`; in HDF5 the file's attributes of their own names
+(what HDF5 has no type for as JSON text), and all of them as JSON text in `attributes`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import secrets
+import shutil
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.decode.lightfield.light_field import LightField
+from dappled.errors import DappledError
+from dappled.flight import durable
+
+_ARRAYS: dict[str, tuple[type[np.generic], int]] = {
+    "slices": (np.complex64, 3),
+    "carriers": (np.float64, 2),
+    "views": (np.float32, 4),
+    "view_offsets": (np.float64, 3),
+    "grid": (np.float64, 2),
+}
+_ATTRIBUTES = "attributes"
+
+
+class LightFileError(DappledError):
+    """A light field can't be written or read; one sentence with the file's name."""
+
+
+def save(path: Path, field: LightField, *, overwrite: bool = False) -> None:
+    """Write a light field; the extension says how: .zarr, .npz or .h5. Whole and durable under its name, or not at all.
+
+    Raises LightFileError, also when something stands there already and `overwrite` is false.
+    """
+    write = _of(path, {".zarr": _save_zarr, ".npz": _save_npz, ".h5": _save_h5})
+    arrays: _Arrays = {name: np.asarray(getattr(field, name), dtype=kind) for name, (kind, _) in _ARRAYS.items()}
+    _fits(path, arrays)
+    attributes = _json(path, field.attributes)
+    if path.exists() and not overwrite:
+        raise LightFileError(f"{path} exists already; choose another name, or allow it to be overwritten")
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        write(part, arrays, attributes)
+        _sync(part)
+        _put_in_place(part, path)
+    except OSError as error:
+        raise LightFileError(f"cannot write the light field {path}: {error.strerror or error}") from error
+    finally:
+        _remove(part)
+
+
+def load(path: Path) -> LightField:
+    """Read a light field that `save` wrote. Raises LightFileError."""
+    read = _of(path, {".zarr": _load_zarr, ".npz": _load_npz, ".h5": _load_h5})
+    if not path.exists():
+        raise LightFileError(f"there is no light field {path}; check the path")
+    try:
+        arrays, attributes = read(path)
+    except LightFileError:
+        raise
+    except KeyError as error:
+        raise LightFileError(f"{path} is not a light field: it lacks {error}") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, TypeError) as error:
+        raise LightFileError(f"{path} is not a light field, or is damaged: {error}") from error
+    _fits(path, arrays)
+    for name, (kind, _) in _ARRAYS.items():
+        if arrays[name].dtype != kind:
+            raise LightFileError(f"{path} is not a light field: {name} is {arrays[name].dtype}, not {np.dtype(kind)}")
+    return LightField(**arrays, attributes=attributes)
+
+
+_Arrays = dict[str, NDArray[Any]]
+
+
+def _of(path: Path, kinds: Mapping[str, Callable[..., Any]]) -> Callable[..., Any]:
+    if path.suffix not in kinds:
+        raise LightFileError(
+            f"{path}: a light field's file ends in .zarr, .npz or .h5, not in {path.suffix or 'nothing'}"
+        )
+    return kinds[path.suffix]
+
+
+def _fits(path: Path, arrays: _Arrays) -> None:
+    """Shapes that agree with each other, as `LightField` says them."""
+    for name, (_, dimensions) in _ARRAYS.items():
+        if arrays[name].ndim != dimensions and not (name == "views" and arrays[name].ndim == 5):
+            raise LightFileError(f"{path}: {name} has {arrays[name].ndim} dimensions, a light field has {dimensions}")
+    slices, views = arrays["slices"].shape, arrays["views"].shape
+    expected = {"carriers": (slices[0], 4), "view_offsets": (*views[:2], 2), "grid": (2, 3)}
+    for name, shape in expected.items():
+        if arrays[name].shape != shape:
+            raise LightFileError(
+                f"{path}: {name} has the shape {arrays[name].shape}, beside the others it needs {shape}"
+            )
+
+
+def _json(path: Path, attributes: Mapping[str, Any]) -> dict[str, Any]:
+    def plain(value: object) -> Any:
+        if isinstance(value, np.ndarray | np.generic):
+            return value.tolist()
+        if isinstance(value, os.PathLike):
+            return str(value)
+        raise TypeError(f"{type(value).__name__} is no JSON")
+
+    try:
+        text = json.dumps(dict(attributes), default=plain, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise LightFileError(
+            f"cannot write the light field {path}: its attributes don't fit into JSON ({error})"
+        ) from error
+    value: dict[str, Any] = json.loads(text)
+    return value
+
+
+def _save_zarr(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
+    group = _zarr(part).open_group(store=part, mode="w-", zarr_format=3, attributes=attributes)
+    for name, values in arrays.items():
+        # One chunk a slice, or a view: what is looked at one at a time.
+        lead = {"slices": 1, "views": 2}.get(name, 0)
+        chunks = tuple(max(1, side) for side in ((1,) * lead + values.shape[lead:]))
+        group.create_array(name, shape=values.shape, dtype=values.dtype, chunks=chunks)[...] = values
+
+
+def _load_zarr(path: Path) -> tuple[_Arrays, dict[str, Any]]:
+    zarr = _zarr(path)
+    group = zarr.open_group(store=path, mode="r")
+    arrays: _Arrays = {}
+    for name in _ARRAYS:
+        array = group[name]
+        if not isinstance(array, zarr.Array):
+            raise LightFileError(f"{path} is not a light field: {name} is no array")
+        arrays[name] = np.asarray(array[...])
+    return arrays, dict(group.attrs)
+
+
+def _save_npz(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
+    with part.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays, **{_ATTRIBUTES: np.array(json.dumps(attributes))})
+
+
+def _load_npz(path: Path) -> tuple[_Arrays, dict[str, Any]]:
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in _ARRAYS}, json.loads(str(file[_ATTRIBUTES]))
+
+
+def _save_h5(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
+    with _h5py(part).File(part, "w") as file:
+        for name, values in arrays.items():
+            file.create_dataset(name, data=values)
+        for key, value in attributes.items():
+            file.attrs[key] = value if isinstance(value, str | int | float | bool) else json.dumps(value)
+        file.attrs[_ATTRIBUTES] = json.dumps(attributes)
+
+
+def _load_h5(path: Path) -> tuple[_Arrays, dict[str, Any]]:
+    with _h5py(path).File(path, "r") as file:
+        return {name: np.asarray(file[name]) for name in _ARRAYS}, json.loads(file.attrs[_ATTRIBUTES])
+
+
+def _zarr(path: Path) -> Any:
+    return _ground("zarr", path, "Zarr", "use .npz")
+
+
+def _h5py(path: Path) -> Any:
+    return _ground("h5py", path, "HDF5", "use .npz")
+
+
+def _ground(name: str, path: Path, what: str, instead: str) -> Any:
+    """A library that the onboard install leaves out."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise LightFileError(
+            f"{path.name} needs {what}; install it with: pip install 'dappled[ground]' (or {instead})"
+        ) from error
+
+
+def _sync(path: Path) -> None:
+    """fsync a file, or a folder with all that is in it."""
+    files = [Path(base, name) for base, _, names in os.walk(path) for name in names] if path.is_dir() else [path]
+    for name in files:
+        fd = os.open(name, os.O_RDONLY)
+        try:
+            os.fsync(fd)
+        finally:
+            os.close(fd)
+    if path.is_dir():
+        for base, _, _ in os.walk(path):
+            durable.sync_folder(Path(base))
+
+
+def _put_in_place(part: Path, path: Path) -> None:
+    """Rename; a folder can't replace one that isn't empty, so an old one steps aside first."""
+    old = part.with_name(part.name + ".old.part")
+    if path.is_dir():
+        os.rename(path, old)
+    os.rename(part, path)
+    durable.sync_folder(path.parent)
+    _remove(old)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,183 @@
+"""Files of printed masks: PNG and TIFF with their physical resolution, made in strips; CSV of what was measured."""
+
+from __future__ import annotations
+
+import csv
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
+
+from dappled.decode.optics.film import DensityCurve, density_curve
+from dappled.decode.threads import spans
+from dappled.errors import DappledError
+
+Levels = NDArray[np.unsignedinteger]
+Tile = Callable[[slice, slice], Levels]
+_TILE = 512  # of a TIFF, in pixels a side
+_STRIP = 64  # rows of a PNG at a time
+
+
+class MaskFileError(DappledError):
+    """A mask file can't be written or read; one sentence: what, where, what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """What is written: rows and columns, bits, (vertical, horizontal) pixels a mm, and who makes the levels."""
+
+    shape: tuple[int, int]
+    bits: int
+    px_per_mm: tuple[float, float]
+    tile: Tile
+    progress: Callable[[int], object]
+
+
+def write(
+    path: Path,
+    shape: tuple[int, int],
+    bits: int,
+    px_per_mm: tuple[float, float],
+    tile: Tile,
+    *,
+    progress: Callable[[int], object] = lambda rows: None,
+) -> None:
+    """Write a grey image of `shape` to .png or .tif by asking `tile(rows, columns)` for its levels, strip by strip.
+
+    `px_per_mm` (vertical, horizontal) goes into the file (pHYs, or resolution tags). `progress` is told the rows done.
+    Memory stays at a few strips. The file appears whole or not at all. Raises MaskFileError.
+    """
+    writers = {".png": _write_png, ".tif": _write_tiff, ".tiff": _write_tiff}
+    writer = writers.get(path.suffix.lower())
+    if writer is None:
+        raise MaskFileError(f"{path}: a mask is written as .png or .tif; name it so")
+    part = path.with_name(path.name + ".part")
+    try:
+        writer(part, _Picture(shape, bits, px_per_mm, tile, progress))
+        os.replace(part, path)
+    except OSError as error:
+        raise MaskFileError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _write_png(path: Path, picture: _Picture) -> None:
+    rows, columns = picture.shape
+    packer = zlib.compressobj(1)
+    with path.open("wb") as file:
+
+        def chunk(kind: bytes, data: bytes) -> None:
+            file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
+
+        file.write(b"\x89PNG\r\n\x1a\n")
+        chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, picture.bits, 0, 0, 0, 0))
+        per_m = (round(density * 1000) for density in reversed(picture.px_per_mm))
+        chunk(b"pHYs", struct.pack(">IIB", *per_m, 1))
+        for these in spans(rows, _STRIP):
+            strip = picture.tile(these, slice(0, columns))
+            raw = strip.astype(">u2").view(np.uint8) if picture.bits == 16 else strip
+            lines = np.zeros((len(strip), 1 + columns * picture.bits // 8), dtype=np.uint8)  # filter 0 before each line
+            lines[:, 1:] = raw.reshape(len(strip), -1)
+            if packed := packer.compress(lines.tobytes()):
+                chunk(b"IDAT", packed)
+            picture.progress(len(strip))
+        chunk(b"IDAT", packer.flush())
+        chunk(b"IEND", b"")
+
+
+def _write_tiff(path: Path, picture: _Picture) -> None:
+    rows, columns = picture.shape
+
+    def tiles() -> Iterator[Levels]:
+        for these in spans(rows, _TILE):
+            picture.progress(these.stop - these.start)  # before the last tile: the writer asks for no more after it
+            for across in spans(columns, _TILE):
+                yield np.ascontiguousarray(picture.tile(these, across))
+
+    with tifffile.TiffWriter(path) as writer:
+        writer.write(
+            tiles(),
+            shape=picture.shape,
+            dtype=np.uint8 if picture.bits == 8 else np.uint16,
+            tile=(_TILE, _TILE),
+            photometric="minisblack",
+            compression="zlib",
+            compressionargs={"level": 1},
+            resolution=(picture.px_per_mm[1] * 10, picture.px_per_mm[0] * 10),
+            resolutionunit="CENTIMETER",
+            metadata=None,
+        )
+
+
+def read(path: Path) -> tuple[NDArray[np.float32], tuple[float, float]]:
+    """A grey mask image, float32 (H, W) from 0 to 1, and its (vertical, horizontal) pixels a mm.
+
+    Raises MaskFileError for a file that is no grey image, or does not say its resolution.
+    """
+    try:
+        if path.suffix.lower() == ".png":
+            with Image.open(path) as image:
+                values, dpi = np.asarray(image), image.info.get("dpi")
+            if dpi is None:
+                raise MaskFileError(f"{path} does not say its physical resolution: write it with `dappled mask make`")
+            density = float(dpi[1]) / 25.4, float(dpi[0]) / 25.4
+        else:
+            with tifffile.TiffFile(path) as tiff:
+                page = tiff.pages[0]
+                values = page.asarray()
+                x, y = page.get_resolution("MILLIMETER")
+            density = float(y), float(x)
+    except (OSError, ValueError, tifffile.TiffFileError) as error:
+        raise MaskFileError(f"{path} can't be read as an image: {error}") from None
+    if values.ndim != 2 or (values.dtype.kind != "u" and values.dtype != np.int32):
+        raise MaskFileError(f"{path} is not a grey image of 8 or 16 bits")
+    top = 255 if values.dtype == np.uint8 else 65535
+    return values.astype(np.float32) / np.float32(top), density
+
+
+def read_density_curve(path: Path) -> DensityCurve:
+    """A film's curve from CSV: columns `level` (0 to 255) and `density`. Raises MaskFileError."""
+    rows = _numbers(path, ("level", "density"))
+    try:
+        return density_curve([r[0] for r in rows], [r[1] for r in rows])
+    except ValueError as error:
+        raise MaskFileError(f"{path}: {error}") from None
+
+
+def read_spots(path: Path) -> list[tuple[float, float]]:
+    """Measured spots (x, y) in mm from the centre of the pattern, from CSV: columns `x_mm` and `y_mm`.
+
+    Rows with an empty place or a dash were not seen, and are left out. Raises MaskFileError.
+    """
+    return [(r[0], r[1]) for r in _numbers(path, ("x_mm", "y_mm"))]
+
+
+def _numbers(path: Path, wanted: tuple[str, ...]) -> list[tuple[float, ...]]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            names = [name.strip().lower() for name in reader.fieldnames or []]
+            missing = [name for name in wanted if name not in names]
+            if missing:
+                raise MaskFileError(f"{path} has no column {missing[0]}: its first line must name {', '.join(wanted)}")
+            reader.fieldnames = names
+            found = []
+            for line in reader:
+                texts = [(line[name] or "").strip() for name in wanted]
+                if any(text in ("", "-") for text in texts):
+                    continue
+                found.append(tuple(float(text) for text in texts))
+    except OSError as error:
+        raise MaskFileError(f"{path} can't be read: {error.strerror or error}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise MaskFileError(f"{path} can't be read as CSV: {error}") from None
+    except ValueError as error:
+        raise MaskFileError(f"{path}, line {reader.line_num}: {error}") from None
+    return found

@@ -1,0 +1,65 @@
+"""Views as a folder of pictures, a file each, as HCI's benchmark and others hand light fields out."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.view_stack import CAMERAS, centred
+from dappled.errors import DappledError
+
+_ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+
+
+class ViewFolderError(DappledError):
+    """A folder that doesn't hold n × n views; one sentence."""
+
+
+def read(folder: Path) -> LightField:
+    """All pictures of a folder in the order of their names, row by row from the top left camera. sRGB is made linear.
+
+    The light field has no slices, and `cameras` among its attributes. Where HCI's `input_Cam….png` stand, other
+    pictures are left out. Raises ViewFolderError.
+    """
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _ENDINGS)
+    files = [p for p in files if p.name.startswith("input_Cam")] or files
+    side = math.isqrt(len(files))
+    if side == 0 or side * side != len(files):
+        raise ViewFolderError(f"{folder} holds {len(files)} pictures: a light field needs n × n, one a view")
+    pictures = [_linear(path) for path in files]
+    shapes = {picture.shape for picture in pictures}
+    if len(shapes) > 1:
+        raise ViewFolderError(f"the pictures in {folder} differ in size: {', '.join(map(str, sorted(shapes)))}")
+    shape = pictures[0].shape
+    axis = centred(side) / side
+    return LightField(
+        slices=np.zeros((0, *shape[:2]), dtype=np.complex64),
+        carriers=np.zeros((0, 4)),
+        views=np.stack(pictures).reshape(side, side, *shape),
+        view_offsets=np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1),
+        grid=np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+        attributes={CAMERAS: True, "source": folder.name, "shape": list(shape[:2])},
+    )
+
+
+def _linear(path: Path) -> NDArray[np.float32]:
+    try:
+        with Image.open(path) as picture:
+            values = np.asarray(picture if picture.mode in ("L", "I;16", "I", "RGB") else picture.convert("RGB"))
+    except (OSError, ValueError) as error:
+        raise ViewFolderError(f"{path} can't be read as a picture: {error}") from None
+    top = 255 if values.dtype == np.uint8 else 65535
+    encoded = values.astype(np.float32) / np.float32(top)
+    linear: NDArray[np.float32] = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    if (
+        linear.ndim == 3
+        and np.array_equal(linear[..., 0], linear[..., 1])
+        and np.array_equal(linear[..., 0], linear[..., 2])
+    ):
+        return linear[..., 0].astype(np.float32)
+    return linear.astype(np.float32)

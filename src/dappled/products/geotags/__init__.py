@@ -1,0 +1,1 @@
+"""Where each frame was taken, in the forms that other programs read."""

@@ -1,0 +1,182 @@
+"""EXIF GPS in copies of frames: TIFF-like raws (CR2, DNG, NEF, ARW), TIFF, JPEG, PNG, and Fujifilm's RAF.
+
+A TIFF gets its GPS directory, and a new first directory that points to it, behind its end: nothing else moves, so
+every offset in it, a maker note's too, stays right. A JPEG's EXIF is such a TIFF, and so is a PNG's eXIf chunk; a RAF
+shows EXIF in its JPEG preview.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from dappled.decode.geometry.camera_pose import CameraPose
+from dappled.errors import DappledError
+
+_GPS_IFD = 0x8825
+_BYTE, _ASCII, _LONG, _RATIONAL = 1, 2, 4, 5
+_RAF = b"FUJIFILMCCD-RAW"
+_RAF_JPEG = 84
+_EXIF = b"Exif\0\0"
+_PNG = b"\x89PNG\r\n\x1a\n"
+_SOI, _APP0, _APP1, _SOS = 0xD8, 0xE0, 0xE1, 0xDA
+_SEGMENT = 0xFFFF
+_EMPTY = b"II*\0" + struct.pack("<IHI", 8, 0, 0)
+
+
+class ExifError(DappledError):
+    """A file that EXIF can't be written into; one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """What goes into the GPS directory. Altitude is above mean sea level; None is left out."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    utc_ns: int | None = None
+    direction_deg: float | None = None
+    error_m: float | None = None
+    dop: float | None = None
+    satellites: int | None = None
+
+
+def place(camera: CameraPose, utc_ns: int | None, error_m: float | None = None) -> Place:
+    """The place of a camera, with the direction of the image's top (true north is 0)."""
+    direction = None if camera.pix4d is None else camera.pix4d.yaw_deg
+    return Place(camera.latitude_deg, camera.longitude_deg, camera.altitude_msl_m, utc_ns, direction, error_m)
+
+
+def tagged(data: bytes, where: Place) -> bytes:
+    """A copy of a file with its place. Raises ExifError for a form that isn't known, or is damaged."""
+    try:
+        if data[:4] in (b"II*\0", b"MM\0*"):
+            return _tiff(data, where)
+        if data[:2] == bytes((0xFF, _SOI)):
+            return _jpeg(data, where)
+        if data.startswith(_PNG):
+            return _png(data, where)
+        if data.startswith(_RAF):
+            offset, length = struct.unpack_from(">II", data, _RAF_JPEG)
+            preview = _jpeg(data[offset : offset + length], where)
+            header = data[:_RAF_JPEG] + struct.pack(">II", len(data), len(preview))
+            return header + data[_RAF_JPEG + 8 :] + preview
+    except (struct.error, IndexError) as error:
+        raise ExifError(f"its EXIF is damaged ({error}): no place can be written into a copy") from None
+    raise ExifError("it is no TIFF-like raw, TIFF, JPEG, PNG or RAF: its place stands in the sidecar only")
+
+
+def _tiff(data: bytes, where: Place) -> bytes:
+    order = "<" if data[:2] == b"II" else ">"
+    (first,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, first)
+    body = data[first + 2 : first + 2 + 12 * count + 4]
+    if len(body) != 12 * count + 4:
+        raise IndexError("its first directory is cut off")
+    entries = [body[12 * i : 12 * i + 12] for i in range(count)]
+    kept = [entry for entry in entries if struct.unpack_from(order + "H", entry)[0] != _GPS_IFD]
+    data += b"\0" * (len(data) % 2)
+    gps = _directory(order, len(data), _entries(order, where))
+    pointer = struct.pack(order + "HHII", _GPS_IFD, _LONG, 1, len(data))
+    kept = sorted([*kept, pointer], key=lambda entry: int(struct.unpack_from(order + "H", entry)[0]))
+    start = len(data) + len(gps)
+    directory = struct.pack(order + "H", len(kept)) + b"".join(kept) + body[-4:]
+    return data[:4] + struct.pack(order + "I", start) + data[8:] + gps + directory
+
+
+def _jpeg(data: bytes, where: Place) -> bytes:
+    """APP1 stands where it stood, else behind the start and a JFIF header."""
+    at, insert = 2, 2
+    while data[at] == 0xFF and data[at + 1] not in (_SOS, 0xD9):
+        (length,) = struct.unpack_from(">H", data, at + 2)
+        if data[at + 1] == _APP1 and data[at + 4 : at + 10] == _EXIF:
+            return data[:at] + _segment(_tiff(data[at + 10 : at + 2 + length], where)) + data[at + 2 + length :]
+        at += 2 + length
+        if insert == 2 and data[3] == _APP0:
+            insert = at
+    return data[:insert] + _segment(_tiff(_EMPTY, where)) + data[insert:]
+
+
+def _png(data: bytes, where: Place) -> bytes:
+    """The eXIf chunk (PNG 1.5 extensions) stands where it stood, else before the pixels; no other byte changes."""
+    at, first = len(_PNG), dict[bytes, tuple[int, int]]()
+    while b"IEND" not in first and at + 12 <= len(data):
+        end = at + 12 + int(struct.unpack_from(">I", data, at)[0])
+        first.setdefault(data[at + 4 : at + 8], (at, end))
+        at = end
+    if at > len(data) or not {b"IDAT", b"IEND"} <= first.keys():
+        raise ExifError("the PNG is cut short: no place can be written into a copy")
+    pixels, _ = first[b"IDAT"]
+    start, end = first.get(b"eXIf", (pixels, pixels))
+    told = data[start + 8 : end - 4] if start < end else _EMPTY
+    return data[:start] + _chunk(_tiff(told, where)) + data[end:]
+
+
+def _chunk(tiff: bytes) -> bytes:
+    return struct.pack(">I", len(tiff)) + b"eXIf" + tiff + struct.pack(">I", zlib.crc32(b"eXIf" + tiff))
+
+
+def _segment(tiff: bytes) -> bytes:
+    if len(tiff) + 8 > _SEGMENT:
+        raise ExifError("its EXIF has no room left for a place: it stands in the sidecar only")
+    return struct.pack(">BBH", 0xFF, _APP1, len(tiff) + 8) + _EXIF + tiff
+
+
+def _directory(order: str, start: int, entries: list[tuple[int, int, int, bytes]]) -> bytes:
+    """An image file directory that will stand at `start`, its longer values behind it."""
+    values = b""
+    behind = start + 2 + 12 * len(entries) + 4
+    rows = b""
+    for tag, kind, count, value in entries:
+        if len(value) <= 4:
+            field = value.ljust(4, b"\0")
+        else:
+            field = struct.pack(order + "I", behind + len(values))
+            values += value + b"\0" * (len(value) % 2)
+        rows += struct.pack(order + "HHI", tag, kind, count) + field
+    return struct.pack(order + "H", len(entries)) + rows + bytes(4) + values
+
+
+def _entries(order: str, where: Place) -> list[tuple[int, int, int, bytes]]:
+    """(tag, type, count, value) in the order of their tags (EXIF 2.3, GPS attributes)."""
+
+    def ratios(*parts: tuple[int, int]) -> bytes:
+        return b"".join(struct.pack(order + "II", *part) for part in parts)
+
+    def angle(degrees: float) -> bytes:
+        units = round(abs(degrees) * 3600 * 10**6)
+        minutes, rest = divmod(units, 60 * 10**6)
+        return ratios((minutes // 60, 1), (minutes % 60, 1), (rest, 10**6))
+
+    def text(words: str) -> tuple[int, bytes]:
+        coded = words.encode("ascii") + b"\0"
+        return len(coded), coded
+
+    entries: list[tuple[int, int, int, bytes]] = [
+        (0x00, _BYTE, 4, bytes((2, 3, 0, 0))),
+        (0x01, _ASCII, 2, b"S\0" if where.latitude_deg < 0 else b"N\0"),
+        (0x02, _RATIONAL, 3, angle(where.latitude_deg)),
+        (0x03, _ASCII, 2, b"W\0" if where.longitude_deg < 0 else b"E\0"),
+        (0x04, _RATIONAL, 3, angle(where.longitude_deg)),
+        (0x05, _BYTE, 1, bytes((where.altitude_m < 0,))),
+        (0x06, _RATIONAL, 1, ratios((round(abs(where.altitude_m) * 1000), 1000))),
+        (0x12, _ASCII, *text("WGS-84")),
+    ]
+    if where.utc_ns is not None:
+        taken = datetime.fromtimestamp(where.utc_ns // 10**9, UTC)
+        seconds = (taken.second * 10**6 + where.utc_ns % 10**9 // 1000, 10**6)
+        entries.append((0x07, _RATIONAL, 3, ratios((taken.hour, 1), (taken.minute, 1), seconds)))
+        entries.append((0x1D, _ASCII, *text(taken.strftime("%Y:%m:%d"))))
+    if where.satellites is not None:
+        entries.append((0x08, _ASCII, *text(str(where.satellites))))
+    if where.dop is not None:
+        entries.append((0x0B, _RATIONAL, 1, ratios((round(where.dop * 100), 100))))
+    if where.direction_deg is not None:
+        entries.append((0x10, _ASCII, 2, b"T\0"))
+        entries.append((0x11, _RATIONAL, 1, ratios((round(where.direction_deg * 100) % 36000, 100))))
+    if where.error_m is not None:
+        entries.append((0x1F, _RATIONAL, 1, ratios((round(where.error_m * 1000), 1000))))
+    return sorted(entries)

@@ -1,0 +1,246 @@
+"""A recorded flight's places in the forms that other programs read. Nothing recorded is touched."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from dappled.decode.geometry import camera_pose
+from dappled.decode.geometry.camera_pose import NADIR, CameraPose, Matrix
+from dappled.decode.geometry.pose import Pose, Vector3
+from dappled.flight import durable, layout
+from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.ledger import LedgerReader
+from dappled.flight.records import Frame, Tag
+from dappled.products.geotags import exif_gps, sidecars
+from dappled.products.geotags.exif_gps import ExifError
+from dappled.products.maps.earth import Geoid
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """One frame with its tag; `camera` is None where its position is not known. `utc_ns` is mid-exposure, put right
+    where UTC was learnt in flight; None where nobody ever knew it."""
+
+    frame: Frame
+    tag: Tag
+    camera: CameraPose | None
+    utc_ns: int | None
+
+    @property
+    def file_name(self) -> str:
+        """The frame's name without its folder."""
+        return PurePosixPath(self.frame.name).name
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """What was written, and which frames have no place or no tag."""
+
+    files: tuple[Path, ...]
+    placed: int
+    without_position: tuple[str, ...]
+    without_tag: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Mounting:
+    """How the camera hangs on the vehicle (see `camera_pose.of`), and what mean sea level stands on."""
+
+    lever_m: Vector3 = (0.0, 0.0, 0.0)
+    matrix: Matrix = field(default_factory=lambda: NADIR)
+    on_gimbal: bool = False
+    geoid: Geoid | None = None
+
+    def camera(self, pose: Pose) -> CameraPose | None:
+        """The camera's pose; None where the vehicle's position is not known. Raises EarthError."""
+        undulation_m = None
+        if self.geoid is not None and pose.latitude_rad is not None and pose.longitude_rad is not None:
+            undulation_m = self.geoid.undulation_m(math.degrees(pose.latitude_rad), math.degrees(pose.longitude_rad))
+        return camera_pose.of(pose, self.lever_m, self.matrix, on_gimbal=self.on_gimbal, undulation_m=undulation_m)
+
+
+def read(flight: Path, mounting: Mounting | None = None) -> tuple[list[Placed], list[str]]:
+    """A flight's tagged frames in order, and the names of frames without a tag. Raises FlightError and EarthError."""
+    mounting = mounting or Mounting()
+    with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
+        tags, frames, correction_ns = ledger.tags(), ledger.frames(), ledger.utc_correction_ns()
+    placed = [
+        Placed(frame, tag, mounting.camera(tag.pose), None if correction_ns is None else tag.utc_ns + correction_ns)
+        for frame in frames
+        if (tag := tags.get(frame.index)) is not None
+    ]
+    return placed, [frame.name for frame in frames if frame.index not in tags]
+
+
+def write(
+    flight: Path,
+    mounting: Mounting | None = None,
+    *,
+    output: Path | None = None,
+    replace_extension: bool = False,
+    force: bool = False,
+) -> Written:
+    """Sidecars beside the frames, and geo.txt, pix4d.csv and track.geojson in `<flight>/geotags/`; all of it in
+    `output` instead where that is given. Raises FlightError, SidecarError and EarthError."""
+    placed, without_tag = read(flight, mounting)
+    folder = output or flight / "geotags"
+    _make(folder)
+    files = []
+    for one in placed:
+        beside = folder / one.file_name if output else flight / one.frame.name
+        path = sidecars.path_of(beside, replace_extension=replace_extension)
+        sidecars.write(path, sidecars.text(one.tag, one.camera, one.utc_ns), force=force)
+        files.append(path)
+    forms: dict[str, Callable[[Sequence[Placed]], str]] = {
+        "geo.txt": odm,
+        "pix4d.csv": pix4d,
+        "track.geojson": geojson,
+    }
+    for name, form in forms.items():
+        path = folder / name
+        _write(path, form(placed).encode())
+        files.append(path)
+    lost = tuple(one.frame.name for one in placed if one.camera is None)
+    return Written(tuple(files), len(placed) - len(lost), lost, tuple(without_tag))
+
+
+def copies(flight: Path, folder: Path, mounting: Mounting | None = None) -> Iterator[tuple[str, Path | str]]:
+    """Copies of the placed frames in `folder` with their place in EXIF: (frame, the copy or why there is none).
+
+    The originals are only read. Raises FlightError, also for a folder within the flight.
+    """
+    if folder.resolve().is_relative_to(flight.resolve()):
+        raise FlightError(f"cannot write copies into the flight itself ({folder}): give another folder")
+    placed, without_tag = read(flight, mounting)
+    _make(folder)
+    for one in placed:
+        if one.camera is None:
+            yield one.frame.name, "its position is not known"
+            continue
+        gnss = one.tag.pose.gnss
+        where = replace(
+            exif_gps.place(one.camera, one.utc_ns, one.tag.pose.position_sigma_m),
+            dop=gnss.hdop if gnss else None,
+            satellites=gnss.satellites if gnss else None,
+        )
+        try:
+            made = exif_gps.tagged((flight / one.frame.name).read_bytes(), where)
+        except OSError as error:
+            raise disk_error("read", flight / one.frame.name, error) from error
+        except ExifError as error:
+            yield one.frame.name, str(error)
+            continue
+        _write(folder / one.file_name, made)
+        yield one.frame.name, folder / one.file_name
+    for name in without_tag:
+        yield name, "it was never tagged"
+
+
+def _make(folder: Path) -> None:
+    try:
+        durable.make_folder(folder)
+    except OSError as error:
+        raise disk_error("make the folder", folder, error) from error
+
+
+def _write(path: Path, data: bytes) -> None:
+    try:
+        durable.write_file(path, data)
+    except OSError as error:
+        raise disk_error("write", path, error) from error
+
+
+def odm(placed: Sequence[Placed]) -> str:
+    """OpenDroneMap's geo.txt: EPSG:4326, then `name x y z [yaw pitch roll [hacc [vacc]]]`.
+
+    Its fields go by position: where one is unknown a line ends before it. z is above mean sea level.
+    """
+    lines = ["EPSG:4326"]
+    for one in placed:
+        if one.camera is None:
+            continue
+        camera, sigma = one.camera, one.tag.pose.position_sigma_m
+        words = [one.file_name, f"{camera.longitude_deg:.9f}", f"{camera.latitude_deg:.9f}"]
+        words.append(f"{camera.altitude_msl_m:.3f}")
+        if camera.pix4d:
+            words += [f"{angle:.4f}" for angle in _ypr(camera)]
+            vertical = one.tag.pose.vertical_sigma_m
+            words += [] if sigma is None else [f"{sigma:.3f}"]
+            words += [] if sigma is None or vertical is None else [f"{vertical:.3f}"]
+        lines.append(" ".join(words))
+    return "\n".join(lines) + "\n"
+
+
+def pix4d(placed: Sequence[Placed]) -> str:
+    """Pix4D's geolocation CSV, no header: name, latitude, longitude, altitude, yaw, pitch, roll, horizontal accuracy,
+    vertical accuracy; unknown is empty."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    for one in placed:
+        if one.camera is None:
+            continue
+        camera, sigma = one.camera, one.tag.pose.position_sigma_m
+        turned = [f"{angle:.4f}" for angle in _ypr(camera)] if camera.pix4d else ["", "", ""]
+        place = [f"{camera.latitude_deg:.9f}", f"{camera.longitude_deg:.9f}", f"{camera.altitude_msl_m:.3f}"]
+        sigmas = ["" if each is None else f"{each:.3f}" for each in (sigma, one.tag.pose.vertical_sigma_m)]
+        rows.writerow([one.file_name, *place, *turned, *sigmas])
+    return text.getvalue()
+
+
+def geojson(placed: Sequence[Placed]) -> str:
+    """A point a frame and a line through them, in the order of exposure (RFC 7946). The third coordinate is the height
+    above the ellipsoid, where it is known; the altitude above mean sea level is a property."""
+    known = sorted(((one, one.camera) for one in placed if one.camera), key=lambda pair: pair[0].tag.utc_ns)
+    features: list[dict[str, Any]] = []
+    if len(known) > 1:
+        line = [_coordinates(camera) for _, camera in known]
+        features.append(
+            {
+                "type": "Feature",
+                "properties": {"name": "track"},
+                "geometry": {"type": "LineString", "coordinates": line},
+            }
+        )
+    for one, camera in known:
+        turned = _ypr(camera) if camera.pix4d else (None, None, None)
+        features.append(
+            {
+                "type": "Feature",
+                "properties": {
+                    "name": one.file_name,
+                    "index": one.frame.index,
+                    "utc_ns": one.utc_ns,
+                    "time_source": one.tag.time_source,
+                    "pose_source": one.tag.pose.source,
+                    "altitude_msl_m": camera.altitude_msl_m,
+                    "height_above_home_m": camera.height_above_home_m,
+                    "position_sigma_m": one.tag.pose.position_sigma_m,
+                    "vertical_sigma_m": one.tag.pose.vertical_sigma_m,
+                    "gnss": None if one.tag.pose.gnss is None else asdict(one.tag.pose.gnss),
+                    **dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), turned, strict=True)),
+                },
+                "geometry": {
+                    "type": "Point",
+                    "coordinates": _coordinates(camera),
+                },
+            }
+        )
+    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False, indent=1) + "\n"
+
+
+def _coordinates(camera: CameraPose) -> list[float]:
+    place = [round(camera.longitude_deg, 9), round(camera.latitude_deg, 9)]
+    return place if camera.height_ellipsoid_m is None else [*place, round(camera.height_ellipsoid_m, 3)]
+
+
+def _ypr(camera: CameraPose) -> tuple[float, float, float]:
+    """Yaw, pitch, roll in Pix4D's convention."""
+    assert camera.pix4d is not None
+    return camera.pix4d.yaw_deg, camera.pix4d.pitch_deg, camera.pix4d.roll_deg

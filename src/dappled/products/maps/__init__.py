@@ -1,0 +1,1 @@
+"""Frames and flights as maps, terrain and footprints."""

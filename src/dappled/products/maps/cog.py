@@ -1,0 +1,112 @@
+"""Maps as Cloud-Optimised GeoTIFF, whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.flight import durable
+from dappled.products.extras import need
+from dappled.products.maps.map_grid import Image, MapError, MapGrid
+
+TILE = 512
+
+
+def display(image: Image, gain: float) -> NDArray[np.uint8]:
+    """(h, w, 2) grey and alpha, or (h, w, 4) red, green, blue and alpha: linear values times `gain` in sRGB's curve.
+
+    NaN is transparent, and black below.
+    """
+    known = np.asarray(np.isfinite(image).all(axis=2))
+    linear = np.clip(np.where(known[..., None], image, 0.0) * gain, 0.0, 1.0)
+    curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
+    return np.concatenate([np.round(curve * 255), known[..., None] * 255], axis=2).astype(np.uint8)
+
+
+def gain_of(images: Iterable[Image]) -> float:
+    """What brings the brightest hundredth of these pictures to 0.9 of white."""
+    brightest = [float(np.nanpercentile(image, 99)) for image in images]
+    level = float(np.median(brightest)) if brightest else 0.0
+    return 0.9 / level if level > 0 else 1.0
+
+
+def write_pieces(
+    path: Path,
+    grid: MapGrid,
+    pieces: Iterable[tuple[slice, slice, NDArray[Any]]],
+    *,
+    dtype: str,
+    bands: int,
+    tags: Mapping[str, str],
+    names: tuple[str, ...] = (),
+) -> None:
+    """A COG from pieces (rows, columns, values (h, w, bands)) that cover the grid.
+
+    uint8 with 2 or 4 bands is a picture whose last band is alpha; floats hold NaN where nothing is known.
+    Raises MapError.
+    """
+    rasterio, windows, shutil = (need(name) for name in ("rasterio", "rasterio.windows", "rasterio.shutil"))
+    rows, columns = grid.shape
+    profile: dict[str, Any] = {
+        "driver": "GTiff",
+        "width": columns,
+        "height": rows,
+        "count": bands,
+        "dtype": dtype,
+        "crs": grid.crs,
+        "transform": rasterio.Affine(grid.step_x, 0, grid.west, 0, -grid.step_y, grid.north),
+        "tiled": True,
+        "blockxsize": TILE,
+        "blockysize": TILE,
+        "bigtiff": "if_safer",
+    }
+    if dtype == "uint8":  # said at its birth: a GeoTIFF keeps what is said of bands later in a file beside it
+        profile |= {"alpha": "yes", "photometric": "rgb" if bands == 4 else "minisblack"}
+    else:
+        profile["nodata"] = float("nan")
+    durable.make_folder(path.parent)
+    with tempfile.TemporaryDirectory(prefix=".maps-", dir=path.parent) as scratch:
+        plain, part = Path(scratch) / "plain.tif", Path(scratch) / "cog.tif"
+        try:
+            with rasterio.open(plain, "w", **profile) as target:
+                for at_rows, at_columns, values in pieces:
+                    window = windows.Window.from_slices(at_rows, at_columns)
+                    target.write(np.moveaxis(values, -1, 0), window=window)
+                for number, name in enumerate(names, 1):
+                    target.set_band_description(number, name)
+                target.update_tags(**tags)
+            shutil.copy(
+                plain,
+                part,
+                driver="COG",
+                compress="deflate",
+                predictor="yes",
+                blocksize=TILE,
+                overview_resampling="average",
+                num_threads=1,
+            )
+        except rasterio.errors.RasterioError as error:
+            raise MapError(f"cannot write the map {path}: {error}") from error
+        settle(part, path)
+
+
+def write(
+    path: Path, grid: MapGrid, values: NDArray[Any], tags: Mapping[str, str], names: tuple[str, ...] = ()
+) -> None:
+    """A COG of values (rows, columns, bands), as `write_pieces`."""
+    everything = (slice(0, grid.shape[0]), slice(0, grid.shape[1]), values)
+    write_pieces(path, grid, [everything], dtype=str(values.dtype), bands=values.shape[2], tags=tags, names=names)
+
+
+def settle(part: Path, path: Path) -> None:
+    """Put a finished file durably under its name."""
+    with part.open("rb") as file:
+        os.fsync(file.fileno())
+    part.rename(path)
+    durable.sync_folder(path.parent)

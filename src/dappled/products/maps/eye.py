@@ -1,0 +1,213 @@
+"""One view's geometry on a map: where a ground point appears in it, and where a pixel's ray goes.
+
+The world is the map: grid east and north as the projection counts them, height in metres above mean sea level. Within
+a frame's footprint the map is flat and uniform: its grid is turned from true north by the convergence, and a metre on
+the ground is `scale` map metres, both taken at the camera. (A kilometre aside that is good to a few centimetres, at a
+hundred metres to under a millimetre.)
+
+Camera axes are right, down, forward. A pixel is (x, y) = (column, row) of the view, its centre at whole numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.config.profiles import Lens
+from dappled.decode.optics.carriers import Sensor
+from dappled.errors import DappledError
+from dappled.products.maps.earth import GridAt
+
+Floats = NDArray[np.float64]
+_LOWEST = math.sin(math.radians(3))  # a ray that dips less is above the horizon for all that a map needs
+
+
+class EyeError(DappledError):
+    """A view that can't be put on a map; one sentence."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Eye:
+    """A pinhole with distortion above the map.
+
+    `matrix` (3, 3) leads from (x, y, 1) on the plane at distance 1 to the pixel (x, y, 1); `rotation` (3, 3) from
+    camera axes to grid east, north, up; `centre` (3,) is the perspective centre on the map; `shape` (rows, columns).
+    """
+
+    matrix: Floats
+    distortion: tuple[float, float, float, float, float]
+    rotation: Floats
+    centre: Floats
+    scale: float
+    shape: tuple[int, int]
+
+    def project(self, points: Floats) -> Floats:
+        """(n, 2) pixels of map points (n, 3); NaN behind the camera."""
+        return self.pixels((points - self.centre) / (self.scale, self.scale, 1.0) @ self.rotation)
+
+    def pixels(self, seen: Floats) -> Floats:
+        """(n, 2) pixels of points (n, 3) in camera axes; NaN behind the camera."""
+        ahead = np.where(seen[:, 2] > 1e-9, seen[:, 2], np.nan)
+        bent = distorted(seen[:, :2] / ahead[:, None], self.distortion)
+        return bent @ self.matrix[:2, :2].T + self.matrix[:2, 2]
+
+    def rays(self, pixels: Floats) -> Floats:
+        """(n, 3) directions on the map of pixels (n, 2); a forward component of 1 in camera axes."""
+        flat = (pixels - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T
+        straight = undistorted(flat, self.distortion)
+        ahead = np.concatenate([straight, np.ones((len(straight), 1))], axis=1)
+        return np.asarray(ahead @ self.rotation.T * (self.scale, self.scale, 1.0))
+
+    def homography(self, height_m: float) -> Floats:
+        """(3, 3) from (east − centre, north − centre, 1) on the plane at a height to the pixel (x, y, 1).
+
+        Exact where the lens does not distort. (East and north count from the centre, for the numbers' sake.)
+        """
+        down = self.rotation.T
+        columns = [down[:, 0] / self.scale, down[:, 1] / self.scale, down[:, 2] * (height_m - self.centre[2])]
+        return np.asarray(self.matrix @ np.stack(columns, axis=1))
+
+    def corners(self) -> Floats:
+        """(4, 2): the outer corners of the corner pixels, top left first, clockwise."""
+        rows, columns = self.shape
+        return np.array([[0, 0], [columns, 0], [columns, rows], [0, rows]], dtype=np.float64) - 0.5
+
+    def border(self, steps: int = 16) -> Floats:
+        """(4·steps, 2): points all around, in the corners' order."""
+        corners = self.corners()
+        share = np.arange(steps)[:, None] / steps
+        sides = [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+        return np.concatenate(sides)
+
+    def check_horizon(self, name: str) -> None:
+        """Raises EyeError where a corner looks at or above the horizon."""
+        rays = self.rays(self.corners())
+        dip = -rays[:, 2] / np.linalg.norm(rays / (self.scale, self.scale, 1.0), axis=1)
+        if not (dip > _LOWEST).all():
+            raise EyeError(
+                f"{name}: the camera looks above the horizon ({math.degrees(math.asin(float(dip.min()))):.0f}° down at "
+                "the highest corner): it can't be put on a map"
+            )
+
+    def gsd_m(self, ground_m: float) -> float:
+        """Ground metres that a pixel in the middle of the view covers, along its shorter side."""
+        rows, columns = self.shape
+        middle = np.array([[(columns - 1) / 2, (rows - 1) / 2]])
+        places = [self.on_plane(middle + step, ground_m)[0] for step in ((0, 0), (1, 0), (0, 1))]
+        return float(min(np.linalg.norm(place - places[0]) for place in places[1:]) / self.scale)
+
+    def on_plane(self, pixels: Floats, height_m: float | Floats) -> Floats:
+        """(n, 2) east and north where rays meet a height; NaN where they never do."""
+        rays = self.rays(pixels)
+        drop = height_m - self.centre[2]
+        depth = drop / np.where(rays[:, 2] < -1e-9, rays[:, 2], np.nan)
+        return np.asarray(self.centre[:2] + rays[:, :2] * np.where(depth > 0, depth, np.nan)[:, None])
+
+    def moved(self, change: Floats) -> Eye:
+        """Shifted by `change`[:3] (east, north in ground metres, up) and then turned by the small rotation vector
+        `change`[3:] (radians, about east, north, up)."""
+        shift = np.asarray(change[:3]) * (self.scale, self.scale, 1.0)
+        return replace(self, centre=self.centre + shift, rotation=turn(np.asarray(change[3:])) @ self.rotation)
+
+
+def intrinsics(sensor: Sensor, lens: Lens, grid: Floats) -> Floats:
+    """(3, 3) from (x, y, 1) at distance 1 to a view's pixel: lens, chip, and the view's `grid` (2, 3) on the sensor."""
+    to_mm, offset = _to_chip(sensor, grid)
+    back = np.linalg.inv(to_mm)
+    principal = np.array([lens.principal_point_mm[1], lens.principal_point_mm[0]])
+    matrix = np.eye(3)
+    matrix[:2, :2] = back * lens.v_mm
+    matrix[:2, 2] = back @ (principal - offset)
+    return matrix
+
+
+def on_chip_mm(pixels: Floats, sensor: Sensor, grid: Floats) -> Floats:
+    """(n, 2) millimetres (x, y) from the chip's middle, of a view's pixels (n, 2)."""
+    to_mm, offset = _to_chip(sensor, grid)
+    return np.asarray(pixels @ to_mm.T + offset)
+
+
+def _to_chip(sensor: Sensor, grid: Floats) -> tuple[Floats, Floats]:
+    """(2, 2) and (2,): from a view's (x, y) to mm (x, y) from the chip's middle."""
+    rows, columns = sensor.shape
+    chip = np.array([[sensor.column_mm[1], sensor.row_mm[1]], [sensor.column_mm[0], sensor.row_mm[0]]])  # (c, r) → mm
+    flip = grid[::-1, [1, 0, 2]]  # (x, y, 1) of the view → (column, row)
+    return chip @ flip[:, :2], chip @ (flip[:, 2] - [(columns - 1) / 2, (rows - 1) / 2])
+
+
+def look(
+    matrix: Floats,
+    lens: Lens,
+    *,
+    shape: tuple[int, int],
+    at: GridAt,
+    height_m: float,
+    camera_to_ned: Floats,
+) -> Eye:
+    """The eye of a camera at a place of the map, `camera_to_ned` (3, 3) its attitude against true north."""
+    centre = np.array([at.east, at.north, height_m])
+    return Eye(matrix, lens.distortion, at.from_ned() @ camera_to_ned, centre, at.scale, shape)
+
+
+def through(eye: Eye, aperture_m: tuple[float, float], focus_m: float = math.inf) -> Eye:
+    """The eye of one view: light from aperture point θ (y, x, metres) leaves the scene at x·Z/v − θ·(1 − Z/F).
+
+    So the perspective centre stands at −θ, and pixels look aside by θ/F: the principal point moves by −θ·v/F.
+    """
+    theta = np.array([aperture_m[1], aperture_m[0]])
+    centre = eye.centre + eye.rotation @ np.array([-theta[0], -theta[1], 0.0]) * (eye.scale, eye.scale, 1.0)
+    matrix = eye.matrix.copy()
+    matrix[:2, 2] -= matrix[:2, :2] @ (theta / focus_m)
+    return replace(eye, centre=centre, matrix=matrix)
+
+
+def distorted(plane: Floats, numbers: tuple[float, float, float, float, float]) -> Floats:
+    """OpenCV's model: points (n, 2) on the plane at distance 1 as the lens bends them."""
+    if not any(numbers):
+        return plane
+    k1, k2, p1, p2, k3 = numbers
+    x, y = plane[:, 0], plane[:, 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    bent_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.stack([bent_x, bent_y], axis=1)
+
+
+def undistorted(bent: Floats, numbers: tuple[float, float, float, float, float]) -> Floats:
+    """The inverse of `distorted`, by Newton's method with a numeric derivative, to 1e-12."""
+    if not any(numbers):
+        return bent
+    plane = bent.copy()
+    step = 1e-6
+    right, down = np.array([step, 0.0]), np.array([0.0, step])
+    for _ in range(20):
+        here = distorted(plane, numbers)
+        along_x = (distorted(plane + right, numbers) - here) / step
+        along_y = (distorted(plane + down, numbers) - here) / step
+        miss = bent - here
+        determinant = along_x[:, 0] * along_y[:, 1] - along_y[:, 0] * along_x[:, 1]
+        change = np.stack(
+            [
+                along_y[:, 1] * miss[:, 0] - along_y[:, 0] * miss[:, 1],
+                along_x[:, 0] * miss[:, 1] - along_x[:, 1] * miss[:, 0],
+            ],
+            axis=1,
+        ) / determinant[:, None]  # fmt: skip
+        plane = plane + change
+        if not np.abs(change).max(initial=0.0) > 1e-12:
+            break
+    return plane
+
+
+def turn(vector: Floats) -> Floats:
+    """The rotation by a vector of radians (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    if angle < 1e-12:
+        return np.asarray(np.eye(3) + cross)
+    return np.asarray(np.eye(3) + math.sin(angle) / angle * cross + (1 - math.cos(angle)) / angle**2 * cross @ cross)

@@ -1,0 +1,272 @@
+"""From a recorded flight to maps: frames decoded, placed, refined where asked for, and drawn."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dappled.drivers.raw.darkroom import Darkroom, Development, Recipe
+from dappled.errors import DappledError
+from dappled.flight import durable
+from dappled.flight.records import Frame, Tag
+from dappled.products.maps import control as control_points
+from dappled.products.maps import footprints, map_grid, photographs, refine
+from dappled.products.maps.basemap import BaseMap
+from dappled.products.maps.earth import Geoid, Projection, utm
+from dappled.products.maps.eye import EyeError
+from dappled.products.maps.ground import Flat, Ground, Raster
+from dappled.products.maps.ground import load as load_ground
+from dappled.products.maps.map_grid import MapError
+from dappled.products.maps.photographs import Mounting, Photograph, Station
+
+Progress = Callable[[str, int, int], None]  # what, done, of
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How a flight is mapped; None leaves a choice to what the flight says.
+
+    `ground_m` above sea level is that of home; `terrain` a raster file, whose heights are ellipsoidal where
+    `terrain_geoid` is given. `gsd_m` is the finest of the frames'. `view` is "mean", "ground" (all views, refocused on
+    the ground) or "v,u". `focus_m` is where the lens was focused. `frames` names the frames by number.
+    """
+
+    mounting: Mounting = field(default_factory=Mounting)
+    ground_m: float | None = None
+    terrain: Path | None = None
+    terrain_geoid: Geoid | None = None
+    crs: str | None = None
+    gsd_m: float | None = None
+    view: str = "mean"
+    focus_m: float = float("inf")
+    focal_length_mm: float | None = None
+    f_number: float | None = None
+    frames: frozenset[int] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """A flight's photographs on one map. `left` names the frames that are not among them, with the reason."""
+
+    flight: str
+    photographs: tuple[Photograph, ...]
+    projection: Projection
+    ground: Ground
+    gsd_m: float
+    focus_m: float
+    left: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...] = ()
+    facts: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def tags(self) -> dict[str, str]:
+        """What map files say of themselves."""
+        return {
+            "DAPPLED_FLIGHT": self.flight,
+            "DAPPLED_GROUND": self.ground.name,
+            "DAPPLED_HEIGHTS": "metres above mean sea level, as the autopilot's",
+            "DAPPLED_FRAMES": ",".join(one.name for one in self.photographs),
+        }
+
+
+def survey(flight: Path, recipe: Recipe, options: Options, progress: Progress, stack: ExitStack) -> Survey:
+    """Decode and place a flight's frames. Frames that can't be are left out and named; `stack` keeps the pictures'
+    scratch folder. Raises DappledError where nothing is left, or the call itself is wrong."""
+    stations, left = photographs.stations(flight, options.mounting)
+    if options.frames is not None:
+        stations = [one for one in stations if one.frame.index in options.frames]
+        left = [pair for pair in left if int(Path(pair[0]).stem) in options.frames]
+    if not stations:
+        raise DappledError(f"no frame of {flight} can be put on a map: " + (left[0][1] if left else "it has none"))
+    first = stations[0].camera
+    projection = Projection(options.crs or utm(first.latitude_deg, first.longitude_deg))
+    projection.at(first.latitude_deg, first.longitude_deg)
+    level = level_of(stations, options)
+    scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-maps-")))
+    darkroom = Darkroom(recipe)
+    darkroom.check()
+    taken: list[Photograph] = []
+    for number, station in enumerate(stations):
+        progress("decode", number, len(stations))
+        try:
+            made = develop(darkroom, flight, station.frame, station.tag, options)
+            one = place(station, made, darkroom, projection, options)
+        except DappledError as error:
+            left.append((station.frame.name, str(error)))
+            continue
+        taken.append(_shelved(one, scratch))
+    progress("decode", len(stations), len(stations))
+    return on_ground(flight.name, taken, left, projection=projection, level_m=level, options=options)
+
+
+def on_ground(
+    flight: str,
+    taken: Sequence[Photograph],
+    left: Sequence[tuple[str, str]],
+    *,
+    projection: Projection,
+    level_m: float,
+    options: Options,
+) -> Survey:
+    """The survey of placed photographs; those that leave the ground or look above the horizon are left out and named.
+
+    `level_m` is the flat ground's height, also where one looks for terrain. Raises DappledError where none is left, or
+    the terrain can't be used.
+    """
+    kept, out = [], list(left)
+
+    def sieve(photos: Sequence[Photograph], ground: Ground) -> list[Photograph]:
+        held = []
+        for one in photos:
+            try:
+                one.eye.check_horizon(f"frame {one.name}")
+                map_grid.footprint(one.eye, ground)
+                held.append(one)
+            except EyeError as error:
+                out.append((one.name, str(error)))
+            except MapError as error:
+                out.append((one.name, f"frame {one.name}: {error}"))
+        return held
+
+    ground: Ground = Flat(level_m)
+    kept = sieve(taken, ground)
+    if kept and options.terrain is not None:
+        ground = _terrain(options.terrain, kept, projection, level_m, options.terrain_geoid)
+        kept = sieve(kept, ground)
+    if not kept:
+        raise DappledError(f"no frame of {flight} can be put on a map: {out[-1][1] if out else 'it has none'}")
+    gsd_m = options.gsd_m or _two_digits(min(one.eye.gsd_m(_below(one, ground)) for one in kept))
+    return Survey(flight, tuple(kept), projection, ground, gsd_m, options.focus_m, tuple(out))
+
+
+def refined(
+    made: Survey,
+    *,
+    base: Path | None = None,
+    neighbours: bool = False,
+    control: Path | None = None,
+    search_m: float = 5.0,
+    sigmas: tuple[float, float] | None = None,
+    progress: Progress = lambda *_: None,
+) -> Survey:
+    """The survey with poses refined; what became of each frame is in its facts. Raises DappledError where a base map or
+    control points can't be used at all."""
+    raster = None if base is None else BaseMap(base, made.projection, made.gsd_m)
+    if raster is not None:
+        raster.check(np.concatenate([map_grid.footprint(one.eye, made.ground)[:, :2] for one in made.photographs]))
+    points = [] if control is None else control_points.read(control, made.projection)
+    points, unseen = control_points.sighted(points, {one.name for one in made.photographs})
+    photos, judged = refine.refine(
+        made.photographs,
+        made.ground,
+        base=raster,
+        neighbours=neighbours,
+        control=points,
+        search_m=search_m,
+        sigmas=sigmas,
+        progress=progress,
+    )
+    facts = {
+        one.name: {**made.facts.get(one.name, {}), **said.facts()} for one, said in zip(photos, judged, strict=True)
+    }
+    kept = [f"frame {one.name} keeps its recorded pose: {said.why}" for one, said in zip(photos, judged, strict=True)
+            if said.why is not None]  # fmt: skip
+    return replace(made, photographs=tuple(photos), facts=facts, notes=(*made.notes, *unseen, *kept))
+
+
+def develop(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, options: Options) -> Development:
+    """One frame of a flight, decoded. Raises DappledError."""
+    return darkroom.develop(
+        flight / frame.name,
+        focal_length_mm=options.focal_length_mm or (tag.focal_length_mm if tag else None),
+        f_number=options.f_number or (tag.f_number if tag else None),
+    )
+
+
+def place(
+    station: Station, made: Development, darkroom: Darkroom, projection: Projection, options: Options
+) -> Photograph:
+    """A decoded frame as a photograph on the map. Raises DappledError."""
+    field, gains = made.light_field, photographs.true_colours(made.raw)
+    if gains is not None and field.views.ndim == 5:
+        field = replace(field, views=field.views * gains.astype(np.float32))
+    profile = darkroom.camera(made.raw.camera_model or "")
+    return photographs.photograph(station, field, profile, projection, view=options.view, focus_m=options.focus_m)
+
+
+def _shelved(one: Photograph, scratch: Path) -> Photograph:
+    """The photograph with its pictures in files, mapped and not held: a flight has many."""
+    np.save(scratch / f"{one.name}.npy", one.image)
+    kept = replace(one, image=np.load(scratch / f"{one.name}.npy", mmap_mode="r"))
+    if one.views is None:
+        return kept
+    np.save(scratch / f"{one.name}-views.npy", one.views)
+    return replace(kept, views=np.load(scratch / f"{one.name}-views.npy", mmap_mode="r"))
+
+
+def level_of(stations: Sequence[Station], options: Options) -> float:
+    """The flat ground's height above sea level."""
+    if options.ground_m is not None:
+        return options.ground_m
+    homes = [one.ground_m for one in stations if one.ground_m is not None]
+    if not homes and options.terrain is None:
+        raise DappledError(
+            "the flight doesn't know how high it flew: give the ground's height with --ground or --terrain"
+        )
+    return float(np.median(homes)) if homes else min(one.camera.altitude_msl_m for one in stations) - 1.0
+
+
+def _terrain(
+    path: Path, taken: Sequence[Photograph], projection: Projection, level_m: float, geoid: Geoid | None
+) -> Raster:
+    met = np.concatenate([map_grid.footprint(one.eye, Flat(level_m))[:, :2] for one in taken])
+    centres = np.array([one.eye.centre[:2] for one in taken])
+    low, high = np.concatenate([met, centres]).min(axis=0), np.concatenate([met, centres]).max(axis=0)
+    margin = 0.25 * float(np.max(high - low)) + 5.0  # hills lie elsewhere than flat ground
+    bounds = (low[0] - margin, low[1] - margin, high[0] + margin, high[1] + margin)
+    return load_ground(path, projection, bounds, geoid=geoid)
+
+
+def _below(one: Photograph, ground: Ground) -> float:
+    middle = np.array([[(one.eye.shape[1] - 1) / 2, (one.eye.shape[0] - 1) / 2]])
+    return float(ground.meet(one.eye, middle)[0, 2])
+
+
+def _two_digits(value: float) -> float:
+    """A length with two digits: a map's step that a person can read."""
+    return float(f"{value:.1e}")
+
+
+def write_footprints(made: Survey, output: Path) -> Path:
+    """footprints.geojson."""
+    features = [
+        footprints.feature(one, made.ground, made.projection, made.facts.get(one.name, {})) for one in made.photographs
+    ]
+    path = output / "footprints.geojson"
+    durable.make_folder(output)
+    durable.write_file(path, footprints.collection(features))
+    return path
+
+
+def write_report(made: Survey, output: Path, files: Sequence[Path]) -> Path:
+    """report.json: what was mapped onto what, what was left out, and how each frame was refined."""
+    facts = {
+        "flight": made.flight,
+        "crs": made.projection.name,
+        "ground": made.ground.name,
+        "gsd_m": made.gsd_m,
+        "frames": [{"name": one.name, **made.facts.get(one.name, {})} for one in made.photographs],
+        "left_out": [{"name": name, "why": why} for name, why in made.left],
+        "notes": list(made.notes),
+        "files": [path.name for path in files],
+    }
+    path = output / "report.json"
+    durable.make_folder(output)
+    durable.write_file(path, (json.dumps(facts, indent=1, allow_nan=False) + "\n").encode())
+    return path

@@ -1,0 +1,204 @@
+"""The ground that rays meet: flat at one height, or a terrain raster (DTED, GeoTIFF …). Heights are above sea level.
+
+`sigma_m` is how far the true ground may lie from this one: refinement trusts points accordingly.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.errors import DappledError
+from dappled.products.extras import need
+from dappled.products.maps.earth import Geoid, Projection, touch
+from dappled.products.maps.eye import Eye
+
+Floats = NDArray[np.float64]
+FLAT_SIGMA_M = 1.5  # grass to roofs, where nobody knows better
+_STEPS = 400  # of a ray through a raster, at most
+
+
+class GroundError(DappledError):
+    """A terrain raster that can't be used; one sentence."""
+
+
+class Ground(Protocol):
+    """What `Eye` rays meet."""
+
+    @property
+    def sigma_m(self) -> float: ...
+
+    @property
+    def name(self) -> str:
+        """What outputs call it."""
+
+    def heights(self, east: Floats, north: Floats) -> Floats:
+        """Height at places, any shape; NaN where it is not known."""
+
+    def meet(self, eye: Eye, pixels: Floats) -> Floats:
+        """(n, 3) where the rays of pixels (n, 2) meet the ground first; NaN where they don't."""
+
+    def sees(self, eye: Eye, east: Floats, north: Floats, height: Floats) -> NDArray[np.bool_]:
+        """Whether the ground lets places be seen, any shape."""
+
+
+@dataclass(frozen=True, slots=True)
+class Flat:
+    """Level ground."""
+
+    height_m: float
+    sigma_m: float = FLAT_SIGMA_M
+
+    @property
+    def name(self) -> str:
+        return f"flat at {self.height_m:.2f} m"
+
+    def heights(self, east: Floats, north: Floats) -> Floats:
+        return np.full(np.broadcast(east, north).shape, self.height_m)
+
+    def meet(self, eye: Eye, pixels: Floats) -> Floats:
+        places = eye.on_plane(pixels, self.height_m)
+        height = np.where(np.isnan(places[:, 0]), np.nan, self.height_m)
+        return np.concatenate([places, height[:, None]], axis=1)
+
+    def sees(self, eye: Eye, east: Floats, north: Floats, height: Floats) -> NDArray[np.bool_]:
+        return np.ones(np.broadcast(east, north).shape, dtype=bool)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Raster:
+    """Terrain on the map's own grid: `values` (rows, columns) with NaN where unknown, node (row, column) at
+    (west + column · step, north − row · step)."""
+
+    values: Floats
+    west: float
+    north: float
+    step_m: float
+    sigma_m: float
+    name: str
+
+    def heights(self, east: Floats, north: Floats) -> Floats:
+        """Bilinear between the nodes."""
+        column, row = (east - self.west) / self.step_m, (self.north - north) / self.step_m
+        rows, columns = self.values.shape
+        inside = (row >= 0) & (row <= rows - 1) & (column >= 0) & (column <= columns - 1)
+        top = np.clip(np.floor(np.where(inside, row, 0)).astype(np.intp), 0, rows - 2)
+        left = np.clip(np.floor(np.where(inside, column, 0)).astype(np.intp), 0, columns - 2)
+        down, aside = row - top, column - left
+        v = self.values
+        upper = v[top, left] * (1 - aside) + v[top, left + 1] * aside
+        lower = v[top + 1, left] * (1 - aside) + v[top + 1, left + 1] * aside
+        return np.asarray(np.where(inside, upper * (1 - down) + lower * down, np.nan))
+
+    def meet(self, eye: Eye, pixels: Floats) -> Floats:
+        rays = eye.rays(pixels)
+        low, high = float(np.nanmin(self.values)), float(np.nanmax(self.values))
+        dips = np.where(rays[:, 2] < -1e-9, rays[:, 2], np.nan)
+        first = np.maximum((high + 0.01 - eye.centre[2]) / dips, 0.0)
+        last = (low - 0.01 - eye.centre[2]) / dips
+        span = float(np.nanmax((last - first) * np.hypot(rays[:, 0], rays[:, 1]), initial=0.0))
+        steps = int(np.clip(math.ceil(2 * span / self.step_m), 2, _STEPS))
+
+        def above(depth: Floats) -> Floats:
+            at = eye.centre + rays * depth[:, None]
+            return np.asarray(at[:, 2] - self.heights(at[:, 0], at[:, 1]))
+
+        near, far = first, np.full(len(rays), np.nan)
+        for count in range(1, steps + 1):
+            depth = first + (last - first) * (count / steps)
+            under = np.isnan(far) & (above(depth) <= 0)
+            far = np.where(under, depth, far)
+            near = np.where(np.isnan(far), depth, near)
+        for _ in range(40):
+            middle = (near + far) / 2
+            under = above(middle) <= 0
+            far, near = np.where(under, middle, far), np.where(under, near, middle)
+        return np.asarray(eye.centre + rays * far[:, None])
+
+    def sees(self, eye: Eye, east: Floats, north: Floats, height: Floats) -> NDArray[np.bool_]:
+        aside = np.hypot(east - eye.centre[0], north - eye.centre[1])
+        top = float(np.nanmax(self.values))
+        rise = np.maximum(eye.centre[2] - height, 1e-6)
+        reach = np.clip((top - height) / rise, 0.0, 1.0)  # beyond this share of the way nothing is higher
+        steps = int(np.clip(math.ceil(float(np.nanmax(aside * reach, initial=0.0)) / self.step_m), 1, _STEPS))
+        clear = np.ones(np.shape(height), dtype=bool)
+        for count in range(1, steps + 1):
+            share = reach * (count / steps)
+            level = height + share * (eye.centre[2] - height)
+            under = self.heights(east + share * (eye.centre[0] - east), north + share * (eye.centre[1] - north))
+            clear &= ~(under > level + 0.1 * self.step_m + 0.05)
+        return clear
+
+
+def load(
+    path: Path,
+    projection: Projection,
+    bounds: tuple[float, float, float, float],
+    *,
+    geoid: Geoid | None = None,
+    sigma_m: float | None = None,
+) -> Raster:
+    """The terrain of a raster file within `bounds` (west, south, east, north on the map), on the map's grid.
+
+    Heights are taken as above sea level (DTED's are). With a `geoid` they are ellipsoidal, and brought down to it.
+    Raises GroundError where the file can't be read, has no place on Earth, or lies elsewhere.
+    """
+    rasterio, warp = need("rasterio"), need("rasterio.warp")
+    try:
+        with rasterio.open(path) as source:
+            if source.crs is None or source.transform.is_identity:
+                raise GroundError(f"the terrain {path} doesn't say where it lies: give one with a coordinate system")
+            target = projection.crs.to_wkt()
+            step = _step(source, projection, bounds)
+            margin = 4 * step
+            west, south = bounds[0] - margin, bounds[1] - margin
+            columns = math.ceil((bounds[2] + margin - west) / step) + 1
+            rows = math.ceil((bounds[3] + margin - south) / step) + 1
+            if rows * columns > 100_000_000:
+                raise GroundError(
+                    f"the terrain {path} has {rows} × {columns} posts under the flight: give a coarser one"
+                )
+            north = south + (rows - 1) * step
+            box = warp.transform_bounds(target, source.crs, west, south, west + (columns - 1) * step, north)
+            if not touch(box, source.bounds, degrees=source.crs.is_geographic):
+                raise GroundError(
+                    f"the terrain {path} lies elsewhere: it covers {_words(source.bounds)}, the flight {_words(box)}"
+                )
+            values = np.full((rows, columns), np.nan)
+            # nodes are pixel centres: the affine's corner lies half a step out
+            affine = rasterio.Affine(step, 0, west - step / 2, 0, -step, north + step / 2)
+            warp.reproject(
+                rasterio.band(source, 1),
+                values,
+                dst_transform=affine,
+                dst_crs=target,
+                dst_nodata=np.nan,
+                resampling=warp.Resampling.bilinear,
+            )
+    except rasterio.errors.RasterioError as error:
+        raise GroundError(f"the terrain {path} can't be read: {error}") from None
+    if np.isnan(values).all():
+        raise GroundError(f"the terrain {path} has no heights under the flight: give one that covers it")
+    if geoid is not None:
+        latitude, longitude = projection.to_geodetic((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2)
+        values -= geoid.undulation_m(float(latitude), float(longitude))
+    return Raster(values, west, north, step, 0.05 * step if sigma_m is None else sigma_m, path.name)
+
+
+def _step(source: Any, projection: Projection, bounds: tuple[float, float, float, float]) -> float:
+    """A raster's own step in map metres, under the flight."""
+    a, e = abs(source.transform.a), abs(source.transform.e)
+    if source.crs.is_geographic:
+        latitude, _ = projection.to_geodetic((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2)
+        return float(min(a * math.cos(math.radians(float(latitude))), e)) * math.radians(1) * 6378137.0
+    factor = source.crs.linear_units_factor[1] if source.crs.is_projected else 1.0
+    return float(min(a, e) * factor)
+
+
+def _words(box: tuple[float, ...]) -> str:
+    return f"{box[0]:.5g} … {box[2]:.5g} by {box[1]:.5g} … {box[3]:.5g}"

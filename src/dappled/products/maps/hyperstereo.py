@@ -1,0 +1,215 @@
+"""Heights from frames of one flight that overlap, their poses the baseline: what a single frame's aperture can't tell.
+
+A plane sweep over the map. Each cell is tried at a row of heights; at the right one the frames that see it agree there,
+by normalised correlation over a window of the map. No picture has to be rectified, any number of frames takes part, and
+tilted cameras and lens distortion are in the eyes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from dappled.errors import DappledError
+from dappled.products.maps.earth import Projection
+from dappled.products.maps.map_grid import MapGrid, sample
+from dappled.products.maps.photographs import Photograph
+
+Floats = NDArray[np.float64]
+Single = NDArray[np.float32]
+LEAST_OVERLAP = 0.2  # of a frame, for a pair
+_PIXEL_SIGMA = 0.12  # of a match, in pixels
+_STEP_PX = 0.7  # of parallax between heights
+_LEAST_SCORE = 0.88  # below, edges and what only seems to be seen twice: wrong more often than not
+_MOST_PARTNERS = 3
+
+
+class HyperstereoError(DappledError):
+    """A flight that shows no ground twice; one sentence."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """Heights float32 (rows, columns) above sea level on a grid, NaN where unknown; `sigma_m` one standard deviation of
+    each by itself, `score` the correlation (−1 to 1) that it was found by. `level_sigma_m` is what doubtful poses do to
+    the heights around a place in common."""
+
+    grid: MapGrid
+    height_m: Single
+    sigma_m: Single
+    score: Single
+    level_sigma_m: float = 0.0
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        return np.isfinite(self.height_m)
+
+
+def surface(
+    photographs: Sequence[Photograph],
+    grid: MapGrid,
+    projection: Projection,
+    *,
+    lowest_m: float,
+    highest_m: float,
+    window: int = 9,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> Surface:
+    """The ground between two heights, from every frame against those that see the same of it.
+
+    Where several frames see a cell as their best partner's, the better score stays. Raises HyperstereoError where no
+    two frames overlap.
+    """
+    middle = (lowest_m + highest_m) / 2
+    height = np.full(grid.shape, np.nan, dtype=np.float32)
+    sigma = np.full(grid.shape, np.nan, dtype=np.float32)
+    best = np.full(grid.shape, -1.0, dtype=np.float32)
+    levels: list[float] = []
+    for number, one in enumerate(photographs):
+        progress("hyperstereo", number, len(photographs))
+        partners = _partners(number, photographs, middle)
+        if not partners:
+            continue
+        levels.append(_level_sigma(one, partners[0], middle))
+        cells = _under(one, grid, (lowest_m, middle, highest_m))
+        if cells is None:
+            continue
+        part = grid.part(*cells)
+        found = _sweep(one, partners, part, projection=projection, heights=(lowest_m, highest_m), window=window)
+        better = found.known & (found.score > best[cells])
+        for mine, theirs in ((height, found.height_m), (sigma, found.sigma_m), (best, found.score)):
+            mine[cells][better] = theirs[better]
+    if not levels:
+        raise HyperstereoError(
+            "no two frames of the flight overlap by a fifth: heights need ground that was seen twice"
+        )
+    score = np.where(np.isfinite(height), best, np.nan).astype(np.float32)
+    return Surface(grid, height, sigma, score, float(np.median(levels)))
+
+
+def _level_sigma(one: Photograph, two: Photograph, level_m: float) -> float:
+    """σ of height from σ of position and attitude at both ends of the baseline: (Z/b)·√2·hypot(σ_p, Z·σ_a)."""
+    above = float(one.eye.centre[2]) - level_m
+    baseline = float(np.linalg.norm(two.eye.centre[:2] - one.eye.centre[:2])) / one.eye.scale
+    return above / max(baseline, 1e-6) * math.sqrt(2) * math.hypot(one.position_sigma_m, above * one.attitude_sigma_rad)
+
+
+def _partners(number: int, photographs: Sequence[Photograph], level_m: float) -> list[Photograph]:
+    """The frames with the widest baselines that still share enough ground with this one."""
+    one = photographs[number]
+    ring = one.eye.on_plane(one.eye.border(4), level_m)
+    low, high = ring.min(axis=0), ring.max(axis=0)
+    axis = np.linspace(0.02, 0.98, 12)
+    east, north = np.meshgrid(low[0] + axis * (high[0] - low[0]), low[1] + axis * (high[1] - low[1]))
+    places = np.stack([east.ravel(), north.ravel(), np.full(east.size, level_m)], axis=1)
+    mine = _inside(one, places)
+    shared = []
+    for other, two in enumerate(photographs):
+        if other == number:
+            continue
+        share = float(np.sum(mine & _inside(two, places))) / max(1, int(mine.sum()))
+        if share >= LEAST_OVERLAP:
+            baseline = float(np.linalg.norm(two.eye.centre[:2] - one.eye.centre[:2]))
+            shared.append((baseline * math.sqrt(share), other))
+    return [photographs[other] for _, other in sorted(shared, reverse=True)[:_MOST_PARTNERS]]
+
+
+def _inside(one: Photograph, places: Floats) -> NDArray[np.bool_]:
+    pixels = one.eye.project(places)
+    rows, columns = one.eye.shape
+    return np.asarray(((pixels >= 0) & (pixels <= [columns - 1, rows - 1])).all(axis=1))
+
+
+def _under(one: Photograph, grid: MapGrid, levels: tuple[float, ...]) -> tuple[slice, slice] | None:
+    """The grid's rows and columns that a frame may see at some of these levels."""
+    met = np.concatenate([one.eye.on_plane(one.eye.border(4), level) for level in levels])
+    columns = (met[:, 0] - grid.west) / grid.step_x
+    rows = (grid.north - met[:, 1]) / grid.step_y
+    found = []
+    for line, side in ((rows, grid.shape[0]), (columns, grid.shape[1])):
+        first, last = max(0, math.floor(line.min())), min(side, math.ceil(line.max()))
+        if first >= last:
+            return None
+        found.append(slice(first, last))
+    return found[0], found[1]
+
+
+def _sweep(
+    one: Photograph,
+    partners: Sequence[Photograph],
+    part: MapGrid,
+    *,
+    projection: Projection,
+    heights: tuple[float, float],
+    window: int,
+) -> Surface:
+    east, north = part.places(projection)
+    slope = max(_parallax(one, two, east, north, sum(heights) / 2) for two in partners)  # px a metre
+    count = int(np.clip(math.ceil((heights[1] - heights[0]) * slope / _STEP_PX), 3, 400)) + 1
+    levels = np.linspace(*heights, count)
+    grey = [_grey(photo) for photo in (one, *partners)]
+    scores = np.full((count, *part.shape), -1.0, dtype=np.float32)
+    for number, level in enumerate(levels):
+        mine = _seen(one, grey[0], east, north, level)
+        total = np.zeros(part.shape, dtype=np.float32)
+        votes = np.zeros(part.shape, dtype=np.float32)
+        for two, theirs in zip(partners, grey[1:], strict=True):
+            alike = _correlation(mine, _seen(two, theirs, east, north, level), window)
+            seen = np.isfinite(alike)
+            total += np.where(seen, alike, 0)
+            votes += seen
+        scores[number] = np.where(votes > 0, total / np.maximum(votes, 1), -1.0)
+    top = scores.argmax(axis=0)
+    inner = np.clip(top, 1, count - 2)
+    before, here, after = (np.take_along_axis(scores, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1))
+    bend = before - 2 * here + after
+    aside = np.where(bend < 0, np.clip(0.5 * (before - after) / np.where(bend < 0, bend, -1), -0.5, 0.5), 0)
+    score = np.take_along_axis(scores, top[None], axis=0)[0]
+    known = (score >= _LEAST_SCORE) & (top == inner)
+    step = levels[1] - levels[0]
+    height = np.where(known, levels[0] + (inner + aside) * step, np.nan)
+    sigma = _PIXEL_SIGMA / slope * np.maximum((1 - score) / 0.02, 1)  # the less alike, the worse
+    return Surface(part, height.astype(np.float32), np.where(known, sigma, np.nan).astype(np.float32), score)
+
+
+def _parallax(one: Photograph, two: Photograph, east: Floats, north: Floats, level: float) -> float:
+    """Pixels that a metre of height moves the second frame's picture against the first's, in the part's middle."""
+    place = np.array([[float(east.mean()), float(north.mean()), level]])
+    moved = one.eye.on_plane(one.eye.project(place), level + 1.0)
+    raised = two.eye.project(np.concatenate([moved, [[level + 1.0]]], axis=1))
+    return max(float(np.linalg.norm(raised - two.eye.project(place))), 1e-3)
+
+
+def _seen(one: Photograph, grey: Single, east: Floats, north: Floats, level: float) -> Single:
+    """The frame laid on a plane at a level; NaN outside of it."""
+    points = np.stack([east.ravel(), north.ravel(), np.full(east.size, level)], axis=1)
+    at = one.eye.project(points)
+    rows, columns = one.eye.shape
+    inside = np.asarray(((at >= 0) & (at <= [columns - 1, rows - 1])).all(axis=1))
+    return sample(grey, np.where(inside[:, None], at, np.nan).reshape(*east.shape, 2))[..., 0]
+
+
+def _correlation(a: Single, b: Single, window: int) -> Single:
+    """Normalised correlation in a window around each cell; NaN where one of the two isn't known all over it."""
+    known = np.isfinite(a) & np.isfinite(b)
+    a, b = np.where(known, a, 0), np.where(known, b, 0)
+
+    def mean(values: Single) -> Single:
+        return np.asarray(ndimage.uniform_filter(values, window, mode="constant"), np.float32)
+
+    whole = mean(known.astype(np.float32)) > 1 - 1e-4
+    mean_a, mean_b = mean(a), mean(b)
+    var_a, var_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
+    floor = 1e-6 * np.maximum(mean_a * mean_b, 1e-12)
+    score = (mean(a * b) - mean_a * mean_b) / np.sqrt(np.maximum(var_a, floor) * np.maximum(var_b, floor))
+    return np.where(whole, np.clip(score, -1, 1), np.nan).astype(np.float32)
+
+
+def _grey(one: Photograph) -> Single:
+    image = np.asarray(one.image, dtype=np.float32)
+    return np.ascontiguousarray(image.mean(axis=2) if image.ndim == 3 else image)[..., None]

@@ -1,0 +1,200 @@
+"""Pictures on a virtual globe: KMZ with north-up ground overlays, which every viewer draws.
+
+A picture across the antimeridian becomes two overlays. A LatLonQuad (Google's extension) keeps a view unrotated; not
+every viewer draws it.
+"""
+
+from __future__ import annotations
+
+import io
+import xml.etree.ElementTree as ET
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as Pictures
+
+from dappled.flight import durable
+from dappled.products.maps.map_grid import MapGrid
+
+KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
+TILE = 1024
+Pixels = NDArray[np.uint8]
+_FOLDER = "tiles/"
+_WHEN = (1980, 1, 1, 0, 0, 0)  # zip's zero: the same picture gives the same bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Overlay:
+    """One picture uint8 (h, w, 2 or 4) on the ground: north-up on a grid in degrees, or between the four corners
+    `quad` (longitude, latitude) in KML's order: lower left, lower right, upper right, upper left."""
+
+    name: str
+    picture: Pixels
+    grid: MapGrid | None = None
+    quad: tuple[tuple[float, float], ...] = ()
+
+
+def write(path: Path, name: str, overlays: Sequence[Overlay]) -> None:
+    """A KMZ of these overlays. Large ones become trees of tiles that a viewer loads as it comes near.
+
+    Raises OSError.
+    """
+    ET.register_namespace("", KML)
+    ET.register_namespace("gx", GX)
+    files: dict[str, bytes] = {}
+    root = ET.Element(_k("kml"))
+    document = ET.SubElement(root, _k("Document"))
+    ET.SubElement(document, _k("name")).text = name
+    for number, overlay in enumerate(overlays):
+        if overlay.grid is None:
+            document.append(_quad(overlay, _picture(files, f"{number}", overlay.picture)))
+            continue
+        for side, (grid, picture) in enumerate(_sides(overlay.grid, overlay.picture)):
+            place = f"{number}-{side}"
+            if max(grid.shape) > TILE:
+                document.append(_tree(files, place, Overlay(overlay.name, picture, grid), _FOLDER))
+            else:
+                document.append(_box(overlay.name, grid, _picture(files, place, picture)))
+    pages = {"doc.kml": _text(root), **files}  # the first .kml in the archive is the one that is opened
+    durable.write_file(path, _zipped(pages))
+
+
+def _sides(grid: MapGrid, picture: Pixels) -> list[tuple[MapGrid, Pixels]]:
+    """The picture, cut at the antimeridian where it crosses, each with longitudes from −180 to 180."""
+    west, _, east, _ = grid.bounds
+    shift = 360.0 * np.floor((west + 180) / 360)
+    cut = round((180 + shift - west) / grid.step_x)
+    pieces = [slice(0, grid.shape[1])]
+    if east - shift > 180 and 0 < cut < grid.shape[1]:
+        pieces = [slice(0, cut), slice(cut, grid.shape[1])]
+    made = []
+    for number, columns in enumerate(pieces):
+        part = grid.part(slice(0, grid.shape[0]), columns)
+        moved = MapGrid(part.crs, part.west - shift - 360 * number, part.north, part.step_x, part.step_y, part.shape)
+        if len(pieces) == 2:  # the cut is at a whole cell: the seam itself is the meridian
+            edge = -180.0 if number else 180.0 - part.shape[1] * part.step_x
+            moved = MapGrid(part.crs, edge, part.north, part.step_x, part.step_y, part.shape)
+        made.append((moved, picture[:, columns]))
+    return made
+
+
+def _tree(files: dict[str, bytes], place: str, overlay: Overlay, folder: str = "") -> ET.Element:
+    """A super-overlay: the link to a page with a coarse picture of the whole and, behind links of its own, the four
+    quarters, and so on. `folder` leads from where the link stands to where all pages and pictures lie."""
+    grid, picture = overlay.grid, overlay.picture
+    assert grid is not None
+    link = ET.Element(_k("NetworkLink"))
+    link.append(_element("name", overlay.name))
+    link.append(_region(grid))
+    target = ET.SubElement(link, _k("Link"))
+    target.append(_element("href", f"{folder}{place}.kml"))
+    target.append(_element("viewRefreshMode", "onRegion"))
+    root = ET.Element(_k("kml"))
+    document = ET.SubElement(root, _k("Document"))
+    document.append(_region(grid))  # GDAL looks for it here
+    step = -(-max(grid.shape) // TILE)
+    drawn = _box(overlay.name, grid, _picture(files, f"{_FOLDER}{place}", _shrunk(picture, step)).removeprefix(_FOLDER))
+    drawn.insert(1, _region(grid))
+    drawn.insert(2, _element("drawOrder", str(len(place))))
+    document.append(drawn)
+    if step > 1:
+        middle = [-(-side // 2) for side in grid.shape]
+        for quarter, (row, column) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+            rows = slice(middle[0] * row, grid.shape[0] if row else middle[0])
+            columns = slice(middle[1] * column, grid.shape[1] if column else middle[1])
+            piece = picture[rows, columns]
+            if piece.size and piece[..., -1].any():
+                inner = Overlay(overlay.name, piece, grid.part(rows, columns))
+                document.append(_tree(files, f"{place}{quarter}", inner))
+    files[f"{_FOLDER}{place}.kml"] = _text(root)
+    return link
+
+
+def _box(name: str, grid: MapGrid, href: str) -> ET.Element:
+    overlay = ET.Element(_k("GroundOverlay"))
+    overlay.append(_element("name", name))
+    ET.SubElement(overlay, _k("Icon")).append(_element("href", href))
+    west, south, east, north = grid.bounds
+    box = ET.SubElement(overlay, _k("LatLonBox"))
+    for key, value in (("north", north), ("south", south), ("east", east), ("west", west)):
+        box.append(_element(key, _degrees(value)))
+    return overlay
+
+
+def _quad(overlay: Overlay, href: str) -> ET.Element:
+    element = ET.Element(_k("GroundOverlay"))
+    element.append(_element("name", overlay.name))
+    ET.SubElement(element, _k("Icon")).append(_element("href", href))
+    quad = ET.SubElement(element, f"{{{GX}}}LatLonQuad")
+    corners = " ".join(f"{_degrees(lon)},{_degrees(lat)}" for lon, lat in overlay.quad)
+    quad.append(_element("coordinates", corners))
+    return element
+
+
+def _region(grid: MapGrid) -> ET.Element:
+    """Where a viewer must look, and how large on its screen this must be (px), before it loads what lies here."""
+    region = ET.Element(_k("Region"))
+    west, south, east, north = grid.bounds
+    box = ET.SubElement(region, _k("LatLonAltBox"))
+    for key, value in (("north", north), ("south", south), ("east", east), ("west", west)):
+        box.append(_element(key, _degrees(value)))
+    lod = ET.SubElement(region, _k("Lod"))
+    lod.append(_element("minLodPixels", "256"))
+    lod.append(_element("maxLodPixels", "-1"))
+    return region
+
+
+def _picture(files: dict[str, bytes], place: str, picture: Pixels) -> str:
+    """The picture as PNG among the archive's files; its name."""
+    mode = "LA" if picture.shape[2] == 2 else "RGBA"
+    memory = io.BytesIO()
+    Pictures.fromarray(np.ascontiguousarray(picture), mode).save(memory, "PNG")
+    name = f"{place}.png"
+    files[name] = memory.getvalue()
+    return name
+
+
+def _shrunk(picture: Pixels, step: int) -> Pixels:
+    """Means over step × step cells; what is transparent has no say in the colour."""
+    if step == 1:
+        return picture
+    rows, columns = (-(-side // step) * step for side in picture.shape[:2])
+    padded = np.zeros((rows, columns, picture.shape[2]), dtype=np.float32)
+    padded[: picture.shape[0], : picture.shape[1]] = picture
+    padded[..., :-1] *= padded[..., -1:] / 255
+    means = padded.reshape(rows // step, step, columns // step, step, -1).mean(axis=(1, 3))
+    means[..., :-1] /= np.maximum(means[..., -1:], 1e-6) / 255
+    return np.asarray(np.round(np.clip(means, 0, 255)), dtype=np.uint8)
+
+
+def _zipped(files: dict[str, bytes]) -> bytes:
+    memory = io.BytesIO()
+    with zipfile.ZipFile(memory, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            info = zipfile.ZipInfo(name, _WHEN)
+            info.compress_type = zipfile.ZIP_STORED if name.endswith(".png") else zipfile.ZIP_DEFLATED
+            info.external_attr = 0o644 << 16
+            archive.writestr(info, data)
+    return memory.getvalue()
+
+
+def _text(root: ET.Element) -> bytes:
+    return bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True))
+
+
+def _element(tag: str, text: str) -> ET.Element:
+    element = ET.Element(_k(tag))
+    element.text = text
+    return element
+
+
+def _k(tag: str) -> str:
+    return f"{{{KML}}}{tag}"
+
+
+def _degrees(value: float) -> str:
+    return f"{value:.10f}"

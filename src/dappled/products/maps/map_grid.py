@@ -1,0 +1,186 @@
+"""From a view to a north-up map: which ground every map cell shows, where the view saw it, and its value there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.errors import DappledError
+from dappled.products.extras import need
+from dappled.products.maps.earth import GEODETIC, Projection, wrapped
+from dappled.products.maps.eye import Eye, distorted
+from dappled.products.maps.ground import Flat, Ground
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+LARGEST = 30_000  # cells on a side
+_NODE = 16  # cells between places that are transformed exactly when the map is in degrees
+_CELLS = 1 << 20  # worked on at once
+
+
+class MapError(DappledError):
+    """A map that can't be drawn; one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapGrid:
+    """A north-up raster: cell (row, column)'s centre lies at (west + (column + ½)·step_x, north − (row + ½)·step_y).
+
+    In `crs` the projection's name, in metres, or EPSG:4326, in degrees of longitude and latitude.
+    """
+
+    crs: str
+    west: float
+    north: float
+    step_x: float
+    step_y: float
+    shape: tuple[int, int]
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """West, south, east, north: outer edges."""
+        rows, columns = self.shape
+        return self.west, self.north - rows * self.step_y, self.west + columns * self.step_x, self.north
+
+    def part(self, rows: slice, columns: slice) -> MapGrid:
+        """The grid of some rows and columns."""
+        return MapGrid(
+            self.crs,
+            self.west + columns.start * self.step_x,
+            self.north - rows.start * self.step_y,
+            self.step_x,
+            self.step_y,
+            (rows.stop - rows.start, columns.stop - columns.start),
+        )
+
+    def axes(self) -> tuple[Floats, Floats]:
+        """(x of the columns, y of the rows), cell centres."""
+        rows, columns = (np.arange(side, dtype=np.float64) + 0.5 for side in self.shape)
+        return np.asarray(self.west + columns * self.step_x), np.asarray(self.north - rows * self.step_y)
+
+    def places(self, projection: Projection) -> tuple[Floats, Floats]:
+        """(east, north) on the projection of each cell, (rows, columns) each."""
+        x, y = self.axes()
+        if self.crs != GEODETIC:
+            east, north = np.meshgrid(x, y)
+            return np.asarray(east, np.float64), np.asarray(north, np.float64)
+        # Every _NODE-th cell exactly; between them the two grids differ by far less than a cell's hundredth.
+        at_x, at_y = (np.linspace(line[0], line[-1], max(2, math.ceil(len(line) / _NODE) + 1)) for line in (x, y))
+        node_x, node_y = np.meshgrid(at_x, at_y)
+        nodes = projection.to_map(node_y, node_x)
+        aside, down = between(x, at_x), between(y, at_y)
+        east, north = (np.asarray(down @ node @ aside.T, np.float64) for node in nodes)
+        return east, north
+
+
+def around(points: Floats, crs: str, step_x: float, step_y: float) -> MapGrid:
+    """The grid that covers points (n, 2) of (x, y), its edges at whole steps. Raises MapError for a vast one."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    west, east = math.floor(low[0] / step_x), math.ceil(high[0] / step_x)
+    south, north = math.floor(low[1] / step_y), math.ceil(high[1] / step_y)
+    shape = max(1, north - south), max(1, east - west)
+    if max(shape) > LARGEST:
+        raise MapError(f"the map would have {shape[0]} × {shape[1]} cells: choose a larger --gsd, or fewer frames")
+    return MapGrid(crs, west * step_x, north * step_y, step_x, step_y, shape)
+
+
+def footprint(eye: Eye, ground: Ground, steps: int = 16) -> Floats:
+    """(n, 3) east, north, height all around the view, its corners first of each side. Raises MapError where a ray
+    misses the ground."""
+    met = ground.meet(eye, eye.border(steps))
+    if np.isnan(met).any():
+        raise MapError(f"its view leaves the ground ({ground.name}): give terrain that covers it")
+    return met
+
+
+def degree_steps(projection: Projection, east: float, north: float, gsd_m: float) -> tuple[float, float]:
+    """(longitude, latitude) degrees for one cell of `gsd_m` at a place."""
+    latitude, _ = projection.to_geodetic(east, north)
+    metres = math.radians(1) * 6378137.0
+    return gsd_m / (metres * max(0.01, math.cos(math.radians(float(latitude))))), gsd_m / metres
+
+
+def unwrapped(longitude_deg: Floats, near_deg: float) -> Floats:
+    """Longitudes as numbers within 180° of `near_deg`: a strip across the antimeridian is one strip."""
+    return np.asarray(near_deg + np.vectorize(wrapped)(longitude_deg - near_deg), dtype=np.float64)
+
+
+def draw(image: Image, eye: Eye, grid: MapGrid, ground: Ground, projection: Projection) -> Image:
+    """float32 (rows, columns, c): the view on the map, NaN where it doesn't see the ground.
+
+    `image` float32 (h, w) or (h, w, c) is the view of `eye`. Each cell is looked up in the view (cubic), where the
+    ground's point below the cell appears in it; cells that the ground hides are left out.
+    """
+    image = smoothed(image, eye, grid, ground)
+    made = np.full((*grid.shape, image.shape[2]), np.nan, dtype=np.float32)
+    rows_at_once = max(1, _CELLS // grid.shape[1])
+    for first in range(0, grid.shape[0], rows_at_once):
+        rows = slice(first, min(first + rows_at_once, grid.shape[0]))
+        made[rows] = sample(image, seen_at(eye, grid.part(rows, slice(0, grid.shape[1])), ground, projection))
+    return made
+
+
+def sample(image: Image, at: Floats) -> Image:
+    """float32 (rows, columns, c): an image (h, w, c) at pixels (rows, columns, 2), NaN where those are."""
+    cv2 = need("cv2")
+    inside = np.isfinite(at[..., 0])
+    if not inside.any():
+        return np.full((*inside.shape, image.shape[2]), np.nan, dtype=np.float32)
+    x, y = (np.where(inside, at[..., axis], 0).astype(np.float32) for axis in (0, 1))
+    values = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).reshape(*inside.shape, -1)
+    return np.where(inside[..., None], values, np.float32(np.nan)).astype(np.float32)
+
+
+def seen_at(eye: Eye, grid: MapGrid, ground: Ground, projection: Projection) -> Floats:
+    """(rows, columns, 2): the view's pixel (x, y) that shows each map cell, NaN where none does."""
+    east, north = grid.places(projection)
+    if isinstance(ground, Flat):  # one homography for the whole frame
+        to_view = eye.homography(ground.height_m)
+        from_view = np.linalg.inv(eye.matrix)
+        x, y = east - eye.centre[0], north - eye.centre[1]
+        u, v, w = (row[0] * x + row[1] * y + row[2] for row in from_view @ to_view)
+        ahead = np.where(w > 0, w, np.nan)
+        plane = distorted(np.stack([u / ahead, v / ahead], axis=-1).reshape(-1, 2), eye.distortion)
+        at = plane @ eye.matrix[:2, :2].T + eye.matrix[:2, 2]
+        seen = np.ones(len(at), dtype=bool)
+    else:
+        height = ground.heights(east, north)
+        at = eye.project(np.stack([east, north, height], axis=-1).reshape(-1, 3))
+        seen = ground.sees(eye, east, north, height).ravel()
+    rows, columns = eye.shape
+    inside = seen & (np.abs(at - [(columns - 1) / 2, (rows - 1) / 2]) <= [columns / 2, rows / 2]).all(axis=1)
+    return np.where(inside[:, None], at, np.nan).reshape(*grid.shape, 2)
+
+
+def smoothed(image: Image, eye: Eye, grid: MapGrid, ground: Ground) -> Image:
+    """The image (h, w, c), smoothed where the map is much coarser than it."""
+    if image.ndim == 2:
+        image = image[..., None]
+    middle = np.array([[(eye.shape[1] - 1) / 2, (eye.shape[0] - 1) / 2]])
+    level = float(ground.meet(eye, middle)[0, 2])
+    step_m = grid.step_y * math.radians(1) * 6378137.0 if grid.crs == GEODETIC else grid.step_y
+    return smoothed_to(image, step_m / eye.gsd_m(level) if math.isfinite(level) else 1.0)
+
+
+def smoothed_to(image: Image, ratio: float) -> Image:
+    """The image, smoothed to be sampled at every `ratio`-th of its pixels; as it is below 1.5."""
+    if ratio < 1.5:
+        return image
+    cv2 = need("cv2")
+    smooth = cv2.GaussianBlur(image, (0, 0), 0.5 * math.sqrt(ratio**2 - 1), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(smooth, np.float32).reshape(image.shape)
+
+
+def between(fine: Floats, nodes: Floats) -> Floats:
+    """(len(fine), len(nodes)): weights of linear interpolation between evenly spaced nodes."""
+    step = (nodes[-1] - nodes[0]) / (len(nodes) - 1) or 1.0
+    place = np.clip((fine - nodes[0]) / step, 0, len(nodes) - 1)
+    left = np.minimum(np.floor(place).astype(np.intp), len(nodes) - 2)
+    weights = np.zeros((len(fine), len(nodes)))
+    rows = np.arange(len(fine))
+    weights[rows, left] = 1 - (place - left)
+    weights[rows, left + 1] = place - left
+    return weights

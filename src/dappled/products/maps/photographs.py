@@ -1,0 +1,267 @@
+"""A flight's frames as photographs of the ground: the decoded image, and the eye that saw it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.config.profiles import CameraProfile, Lens
+from dappled.decode.geometry import camera_pose
+from dappled.decode.geometry.camera_pose import CameraPose, Matrix
+from dappled.decode.geometry.pose import Pose, Vector3
+from dappled.decode.lightfield.light_field import LightField
+from dappled.drivers.raw.reading import RawFile
+from dappled.errors import DappledError
+from dappled.flight import layout
+from dappled.flight.ledger import LedgerReader
+from dappled.flight.records import Frame, Tag
+from dappled.products.maps.earth import Projection
+from dappled.products.maps.eye import Eye, intrinsics, look, through
+from dappled.products.maps.map_grid import Image
+
+DEFAULT_POSITION_SIGMA_M = 3.0
+DEFAULT_ATTITUDE_SIGMA_RAD = 0.02
+
+
+class PhotographError(DappledError):
+    """A frame that can't be placed; one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Station:
+    """A frame with everything that places it: its tag, and where the camera stood and how it looked."""
+
+    frame: Frame
+    tag: Tag
+    camera: CameraPose
+    camera_to_ned: Matrix
+
+    @property
+    def name(self) -> str:
+        """The frame's number, as its file has it."""
+        return Path(self.frame.name).stem
+
+    @property
+    def ground_m(self) -> float | None:
+        """The height of home above sea level, as the autopilot tells it."""
+        height = self.camera.height_above_home_m
+        return None if height is None else self.camera.altitude_msl_m - height
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photograph:
+    """One frame's image float32 (h, w) or (h, w, 3), linear, 1.0 = sensor white, and its eye on the map.
+
+    Sigmas are one standard deviation of the eye's centre (m) and attitude (rad) as recorded. `grid` leads to the
+    sensor, as in `LightField`. With `views` (n, h, w[, 3]) and their eyes relative to the frame's, maps are drawn from
+    these: their mean on the ground is the frame refocused there.
+    """
+
+    name: str
+    utc_ns: int
+    image: Image
+    eye: Eye
+    position_sigma_m: float
+    attitude_sigma_rad: float
+    grid: NDArray[np.float64]
+    views: Image | None = None
+    apertures_m: NDArray[np.float64] | None = None
+
+    def layers(self, focus_m: float = math.inf) -> list[tuple[Image, Eye]]:
+        """The images that make up the map, each with its eye."""
+        if self.views is None or self.apertures_m is None:
+            return [(self.image, self.eye)]
+        return [
+            (view, through(self.eye, (float(y), float(x)), focus_m))
+            for view, (y, x) in zip(self.views, self.apertures_m, strict=True)
+        ]
+
+
+@dataclass(frozen=True, slots=True)
+class Mounting:
+    """How the camera sits on the vehicle: antenna to camera in body axes, and camera axes to body axes, or with
+    `on_gimbal` to those of the gimbal's head, whose recorded attitude then counts."""
+
+    lever_m: Vector3 = (0.0, 0.0, 0.0)
+    mount: tuple[float, ...] = tuple(camera_pose.NADIR.ravel().tolist())
+    on_gimbal: bool = False
+
+    @classmethod
+    def of(cls, facts: Mapping[str, Any]) -> Mounting:
+        """As a flight's facts have it: its settings `pose.lever_arm_m`, `pose.mount` and `pose.on_gimbal`."""
+        said, plain = facts.get("settings", {}).get("pose", {}), cls()
+        forward, right, down = said.get("lever_arm_m") or plain.lever_m
+        return cls(
+            (float(forward), float(right), float(down)),
+            tuple(map(float, said.get("mount") or plain.mount)),
+            bool(said.get("on_gimbal", False)),
+        )
+
+    @property
+    def matrix(self) -> Matrix:
+        """(3, 3). Raises DappledError for what is no rotation."""
+        return camera_pose.mount(self.mount)
+
+
+def stations(flight: Path, mounting: Mounting) -> tuple[list[Station], list[tuple[str, str]]]:
+    """A flight's frames that have a full pose, in order, and (name, sentence) of those that have none.
+
+    Raises FlightError.
+    """
+    frames, tags = recorded(flight)
+    placed: list[Station] = []
+    left: list[tuple[str, str]] = []
+    for frame in frames:
+        try:
+            placed.append(station(frame, tags.get(frame.index), mounting))
+        except PhotographError as error:
+            left.append((frame.name, str(error)))
+    return placed, left
+
+
+def recorded(flight: Path) -> tuple[list[Frame], dict[int, Tag]]:
+    """A flight's safe frames and their tags. Raises FlightError."""
+    with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
+        return ledger.frames(), ledger.tags()
+
+
+def station(frame: Frame, tag: Tag | None, mounting: Mounting) -> Station:
+    """Where a frame was taken. Raises PhotographError where that isn't known."""
+    if tag is None:
+        raise PhotographError(f"{frame.name} was never tagged: `dappled geotag` tags what a crash left so")
+    camera = camera_pose.of(tag.pose, mounting.lever_m, mounting.matrix, on_gimbal=mounting.on_gimbal)
+    if camera is None:
+        raise PhotographError(f"no position is known for {frame.name}: there was no telemetry at its exposure")
+    attitude = tag.pose.gimbal_attitude if mounting.on_gimbal else tag.pose.attitude
+    if attitude is None:
+        whose = "of the gimbal " if mounting.on_gimbal else ""
+        raise PhotographError(f"no attitude {whose}is known for {frame.name}: there was none in its telemetry")
+    return Station(frame, tag, camera, camera_pose.matrix_of(attitude) @ mounting.matrix)
+
+
+def lens_of(profile: CameraProfile, focal_length_mm: float, focus_m: float = math.inf) -> Lens:
+    """The calibrated lens, or a plain one focused at a distance: v = f / (1 − f/F). Raises PhotographError for a
+    distance within the focal length."""
+    share = focal_length_mm * 1e-3 / focus_m
+    if share >= 1:
+        raise PhotographError(f"a lens of {focal_length_mm:g} mm can't be focused at {focus_m:g} m: see --focus")
+    return profile.lens(focal_length_mm) or Lens(focal_length_mm, focal_length_mm / (1 - share))
+
+
+def eye_of(
+    station: Station, field: LightField, profile: CameraProfile, projection: Projection, *, focus_m: float = math.inf
+) -> Eye:
+    """The eye of a light field's mean view on the map, its lens focused at a distance.
+
+    Raises PhotographError, ConfigError, EarthError.
+    """
+    rows, columns = field.attributes["shape"]
+    lens = lens_of(profile, _focal_length_mm(station, field), focus_m)
+    camera = station.camera
+    return look(
+        intrinsics(profile.sensor((int(rows), int(columns))), lens, field.grid),
+        lens,
+        shape=(field.slices.shape[1], field.slices.shape[2]),
+        at=projection.at(camera.latitude_deg, camera.longitude_deg),
+        height_m=camera.altitude_msl_m,
+        camera_to_ned=station.camera_to_ned,
+    )
+
+
+def _focal_length_mm(station: Station, field: LightField) -> float:
+    known = field.attributes.get("focal_length_mm") or station.tag.focal_length_mm
+    if known is None:
+        raise PhotographError(f"the focal length of {station.frame.name} is unknown: give it with --focal-length")
+    return float(known)
+
+
+def photograph(
+    station: Station,
+    field: LightField,
+    profile: CameraProfile,
+    projection: Projection,
+    *,
+    view: str = "mean",
+    focus_m: float = math.inf,
+) -> Photograph:
+    """A decoded frame's photograph; `view` is "mean", "ground" (all views, to be laid over each other on the ground),
+    or "v,u", the row and column of one view. Raises PhotographError where there is no such view, and as `eye_of`."""
+    eye = eye_of(station, field, profile, projection, focus_m=focus_m)
+    image, views, apertures = mean_view(field), None, None
+    if view == "ground" and field.views.shape[0]:
+        views = field.views.reshape(-1, *field.views.shape[2:])
+        apertures = field.view_offsets.reshape(-1, 2) * _aperture_m(station, field)
+    elif view not in ("mean", "ground"):
+        v, u = _which(view, field)
+        image = np.ascontiguousarray(field.views[v, u])
+        y, x = field.view_offsets[v, u] * _aperture_m(station, field)
+        eye = through(eye, (float(y), float(x)), focus_m)
+    return Photograph(
+        station.name, station.tag.utc_ns, image, eye, *_sigmas(station.tag.pose), field.grid, views, apertures
+    )
+
+
+def _aperture_m(station: Station, field: LightField) -> float:
+    """The full aperture's diameter: focal length / f-number. Raises PhotographError where one is unknown."""
+    f_number = field.attributes.get("f_number") or station.tag.f_number
+    if f_number is None:
+        raise PhotographError(
+            f"the f-number of {station.frame.name} is unknown: give it with --f-number, or map its mean"
+        )
+    return _focal_length_mm(station, field) / float(f_number) * 1e-3
+
+
+def true_colours(raw: RawFile) -> NDArray[np.float64] | None:
+    """(3,) what views in red, green and blue are to be multiplied by; None for a frame without such colours.
+
+    The decoder gives all colours of a frame one mean, so that the mosaic has no impulse of its own. Here that is
+    undone, and the camera's white balance put in its place: neighbouring frames of one ground have one colour.
+    """
+    names = raw.colour_names
+    if raw.cfa is None or not set("RGB") <= set(names):
+        return None
+    blacks = raw.black if isinstance(raw.black, tuple) else (raw.black,) * len(names)
+    a, b = raw.cfa.shape
+    means: dict[str, list[float]] = {}
+    for (row, column), index in np.ndenumerate(raw.cfa):
+        level = float(raw.mosaic[row::a, column::b].mean(dtype=np.float64)) - blacks[index]
+        means.setdefault(names[index], []).append(max(level, 0.0))
+    balance = dict(zip(names, raw.balance, strict=True)) if raw.balance is not None else {}
+    light = {name: float(np.mean(means[name])) * balance.get(name, 1.0) for name in "RGB"}
+    if not light["G"] > 0:
+        return None
+    return np.array([light[name] / light["G"] for name in "RGB"])
+
+
+def mean_view(field: LightField) -> Image:
+    """The mean of the views, or where there are none the slice of the mean: the same picture, in grey."""
+    if field.views.shape[0]:
+        return np.asarray(field.views.mean(axis=(0, 1), dtype=np.float32))
+    return np.ascontiguousarray(field.slices[0].real)
+
+
+def _which(view: str, field: LightField) -> tuple[int, int]:
+    rows, columns = field.views.shape[:2]
+    if not rows:
+        raise PhotographError("the frame has no views, only slices: decode it with a calibration, or map its mean")
+    try:
+        v, u = (int(word) for word in view.split(","))
+    except ValueError:
+        raise PhotographError(f"{view!r} names no view: give row,column, as 0,4") from None
+    if not (0 <= v < rows and 0 <= u < columns):
+        raise PhotographError(f"there is no view {view}: rows go to {rows - 1}, columns to {columns - 1}")
+    return v, u
+
+
+def _sigmas(pose: Pose) -> tuple[float, float]:
+    position, attitude = pose.position_sigma_m, pose.attitude_sigma_rad
+    return (
+        DEFAULT_POSITION_SIGMA_M if position is None else position,
+        DEFAULT_ATTITUDE_SIGMA_RAD if attitude is None else attitude,
+    )

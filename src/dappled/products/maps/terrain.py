@@ -1,0 +1,108 @@
+"""Heights as files: a GeoTIFF of heights and sigmas, and LAS points, each with the difference to given terrain."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+
+from dappled.flight import durable
+from dappled.products.extras import need
+from dappled.products.maps import cog, hyperstereo, mosaic, own_ground
+from dappled.products.maps.earth import Projection
+from dappled.products.maps.georeference import Survey
+from dappled.products.maps.ground import Flat
+from dappled.products.maps.hyperstereo import Surface
+
+VERTICAL = "EPSG:5773"  # EGM96 height: what autopilots call mean sea level
+CELL = 2.0  # of a map's cells: heights are coarser than pictures
+_SEARCH_M = (3.0, 12.0)  # below and above flat ground, or the given terrain's lowest and highest
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Terrain:
+    """A surface, and how far it lies above the given terrain float32 (rows, columns); None where there is none."""
+
+    surface: Surface
+    difference_m: NDArray[np.float32] | None
+
+
+def of(made: Survey, progress: Progress, *, lowest_m: float | None = None, highest_m: float | None = None) -> Terrain:
+    """The terrain of a survey by hyperstereo, searched between two heights above sea level. Raises HyperstereoError."""
+    grid = mosaic.grid_of(made.photographs, made.ground, made.projection, CELL * made.gsd_m)
+    east, north = grid.places(made.projection)
+    given = made.ground.heights(east, north)
+    low = float(np.nanmin(given)) - _SEARCH_M[0] if lowest_m is None else lowest_m
+    high = float(np.nanmax(given)) + _SEARCH_M[1] if highest_m is None else highest_m
+    lowest_eye = min(float(one.eye.centre[2]) for one in made.photographs)
+    high = min(high, low + 0.8 * (lowest_eye - low))  # nothing that is nearer than a fifth of the way
+    surface = hyperstereo.surface(
+        made.photographs, grid, made.projection, lowest_m=low, highest_m=high, progress=progress
+    )
+    flat = isinstance(made.ground, Flat)
+    return Terrain(surface, None if flat else (surface.height_m - given).astype(np.float32))
+
+
+def write_raster(made: Survey, terrain: Terrain, path: Path) -> Path:
+    """A COG with the bands height, sigma and, where terrain was given, difference; metres, NaN where unknown."""
+    surface = terrain.surface
+    bands = [surface.height_m, surface.sigma_m]
+    names = ["height above sea level, m", "sigma of a height by itself, m"]
+    if terrain.difference_m is not None:
+        bands.append(terrain.difference_m)
+        names.append("difference to the given terrain, m")
+    tags = {**made.tags(), "DAPPLED_LEVEL_SIGMA_M": f"{surface.level_sigma_m:.3f}"}
+    cog.write(path, surface.grid, np.stack(bands, axis=-1), tags, tuple(names))
+    return path
+
+
+def write_ground(made: Survey, terrain: Terrain, path: Path) -> Path:
+    """The heights as ground to lay frames on: a COG without holes, with the survey's own ground around it."""
+    grid, heights = own_ground.heights(terrain.surface, made.ground)
+    names = ("height above sea level, m: found, between found ones, or given",)
+    cog.write(path, grid, heights[..., None].astype(np.float32), made.tags(), names)
+    return path
+
+
+def write_points(made: Survey, terrain: Terrain, path: Path) -> Path:
+    """LAS 1.4 points, on the map's projection with EGM96 heights; `sigma` and, where terrain was given, `difference` as
+    extra dimensions in metres."""
+    laspy = need("laspy")
+    surface = terrain.surface
+    known = surface.known
+    east, north = surface.grid.places(made.projection)
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.offsets = [np.floor(east.min()), np.floor(north.min()), 0.0]
+    header.scales = [0.001, 0.001, 0.001]
+    header.generating_software = "dappled"
+    header.creation_date = datetime.fromtimestamp(made.photographs[0].utc_ns // 1_000_000_000, UTC).date()
+    header.add_crs(compound(made.projection))
+    header.add_extra_dim(laspy.ExtraBytesParams("sigma", np.float32, "m, one standard deviation"))
+    if terrain.difference_m is not None:
+        header.add_extra_dim(laspy.ExtraBytesParams("difference", np.float32, "m above the given terrain"))
+    points: Any = laspy.LasData(header)
+    points.x, points.y, points.z = east[known], north[known], surface.height_m[known].astype(np.float64)
+    points.sigma = surface.sigma_m[known]
+    if terrain.difference_m is not None:
+        points.difference = terrain.difference_m[known]
+    durable.make_folder(path.parent)
+    with tempfile.TemporaryDirectory(prefix=".maps-", dir=path.parent) as scratch:
+        part = Path(scratch) / "points.las"
+        points.write(part)
+        cog.settle(part, path)
+    return path
+
+
+def compound(projection: Projection) -> pyproj.CRS:
+    """The map's system with heights above mean sea level (EGM96)."""
+    vertical = pyproj.CRS.from_user_input(VERTICAL)
+    return pyproj.crs.CompoundCRS(f"{projection.crs.name} + {vertical.name}", [projection.crs, vertical])

@@ -1,0 +1,212 @@
+"""A MAVLink camera on real UDP links, without hardware: links, component and shutter as the daemon has them."""
+
+from __future__ import annotations
+
+import queue
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+
+from dappled.clock import Clock, RecordedClock, SystemClock
+from dappled.daemon.camera_protocol.camera_settings import Knobs
+from dappled.daemon.camera_protocol.component import CameraFacts, Captured, Component, Storage
+from dappled.daemon.navigation.telemetry import Telemetry
+from dappled.daemon.pipeline.shutter import Shutter
+from dappled.drivers.camera import Setting, SettingName
+from dappled.drivers.mavlink.framing import pack
+from dappled.drivers.mavlink.links import MavlinkLinks, Message, Packet, mavlink
+from dappled.drivers.mavlink.signing import Signing
+from dappled.flight.records import Cause
+from tests.daemon.fakes import eventually
+
+
+class Camera:
+    """A camera that has each frame `exposure_s` after the wish. `fails` are indices that fail; `hung`: none ever comes.
+    `settled`: it belongs to system 1 without having listened for autopilots.
+
+    `causes` are the shots, in order; `done` how they ended."""
+
+    def __init__(
+        self,
+        *,
+        urls: Sequence[str] = ("udpin:127.0.0.1:0",),
+        first: int = 0,
+        capacity: int = 8,
+        exposure_s: float = 0.02,
+        fails: Sequence[int] = (),
+        done: dict[int, Captured] | None = None,
+        signing: Signing | None = None,
+        settled: bool = True,
+        clock: Clock | None = None,
+    ) -> None:
+        self.clock = clock or SystemClock()
+        self.telemetry = Telemetry()
+        self.logged = 0
+        self.causes: list[Cause] = []
+        self.done: dict[int, Captured] = {} if done is None else done
+        self.hung = False
+        self._first, self._exposure_s, self._fails = first, exposure_s, fails
+        self._fired: queue.Queue[int | None] = queue.Queue()
+        self.links = MavlinkLinks(
+            urls,
+            system_id=1,
+            component_id=100,
+            tap=self._tap,
+            on_packet=self._on_packet,
+            clock=self.clock,
+            signing=signing,
+        )
+        self.shutter = Shutter(
+            next_index=first,
+            note=lambda shot: self.causes.append(shot.cause),
+            fire=self._fired.put,
+            clock=self.clock,
+            capacity=capacity,
+            on_change=lambda: self.component.state_changed(),  # noqa: PLW0108  # the component is made after the shutter
+        )
+        self.component = Component(
+            self.links,
+            self.shutter,
+            self.clock,
+            Knobs(self),
+            facts=lambda: CameraFacts("dappled", "test", (0, 1, 0)),
+            storage=lambda: Storage(2**34, 2**33, 2**33),
+            lookup=self.done.get,
+        )
+        self.component._identity.settled = settled
+        self._worker = threading.Thread(target=self._work)
+
+    def __enter__(self) -> Camera:
+        self.links.start()
+        self.shutter.start()
+        self._worker.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(self.clock, RecordedClock):
+            self.clock.close()
+        self.shutter.stop()
+        self.links.stop()
+        self._fired.put(None)
+        self._worker.join(5)
+
+    @property
+    def url(self) -> str:
+        return f"udpout:127.0.0.1:{self.links.port(0)}"
+
+    def idle(self) -> None:
+        """Wait until every shot has ended and was announced."""
+        eventually(
+            lambda: all(index in self.done for index in range(self._first, self._first + len(self.causes))),
+            f"every shot ended: {sorted(self.done)}",
+        )
+
+    def received(self) -> int:
+        """Packets that came in and were handled, on all links."""
+        with self.links._order:  # the one that was counted last is handled too
+            return sum(link.packets_in for link in self.links.statistics())
+
+    def failures(self) -> int:
+        """Packets whose handling raised: always a bug."""
+        return sum(link.failures for link in self.links.statistics())
+
+    def settings(self) -> tuple[Setting, ...]:
+        return (Setting("iso", "100", ("100", "200")),)
+
+    def change(self, name: SettingName, value: str) -> None:
+        """Never done: the body is deaf."""
+
+    def _tap(self, stamp_us: int, raw: bytes) -> int:
+        self.logged += 1
+        return self.logged - 1
+
+    def _on_packet(self, packet: Packet) -> None:
+        assert packet.number is not None
+        self.telemetry.feed(packet.number, packet.stamp_us, packet.message)
+        self.component.on_packet(packet)
+
+    def _work(self) -> None:
+        while True:
+            try:
+                index = self._fired.get(timeout=0.005)
+            except queue.Empty:
+                self.component.tick()
+                continue
+            if index is None:
+                return
+            if self.hung:
+                continue
+            threading.Event().wait(self._exposure_s)
+            captured = Captured(index, ok=index not in self._fails, utc_ns=self.clock.utc_ns())
+            self.shutter.settled(index, captured.ok)
+            self.component.announce(captured)
+            self.done[index] = captured
+
+
+class Peer:
+    """A program at the other end of a link, byte by byte: what it sends and hears is in the test's hand."""
+
+    def __init__(self, port: int, system: int = 255, component: int = 190) -> None:
+        self.packer = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect(("127.0.0.1", port))
+        self.heard: list[Message] = []
+        self._decode = mavlink.MAVLink(None).decode
+
+    def __enter__(self) -> Peer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._socket.close()
+
+    def packed(self, message: Message, *, version_1: bool = False) -> bytes:
+        return pack(message, self.packer, version_1=version_1)
+
+    def raw(self, data: bytes) -> None:
+        self._socket.send(data)
+
+    def send(self, message: Message) -> None:
+        self.raw(self.packed(message))
+
+    def heartbeat(self) -> None:
+        """As the kind of machine that this one's ids say it is."""
+        kind = (2, 3) if self.packer.srcComponent == 1 else (6, 8)
+        self.send(mavlink.MAVLink_heartbeat_message(*kind, 0, 0, 4, 3))
+
+    def command(self, name: int, *parameters: float, confirmation: int = 0, target: tuple[int, int] = (1, 100)) -> None:
+        padded = (*parameters, *[0.0] * (7 - len(parameters)))
+        self.send(mavlink.MAVLink_command_long_message(*target, name, confirmation, *padded))
+
+    def until(self, wanted: Callable[[Message], bool], what: str, timeout_s: float = 20.0) -> Message:
+        """The first message not returned yet that is wanted; others before it are kept in `heard` alone."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            left = deadline - time.monotonic()
+            assert left > 0, f"never heard: {what}; heard {[m.get_type() for m in self.heard[-20:]]}"
+            self._socket.settimeout(left)
+            try:
+                message = self._decode(bytearray(self._socket.recv(65536)))
+            except TimeoutError:
+                continue
+            self.heard.append(message)
+            if wanted(message):
+                return message
+
+    def ack(self, name: int) -> int:
+        """The result of the command that was sent last."""
+        message = self.until(lambda m: m.get_type() == "COMMAND_ACK" and m.command == name, f"an answer to {name}")
+        return int(message.result)
+
+    def one(self, kind: str) -> Message:
+        """The next message of this type."""
+        return self.until(lambda m: m.get_type() == kind, kind)
+
+    def count(self, kind: str) -> int:
+        """How many of this type were heard."""
+        return sum(m.get_type() == kind for m in self.heard)

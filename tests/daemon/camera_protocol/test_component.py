@@ -1,0 +1,565 @@
+"""The MAVLink camera, message by message, without a link: what peers send, and what they must hear."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dappled.clock import RecordedClock
+from dappled.daemon.camera_protocol.camera_settings import Knobs, OwnKnob, code
+from dappled.daemon.camera_protocol.component import CameraFacts, Captured, Component, Storage
+from dappled.daemon.pipeline.shutter import Shutter
+from dappled.drivers.camera import Setting, SettingName, check_change
+from dappled.drivers.mavlink.framing import pack
+from dappled.drivers.mavlink.links import Message, Packet, mavlink
+
+NAN = math.nan
+GCS = (255, 190)
+AUTOPILOT = (1, 1)
+
+
+class Body:
+    """A body's settings: it takes a change when the test lets it."""
+
+    def __init__(self) -> None:
+        self.now = {"iso": Setting("iso", "100", ("100", "200", "400")), "aperture": Setting("aperture", "5.6")}
+        self.asked: list[tuple[str, str]] = []
+
+    def settings(self) -> tuple[Setting, ...]:
+        return tuple(self.now.values())
+
+    def change(self, name: SettingName, value: str) -> None:
+        check_change(self.settings(), name, value)
+        self.asked.append((name, value))
+
+    def take(self, name: SettingName, value: str) -> None:
+        self.now[name] = Setting(name, value, self.now[name].choices)
+
+
+class Rig:
+    """A component whose links are a list."""
+
+    def __init__(self, *, feedback_is_shot: bool = False, capacity: int = 8) -> None:
+        self.body = Body()
+        self.decode = "on"
+        own = OwnKnob("LF_DECODE", "Decode in flight", lambda: self.decode, ("on", "off"), self._decode)
+        self.system_id, self.component_id = 1, 100
+        self.packer = mavlink.MAVLink(None)
+        self.copies = 1
+        self.trusted = True
+        self.sent: list[Message] = []
+        self.fired: list[int] = []
+        self.obstacle: str | None = None
+        self.well, self.troubled = True, False
+        self.clock = RecordedClock(10**18, 10**18 - 10**9)
+        self.shutter = Shutter(
+            next_index=5,
+            note=lambda _: None,
+            fire=self.fired.append,
+            clock=self.clock,
+            obstacle=lambda: self.obstacle,
+            capacity=capacity,
+            on_change=lambda: self.component.state_changed(),  # noqa: PLW0108 (the component is made after the shutter)
+        )
+        self.component = Component(
+            self,
+            self.shutter,
+            self.clock,
+            Knobs(self.body, (own,)),
+            feedback_is_shot=feedback_is_shot,
+            facts=lambda: CameraFacts("Canon", "EOS 450D", (0, 1, 0), 50.0, 22.2, 14.8, 4272, 2848),
+            storage=lambda: Storage(2**34, 2**33, 2**33),
+            lookup=lambda index: Captured(index, ok=index != 3) if index < 5 else None,
+            healthy=lambda: self.well,
+            troubled=lambda: self.troubled,
+        )
+
+    def _decode(self, value: str) -> None:
+        self.decode = value
+
+    def send(self, message: Message, link: int | None = None) -> bool:
+        self.sent.append(message)
+        return True
+
+    def of(self, kind: str) -> list[Message]:
+        """What was sent of this type."""
+        return [m for m in self.sent if m.get_type() == kind]
+
+    def hear(self, message: Message, sender: tuple[int, int] = GCS, link: int = 0) -> None:
+        self.packer.srcSystem, self.packer.srcComponent = sender
+        raw = pack(message, self.packer, version_1=False)
+        for _ in range(self.copies):
+            self.component.on_packet(Packet(0, 0, link, message, raw, trusted=self.trusted))
+
+    def command(self, name: int, *p: float, target: tuple[int, int] = (1, 100), confirmation: int = 0) -> int | None:
+        """Its MAV_RESULT, None for no acknowledgement."""
+        self.sent.clear()
+        padded = (*p, *[0.0] * (7 - len(p)))
+        self.hear(mavlink.MAVLink_command_long_message(*target, name, confirmation, *padded))
+        acks = [m for m in self.sent if m.get_type() == "COMMAND_ACK"]
+        assert len(acks) <= 1
+        if acks:
+            assert self.sent[0] is acks[0]  # first the answer, then the message
+            assert (acks[0].target_system, acks[0].target_component) == GCS
+        return int(acks[0].result) if acks else None
+
+    def tick(self, seconds: float = 0.0) -> list[str]:
+        self.clock.advance(seconds)
+        self.sent.clear()
+        self.component.tick()
+        return [m.get_type() for m in self.sent]
+
+
+def test_one_request_one_shot_acknowledged_at_once() -> None:
+    rig = Rig()
+    assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, 1) == mavlink.MAV_RESULT_ACCEPTED
+    assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, 1, confirmation=1) == mavlink.MAV_RESULT_ACCEPTED
+    assert rig.fired == [5]
+
+
+def test_px4s_triple_is_one_shot() -> None:
+    rig = Rig()
+    rig.tick(4)
+    rig.hear(mavlink.MAVLink_camera_trigger_message(123456, 9), AUTOPILOT)
+    nans = [NAN] * 4
+    rig.hear(
+        mavlink.MAVLink_command_long_message(1, 100, mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 0, 1, 7, *nans[:3]),
+        AUTOPILOT,
+    )
+    rig.hear(
+        mavlink.MAVLink_command_long_message(1, 0, mavlink.MAV_CMD_DO_DIGICAM_CONTROL, 0, *nans, 1, NAN, NAN), AUTOPILOT
+    )
+    assert rig.fired == [5]
+
+
+def test_a_broadcast_that_the_network_doubled_is_one_shot_and_the_next_one_another() -> None:
+    rig = Rig()
+    rig.tick(4)
+    rig.copies = 2
+    for _ in range(3):
+        rig.clock.advance(0.35)
+        nans = [NAN] * 4
+        rig.hear(
+            mavlink.MAVLink_command_long_message(0, 0, mavlink.MAV_CMD_DO_DIGICAM_CONTROL, 0, *nans, 1, NAN, NAN),
+            AUTOPILOT,
+        )
+    assert rig.fired == [5, 6, 7]
+
+
+def test_a_refusal_says_why_and_pushes_the_status() -> None:
+    rig = Rig()
+    rig.tick(4)
+    rig.obstacle = "no camera on the bus"
+    result = rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, 1)
+    assert result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+    assert any("no camera on the bus" in str(m) for m in rig.sent)
+    assert "CAMERA_CAPTURE_STATUS" in rig.tick()
+
+
+@pytest.mark.parametrize(
+    ("command", "parameters", "then"),
+    [
+        (mavlink.MAV_CMD_REQUEST_MESSAGE, (259,), "CAMERA_INFORMATION"),
+        (mavlink.MAV_CMD_REQUEST_MESSAGE, (260, NAN), "CAMERA_SETTINGS"),
+        (mavlink.MAV_CMD_REQUEST_MESSAGE, (261,), "STORAGE_INFORMATION"),
+        (mavlink.MAV_CMD_REQUEST_MESSAGE, (262,), "CAMERA_CAPTURE_STATUS"),
+        (mavlink.MAV_CMD_REQUEST_MESSAGE, (271,), "CAMERA_FOV_STATUS"),
+        (mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, (262,), "MESSAGE_INTERVAL"),
+        (mavlink.MAV_CMD_REQUEST_CAMERA_INFORMATION, (0,), "CAMERA_INFORMATION"),
+        (mavlink.MAV_CMD_REQUEST_CAMERA_SETTINGS, (1,), "CAMERA_SETTINGS"),
+        (mavlink.MAV_CMD_REQUEST_STORAGE_INFORMATION, (0, 1), "STORAGE_INFORMATION"),
+        (mavlink.MAV_CMD_REQUEST_CAMERA_CAPTURE_STATUS, (NAN,), "CAMERA_CAPTURE_STATUS"),
+        (mavlink.MAV_CMD_SET_CAMERA_MODE, (0, 2), "CAMERA_SETTINGS"),
+        (mavlink.MAV_CMD_RESET_CAMERA_SETTINGS, (1,), "CAMERA_SETTINGS"),
+    ],
+)
+def test_what_is_asked_for_follows_its_acknowledgement(command: int, parameters: tuple[float, ...], then: str) -> None:
+    rig = Rig()
+    assert rig.command(command, *parameters) == mavlink.MAV_RESULT_ACCEPTED
+    assert [m.get_type() for m in rig.sent] == ["COMMAND_ACK", then]
+
+
+def test_past_images_are_answered_failures_too_and_without_an_index_one_after_the_other() -> None:
+    rig = Rig()
+    rig.tick(4)
+    for index, wanted in ((0, 0), (3, 3), *((NAN, one) for one in (0, 1, 2, 3, 4, 0))):
+        assert rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 263, index) == mavlink.MAV_RESULT_ACCEPTED
+        rig.tick()
+        (image,) = [m for m in rig.sent if m.get_type() == "CAMERA_IMAGE_CAPTURED"]
+        assert (image.image_index, image.capture_result) == (wanted, int(wanted != 3))
+    assert rig.command(mavlink.MAV_CMD_REQUEST_CAMERA_IMAGE_CAPTURE, 5) == mavlink.MAV_RESULT_DENIED
+
+
+def test_more_past_images_than_can_wait_are_refused_and_every_accepted_one_is_told() -> None:
+    rig = Rig()
+    rig.tick(4)
+    results = [rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 263, at % 5) for at in range(300)]
+    told = 0
+    for _ in range(300):
+        told += rig.tick().count("CAMERA_IMAGE_CAPTURED")
+    assert results == [mavlink.MAV_RESULT_ACCEPTED] * told + [mavlink.MAV_RESULT_TEMPORARILY_REJECTED] * (300 - told)
+    assert told == 256
+    assert rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 263, 1) == mavlink.MAV_RESULT_ACCEPTED
+
+
+def test_a_past_image_whose_flight_was_moved_away_is_missed_in_words() -> None:
+    rig = Rig()
+    rig.tick(4)
+    assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, 1) == mavlink.MAV_RESULT_ACCEPTED
+    assert rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 263, 5) == mavlink.MAV_RESULT_ACCEPTED
+    rig.tick()
+    assert b"image 5 is in none of the flights" in b"".join(m._text_raw for m in rig.of("STATUSTEXT"))
+
+
+def test_refused_by_name_and_silent_on_broadcasts() -> None:
+    rig = Rig()
+    for command in (mavlink.MAV_CMD_VIDEO_START_CAPTURE, 206, 214, 2003, 2505):
+        assert rig.command(command, NAN) == mavlink.MAV_RESULT_UNSUPPORTED
+        assert rig.command(command, NAN, target=(0, 0)) is None
+    assert rig.command(mavlink.MAV_CMD_SET_CAMERA_MODE, 0, 1) == mavlink.MAV_RESULT_DENIED
+    assert rig.command(mavlink.MAV_CMD_STORAGE_FORMAT, 1, 1, 1) == mavlink.MAV_RESULT_DENIED
+    for video in (269, 270):  # there are no streams: any answer to 269 would be one in MAVProxy's list
+        assert rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, video, 1) == mavlink.MAV_RESULT_UNSUPPORTED
+    assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, target=(2, 100)) is None
+    assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, target=(1, 101)) is None
+    assert not rig.fired
+
+
+def test_an_interval_starts_stops_and_shows() -> None:
+    rig = Rig()
+    rig.tick(4)
+    assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 2.0, 0, 3) == mavlink.MAV_RESULT_ACCEPTED
+    rig.tick()
+    (status,) = [m for m in rig.sent if m.get_type() == "CAMERA_CAPTURE_STATUS"]
+    assert (status.image_status, status.image_interval, status.image_count) == (3, 2.0, 6)
+    assert rig.command(mavlink.MAV_CMD_IMAGE_STOP_CAPTURE, 0) == mavlink.MAV_RESULT_ACCEPTED
+    assert rig.shutter.statistics().interval_s is None
+
+
+@pytest.mark.parametrize(("autopilots", "system"), [((7,), 7), ((), 1), ((7, 8), 1)])
+def test_the_sole_autopilots_system_is_adopted(autopilots: tuple[int, ...], system: int) -> None:
+    rig = Rig()
+    assert rig.tick() == []
+    for each in autopilots:
+        rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), (each, 1))
+    assert "HEARTBEAT" in rig.tick(3.1)
+    assert rig.system_id == system
+
+
+def autopilot_heartbeat(rig: Rig, system: int) -> None:
+    rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), (system, 1))
+
+
+def test_an_autopilot_that_boots_after_the_camera_is_taken_and_fires_it() -> None:
+    rig = Rig()
+    assert "HEARTBEAT" in rig.tick(3.1)
+    assert (rig.system_id, rig.component.doubt()) == (1, None)
+    rig.clock.advance(60)
+    autopilot_heartbeat(rig, 7)
+    rig.tick(1.3)
+    assert (rig.system_id, rig.component.vehicle, rig.component.doubt()) == (7, 7, None)
+    rig.hear(mavlink.MAVLink_camera_trigger_message(1, 1), (7, 1))
+    assert rig.fired == [5]
+    autopilot_heartbeat(rig, 8)
+    rig.tick(1.3)
+    assert (rig.system_id, rig.component.doubt()) == (7, None)
+
+
+def test_several_autopilots_that_come_late_leave_the_configured_system_and_it_is_said() -> None:
+    rig = Rig()
+    rig.tick(3.1)
+    for system in (8, 7):
+        autopilot_heartbeat(rig, system)
+        rig.tick(0.5)
+    rig.tick(1)
+    assert rig.system_id == 1
+    assert rig.component.doubt() == ("autopilots 7, 8 are heard, the camera belongs to system 1: set mavlink.system_id")
+    autopilot_heartbeat(rig, 1)
+    assert rig.component.doubt() is None
+
+
+def test_heartbeats_time_requests_and_streams_come_in_time_and_none_while_faulted() -> None:
+    rig = Rig()
+    rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), AUTOPILOT)
+    first = rig.tick(1.3)
+    assert first.count("HEARTBEAT") == 1
+    assert first.count("COMMAND_LONG") == 4
+    seen = [kind for _ in range(100) for kind in rig.tick(0.02)]
+    assert seen.count("HEARTBEAT") == 2
+    assert seen.count("TIMESYNC") == 10
+    assert {m.system_status for m in rig.of("HEARTBEAT")} == {mavlink.MAV_STATE_ACTIVE}
+    rig.troubled = True
+    rig.sent.clear()
+    rig.tick(1.5)
+    assert {m.system_status for m in rig.of("HEARTBEAT")} == {mavlink.MAV_STATE_CRITICAL}
+    rig.well = False
+    assert "HEARTBEAT" not in rig.tick(1.5)
+
+
+def extended(rig: Rig, name: bytes, value: int, kind: int = mavlink.MAV_PARAM_EXT_TYPE_UINT32) -> list[int]:
+    """The results that follow a PARAM_EXT_SET at once."""
+    rig.sent.clear()
+    rig.hear(mavlink.MAVLink_param_ext_set_message(1, 100, name, struct.pack("<I", value), kind))
+    return [m.param_result for m in rig.of("PARAM_EXT_ACK")]
+
+
+def test_settings_are_listed_read_and_match_the_definition_that_is_served() -> None:
+    rig = Rig()
+    rig.hear(mavlink.MAVLink_param_ext_request_list_message(1, 100))
+    listed = [(m.param_id, m.param_index, m.param_count) for m in rig.of("PARAM_EXT_VALUE")]
+    assert listed == [("CAM_ISO", 0, 3), ("CAM_APERTURE", 1, 3), ("LF_DECODE", 2, 3)]
+    rig.sent.clear()
+    rig.hear(mavlink.MAVLink_param_ext_request_read_message(1, 100, b"CAM_ISO", -1))
+    rig.hear(mavlink.MAVLink_param_ext_request_read_message(1, 100, b"", 2))
+    rig.hear(mavlink.MAVLink_param_ext_request_read_message(1, 100, b"NOT_THERE", -1))
+    assert [m.param_id for m in rig.sent] == ["CAM_ISO", "LF_DECODE"]
+    assert struct.unpack("<I", rig.sent[0]._param_value_raw[:4]) == (100,)
+
+
+def test_a_setting_of_ours_takes_effect_at_once() -> None:
+    rig = Rig()
+    assert extended(rig, b"LF_DECODE", code("off")) == [mavlink.PARAM_ACK_ACCEPTED]
+    assert rig.decode == "off"
+    assert extended(rig, b"LF_DECODE", 12345) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
+    assert extended(rig, b"LF_DECODE", code("on"), 1) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
+    assert extended(rig, b"NO_SUCH", 1) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
+
+
+def test_a_refused_setting_is_acknowledged_with_its_value_of_now() -> None:
+    rig = Rig()
+    for value, kind in ((200, mavlink.MAV_PARAM_EXT_TYPE_UINT8), (200, mavlink.MAV_PARAM_EXT_TYPE_REAL32), (7, 5)):
+        assert extended(rig, b"CAM_ISO", value, kind) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
+        (ack,) = rig.of("PARAM_EXT_ACK")
+        assert struct.unpack("<I", ack._param_value_raw[:4].ljust(4, b"\0")) == (100,)
+    assert rig.body.asked == []
+
+
+@pytest.mark.parametrize("kind", [kind for kind in range(1, 12) if kind != mavlink.MAV_PARAM_EXT_TYPE_UINT32])
+def test_a_setting_in_a_type_that_is_not_its_own_changes_nothing(kind: int) -> None:
+    rig = Rig()
+    assert extended(rig, b"LF_DECODE", code("off"), kind) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
+    assert rig.decode == "on"
+
+
+def test_what_one_ground_station_sets_the_others_see_too() -> None:
+    rig = Rig()
+    rig.tick(4)
+    assert extended(rig, b"LF_DECODE", code("off")) == [mavlink.PARAM_ACK_ACCEPTED]
+    assert [m.param_id for m in rig.of("PARAM_EXT_VALUE")] == ["LF_DECODE"]
+    assert extended(rig, b"LF_DECODE", code("off")) == [mavlink.PARAM_ACK_ACCEPTED]
+    assert rig.of("PARAM_EXT_VALUE") == []
+    rig.body.take("iso", "400")  # somebody turns the dial
+    rig.sent.clear()
+    rig.component.settings_changed()
+    (value,) = rig.of("PARAM_EXT_VALUE")
+    assert (value.param_id, struct.unpack("<I", value._param_value_raw[:4])) == ("CAM_ISO", (400,))
+
+
+def test_a_bodys_setting_is_in_progress_until_the_body_has_it_and_a_retry_asks_it_once() -> None:
+    rig = Rig()
+    rig.tick(4)
+    assert extended(rig, b"CAM_ISO", 400) == [mavlink.PARAM_ACK_IN_PROGRESS]
+    assert extended(rig, b"CAM_ISO", 400) == [mavlink.PARAM_ACK_IN_PROGRESS]
+    assert rig.body.asked == [("iso", "400")]
+    rig.body.take("iso", "400")
+    rig.sent.clear()
+    rig.component.settings_changed()
+    assert [m.param_result for m in rig.of("PARAM_EXT_ACK")] == [mavlink.PARAM_ACK_ACCEPTED]
+    assert extended(rig, b"CAM_ISO", 400) == [mavlink.PARAM_ACK_ACCEPTED]
+
+
+@pytest.mark.parametrize("silent", [True, False])
+def test_a_body_that_will_not_or_does_not_answer_has_failed_in_words(silent: bool) -> None:
+    rig = Rig()
+    rig.tick(4)
+    assert extended(rig, b"CAM_ISO", 200) == [mavlink.PARAM_ACK_IN_PROGRESS]
+    if silent:
+        rig.tick(5.1)
+    else:
+        rig.sent.clear()
+        rig.component.settings_changed("the dial stands on Auto")
+    (ack,) = rig.of("PARAM_EXT_ACK")
+    assert ack.param_result == mavlink.PARAM_ACK_FAILED
+    assert struct.unpack("<I", ack._param_value_raw[:4].ljust(4, b"\0")) == (100,)
+    said = b"".join(m._text_raw for m in rig.of("STATUSTEXT")).decode()
+    assert ("5 s" if silent else "dial stands on Auto") in said
+    assert extended(rig, b"CAM_APERTURE", 8) == [mavlink.PARAM_ACK_VALUE_UNSUPPORTED]
+
+
+def test_a_packet_on_two_links_is_one_packet_and_is_answered_on_both() -> None:
+    rig = Rig()
+    rig.tick(4)
+    rig.packer.srcSystem, rig.packer.srcComponent = GCS
+    message = mavlink.MAVLink_command_long_message(1, 100, mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 0, 1, 0, 0, 0, 0)
+    raws = [message.pack(rig.packer), message.pack(rig.packer, force_mavlink1=True)]
+    for link, raw in enumerate(raws):  # one link speaks version 1: the same packet all the same
+        rig.component.on_packet(Packet(0, 0, link, mavlink.MAVLink(None).decode(bytearray(raw)), raw))
+    assert rig.fired == [5]
+    assert [m.result for m in rig.of("COMMAND_ACK")] == [mavlink.MAV_RESULT_ACCEPTED] * 2
+
+
+def test_an_unsigned_packet_on_a_signed_link_is_heard_and_not_obeyed() -> None:
+    rig = Rig()
+    rig.tick(4)
+    rig.trusted = False
+    assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, 0) is None
+    rig.hear(mavlink.MAVLink_camera_trigger_message(1, 1), AUTOPILOT)
+    rig.hear(mavlink.MAVLink_param_ext_set_message(1, 100, b"LF_DECODE", struct.pack("<I", code("off")), 5))
+    assert (rig.fired, rig.decode, rig.of("COMMAND_ACK")) == ([], "on", [])
+
+
+@pytest.mark.parametrize("late_s", [0.0, 60.0])
+def test_an_unsigned_heartbeat_does_not_decide_whose_camera_this_is(late_s: float) -> None:
+    rig = Rig()
+    rig.tick(late_s)
+    rig.trusted = False
+    autopilot_heartbeat(rig, 66)
+    rig.tick(4)
+    assert (rig.system_id, rig.component.vehicle) == (1, None)
+    rig.trusted = True
+    autopilot_heartbeat(rig, 7)
+    rig.trusted = False
+    autopilot_heartbeat(rig, 66)
+    rig.tick(4)
+    assert (rig.system_id, rig.component.vehicle) == (7, 7)
+    assert rig.component.order(2000, (0,)) is None
+    assert rig.of("COMMAND_LONG")[-1].target_system == 7
+
+
+@pytest.mark.parametrize("counts", [True, False])
+def test_feedback_is_a_shot_only_where_the_autopilot_fires(counts: bool) -> None:
+    rig = Rig(feedback_is_shot=counts)
+    rig.tick(4)
+    feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+    rig.hear(feedback, AUTOPILOT)
+    rig.hear(feedback, (9, 1))  # somebody else's autopilot
+    assert rig.fired == ([5] if counts else [])
+
+
+def test_the_echo_of_an_order_is_no_wish_and_the_next_trigger_is_one() -> None:
+    rig = Rig(feedback_is_shot=True)
+    rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), AUTOPILOT)
+    rig.tick(4)
+    fire = mavlink.MAVLink_command_long_message(0, 0, mavlink.MAV_CMD_DO_DIGICAM_CONTROL, 0, 0, 0, 0, 0, 1, 0, 0)
+    feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+    for turn in range(2):
+        assert rig.component.order(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1)) is None
+        rig.clock.advance(0.05)
+        for message in (mavlink.MAVLink_camera_trigger_message(1, turn), fire, feedback):
+            rig.hear(message, AUTOPILOT)
+        rig.clock.advance(0.5)
+    assert rig.fired == []
+    rig.hear(mavlink.MAVLink_camera_trigger_message(9, 9), AUTOPILOT)
+    assert rig.fired == [5]
+    rig.component.order(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1))
+    rig.clock.advance(2.1)
+    rig.hear(mavlink.MAVLink_camera_trigger_message(10, 10), AUTOPILOT)
+    assert rig.fired == [5, 6]
+
+
+def test_zoom_and_focus_by_hand_are_refused_in_words() -> None:
+    rig = Rig()
+    rig.tick(4)
+    assert rig.command(mavlink.MAV_CMD_SET_CAMERA_ZOOM, 3, 35) == mavlink.MAV_RESULT_DENIED
+    assert "by hand" in rig.of("STATUSTEXT")[0].text
+    assert rig.command(mavlink.MAV_CMD_SET_CAMERA_FOCUS, 0, 1) == mavlink.MAV_RESULT_DENIED
+    assert "by hand" in rig.of("STATUSTEXT")[0].text
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "wanted"),
+    [(3, 33.0, "35"), (3, 1e9, "55"), (2, 0.0, "18"), (2, 100.0, "55"), (0, 1.0, "35"), (0, -1.0, "18"),
+     (4, 63.0, "18"), (1, 1.0, None), (2, 101.0, None), (3, NAN, None), (4, 200.0, None)],
+)  # fmt: skip
+def test_a_lens_that_can_be_set_zooms_to_the_nearest_focal_length(kind: int, value: float, wanted: str | None) -> None:
+    rig = Rig()
+    rig.tick(4)
+    rig.body.now["focal_length"] = Setting("focal_length", "24", ("18", "24", "35", "55"))
+    result = rig.command(mavlink.MAV_CMD_SET_CAMERA_ZOOM, kind, value)
+    assert result == (mavlink.MAV_RESULT_DENIED if wanted is None else mavlink.MAV_RESULT_ACCEPTED)
+    assert rig.body.asked == ([] if wanted is None else [("focal_length", wanted)])
+    rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 260)
+    assert rig.of("CAMERA_SETTINGS")[0].zoomLevel == pytest.approx(100 / 3, abs=0.01)
+    rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 259)
+    assert rig.of("CAMERA_INFORMATION")[0].flags & mavlink.CAMERA_CAP_FLAGS_HAS_BASIC_ZOOM
+
+
+def test_a_repeated_zoom_step_is_one_step_and_another_step_is_another() -> None:
+    rig = Rig()
+    rig.tick(4)
+
+    def step(after_s: float, value: float, confirmation: int = 0) -> str:
+        """The focal length that the body has after it."""
+        rig.clock.advance(after_s)
+        result = rig.command(mavlink.MAV_CMD_SET_CAMERA_ZOOM, 0, value, confirmation=confirmation)
+        assert result == mavlink.MAV_RESULT_ACCEPTED
+        rig.body.take("focal_length", rig.body.asked[-1][1])
+        return rig.body.now["focal_length"].value
+
+    rig.body.now["focal_length"] = Setting("focal_length", "18", ("18", "24", "35", "55"))
+    assert [step(0, 1), step(0.5, 1), step(3, 1, confirmation=1)] == ["24", "24", "24"]
+    assert [step(0.1, -1), step(0.1, 1), step(2, 1), step(2, 1)] == ["18", "24", "35", "55"]
+
+
+def test_field_of_view_from_lens_and_sensor() -> None:
+    rig = Rig()
+    rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 271)
+    (view,) = rig.of("CAMERA_FOV_STATUS")
+    assert view.hfov == pytest.approx(math.degrees(2 * math.atan(22.2 / 100)), abs=1e-3)
+    assert view.lat_camera == view.lat_image == 2**31 - 1
+    assert math.isnan(view.q[0])
+
+
+def test_the_same_line_is_said_once_in_ten_seconds_and_a_long_one_in_pieces() -> None:
+    rig = Rig()
+    rig.tick(4)
+    text = "the camera is absent: nothing is on the bus; plug it in, switch it on and set it to PTP"
+    for _ in range(3):
+        rig.component.say(text)
+    pieces = rig.of("STATUSTEXT")
+    assert "".join(m.text for m in pieces) == text
+    assert [m.chunk_seq for m in pieces] == list(range(len(pieces)))
+    assert len({m.id for m in pieces}) == 1
+    rig.clock.advance(11)
+    rig.component.say(text)
+    assert len(rig.of("STATUSTEXT")) == 2 * len(pieces)
+
+
+@given(
+    st.sampled_from(
+        [2000, 2001, 203, 511, 512, 521, 522, 525, 526, 527, 529, 530, 531, 532, 510, 2002, 206, 2500, 0, 65535]
+    ),
+    st.lists(st.one_of(st.floats(width=32), st.integers(-3, 300).map(float)), min_size=7, max_size=7),
+    st.integers(0, 255),
+    st.booleans(),
+)
+def test_no_parameters_crash_it(command: int, parameters: list[float], confirmation: int, broadcast: bool) -> None:
+    rig = Rig()
+    rig.tick(4)
+    target = (0, 0) if broadcast else (1, 100)
+    result = rig.command(command, *parameters, target=target, confirmation=confirmation)
+    assert (result is None) <= broadcast
+    assert len(rig.fired) <= 1
+    for message in rig.sent:
+        message.pack(mavlink.MAVLink(None))
+    rig.tick(1)
+
+
+def test_the_autopilot_is_given_orders_and_its_refusal_is_told() -> None:
+    rig = Rig()
+    assert rig.component.order(181, (0, 1)) is not None  # nobody was heard yet
+    rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3), sender=(1, 1))
+    rig.tick(4)
+    assert rig.component.order(181, (0, 1)) is None
+    (order,) = rig.of("COMMAND_LONG")[-1:]
+    assert (order.target_system, order.target_component, order.command) == (1, 1, 181)
+    assert (order.param1, order.param2, order.param7) == (0, 1, 0)
+    for command, result, words in ((181, 0, 0), (999, 2, 0), (181, 2, 1)):
+        rig.sent.clear()
+        rig.hear(mavlink.MAVLink_command_ack_message(command, result, 0, 0, 1, 100), sender=(1, 1))
+        assert len(rig.of("STATUSTEXT")) >= words
+        assert bool(rig.of("STATUSTEXT")) == bool(words)

@@ -1,0 +1,114 @@
+"""Go or no-go, on frames whose faults are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from dappled.daemon.health.frame_checks import Finding, examine, sharpness
+from dappled.daemon.health.go_no_go import verdict
+from dappled.drivers.raw.darkroom import Recipe
+from dappled.errors import DappledError
+from dappled.mocks.scene.masked_camera import reference_camera
+
+RECIPE = Recipe(camera="reference-36mm", mask="reference-5x5")
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("frame") / "good.dng"
+    path.write_bytes(reference_camera(1, scale=0.5).expose(10.0, 1, f_number=14.8).file)
+    return path
+
+
+def by_name(findings: list[Finding]) -> dict[str, Finding]:
+    return {one.name: one for one in findings}
+
+
+def test_a_good_frame_is_go(good: Path) -> None:
+    found = by_name(examine(good, RECIPE))
+    assert {one.state for one in found.values()} == {"go"}
+    assert set(found) == {"focal length", "exposure", "carriers", "focus", "motion"}
+    assert found["focal length"].measured["focal_length_mm"] == 50.0
+    assert verdict(list(found.values())) == "go"
+
+
+def test_without_a_mask_configured_the_rest_is_looked_at(good: Path) -> None:
+    found = by_name(examine(good, None))
+    assert found["carriers"].state == "caution"
+    assert found["exposure"].state == "go"
+
+
+def test_a_clipped_frame_is_no_go(tmp_path: Path) -> None:
+    path = tmp_path / "bright.dng"
+    camera = reference_camera(1, scale=0.25)
+    metered_s, _ = camera.metered(14.8)
+    path.write_bytes(camera.expose(10.0, 1, f_number=14.8, exposure_s=8 * metered_s).file)
+    found = by_name(examine(path, None))
+    assert found["exposure"].state == "no-go"
+    assert "expose less" in found["exposure"].text
+
+
+def test_a_frame_without_light_is_no_go(tmp_path: Path) -> None:
+    path = tmp_path / "dark.dng"
+    camera = reference_camera(1, scale=0.25)
+    metered_s, _ = camera.metered(14.8)
+    path.write_bytes(camera.expose(10.0, 1, f_number=14.8, exposure_s=metered_s / 50).file)
+    assert "expose more" in by_name(examine(path, None))["exposure"].text
+
+
+def test_the_wrong_mask_shows_no_carriers(good: Path) -> None:
+    found = by_name(examine(good, Recipe(camera="reference-36mm", mask="mask-5")))
+    assert found["carriers"].state == "no-go"
+    assert "mask" in found["carriers"].text
+
+
+def test_a_mask_away_from_its_place_is_cautioned_of(tmp_path: Path) -> None:
+    camera = reference_camera(1, scale=0.5)
+    (tmp_path / "stopped.dng").write_bytes(camera.expose(10.0, 1, f_number=59.2).file)
+    height, width = camera.sensor.shape
+    (tmp_path / "off.toml").write_text(
+        'law = "geometric"\nmask_distance_mm = 0.48\n[[raw]]\nname = "half"\n'
+        f"shape = [{height}, {width}]\nrow_mm = [0.0092, 0.0]\ncolumn_mm = [0.0, 0.0092]\n"
+    )
+    found = by_name(examine(tmp_path / "stopped.dng", Recipe(camera=str(tmp_path / "off.toml"), mask="reference-5x5")))
+    assert found["carriers"].state == "caution"
+    assert "farther out than predicted" in found["carriers"].text
+
+
+def test_a_file_that_is_no_picture_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "x.dng"
+    path.write_bytes(b"nothing")
+    with pytest.raises(DappledError, match=r"x\.dng"):
+        examine(path, None)
+
+
+def ground(seed: int) -> NDArray[np.float64]:
+    """A picture with edges of all directions at all sizes, as the ground has from the air."""
+    rng = np.random.default_rng(seed)
+    picture = np.full((240, 320), 0.5)
+    rows, columns = np.mgrid[:240, :320]
+    for _ in range(600):
+        disc = np.hypot(rows - rng.uniform(0, 240), columns - rng.uniform(0, 320)) < rng.uniform(1.5, 30)
+        picture[disc] = rng.uniform(0.2, 1.0)
+    blurred: NDArray[np.float64] = ndimage.gaussian_filter(picture, 0.5)
+    return blurred
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_focus_and_motion_are_told_apart(seed: int) -> None:
+    sharp = ground(seed)
+    assert [one.state for one in sharpness(sharp)] == ["go", "go"]
+    assert [one.state for one in sharpness(ndimage.gaussian_filter(sharp, 2.0))] == ["no-go", "caution"]
+    for axis, word in ((1, "across"), (0, "along")):
+        focus, motion = sharpness(ndimage.uniform_filter1d(sharp, 5, axis=axis))
+        assert (focus.state, motion.state) == ("go", "no-go")
+        assert f"lost {word}" in motion.text
+    falling = np.diag(np.ones(5)) / 5
+    focus, motion = sharpness(ndimage.convolve(sharp, falling))
+    assert motion.state == "no-go"
+    assert "falling" in motion.text

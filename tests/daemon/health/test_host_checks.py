@@ -1,0 +1,201 @@
+"""What `dappled doctor` sees on machines that lack this or that."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dappled.config.settings import CameraSettings, MavlinkSettings, RecordSettings, Settings
+from dappled.daemon.health import host_checks
+from dappled.daemon.health.host_checks import Finding, Machine, next_step
+from dappled.drivers.camera import CameraError
+from dappled.drivers.usb_bus import CANON, FUJIFILM, UsbBody, UsbError
+from tests.daemon.fakes import FakeCamera
+
+EOS = UsbBody(1, 5, CANON, 0x3145, "PTP", "EOS 450D")
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Machine:
+    proc = tmp_path / "proc"
+    proc.mkdir()
+    return Machine(bodies=list, proc=proc, dev=tmp_path / "dev", open_s=5.0, unsynchronised=lambda: False)
+
+
+def having(machine: Machine, *bodies: UsbBody) -> Machine:
+    return replace(machine, bodies=lambda: list(bodies))
+
+
+def the_one(findings: list[Finding]) -> Finding:
+    (found,) = findings
+    return found
+
+
+def no_libusb() -> list[UsbBody]:
+    raise UsbError("no libusb is on this machine")
+
+
+def test_without_a_camera_it_says_what_to_do_next(machine: Machine) -> None:
+    found = the_one(host_checks.bodies(Settings(), machine))
+    assert found.state == "wrong"
+    assert "USB mode" in found.todo
+    assert "--simulate" in found.todo
+
+
+def test_without_a_libusb_it_says_what_to_install(machine: Machine) -> None:
+    found = host_checks.libraries(Settings(), replace(machine, bodies=no_libusb))
+    assert found[-1].state == "wrong"
+    assert "apt install" in found[-1].todo
+    assert host_checks.bodies(Settings(), replace(machine, bodies=no_libusb)) == []
+
+
+def test_a_body_that_can_be_fired(machine: Machine) -> None:
+    found = the_one(host_checks.bodies(Settings(), having(machine, EOS)))
+    assert (found.state, "can be fired" in found.text, "EOS 450D" in found.text) == ("ok", True, True)
+
+
+def test_a_body_in_the_wrong_usb_mode(machine: Machine) -> None:
+    found = the_one(host_checks.bodies(Settings(), having(machine, replace(EOS, mode="mass storage"))))
+    assert found.state == "wrong"
+    assert "PTP" in found.todo
+
+
+def test_a_body_that_this_user_may_not_open(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    node = EOS.node(machine.dev / "bus" / "usb")
+    node.parent.mkdir(parents=True)
+    node.write_bytes(b"")
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != node)  # root may do everything
+    found = the_one(host_checks.bodies(Settings(), having(machine, EOS)))
+    assert found.state == "wrong"
+    assert "udev rule" in found.todo
+
+
+def test_a_body_that_another_program_holds(machine: Machine) -> None:
+    process = machine.proc / "4711"
+    (process / "fd").mkdir(parents=True)
+    (process / "fd" / "3").symlink_to(EOS.node(machine.dev / "bus" / "usb"))
+    (process / "comm").write_text("gvfsd-gphoto2\n")
+    found = the_one(host_checks.bodies(Settings(), having(machine, EOS)))
+    assert "gvfsd-gphoto2 (process 4711)" in found.text
+    assert "gvfs-gphoto2-volume-monitor" in found.todo
+
+
+def test_gvfs_is_named_as_the_culprit(machine: Machine) -> None:
+    assert host_checks.grabbers(Settings(), machine) == []
+    (machine.proc / "17").mkdir()
+    (machine.proc / "17" / "comm").write_text("gvfs-gphoto2-vo\n")
+    found = the_one(host_checks.grabbers(Settings(), machine))
+    assert found.state == "wrong"
+    assert "mask --now" in found.todo
+    elsewhere = Settings(camera=CameraSettings(port="ptpip:127.0.0.1:1:1"))
+    assert the_one(host_checks.grabbers(elsewhere, machine)).state == "note"
+
+
+def test_a_fujifilm_is_told_to_need_a_wire(machine: Machine) -> None:
+    finepix = UsbBody(1, 6, FUJIFILM, 0x1BF, "mass storage", "FinePix S5200")
+    found = the_one(host_checks.bodies(Settings(), having(machine, finepix)))
+    assert "can't fire it" in found.text
+    assert "camera.shutter" in found.todo
+    right = Settings(camera=CameraSettings(driver="fujifilm", shutter="relay:0"))
+    assert the_one(host_checks.bodies(right, having(machine, finepix))).state == "ok"
+
+
+def test_a_driver_that_opens_is_ready(machine: Machine) -> None:
+    settings = Settings(camera=CameraSettings(driver="simulated", options={"picture": "pattern:1000:dng"}))
+    found = the_one(host_checks.camera(settings, machine))
+    assert (found.state, "Simulated" in found.text) == ("ok", True)
+
+
+@pytest.mark.parametrize(
+    ("camera", "words"),
+    [
+        ({"driver": "fujifilm"}, "camera.shutter"),
+        ({"driver": "nothing"}, "nothing"),
+        ({"driver": "fujifilm", "shutter": "gpio:/no/such/chip:4"}, "/no/such/chip"),
+    ],
+)
+def test_a_driver_that_can_t_be_opened_says_why(machine: Machine, camera: dict[str, Any], words: str) -> None:
+    found = the_one(host_checks.camera(Settings(camera=CameraSettings(**camera)), replace(machine, open_s=0.3)))
+    assert found.state == "wrong"
+    assert words in found.text
+    assert found.todo
+
+
+def test_a_driver_that_fails_as_it_begins_costs_no_other_finding(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Broken(FakeCamera):
+        def start(self) -> None:
+            raise CameraError("no such port")
+
+    broken = Broken()
+    monkeypatch.setattr(host_checks, "open_camera", lambda _: broken)
+    found = host_checks.checkup(Settings(), machine, [host_checks.camera, host_checks.mask])
+    assert [one.name for one in found] == ["camera", "mask"]
+    assert (found[0].state, "no such port" in found[0].text, broken.stopped) == ("wrong", True, True)
+
+
+def test_the_disk_behind_a_closed_door(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder in one that may not be looked into: as if it were not there yet."""
+    closed = tmp_path / "closed"
+    real = os.stat
+
+    def stat(path: Any, **how: Any) -> os.stat_result:
+        if str(path).startswith(f"{closed}/"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path, **how)
+
+    closed.mkdir()
+    monkeypatch.setattr(os, "stat", stat)
+    settings = Settings(record=RecordSettings(directory=str(closed / "flights")))
+    assert the_one(host_checks.disk(settings, machine)).state == "ok"
+
+
+def test_the_disk(machine: Machine, tmp_path: Path) -> None:
+    def at(folder: Path, least: int = 0) -> Settings:
+        return Settings(record=RecordSettings(directory=str(folder), min_free_mb=least))
+
+    assert the_one(host_checks.disk(at(tmp_path / "not" / "yet"), machine)).state == "ok"
+    assert the_one(host_checks.disk(at(tmp_path, 10_000_000), machine)).state == "wrong"
+
+
+def test_the_disk_of_somebody_else(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    settings = Settings(record=RecordSettings(directory=str(tmp_path)))
+    assert "record.directory" in the_one(host_checks.disk(settings, machine)).todo
+
+
+@pytest.mark.parametrize(
+    ("check", "settings", "state"),
+    [
+        (host_checks.link, Settings(), "note"),
+        (host_checks.link, Settings(mavlink=MavlinkSettings(url=("/dev/no-such-tty:57600",))), "wrong"),
+        (host_checks.link, Settings(mavlink=MavlinkSettings(url=("udpin:127.0.0.1:14550",))), "ok"),
+        (host_checks.mask, Settings(), "note"),
+        (host_checks.clock, Settings(), "ok"),
+    ],
+)
+def test_the_rest(
+    machine: Machine, check: Callable[[Settings, Machine], list[Finding]], settings: Settings, state: str
+) -> None:
+    assert the_one(check(settings, machine)).state == state
+
+
+def test_a_clock_that_nobody_keeps_is_noted(machine: Machine) -> None:
+    found = the_one(host_checks.clock(Settings(), replace(machine, unsynchronised=lambda: True)))
+    assert (found.state, "chrony" in found.todo) == ("note", True)
+
+
+def test_this_machine_s_own_clock_can_be_asked() -> None:
+    assert Machine().unsynchronised() in (True, False)
+
+
+def test_the_first_wrong_thing_is_the_next_step() -> None:
+    findings = [Finding("a", "ok", ""), Finding("b", "note", "", "later"), Finding("c", "wrong", "", "now")]
+    assert next_step(findings) == "now"
+    assert next_step(findings[:2]) == ""

@@ -1,0 +1,52 @@
+"""The log's last lines in words."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+from dappled.daemon.health.logbook import Logbook, of_story
+from dappled.daemon.pipeline.pending_shot import Story
+from dappled.flight.records import Cause, Frame, Shot
+
+SHOT = Shot(7, Cause("console", "console", 1), 0, 0)
+FRAME = Frame(7, "frames/000007.dng", "IMG.DNG", 5_100_000, "0" * 64, 0)
+
+
+def test_lines_are_numbered_and_bounded() -> None:
+    book = Logbook(lambda: 3, capacity=4)
+    for number in range(10):
+        book.add(f"line {number}")
+    assert [line["number"] for line in book.after(0)] == [7, 8, 9, 10]
+    assert [line["text"] for line in book.after(8)] == ["line 8", "line 9"]
+    assert len(book.after(0, limit=2)) == 2
+
+
+def test_a_line_said_twice_stands_once() -> None:
+    book = Logbook(lambda: 0)
+    book.add("the camera is absent")
+    book.add("the camera is absent")
+    assert len(book.after(0)) == 1
+
+
+def test_warnings_of_the_loggers_are_kept_and_lesser_ones_not() -> None:
+    book = Logbook(lambda: 0)
+    logger = logging.Logger("dappled.test")
+    logger.addHandler(book)
+    logger.warning("link %s is gone", "a")
+    logger.info("nothing of note")
+    logger.warning("%d", "not a number")
+    texts = [line["text"] for line in book.after(0)]
+    assert texts[0] == "link a is gone"
+    assert len(texts) == 2
+    assert "TypeError" in texts[1]
+
+
+def test_a_story_in_words() -> None:
+    story = Story(SHOT, frame=FRAME)
+    assert of_story(story) == ("frame 7 is safe, 5.1 MB", "info")
+    assert of_story(replace(story, problem="not decoded: no carriers")) == (
+        "frame 7: not decoded: no carriers",
+        "warning",
+    )
+    assert of_story(Story(SHOT, problem="the mirror is stuck")) == ("shot 7: the mirror is stuck", "warning")

@@ -1,0 +1,98 @@
+"""The health record: well when all is well, and one sentence for each thing that isn't."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import jsonschema
+import pytest
+
+from dappled.config.settings import MaskSettings, MavlinkSettings, RecordSettings, Settings
+from dappled.daemon.health import record as health
+from dappled.daemon.navigation.telemetry import Telemetry
+from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.shutter import ShutterStatistics
+from dappled.daemon.stream import wire
+from dappled.daemon.stream.publisher import PublisherStatistics
+from dappled.drivers.mavlink.links import LinkStatistics
+from dappled.drivers.mavlink.signing import SigningStatistics
+from dappled.workers import Stage
+
+WELL = Settings(
+    mask=MaskSettings("mask-1"),
+    mavlink=MavlinkSettings(("udpin:127.0.0.1:1",)),
+    record=RecordSettings(warn_free_mb=0, min_free_mb=0),
+)
+S = 10**9
+LINK = LinkStatistics("udpin:127.0.0.1:1", 5, 5, 0, 0, 0, 0, 100 * S, None)
+
+
+def record(
+    folder: Path, settings: Settings = WELL, link: LinkStatistics = LINK, state: str = "ready", **more: Any
+) -> dict[str, Any]:
+    stage: Stage[int] = Stage("decode", lambda _: None, capacity=1)
+    for number in range(more.pop("items", 0)):
+        stage.put(number)
+    street = SimpleNamespace(camera_state=state, camera_reason=more.pop("reason", ""), stages=(stage,))
+    return health.record(
+        settings,
+        utc_ns=1,
+        monotonic_ns=101 * S,
+        began_monotonic_ns=more.pop("began", 90 * S),
+        street=cast(Street, street),
+        shutter=ShutterStatistics(3, 2, 1, 0, 0, 2, 0, 2, None),
+        links=[link],
+        telemetry=Telemetry().statistics(),
+        publisher=PublisherStatistics({}, {}, 0, 0, 0),
+        folder=folder,
+        utc_known=more.pop("utc_known", True),
+        dead=more.pop("dead", ()),
+        doubts=more.pop("doubts", ()),
+    )
+
+
+def test_well(tmp_path: Path) -> None:
+    found = record(tmp_path)
+    assert found["problems"] == []
+    envelope = {"schema": "dappled/health", "version": 1, "flight": "f", "seq": 0, "dropped": 0}
+    jsonschema.validate({**envelope, **found}, wire.schema("health"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"state": "absent", "reason": "nothing on the bus"}, "the camera is absent: nothing on the bus"),
+        ({"state": "faulted"}, "the camera is faulted"),
+        ({"link": replace(LINK, last_heard_monotonic_ns=95 * S)}, "nobody was heard for 5 s"),
+        ({"link": replace(LINK, last_heard_monotonic_ns=None)}, "nobody was heard for 5 s"),
+        ({"link": replace(LINK, error="link down")}, "link down"),
+        (
+            {"link": replace(LINK, last_heard_monotonic_ns=None, signing=SigningStatistics(0, 3, 1, 0, 7))},
+            "7 packets were unsigned, 3 forged, 1 too old",
+        ),
+        ({"settings": replace(WELL, mavlink=MavlinkSettings())}, "no MAVLink link is configured"),
+        ({"settings": replace(WELL, mask=MaskSettings())}, "no mask is configured"),
+        ({"settings": replace(WELL, record=RecordSettings(min_free_mb=10_000_000))}, "disk nearly full"),
+        ({"doubts": ["autopilot 7 is heard"]}, "autopilot 7 is heard"),
+        ({"utc_known": False}, "UTC is not known yet"),
+        ({"settings": replace(WELL, record=RecordSettings(warn_free_mb=10_000_000))}, "the disk is filling up"),
+        ({"dead": ["mavlink 0"]}, "the mavlink 0 thread has ended: restart dappled"),
+        ({"dead": ["capture"]}, "the capture thread has ended: restart dappled"),
+        ({"items": 3}, "decode fell behind: 2 frames are only in the record"),
+    ],
+)
+def test_one_problem_one_sentence(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+    (problem,) = record(tmp_path, **changes)["problems"]
+    assert words in problem
+
+
+def test_a_start_is_no_problem(tmp_path: Path) -> None:
+    silent = replace(LINK, last_heard_monotonic_ns=None)
+    assert record(tmp_path, link=silent, state="starting", began=100 * S)["problems"] == []
+
+
+def test_a_folder_that_is_gone_is_unknown_not_zero(tmp_path: Path) -> None:
+    assert record(tmp_path / "gone")["disk"]["free_bytes"] is None

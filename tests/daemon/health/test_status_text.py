@@ -1,0 +1,61 @@
+"""What the pilot is told of problems: each once, and that they are gone."""
+
+from __future__ import annotations
+
+from dappled.daemon.health.status_text import AGAIN_NS, AWAY_NS, PIECE_BYTES, Alarms, Audience, PilotLines
+from dappled.drivers.mavlink.links import Message, mavlink
+
+
+def test_a_problem_is_told_once_though_its_numbers_change_and_its_end_too() -> None:
+    alarms = Alarms()
+    warning, info = mavlink.MAV_SEVERITY_WARNING, mavlink.MAV_SEVERITY_INFO
+    assert alarms.lines([]) == []
+    assert alarms.lines(["409 MB left"]) == [("409 MB left", warning)]
+    troubled = [alarms.troubled]
+    assert alarms.lines(["408 MB left", "no camera"]) == [("no camera", warning)]
+    assert alarms.lines(["407 MB left"]) == []
+    assert alarms.lines([]) == [("all is well again", info)]
+    assert [*troubled, alarms.troubled] == [True, False]
+    assert alarms.lines(["409 MB left"]) == [("409 MB left", warning)]
+
+
+def test_a_sentence_goes_in_pieces_and_not_twice_in_ten_seconds() -> None:
+    lines = PilotLines()
+    text = "x" * (PIECE_BYTES + 5)
+    assert len(lines.messages(text, 4, 0)) == 2
+    assert lines.messages(text, 4, 9 * 10**9) == []
+    assert len(lines.messages(text, 4, 10 * 10**9)) == 2
+
+
+def test_what_lasts_is_told_again_when_it_is_asked_for() -> None:
+    alarms = Alarms()
+    alarms.lines(["no camera"])
+    assert alarms.lines(["no camera"], again=True) == [("no camera", mavlink.MAV_SEVERITY_WARNING)]
+    assert alarms.lines([], again=True) == [("all is well again", mavlink.MAV_SEVERITY_INFO)]
+    assert alarms.lines([], again=True) == []
+
+
+def heartbeat(system: int, kind: int = mavlink.MAV_TYPE_GCS) -> Message:
+    message = mavlink.MAVLink_heartbeat_message(kind, 8, 0, 0, 4, 3)
+    packer = mavlink.MAVLink(None, system, 190)
+    message.pack(packer)
+    return packer.decode(bytearray(message.get_msgbuf()))
+
+
+def test_a_ground_station_that_comes_late_or_back_is_news_once() -> None:
+    audience, now_ns = Audience(), 0
+    audience.heard(heartbeat(1, mavlink.MAV_TYPE_QUADROTOR), now_ns)
+    assert not audience.has_grown(AGAIN_NS)
+    audience.heard(heartbeat(255), now_ns)
+    assert [audience.has_grown(AGAIN_NS - 1), audience.has_grown(AGAIN_NS), audience.has_grown(AGAIN_NS)] == [
+        False,
+        True,
+        False,
+    ]
+    audience.heard(heartbeat(255), AWAY_NS)
+    assert not audience.has_grown(AWAY_NS + AGAIN_NS)  # it was there all the time
+    audience.heard(heartbeat(255), 3 * AWAY_NS)
+    assert audience.has_grown(3 * AWAY_NS + AGAIN_NS)
+    for system in range(1, 200):  # bounded, whoever invents stations
+        audience.heard(heartbeat(system), 4 * AWAY_NS)
+    assert audience.has_grown(4 * AWAY_NS + AGAIN_NS)

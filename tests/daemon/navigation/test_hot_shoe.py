@@ -1,0 +1,174 @@
+"""Which hot-shoe word belongs to which exposure, the camera's own clock, and the figures of a whole flight."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from dappled.daemon.navigation import hot_shoe
+from dappled.daemon.navigation.boot_clock import BootClock
+from dappled.daemon.navigation.camera_clock import CameraClock, exposure_from_camera, shown
+from dappled.daemon.navigation.hot_shoe import Feedback
+from dappled.daemon.navigation.telemetry import Telemetry
+from dappled.daemon.pipeline.tagger import BodyLatency, Exposure, mid_exposure
+from dappled.drivers.mavlink.links import Message, mavlink
+from dappled.mocks.autopilot.autopilot import BootTime, flight
+from dappled.mocks.autopilot.path import Path as FlightPath
+
+MS = 10**6
+START_NS = 1_790_000_000 * 10**9
+CLOCK = BootClock("timesync", 0, START_NS, 0.0, 0.3 * MS)
+EXPECTED = mid_exposure(START_NS + 10**9, BodyLatency(60.0, 10.0, "latency"), 0.002)
+
+
+def event(after_call_ms: float, number: int = 0) -> Feedback:
+    boot_ns = 10**9 + round(after_call_ms * MS)
+    return Feedback(number, START_NS + boot_ns, boot_ns, "CAMERA_FEEDBACK")
+
+
+def test_the_contact_is_taken_and_half_the_exposure_added() -> None:
+    chosen = hot_shoe.choose([event(55)], EXPECTED, CLOCK)
+    assert chosen == event(55)
+    better, boot_ns = hot_shoe.refined(EXPECTED, event(55), CLOCK)
+    assert boot_ns == 10**9 + 56 * MS
+    assert better.utc_ns == START_NS + boot_ns
+    assert better.source == "hot shoe (CAMERA_FEEDBACK)"
+    assert MS <= better.sigma_ns < 1.1 * MS
+
+
+@pytest.mark.parametrize("after_call_ms", [-200, -30, 0, 2.5])
+def test_the_word_for_a_mere_wish_is_not_taken(after_call_ms: float) -> None:
+    assert hot_shoe.choose([event(after_call_ms)], EXPECTED, CLOCK) is None
+    assert hot_shoe.choose([event(after_call_ms), event(64, 1)], EXPECTED, CLOCK) == event(64, 1)
+
+
+def test_what_is_far_off_or_of_two_minds_is_not_taken() -> None:
+    assert hot_shoe.choose([event(152)], EXPECTED, CLOCK) is None
+    assert hot_shoe.choose([event(50), event(71, 1)], EXPECTED, CLOCK) is None
+    assert hot_shoe.choose([event(55), event(55, 1)], EXPECTED, CLOCK) == event(55)  # the same, on a second link
+    assert hot_shoe.choose([event(55)], Exposure(EXPECTED.utc_ns, 10 * MS, "given"), CLOCK) is None
+
+
+def made(message: Message, component: int = 1) -> Message:
+    message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=component))
+    return message
+
+
+@pytest.mark.parametrize("kind", ["CAMERA_FEEDBACK", "CAMERA_TRIGGER"])
+@pytest.mark.parametrize("epoch", ["boot", "gps"])
+def test_feedback_in_either_epoch_places_the_frame(kind: str, epoch: str) -> None:
+    """The packets a replay was given as limit decide, not those read since."""
+    boot, path, number = BootTime(), FlightPath(3), 0
+    telemetry = Telemetry()
+    contact_s = 8.0585
+
+    def feed(t_s: float, message: Message) -> None:
+        nonlocal number
+        telemetry.feed(number, START_NS // 1000 + round(t_s * 1e6), made(message))
+        number += 1
+
+    limit = 0
+    for t_s, message in flight(path, boot, 0, 10):
+        if limit == 0 and t_s > contact_s + 0.3:
+            limit = number
+            time_us = boot.ns(contact_s) // 1000 if epoch == "boot" else START_NS // 1000 + round(contact_s * 1e6)
+            told = (
+                mavlink.MAVLink_camera_trigger_message(time_us, 1)
+                if kind == "CAMERA_TRIGGER"
+                else mavlink.MAVLink_camera_feedback_message(time_us, 1, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+            )
+            feed(t_s, told)
+        if message.get_type() == "SYSTEM_TIME":
+            message.time_unix_usec = START_NS // 1000 + round(t_s * 1e6)
+        feed(t_s, message)
+    expected = mid_exposure(START_NS + 8 * 10**9, BodyLatency(60.0, 10.0, "latency"), None)
+    exposure, pose = telemetry.locate(expected)
+    assert exposure.source == f"hot shoe ({kind})"
+    assert exposure.utc_ns == pytest.approx(START_NS + contact_s * 1e9, abs=2 * MS)
+    assert pose.boot_us is not None
+    assert pose.boot_us == pytest.approx(boot.ns(contact_s) / 1e3, abs=1500)
+    before, _ = telemetry.locate(expected, upto_packet=limit)
+    assert before == expected
+    assert telemetry.statistics().feedbacks == 1
+
+
+def test_the_cameras_clock_is_learnt_from_shots() -> None:
+    clock, offset_ns = CameraClock(), -3_600_370 * MS
+    for number in range(100):
+        begin_ns = START_NS + number * 1_370 * MS
+        known = Exposure(begin_ns + MS, 10 * MS, "latency", MS)
+        assert (exposure_from_camera(clock, 0, 10**9, None) is None) == (number < 3)
+        clock = clock.learnt((begin_ns + offset_ns) // 10**9 * 10**9, 10**9, known)
+    found = clock.offset_ns()
+    assert found is not None
+    assert abs(found[0] - offset_ns) < 4 * found[1]
+    exposure = exposure_from_camera(clock, (START_NS + offset_ns) // 10**9 * 10**9, 10**9, 0.002)
+    assert exposure is not None
+    assert abs(exposure.utc_ns - START_NS - MS) <= 0.6 * 10**9
+    assert exposure.sigma_ns == pytest.approx(290 * MS, rel=0.02)
+
+
+def test_a_camera_clock_that_was_set_is_learnt_anew() -> None:
+    clock = CameraClock()
+    for number in range(8):
+        begin_ns = START_NS + number * 10**9
+        offset_ns = 0 if number < 5 else 3_600 * 10**9
+        clock = clock.learnt(begin_ns + offset_ns, 10**9, Exposure(begin_ns, MS, "latency"))
+        assert (clock.offset_ns() is None) == (number in (0, 1, 5, 6))
+    found = clock.offset_ns()
+    assert found is not None
+    assert abs(found[0] - 3_600 * 10**9) <= 10**9
+
+
+def test_what_exif_shows() -> None:
+    assert shown("1970-01-02T00:00:01") == (86_401 * 10**9, 10**9)
+    assert shown("1970-01-01T00:00:01.25") == (1_250 * MS, 10 * MS)
+    assert shown("not a time") is None
+    assert shown("1970-01-01T00:00:01.x") is None
+    assert shown(None) is None
+
+
+def benchmark() -> ModuleType:
+    file = Path(__file__).parents[3] / "benchmarks" / "pose.py"
+    spec = importlib.util.spec_from_file_location("pose_benchmark", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_flight_is_placed_as_well_as_promised_and_says_so(seed: int) -> None:
+    """The body's latency has σ = 10 ms: 15 cm and 0.30° at this speed and turn, and a fifteenth by chance."""
+    figures: dict[str, Any] = benchmark().measure(300, seed)
+    assert figures["hot_shoe"]["position_rms_m"] <= 0.03
+    assert figures["hot_shoe"]["attitude_rms_deg"] <= 0.05
+    assert figures["body_latency"]["position_rms_m"] <= 0.16
+    assert figures["body_latency"]["attitude_rms_deg"] <= 0.32
+    for row in figures.values():
+        assert row["frames"] >= 297
+        for what in ("time", "position", "attitude"):
+            assert 0.8 <= row[f"{what}_sigma_over_error"] <= 1.2, what
+
+
+def test_each_sample_of_a_real_flight_is_predicted_by_its_neighbours(shared_data: Path) -> None:
+    """A copter, one sample in half a second: with one left out a second is bridged, and the doubt is as large as the
+    error."""
+    rows: dict[str, Any] = benchmark().leave_one_out(shared_data / "telemetry" / "dronekit-flight.tlog")
+    assert rows["position_m"]["samples"] > 2600
+    assert rows["attitude_deg"]["samples"] > 2800
+    assert rows["position_m"]["median"] < 0.05
+    assert rows["position_m"]["rms"] < 0.2
+    assert rows["attitude_deg"]["median"] < 0.05
+    for row in rows.values():
+        assert 0.8 <= row["doubt_over_error"] <= 1.2
+        assert row["within_2_doubts"] > 0.9
+        assert row["refused"] < 20

@@ -1,0 +1,135 @@
+"""What a machine knows of UTC, and how it is learnt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dappled.daemon.navigation import utc
+from dappled.daemon.navigation.telemetry import Telemetry, UtcCorrection
+from dappled.daemon.navigation.utc import FLOOR_NS, UtcLearner
+from dappled.drivers.mavlink.links import mavlink
+from dappled.errors import DappledError
+from dappled.mocks.autopilot.autopilot import BootTime, flight
+from dappled.mocks.autopilot.path import Path as FlightPath
+
+NOW_NS = FLOOR_NS + 10**18
+
+
+def machine(root: Path, *, board: bool, clock: bool) -> Path:
+    if board:
+        (root / "proc/device-tree").mkdir(parents=True)
+        (root / "proc/device-tree/model").write_text("Raspberry Pi 4 Model B")
+    if clock:
+        (root / "sys/class/rtc/rtc0").mkdir(parents=True)
+    return root
+
+
+@pytest.mark.parametrize(
+    ("board", "clock", "synchronised", "knows"),
+    [(True, False, False, False), (True, False, True, True), (True, True, False, True), (False, False, False, True)],
+)
+def test_a_board_without_a_clock_knows_utc_only_from_the_network(
+    tmp_path: Path, board: bool, clock: bool, synchronised: bool, knows: bool
+) -> None:
+    root = machine(tmp_path, board=board, clock=clock)
+    assert utc.system_knows(NOW_NS, synchronised=lambda: synchronised, root=root) is knows
+
+
+def test_where_the_kernel_may_not_be_asked_timesyncd_s_mark_tells(tmp_path: Path) -> None:
+    root = machine(tmp_path, board=True, clock=False)
+    mark = root / "run/systemd/timesync/synchronized"
+    mark.parent.mkdir(parents=True)
+    assert not utc.system_knows(NOW_NS, synchronised=lambda: False, root=root)
+    mark.touch()
+    assert utc.system_knows(NOW_NS, synchronised=lambda: False, root=root)
+
+
+def test_a_clock_that_was_never_set_is_not_believed(tmp_path: Path) -> None:
+    assert not utc.system_knows(FLOOR_NS - 1, synchronised=lambda: True, root=tmp_path)
+    assert not utc.known("auto", 10**18)
+
+
+def test_a_person_may_say_so() -> None:
+    assert utc.known("system", 0)
+    assert not utc.known("autopilot", NOW_NS)
+
+
+def test_the_kernel_can_be_asked() -> None:
+    assert utc.kernel_synchronised() in (True, False)
+
+
+def test_the_first_word_is_noted_and_then_only_much_better_ones() -> None:
+    noted: list[UtcCorrection] = []
+    learner = UtcLearner(known=False, note=noted.append)
+    assert learner.utc_ns(5) is None
+    learner.look(None)
+    assert not learner.known
+    for correction_ns, sigma_ns in ((100, 50), (101, 40), (102, 25), (103, 24)):
+        learner.look(UtcCorrection(correction_ns, sigma_ns, "test"))
+    assert [one.correction_ns for one in noted] == [100, 102]
+    assert learner.utc_ns(5) == 107
+    assert learner.known
+
+
+def test_what_could_not_be_noted_is_tried_again() -> None:
+    refusals = iter([DappledError("the disk is full")])
+
+    def note(_: UtcCorrection) -> None:
+        for error in refusals:
+            raise error
+
+    learner = UtcLearner(known=False, note=note)
+    with pytest.raises(DappledError):
+        learner.look(UtcCorrection(1, 1, "test"))
+    assert learner.learnt is None
+    learner.look(UtcCorrection(1, 1, "test"))
+    assert learner.learnt is not None
+
+
+def test_a_machine_that_knows_learns_nothing() -> None:
+    learner = UtcLearner(known=True, note=lambda _: pytest.fail("nothing to note"))
+    learner.look(UtcCorrection(1, 1, "test"))
+    assert learner.utc_ns(5) == 5
+
+
+S = 10**9
+
+
+@pytest.mark.parametrize(
+    ("correction_ns", "sigma_ns", "said"),
+    [
+        (3600 * S, S // 100, "3600 s slow"),
+        (-3600 * S, S // 100, "3600 s fast"),
+        (2 * S, S // 100, "2 s slow"),
+        (S // 2, 0, None),
+        (3 * S, S, None),  # nobody knows it that well
+    ],
+)
+def test_a_clock_that_is_believed_and_wrong_is_told(correction_ns: int, sigma_ns: int, said: str | None) -> None:
+    learner = UtcLearner(known=True, note=lambda _: pytest.fail("nothing to note"))
+    assert learner.doubt() is None
+    learner.look(UtcCorrection(correction_ns, sigma_ns, "test"))
+    learner.look(None)  # the autopilot was silent for a moment
+    told = learner.doubt()
+    assert (told is None) if said is None else (told is not None and said in told)
+    assert learner.utc_ns(5) == 5
+    unsure = UtcLearner(known=False, note=lambda _: None)
+    unsure.look(UtcCorrection(correction_ns, sigma_ns, "test"))
+    assert unsure.doubt() is None
+
+
+def test_the_autopilots_satellites_tell_what_is_missing() -> None:
+    """Our clock began in 1970; the autopilot sends SYSTEM_TIME, first without a time, then with."""
+    telemetry, truth_ns = Telemetry(), 1_790_000_000 * 10**9
+    for number, (t_s, message) in enumerate(flight(FlightPath(3), BootTime(), 0, 6)):
+        if message.get_type() == "SYSTEM_TIME" and t_s > 3:
+            message.time_unix_usec = truth_ns // 1000 + round(t_s * 1e6)
+        message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
+        telemetry.feed(number, round((100 + t_s) * 1e6), message)
+        found = telemetry.utc_correction()
+        assert (found is None) or t_s > 3
+    assert found is not None
+    assert found.correction_ns == pytest.approx(truth_ns - 100 * 10**9, abs=6e6)
+    assert 0 < found.sigma_ns < 10**7

@@ -1,0 +1,122 @@
+"""The decode process: it may die, hang or meet nonsense; that costs one sentence, and the next frame is decoded."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dappled.daemon.pipeline.decode_process import DevelopmentError, WorkerDeveloper
+from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.restart_budget import RestartBudget
+from dappled.mocks.scene.masked_camera import reference_camera
+from tests.daemon.fakes import eventually
+
+RECIPE = Recipe("reference-36mm", "reference-5x5")
+
+
+@pytest.fixture(scope="module")
+def frame(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("frame") / "good.dng"
+    path.write_bytes(reference_camera(1, scale=0.5, scene="white").bench_frame().file)
+    return str(path)
+
+
+@pytest.fixture
+def developer() -> Iterator[WorkerDeveloper]:
+    one = WorkerDeveloper(RECIPE)
+    yield one
+    one.close()
+
+
+def pid(developer: WorkerDeveloper) -> int:
+    assert developer._process is not None
+    return developer._process.pid
+
+
+def test_bad_frames_cost_nothing_but_themselves(developer: WorkerDeveloper, frame: str, tmp_path: Path) -> None:
+    junk = tmp_path / "junk.dng"
+    junk.write_bytes(b"II*\0" + bytes(range(256)) * 100)
+    for path in (str(junk), str(tmp_path / "nothing.dng"), str(tmp_path)):
+        with pytest.raises(DevelopmentError) as caught:
+            developer.develop(path, None, None)
+        assert path in str(caught.value)
+        assert "\n" not in str(caught.value)
+    done = developer.develop(frame, None, None)
+    assert hashlib.sha256(done.body).hexdigest() == done.sha256
+    assert done.arrays[0]["shape"][0] == len(done.carriers)
+    assert done.preview.startswith(b"\xff\xd8")
+    assert developer.restarts == 0
+
+
+def test_a_recipe_that_can_t_work_is_told_at_the_warm_up() -> None:
+    developer = WorkerDeveloper(Recipe("reference-36mm", "no-such-mask"))
+    with pytest.raises(DevelopmentError, match="no-such-mask"):
+        developer.warm_up()
+    developer.close()
+
+
+def test_a_worker_that_died_between_two_frames_is_replaced_unseen(developer: WorkerDeveloper, frame: str) -> None:
+    first = developer.develop(frame, None, None)
+    os.kill(pid(developer), signal.SIGKILL)
+    assert developer._process is not None
+    developer._process.wait(5)
+    assert developer.develop(frame, None, None).sha256 == first.sha256
+    assert developer.restarts == 1
+
+
+def test_a_worker_that_hangs_is_given_up_and_replaced(frame: str) -> None:
+    developer = WorkerDeveloper(RECIPE, timeout_s=20.0)
+    developer.warm_up()
+    os.kill(pid(developer), signal.SIGSTOP)
+    developer._timeout_s = 0.2
+    with pytest.raises(DevelopmentError, match="given up"):
+        developer.develop(frame, None, None)
+    developer._timeout_s = 20.0
+    assert developer.develop(frame, None, None).sha256
+    developer.close()
+
+
+def test_a_worker_that_keeps_dying_is_not_started_without_end(frame: str) -> None:
+    now_ns = [0]
+    budget = RestartBudget(limit=2, window_s=60.0)
+    developer = WorkerDeveloper(RECIPE, budget=budget, clock_ns=lambda: now_ns[0])
+    for _ in range(2):
+        developer.warm_up()
+        os.kill(pid(developer), signal.SIGKILL)
+        assert developer._process is not None
+        developer._process.wait(5)
+    now_ns[0] = 20 * 10**9
+    with pytest.raises(DevelopmentError, match="keeps dying: it starts again in 40 s"):
+        developer.develop(frame, None, None)
+    now_ns[0] = 61 * 10**9
+    assert developer.develop(frame, None, None).sha256
+    developer.close()
+
+
+@pytest.mark.timeout(40)  # the frame itself would take for ever
+def test_close_does_not_wait_for_a_frame_in_hand(frame: str) -> None:
+    developer = WorkerDeveloper(RECIPE, timeout_s=3600)
+    developer.warm_up()
+    os.kill(pid(developer), signal.SIGSTOP)
+    problems: list[Exception] = []
+
+    def develop() -> None:
+        try:
+            developer.develop(frame, None, None)
+        except DevelopmentError as error:
+            problems.append(error)
+
+    thread = threading.Thread(target=develop)
+    thread.start()
+    eventually(developer._turn.locked, "it is at work")
+    developer.close()
+    thread.join(5)
+    assert len(problems) == 1
+    with pytest.raises(DevelopmentError, match="stopped"):
+        developer.develop(frame, None, None)

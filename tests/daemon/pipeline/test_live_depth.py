@@ -1,0 +1,138 @@
+"""Depth in flight: one frame now and then, and never in anybody's way."""
+
+from __future__ import annotations
+
+import mmap
+import threading
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+
+from dappled.daemon.pipeline.decode_process import DepthFound, Developed, DevelopmentError
+from dappled.daemon.pipeline.live_depth import LiveDepth
+from dappled.daemon.pipeline.pending_shot import Story
+from dappled.daemon.pipeline.tagger import Exposure, tag
+from dappled.daemon.pipeline.tagger import Settings as Shown
+from dappled.daemon.stream import wire
+from dappled.flight.records import Cause, Frame, Shot
+from tests.daemon.fakes import eventually, no_pose
+
+
+class FakeMaker:
+    """Finds the same depth in every frame, or fails."""
+
+    def __init__(self) -> None:
+        self.gate = threading.Event()
+        self.gate.set()
+        self.problem = ""
+        self.nearest_m: tuple[float, float] | None = None
+        self.asked: list[tuple[str, str]] = []
+        self.closed = False
+
+    def close(self) -> None:
+        self.closed = True
+
+    def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> DepthFound:
+        self.asked.append((path, method))
+        assert self.gate.wait(20)
+        if self.problem:
+            raise DevelopmentError(self.problem)
+        body = mmap.mmap(-1, 48)
+        both = np.zeros((2, 2, 3), dtype=np.float32)
+        body.write(both.tobytes())
+        arrays = [wire.describe_array(name, both[0], "px") for name in ("disparity", "sigma")]
+        return DepthFound(body, arrays, [-0.5, 0.5], [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]], "geometric", self.nearest_m)
+
+
+def story(index: int, *, decoded: bool = True) -> Story:
+    frame = Frame(index, f"frames/{index}.dng", "IMG.DNG", 10, "0" * 64, 0)
+    exposure = Exposure(0, 1, "test")
+    made = tag(frame, exposure, Shown(50.0, 8.0, 0.01, 100.0), camera="c", mask="m", pose=no_pose())
+    developed = None
+    if decoded:
+        grid = [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]
+        developed = Developed(mmap.mmap(-1, 16), "0" * 64, [], [], "measured", 0, 0, "geometric", grid, b"", (0, 0))
+    return Story(Shot(index, Cause("t", "t"), 0, 0), frame=frame, tag=made, developed=developed)
+
+
+class Bench:
+    """Live depth with a clock that the test turns, and what it published."""
+
+    def __init__(self, interval_s: float = 5.0) -> None:
+        self.maker, self.now_s = FakeMaker(), 0.0
+        self.published: list[tuple[str, dict[str, Any], Any]] = []
+        self.nearest: list[tuple[float, float]] = []
+        self.depth = LiveDepth(
+            self.maker,
+            method="gradient",
+            interval_s=interval_s,
+            path=lambda one: one.frame.name if one.frame else "",
+            publish=lambda topic, facts, body: self.published.append((topic, dict(facts), body)),
+            tell=self.nearest.append,
+            clock=lambda: self.now_s,
+        )
+
+
+@pytest.fixture
+def bench() -> Any:
+    one = Bench()
+    one.depth.start()
+    yield one
+    one.maker.gate.set()
+    one.depth.stop()
+
+
+def test_a_message_as_the_schema_says(bench: Bench) -> None:
+    bench.depth.offer(story(3))
+    eventually(lambda: bench.published, "it is published")
+    ((topic, facts, body),) = bench.published
+    assert topic == "depth"
+    envelope = {"schema": "dappled/depth", "version": 1, "flight": "f", "seq": 0, "dropped": 0}
+    header = {**envelope, **facts}
+    jsonschema.validate(header, wire.schema("depth"))
+    arrays = wire.Message("depth", header, body).arrays()
+    assert [arrays[name].shape for name in ("disparity", "sigma")] == [(2, 3), (2, 3)]
+    assert bench.maker.asked == [("frames/3.dng", "gradient")]
+
+
+def test_not_more_often_than_asked_for(bench: Bench) -> None:
+    for index in range(5):
+        bench.depth.offer(story(index))
+    eventually(lambda: len(bench.published) == 1, "the first")
+    bench.now_s = 5.0
+    bench.depth.offer(story(9))
+    eventually(lambda: len(bench.published) == 2, "the next that is due")
+    assert [path for path, _ in bench.maker.asked] == ["frames/0.dng", "frames/9.dng"]
+
+
+def test_a_slow_one_loses_the_older_frame(bench: Bench) -> None:
+    bench.maker.gate.clear()
+    for index in range(4):
+        bench.now_s += 10
+        bench.depth.offer(story(index))
+        eventually(lambda: bench.maker.asked, "the first is in hand")
+    bench.maker.gate.set()
+    eventually(lambda: len(bench.published) == 2, "the first and the newest")
+    assert [path for path, _ in bench.maker.asked] == ["frames/0.dng", "frames/3.dng"]
+    assert bench.depth.statistics().dropped == 2
+
+
+def test_what_was_not_decoded_has_no_depth_and_a_failure_is_counted(bench: Bench) -> None:
+    bench.depth.offer(story(0, decoded=False))
+    bench.maker.problem = "no carriers"
+    bench.depth.offer(story(1))
+    eventually(lambda: bench.depth.statistics().failed == 1, "it failed")
+    assert [path for path, _ in bench.maker.asked] == ["frames/1.dng"]
+    assert bench.published == []
+
+
+def test_the_nearest_distance_is_told_where_it_is_known(bench: Bench) -> None:
+    bench.depth.offer(story(0))
+    eventually(lambda: len(bench.published) == 1, "without metres")
+    bench.maker.nearest_m = (7.5, 0.2)
+    bench.now_s = 10
+    bench.depth.offer(story(1))
+    eventually(lambda: bench.nearest, "it is told")
+    assert bench.nearest == [(7.5, 0.2)]

@@ -1,0 +1,374 @@
+"""The street with a camera that does what the test says: each shot ends once, and the record says how."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from dappled.daemon.navigation import camera_clock
+from dappled.daemon.pipeline import capture, tagger
+from dappled.drivers.camera import Blob, CameraError, Companion, Deferred, Event
+from dappled.flight import check, summary
+from dappled.flight.records import ShotState
+from tests.daemon.fakes import FakeCamera, arrival, eventually, failed, fired, good, rig
+
+
+def states(flight: Path) -> dict[int, ShotState]:
+    return {line.row.shot.index: line.row.state for line in summary.show(flight).lines}
+
+
+def test_a_shot_goes_all_the_way(tmp_path: Path) -> None:
+    with rig(tmp_path) as one:
+        assert one.wish(1).index == 0
+        story = one.ended(0)
+        assert story.problem == ""
+        assert story.frame is not None
+        assert story.tag is not None
+        assert story.developed is not None
+        assert (one.settled, one.tagged, one.camera.released) == ([(0, True)], [0], [0])
+        assert one.flight.ledger.result(0) is not None
+    assert one.camera.stopped
+    assert check.check(one.flight.folder.path).intact
+
+
+def test_a_driver_that_raises_fails_the_shot_and_the_next_works(tmp_path: Path) -> None:
+    def script(shot: int) -> list[Event | Exception]:
+        return [CameraError("no film")] if shot == 0 else good(shot)
+
+    with rig(tmp_path, script) as one:
+        assert one.wish(1).outcome == "shot"
+        assert "no film" in one.ended(0).problem
+        one.wish(2)
+        assert one.ended(1).frame is not None
+        assert one.settled == [(0, False), (1, True)]
+    assert states(one.flight.folder.path) == {0: "failed", 1: "safe"}
+
+
+def test_a_driver_s_bug_in_next_event_does_not_end_the_capture(tmp_path: Path) -> None:
+    with rig(tmp_path, lambda shot: [RuntimeError("bug"), *good(shot)]) as one:
+        one.wish(1)
+        assert one.ended(0).frame is not None
+
+
+def test_a_file_that_comes_twice_is_one_frame(tmp_path: Path) -> None:
+    with rig(tmp_path, lambda shot: [*good(shot), arrival(shot)]) as one:
+        one.wish(1)
+        one.ended(0)
+        eventually(lambda: len(one.camera.released) == 2, "the second is released too")
+        assert (len(one.stories), one.settled, one.tagged) == (1, [(0, True)], [0])
+        assert any(line.startswith("double: ") for line in one.events())
+
+
+def test_a_second_file_of_a_shot_is_a_stray_and_undoes_nothing(tmp_path: Path) -> None:
+    with rig(tmp_path, lambda shot: [*good(shot), arrival(shot, b"other")]) as one:
+        assert one.developer is not None
+        one.developer.gate.clear()  # the first is still on the street
+        one.wish(1)
+        eventually(one.flight.ledger.strays, "the stray")
+        one.developer.gate.set()
+        assert one.ended(0).problem == ""
+        assert one.settled == [(0, True)]
+    assert check.check(one.flight.folder.path).intact
+
+
+def test_a_failure_after_the_file_undoes_nothing(tmp_path: Path) -> None:
+    with rig(tmp_path, lambda shot: [*good(shot), failed(shot)]) as one:
+        one.wish(1)
+        assert one.ended(0).problem == ""
+        eventually(lambda: one.camera.released, "released")
+    assert (states(one.flight.folder.path), one.settled) == ({0: "safe"}, [(0, True)])
+
+
+def test_a_file_after_the_failure_is_a_frame_after_all(tmp_path: Path) -> None:
+    with rig(tmp_path) as one:
+        one.camera.script = lambda shot: [fired(shot), failed(shot)]
+        one.wish(1)
+        assert one.ended(0).problem == "the mirror is stuck"
+        one.camera.say(arrival(0))
+        eventually(lambda: one.flight.ledger.result(0), "it is decoded too")
+        assert one.settled == [(0, False), (0, True)]
+        assert one.tagged == [0, 0]
+        assert any(line.startswith("late: ") for line in one.events())
+    assert len(one.stories) == 1
+    assert states(one.flight.folder.path) == {0: "safe"}
+
+
+def test_a_trigger_told_after_the_file_does_not_change_the_tag(tmp_path: Path) -> None:
+    with rig(tmp_path, lambda shot: [arrival(shot), fired(shot)]) as one:
+        one.wish(1)
+        story = one.ended(0)
+        assert story.tag is not None
+        assert story.tag.utc_ns == story.shot.wished_utc_ns + 60_000_000
+        assert any(line.startswith("untimed: ") for line in one.events())
+
+
+def test_a_file_of_nobody_is_a_stray(tmp_path: Path) -> None:
+    with rig(tmp_path) as one:
+        one.camera.say(arrival(None))
+        one.camera.say(arrival(77))
+        eventually(lambda: len(one.flight.ledger.strays()) == 2, "two strays")
+    assert not one.stories
+    assert check.check(one.flight.folder.path).intact
+
+
+def test_an_empty_file_fails_the_shot(tmp_path: Path) -> None:
+    with rig(tmp_path) as one:
+        one.camera.script = lambda shot: [fired(shot)]
+        one.wish(1)
+        empty = arrival(0, b"x")
+        one.camera.say(type(empty)(0, empty.name, type(empty.blob)(empty.blob.fd, 0), empty.monotonic_ns))
+        assert "empty" in one.ended(0).problem
+        assert one.settled == [(0, False)]
+
+
+def test_a_shot_that_brings_nothing_fails_when_the_flight_ends(tmp_path: Path) -> None:
+    with rig(tmp_path, lambda _: [], stop_s=0.1) as one:
+        one.wish(1)
+    assert one.settled == [(0, False)]
+    assert "the flight ended" in one.ended(0).problem
+    assert states(one.flight.folder.path) == {0: "failed"}
+
+
+def test_a_file_that_comes_as_the_camera_is_let_go_of_is_taken_though_the_driver_raises(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(capture, "_LAST_EVENTS_S", 20.0)
+
+    class Late(FakeCamera):
+        """Finishes its last file when it is stopped, with a bug on the way."""
+
+        def stop(self) -> None:
+            self._events.put(RuntimeError("bug"))
+            self.say(arrival(0))
+
+    with rig(tmp_path, camera=Late(lambda shot: [fired(shot)]), stop_s=0.1) as one:
+        one.wish(1)
+    assert one.settled == [(0, True)]
+    assert states(one.flight.folder.path) == {0: "safe"}
+
+
+def test_a_watcher_that_raises_stops_nobody(tmp_path: Path) -> None:
+    with rig(tmp_path) as one:
+        stories = one.stories
+        one.stories = None  # type: ignore[assignment]  # as a bug in a watcher would
+        one.wish(1)
+        eventually(lambda: one.flight.ledger.result(0), "decoded all the same")
+        one.stories = stories
+        one.wish(2)
+        assert one.ended(1).problem == ""
+
+
+def test_a_full_decode_queue_leaves_frames_in_the_record(tmp_path: Path) -> None:
+    with rig(tmp_path, queue_=1) as one:
+        assert one.developer is not None
+        one.developer.gate.clear()
+        one.wish(1)
+        eventually(lambda: one.developer and one.developer.seen, "the first is being decoded")
+        for number in (2, 3, 4):
+            one.wish(number)
+        assert "the queue was full" in one.ended(3).problem
+        one.developer.gate.set()
+        assert one.ended(1).problem == ""
+    assert set(states(one.flight.folder.path).values()) == {"safe"}
+    assert len(one.stories) == 4
+
+
+def test_a_frame_that_does_not_decode_is_told_and_the_next_does(tmp_path: Path) -> None:
+    with rig(tmp_path) as one:
+        assert one.developer is not None
+        one.developer.problem = "no carriers"
+        one.wish(1)
+        assert one.ended(0).problem == "not decoded: no carriers"
+        one.developer.problem = ""
+        one.wish(2)
+        assert one.ended(1).problem == ""
+        assert "not decoded: no carriers" in one.events()
+
+
+def test_frames_are_told_as_left_undecoded_where_that_was_switched_off(tmp_path: Path) -> None:
+    with rig(tmp_path) as one:
+        for number, decoding in enumerate((True, False, True)):
+            one.street.decoding = decoding
+            one.wish(number)
+            story = one.ended(number)
+            assert ((story.developed is not None), story.problem) == (decoding, "")
+        assert [text for text in one.events() if text.startswith("not decoded")] == [
+            "not decoded: decoding was switched off"
+        ]
+
+
+def test_a_flight_that_decodes_nothing_tells_it_of_no_frame(tmp_path: Path) -> None:
+    with rig(tmp_path, decode=False) as one:
+        one.wish(1)
+        assert one.ended(0).problem == ""
+        assert not any(text.startswith("not decoded") for text in one.events())
+
+
+@pytest.mark.parametrize("method", ["fired", "add_tag", "add_result", "add_event", "safe"])
+def test_a_ledger_that_refuses_once_costs_one_shot_at_most(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    with rig(tmp_path) as one:
+        with monkeypatch.context() as broken:
+
+            def refuse(*_: object) -> None:
+                raise RuntimeError("nobody foresaw this")
+
+            broken.setattr(one.flight.ledger, method, refuse)
+            one.wish(1)
+            one.ended(0)
+        one.wish(2)
+        assert one.ended(1).problem == ""
+        assert one.ended(1).developed is not None
+    assert len(one.stories) == 2
+    assert states(one.flight.folder.path)[1] == "safe"
+
+
+PIECES = ("fired", "file", "other file", "failed", "stray", "foreign", "bug")
+
+
+@st.composite
+def scripts(draw: st.DrawFn) -> list[tuple[str, int]]:
+    """For one shot: what is said, and how many shots later."""
+    return draw(st.lists(st.tuples(st.sampled_from(PIECES), st.integers(0, 2)), max_size=5))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(scripts(), st.booleans(), st.booleans()), min_size=1, max_size=5))
+def test_every_wish_is_one_shot_and_every_shot_ends_once(plan: list[tuple[list[tuple[str, int]], bool, bool]]) -> None:
+    """Events out of order, twice, late, missing, of nobody, exceptions: through the real street, book and shutter."""
+    late: dict[int, list[tuple[str, int]]] = {}
+
+    def event(piece: str, shot: int) -> Event | Exception:
+        made: dict[str, Callable[[], Event | Exception]] = {
+            "fired": lambda: fired(shot),
+            "file": lambda: arrival(shot),
+            "other file": lambda: arrival(shot, b"other", "IMG_9999.CR2"),
+            "failed": lambda: failed(shot),
+            "stray": lambda: arrival(None),
+            "foreign": lambda: arrival(shot + 100),
+            "bug": lambda: RuntimeError("a driver's bug"),
+        }
+        return made[piece]()
+
+    def script(shot: int) -> list[Event | Exception]:
+        words, raises, _ = plan[shot]
+        for piece, delay in words:
+            late.setdefault(shot + delay, []).append((piece, shot))
+        said = [event(piece, whose) for piece, whose in late.pop(shot, [])]
+        return [CameraError("it will not"), *said] if raises else said
+
+    with tempfile.TemporaryDirectory() as folder:
+        with rig(Path(folder), script, stop_s=0.05) as one:
+            for number, (_, _, twice) in enumerate(plan):
+                verdict = one.wish(number)
+                assert (verdict.outcome, verdict.index) == ("shot", number)
+                if twice:
+                    assert (one.wish(number).outcome, one.wish(number).index) == ("duplicate", number)
+        flight = one.flight.folder.path
+        assert check.check(flight).problems == ()
+        balance = summary.report(flight)
+        assert balance.balanced
+        assert (balance.wishes, balance.open) == (len(plan), 0)
+        assert one.camera.fired == list(range(len(plan)))
+        assert set(states(flight).values()) <= {"safe", "failed"}
+        eventually(lambda: len(one.stories) == len(plan), "every story is told")
+        assert sorted(story.shot.index for story in one.stories) == list(range(len(plan)))
+        counted = one.shutter.statistics()
+        assert (counted.shots, counted.pending) == (len(plan), 0)
+        assert counted.succeeded + counted.failed == len(plan)
+        for index, state in states(flight).items():
+            assert [ok for shot, ok in one.settled if shot == index][-1] is (state == "safe")
+
+
+def with_companion(shot: int) -> list[Event | Exception]:
+    jpeg = Companion(shot, "IMG_0001.JPG", Blob.of(b"jpeg"), time.monotonic_ns())
+    return [fired(shot), arrival(shot, name="IMG_0001.CR2"), jpeg]
+
+
+def test_a_companion_stands_beside_its_frame_in_the_record(tmp_path: Path) -> None:
+    with rig(tmp_path, with_companion) as one:
+        index = one.wish(1).index
+        assert index is not None
+        one.ended(index)
+        eventually(lambda: one.camera.released == [index, index], "both copies at the camera may go")
+        (companion,) = one.flight.ledger.companions()
+        assert (companion.index, companion.name, companion.size) == (index, f"frames/{index:06d}.jpg", 4)
+        assert (one.flight.folder.path / companion.name).read_bytes() == b"jpeg"
+        assert one.flight.ledger.strays() == []
+        path = one.flight.folder.path
+    assert check.check(path).problems == ()
+
+
+def deferred(shot: int) -> list[Event | Exception]:
+    return [fired(shot), Deferred(shot, "it is on the card", time.monotonic_ns())]
+
+
+def test_a_shot_whose_file_follows_is_told_where_it_was_and_has_failed_until_then(tmp_path: Path) -> None:
+    with rig(tmp_path, deferred) as one:
+        index = one.wish(1).index
+        assert index is not None
+        story = one.ended(index)
+        assert story.where is not None
+        assert one.tagged == [index]
+        assert one.settled == [(index, False)]
+        assert one.flight.ledger.following() == {index}
+        assert f"follows: {story.follows}" in one.events()
+        one.camera.say(arrival(index))
+        eventually(lambda: one.flight.ledger.tag(index), "the tag of the file that came after all")
+        assert one.flight.ledger.following() == set()
+        assert one.flight.ledger.frame(index) is not None
+        assert len(one.stories) == 1
+        path = one.flight.folder.path
+    assert check.check(path).problems == ()
+
+
+def test_a_zoom_that_changed_is_told(tmp_path: Path) -> None:
+    frames = [jpeg_at(10.0), jpeg_at(10.0), jpeg_at(24.0)]
+
+    def zooming(shot: int) -> list[Event | Exception]:
+        return [fired(shot), arrival(shot, frames[shot], name=f"DSCF000{shot}.JPG")]
+
+    with rig(tmp_path, zooming) as one:
+        for number in range(3):
+            index = one.wish(number).index
+            assert index is not None
+            one.ended(index)
+        told = [text for text in one.events() if text.startswith("zoom")]
+    assert told == ["zoom: the focal length is 24 mm; it was 10 mm at frame 1"]
+
+
+@pytest.mark.parametrize(("doubt", "by"), [("", camera_clock.SOURCE), ("it may be another's", tagger.WISH_SOURCE)])
+def test_a_shot_in_doubt_teaches_no_time(tmp_path: Path, doubt: str, by: str) -> None:
+    taken = time.strftime("%Y:%m:%d %H:%M:%S", time.gmtime())
+
+    def script(shot: int) -> list[Event | Exception]:
+        came = replace(arrival(shot, jpeg_at(10.0, taken), "A.JPG"), facts={"doubt": doubt} if doubt else {})
+        return [fired(shot), came] if shot < 3 else [came]
+
+    with rig(tmp_path, script) as one:
+        for number in range(4):
+            index = one.wish(number).index
+            assert index is not None
+            last = one.ended(index)
+    assert last.tag is not None
+    assert last.tag.time_source.startswith(by)
+
+
+def jpeg_at(focal_length_mm: float, taken: str = "") -> bytes:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0x920A] = focal_length_mm
+    if taken:
+        exif.get_ifd(0x8769)[0x9003] = taken
+    file = io.BytesIO()
+    Image.new("L", (64, 48)).save(file, "JPEG", exif=exif)
+    return file.getvalue()

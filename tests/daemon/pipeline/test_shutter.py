@@ -1,0 +1,320 @@
+"""The shutter: one shot for every wish, and the written rules of what one wish is."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dappled.clock import RecordedClock, SystemClock
+from dappled.daemon.pipeline import shutter as module
+from dappled.daemon.pipeline.shutter import Shutter, Wish
+from dappled.flight.records import Shot
+
+PILOT = "mavlink:255/190"
+VEHICLE = "mavlink:1/1"
+
+
+class Rig:
+    """A shutter with a clock that stands still, and a list of what it did, in order."""
+
+    def __init__(self, capacity: int = 1000) -> None:
+        self.clock = RecordedClock(10**18, 10**18 - 10**9)
+        self.done: list[tuple[str, int]] = []
+        self.obstacle: str | None = None
+        self.note_error: OSError | None = None
+        self.shutter = Shutter(
+            next_index=42,
+            note=self._note,
+            fire=lambda index: self.done.append(("fire", index)),
+            clock=self.clock,
+            capacity=capacity,
+            obstacle=lambda: self.obstacle,
+        )
+
+    def _note(self, shot: Shot) -> None:
+        if self.note_error:
+            raise self.note_error
+        self.done.append(("note", shot.index))
+
+    def fired(self) -> list[int]:
+        return [index for act, index in self.done if act == "fire"]
+
+    def press(self, after_s: float = 0.0, *, sequence: int = 0, confirmation: int = 0, link: int = 0) -> str:
+        self.clock.advance(after_s)
+        return self.shutter.wish(Wish(PILOT, "IMAGE_START_CAPTURE", sequence, confirmation, link)).outcome
+
+    def tick(self, seconds: float, step_s: float = 0.05) -> None:
+        for _ in range(round(seconds / step_s)):
+            self.clock.advance(step_s)
+            self.shutter.serve()
+
+
+def test_a_wish_is_written_down_before_the_camera_is_touched() -> None:
+    rig = Rig()
+    verdict = rig.shutter.wish(Wish("console", "button"))
+    assert (verdict.outcome, verdict.index) == ("shot", 42)
+    assert rig.done == [("note", 42), ("fire", 42)]
+
+
+def test_retries_every_half_second_are_one_shot() -> None:
+    rig = Rig()
+    assert [rig.press(gap) for gap in (0, 0.5, 0.5, 0.5)] == ["shot", "duplicate", "duplicate", "duplicate"]
+
+
+def test_a_numbered_confirmation_is_a_retry_for_ten_seconds_and_a_lost_first_one_a_shot() -> None:
+    rig = Rig()
+    assert [rig.press(0), rig.press(3, confirmation=1), rig.press(3, confirmation=2)] == ["shot"] + ["duplicate"] * 2
+    assert rig.press(11, confirmation=1) == "shot"
+
+
+def test_other_sequences_and_later_presses_are_shots_of_their_own() -> None:
+    rig = Rig()
+    assert [rig.press(0, sequence=1), rig.press(0.4, sequence=2), rig.press(1.3, sequence=2)] == ["shot"] * 3
+
+
+def test_a_sender_that_presses_every_second_with_sequence_0_is_not_silenced_for_ever() -> None:
+    rig = Rig()
+    assert [rig.press(1.0) for _ in range(6)].count("shot") == 2
+
+
+@given(
+    st.lists(st.floats(0.35, 5.0), min_size=1, max_size=12),
+    st.integers(1, 2),
+    st.randoms(use_true_random=False),
+    st.sets(st.sampled_from(["CAMERA_TRIGGER", "IMAGE_START_CAPTURE", "DO_DIGICAM_CONTROL"]), min_size=1),
+)
+def test_px4s_triple_on_several_links_is_one_shot_a_trigger(
+    gaps: list[float], links: int, order: random.Random, kinds: set[str]
+) -> None:
+    """Every trigger comes as up to three messages over up to two links, in any order, within 50 ms."""
+    rig = Rig()
+    for trigger, gap in enumerate(gaps):
+        rig.clock.advance(gap)
+        messages = [(kind, link) for kind in sorted(kinds) for link in range(links)]
+        order.shuffle(messages)
+        for kind, link in messages:
+            sequence = None if kind == "DO_DIGICAM_CONTROL" else trigger + 1
+            rig.shutter.wish(Wish(VEHICLE, kind, sequence, 0, link, acknowledged=kind == "IMAGE_START_CAPTURE"))
+            rig.clock.advance(0.05 / len(messages))
+    assert rig.fired() == list(range(42, 42 + len(gaps)))
+
+
+@given(st.lists(st.floats(0.31, 3.0), min_size=1, max_size=10))
+def test_broadcast_203_without_a_number_is_a_shot_each_time(gaps: list[float]) -> None:
+    """ArduPilot's way: nobody answers it, so nobody repeats it."""
+    rig = Rig()
+    for gap in gaps:
+        rig.clock.advance(gap)
+        rig.shutter.wish(Wish(VEHICLE, "DO_DIGICAM_CONTROL", None, 0, 0, acknowledged=False))
+    assert len(rig.fired()) == len(gaps)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(0, 2),
+            st.sampled_from([PILOT, VEHICLE]),
+            st.sampled_from("AB"),
+            st.integers(0, 2),
+            st.integers(0, 1),
+        ),
+        max_size=40,
+    )
+)
+def test_the_books_balance_and_no_index_is_used_twice(messages: list[tuple[float, str, str, int, int]]) -> None:
+    rig = Rig(capacity=5)
+    for gap, source, kind, sequence, link in messages:
+        rig.clock.advance(gap)
+        verdict = rig.shutter.wish(Wish(source, kind, sequence, 0, link))
+        assert verdict.accepted == (verdict.index is not None)
+        if verdict.outcome == "shot" and (verdict.index or 0) % 2:
+            rig.shutter.settled(verdict.index or 0, ok=verdict.index != 43)
+    now = rig.shutter.statistics()
+    assert rig.done == [(act, index) for index in rig.fired() for act in ("note", "fire")]
+    assert rig.fired() == list(range(42, now.next_index))
+    assert now.wishes == len(messages) == now.shots + now.duplicates + now.refused
+    assert now.shots == now.pending + now.succeeded + now.failed
+    assert now.pending <= 5
+
+
+def test_refusals_say_why_and_use_no_index() -> None:
+    rig = Rig(capacity=1)
+    rig.obstacle = "no camera on the bus"
+    assert rig.shutter.wish(Wish(PILOT, "x", 1)).reason == "no camera on the bus"
+    rig.obstacle, rig.note_error = None, OSError(28, "No space left on device")
+    assert "No space left" in (rig.shutter.wish(Wish(PILOT, "x", 2)).reason or "")
+    rig.note_error = None
+    assert rig.shutter.wish(Wish(PILOT, "x", 3)).index == 42
+    assert "waiting for the camera" in (rig.shutter.wish(Wish(PILOT, "x", 4)).reason or "")
+    rig.shutter.settled(42, ok=True)
+    rig.shutter.settled(42, ok=False)
+    assert rig.shutter.wish(Wish(PILOT, "x", 5)).index == 43
+    rig.shutter.stop()
+    assert rig.shutter.wish(Wish(PILOT, "x", 6)).reason == "the daemon is stopping"
+
+
+def test_an_interval_counts_to_its_end_and_a_single_shot_does_not_cancel_it() -> None:
+    rig = Rig()
+    wish = Wish(PILOT, "IMAGE_START_CAPTURE", 7)
+    assert rig.shutter.start_interval(wish, 1.0, 3).index == 42
+    assert rig.shutter.start_interval(wish, 1.0, 3).outcome == "duplicate"
+    rig.tick(0.5)
+    assert rig.press(sequence=8) == "shot"
+    assert rig.shutter.statistics().interval_s == 1.0
+    rig.tick(5)
+    assert rig.fired() == [42, 43, 44, 45]
+    assert rig.shutter.statistics().interval_s is None
+
+
+def test_an_endless_interval_ends_when_told_and_late_ticks_are_not_bunched() -> None:
+    rig = Rig()
+    rig.shutter.start_interval(Wish(PILOT, "IMAGE_START_CAPTURE", 1), 0.5, 0)
+    rig.tick(2.0)
+    assert len(rig.fired()) == 5
+    rig.clock.advance(10)
+    rig.shutter.serve()
+    rig.shutter.serve()
+    assert len(rig.fired()) == 6
+    assert rig.shutter.stop_interval()
+    rig.tick(3)
+    assert len(rig.fired()) == 6
+
+
+def start(rig: Rig, interval_s: float, count: int = 0, *, source: str = PILOT, link: int = 0) -> str:
+    """An interval as ground stations start it, who number everything 0."""
+    return rig.shutter.start_interval(Wish(source, "IMAGE_START_CAPTURE", 0, link=link), interval_s, count).outcome
+
+
+@pytest.mark.parametrize("link", [0, 1])
+@pytest.mark.parametrize("gap_s", [0.1, 0.6])
+def test_an_interval_right_after_a_press_runs_and_a_press_right_after_its_start_is_a_shot(
+    gap_s: float, link: int
+) -> None:
+    rig = Rig()
+    assert rig.press() == "shot"
+    rig.clock.advance(gap_s)
+    assert start(rig, 2.0, link=link) == "shot"
+    assert rig.press(gap_s, sequence=3, link=1 - link) == "shot"
+    rig.tick(5)
+    assert rig.shutter.statistics().interval_s == 2.0
+    assert len(rig.fired()) == 5
+
+
+def test_an_interval_that_was_stopped_starts_again_at_once_unless_another_stopped_it() -> None:
+    rig = Rig()
+    for again in ("shot", "shot"):
+        assert start(rig, 2.0) == again
+        rig.clock.advance(0.3)
+        assert rig.shutter.stop_interval(PILOT)
+    assert start(rig, 2.0) == "shot"
+    assert rig.shutter.stop_interval(VEHICLE)
+    assert start(rig, 2.0) == "duplicate"  # a retry that was under way must not undo the stop
+    assert rig.shutter.statistics().interval_s is None
+
+
+def test_a_second_interval_takes_the_place_of_the_first_however_soon_and_the_first_that_of_the_second() -> None:
+    rig = Rig()
+    for interval_s, count in ((2.0, 0), (5.0, 0), (2.0, 0), (2.0, 7)):
+        assert start(rig, interval_s, count) == "shot"
+        assert start(rig, interval_s, count) == "duplicate"
+        assert rig.shutter.statistics().interval_s == interval_s
+        rig.clock.advance(0.2)
+
+
+def test_a_burst_takes_the_next_shot_when_the_last_one_is_settled() -> None:
+    rig = Rig()
+    rig.shutter.start_interval(Wish(PILOT, "IMAGE_START_CAPTURE", 1), 0.0, 3)
+    rig.tick(2)
+    assert rig.fired() == [42]
+    for index in (42, 43, 44):
+        rig.shutter.settled(index, ok=True)
+        rig.tick(0.2)
+    assert rig.fired() == [42, 43, 44]
+
+
+def test_a_burst_before_a_camera_that_is_gone_asks_once_a_second() -> None:
+    rig = Rig()
+    rig.shutter.start_interval(Wish(PILOT, "IMAGE_START_CAPTURE", 1), 0.0, 0)
+    rig.shutter.settled(42, ok=True)
+    rig.obstacle = "the camera is absent"
+    for _ in range(100):
+        rig.tick(0.05)
+    assert 4 <= rig.shutter.statistics().refused <= 6  # each is an event of the record
+    rig.obstacle = None
+    rig.tick(1.0)
+    assert rig.fired() == [42, 43]
+
+
+@pytest.mark.parametrize(("interval_s", "count"), [(-1.0, 0), (float("nan"), 0), (1e9, 0), (1.0, -2)])
+def test_a_senseless_interval_is_refused(interval_s: float, count: int) -> None:
+    rig = Rig()
+    assert rig.shutter.start_interval(Wish(PILOT, "x"), interval_s, count).outcome == "refused"
+    assert not rig.fired()
+
+
+def test_the_thread_serves_intervals_on_the_real_clock() -> None:
+    enough, fired = threading.Event(), []
+
+    def fire(index: int) -> None:
+        fired.append(index)
+        if len(fired) == 3:
+            enough.set()
+
+    shutter = Shutter(next_index=0, note=lambda _: None, fire=fire, clock=SystemClock())
+    shutter.start()
+    try:
+        began = time.monotonic()
+        shutter.start_interval(Wish(PILOT, "x"), 0.1, 3)
+        assert enough.wait(10)
+        assert time.monotonic() - began > 0.19
+    finally:
+        shutter.stop()
+    assert fired == [0, 1, 2]
+
+
+def test_an_interval_outlives_whoever_notes_going_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_AGAIN_S", 0.01)
+    enough, noted, fired = threading.Event(), list[int](), list[int]()
+
+    def note(shot: Shot) -> None:
+        noted.append(shot.index)
+        if len(noted) == 2:
+            raise RuntimeError("nobody foresaw this")
+
+    def fire(index: int) -> None:
+        fired.append(index)
+        if len(fired) == 3:
+            enough.set()
+
+    shutter = Shutter(next_index=0, note=note, fire=fire, clock=SystemClock())
+    shutter.start()
+    try:
+        shutter.start_interval(Wish(PILOT, "x"), 0.1, 3)
+        assert enough.wait(20)
+        assert shutter.dead() == []
+    finally:
+        shutter.stop()
+    assert (noted, fired) == ([0, 1, 1, 2], [0, 1, 2])
+
+
+def test_every_refusal_is_told() -> None:
+    told: list[str] = []
+    shutter = Shutter(
+        next_index=0,
+        note=lambda _: None,
+        fire=lambda _: None,
+        clock=RecordedClock(10**18),
+        capacity=1,
+        on_refused=lambda refused: told.append(refused[1]),
+    )
+    shutter.start_interval(Wish(PILOT, "IMAGE_START_CAPTURE", 1), -1.0, 0)
+    for sequence in (2, 3):
+        shutter.wish(Wish(PILOT, "IMAGE_START_CAPTURE", sequence))
+    assert len(told) == shutter.statistics().refused == 2
+    assert "an interval is" in told[0]
+    assert "waiting for the camera" in told[1]

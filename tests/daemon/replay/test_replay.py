@@ -1,0 +1,178 @@
+"""A recorded flight, or a folder of frames, down the street again."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from pathlib import Path
+
+import pytest
+
+from dappled.daemon.pipeline.pending_shot import Names, Story, Watchers
+from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.tagger import BodyLatency
+from dappled.daemon.replay import replay
+from dappled.daemon.replay.replay import Progress, RecordedTelemetry, ReplayError
+from dappled.drivers.camera import Arrival, Event, Fired, Identity, ShotFailed, StateChanged
+from dappled.drivers.replay import ReplayCamera
+from dappled.flight.errors import FlightError
+from dappled.flight.records import Cause, Shot
+from tests.daemon.fakes import FakeDeveloper, failed, fired, good, rig
+
+
+def record(flights: Path) -> Path:
+    """A flight of two frames, with a failed shot between."""
+    with rig(flights, lambda shot: [fired(shot), failed(shot)] if shot == 1 else good(shot)) as one:
+        for number in range(3):
+            one.wish(number)
+            one.ended(number)
+    return one.flight.folder.path
+
+
+def again(flight: Path, pace: replay.Pace | None = None) -> list[str]:
+    """The verdict of a replay."""
+    recording = replay.of_flight(flight)
+    book = replay.book(recording)
+    progress = Progress.begin()
+    ended: list[Story] = []
+
+    def finished(story: Story) -> None:
+        ended.append(story)
+        progress.note(story)
+
+    street = Street(
+        camera=ReplayCamera(recording.files, Identity("dappled", "recording", "", "")),
+        book=book,
+        poses=RecordedTelemetry(recording.telemetry, recording.horizons, wait_s=0.0).pose,
+        developer=FakeDeveloper(),
+        publisher=None,
+        latency=BodyLatency(60.0, 15.0, "test"),
+        names=Names("test", "mask", "geometric"),
+        watchers=Watchers(finished=finished),
+        decode_queue=100,
+    )
+    street.start()
+    try:
+        replay.play(recording, street, progress, time=replay.clock(recording), pace=pace, timeout_s=20)
+    finally:
+        street.stop(5)
+    assert len(ended) == len(recording.shots)
+    return [text for text in book.verdict() if "unreadable" not in text]  # the fake's frames are no raw files
+
+
+def test_the_same_flight_gives_the_same(tmp_path: Path) -> None:
+    flight = record(tmp_path)
+    assert again(flight) == []
+    assert again(flight, replay.as_recorded(1e5)) == []
+
+
+@pytest.mark.parametrize("data", [b"frame 3", b"frame", b""])
+def test_a_changed_frame_is_told_and_ends(tmp_path: Path, data: bytes) -> None:
+    flight = record(tmp_path)
+    (flight / "frames" / "000002.dng").write_bytes(data)
+    assert any("000002.dng is not the file that was recorded" in text for text in again(flight))
+
+
+def test_a_missing_frame_is_told_and_ends(tmp_path: Path) -> None:
+    flight = record(tmp_path)
+    (flight / "frames" / "000002.dng").unlink()
+    assert any("000002.dng can't be read" in text for text in again(flight))
+
+
+def test_what_was_told_of_a_shot_in_flight_is_no_difference(tmp_path: Path) -> None:
+    """A driver that never says when it fired, and a file that may be another shot's: both go into the tag."""
+
+    def untold(shot: int) -> list[Event | Exception]:
+        (_, arrival) = good(shot)
+        assert isinstance(arrival, Arrival)
+        return [dataclasses.replace(arrival, facts={"doubt": "it came late"})]
+
+    with rig(tmp_path, untold) as one:
+        one.wish(0)
+        one.ended(0)
+        told = one.flight.ledger.tag(0)
+        assert told is not None
+        assert told.time_source == "wish + body latency; in doubt: it came late"
+        assert {event.kind for event in one.flight.ledger.events()} >= {"untimed", "doubt"}
+    assert again(one.flight.folder.path) == []
+
+
+def test_the_street_hears_the_recordings_clock(tmp_path: Path) -> None:
+    recording = replay.of_flight(record(tmp_path))
+    clock = replay.clock(recording)
+    first, last = recording.shots[0], recording.shots[-1]
+    assert (clock.utc_ns(), clock.monotonic_ns()) == (first.wished_utc_ns, first.wished_monotonic_ns)
+    camera = ReplayCamera(recording.files, Identity("dappled", "recording", "", ""), clock.monotonic_ns)
+    camera.start()
+    ready = camera.next_event(1)
+    assert isinstance(ready, StateChanged)
+    assert ready.monotonic_ns == first.wished_monotonic_ns
+    clock.advance_to(last.wished_utc_ns)
+    camera.fire(1)  # it failed
+    fired, failed = camera.next_event(1), camera.next_event(1)
+    assert isinstance(fired, Fired)
+    assert isinstance(failed, ShotFailed)
+    assert failed.monotonic_ns == last.wished_monotonic_ns
+
+
+def test_pace() -> None:
+    slept: list[float] = []
+    wait = replay.as_recorded(2.0, slept.append)
+    shots = [Shot(i, Cause("t", "k"), ns, ns) for i, ns in enumerate((0, 3_000_000_000, 2_000_000_000))]
+    for shot, before in zip(shots, [None, *shots], strict=False):
+        wait(shot, before)
+    assert slept == [1.5, 0.0]
+
+
+def test_what_is_no_flight(tmp_path: Path) -> None:
+    with pytest.raises(FlightError):
+        replay.of_flight(tmp_path / "nothing")
+    with rig(tmp_path) as one:
+        pass
+    with pytest.raises(ReplayError, match="holds no frames"):
+        replay.of_flight(one.flight.folder.path)
+
+
+def test_a_folder_of_frames(tmp_path: Path) -> None:
+    for name in ("b.png", "a.png", "notes.txt"):
+        (tmp_path / name).write_bytes(name.encode())
+    found = replay.of_folder(tmp_path, "*", None, 1_000, 2.0)
+    assert [one.camera_name for one in found.files] == ["a.png", "b.png"]
+    assert [shot.wished_utc_ns for shot in found.shots] == [1_000, 2_000_001_000]
+
+
+def test_a_folder_without_what_was_named(tmp_path: Path) -> None:
+    with pytest.raises(ReplayError, match="matches"):
+        replay.of_folder(tmp_path, "*.png", None, 0, 1.0)
+    (tmp_path / "a.png").write_bytes(b"a")
+    with pytest.raises(ReplayError, match="no such telemetry"):
+        replay.of_folder(tmp_path, "*", tmp_path / "no.tlog", None, 1.0)
+    (tmp_path / "empty.tlog").write_bytes(b"")
+    with pytest.raises(ReplayError, match="holds no position"):
+        replay.of_folder(tmp_path, "*.png", tmp_path / "empty.tlog", None, 1.0)
+
+
+def test_the_only_telemetry_beside_the_frames_is_theirs(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"a")
+    assert replay.of_folder(tmp_path, "*", None, 5, 1.0).telemetry is None
+    (tmp_path / "flight.tlog").write_bytes(b"")
+    assert replay.of_folder(tmp_path, "*", None, 5, 1.0).telemetry == tmp_path / "flight.tlog"
+    (tmp_path / "other.tlog").write_bytes(b"")
+    with pytest.raises(ReplayError, match=r"holds 2 \.tlog files"):
+        replay.of_folder(tmp_path, "*", None, 5, 1.0)
+    given = replay.of_folder(tmp_path, "*", tmp_path / "other.tlog", 5, 1.0)
+    assert given.telemetry == tmp_path / "other.tlog"
+
+
+def test_a_shot_that_never_ends_is_given_up(tmp_path: Path) -> None:
+    flight = record(tmp_path)
+    recording = replay.of_flight(flight)
+
+    class Deaf:
+        def expect(self, shot: Shot) -> None: ...
+
+        def fire(self, index: int) -> None: ...
+
+    deaf = Progress(threading.Semaphore(0))
+    with pytest.raises(ReplayError, match="did not come to an end"):
+        replay.play(recording, Deaf(), deaf, time=replay.clock(recording), pace=None, timeout_s=0.01)  # type: ignore[arg-type]  # a street that does nothing

@@ -1,0 +1,86 @@
+"""Runs: results by another recipe stand beside those of the flight."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dappled.daemon.pipeline.pending_shot import Names
+from dappled.daemon.replay import runs
+from dappled.daemon.replay.runs import Run, RunBook
+from dappled.drivers.raw.darkroom import Recipe
+from dappled.errors import DappledError
+from dappled.flight import recording
+from dappled.flight.check import check
+from dappled.flight.entries import Result
+from dappled.flight.ledger import LedgerReader
+from dappled.flight.recording import Recording
+from tests.flight.makers import deliver, tag, wish
+
+RESULT = Result(0, "a" * 64, 12, 13, "geometric", "calibrated")
+NAMES = Names("reference-36mm", "reference-5x5", "geometric")
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Iterator[Recording]:
+    """One decoded frame."""
+    begun = recording.begin(tmp_path / "flights", lambda: 10**18)
+    wish(begun, 0)
+    begun.ledger.add_tag(tag(deliver(begun, 0, b"raw")))
+    begun.ledger.add_result(RESULT)
+    yield begun
+    if not begun.closed:
+        begun.close()
+
+
+@pytest.fixture
+def recipe(tmp_path: Path) -> Recipe:
+    white = tmp_path / "white.npy"
+    white.write_bytes(b"white")
+    return Recipe(camera="reference-36mm", mask="reference-5x5", white=str(white))
+
+
+def test_a_run_stands_beside_the_flight_and_can_be_had_again(flight: Recording, recipe: Recipe, tmp_path: Path) -> None:
+    flight.close()
+    folder = flight.folder.path
+    with RunBook(folder, Run("second", recipe, NAMES), lambda: 5) as book:
+        book.decoded(replace(RESULT, slices_sha256="b" * 64))
+        assert book.run.recipe.white == str(folder / "inputs" / "second" / "white.npy")
+    with LedgerReader.open(flight.folder.ledger) as ledger:
+        assert ledger.runs() == {"live": 1, "second": 1}
+        assert ledger.results()[0] == RESULT
+        assert ledger.results("second")[0].slices_sha256 == "b" * 64
+        assert ledger.results("second")[0].run == "second"
+    assert check(folder).problems == ()
+    moved = tmp_path / "elsewhere" / folder.name
+    shutil.copytree(folder, moved)
+    again = runs.of_flight(moved, "second")
+    assert again.names == NAMES
+    assert again.recipe.mask == str(moved / "inputs" / "second" / "masks" / "reference-5x5.toml")
+    assert Path(again.recipe.white).read_bytes() == b"white"
+    with pytest.raises(DappledError, match=r"no run 'third'; it has second"):
+        runs.of_flight(moved, "third")
+
+
+def test_a_run_replaces_nothing(flight: Recording, recipe: Recipe) -> None:
+    flight.close()
+    with RunBook(flight.folder.path, Run("second", recipe, NAMES), lambda: 5):
+        pass
+    with pytest.raises(DappledError, match="has a run 'second' already"):
+        RunBook(flight.folder.path, Run("second", recipe, NAMES), lambda: 5)
+
+
+@pytest.mark.parametrize("name", ["live", "", "../x", "a b", "-x"])
+def test_a_name_that_is_none(flight: Recording, recipe: Recipe, name: str) -> None:
+    flight.close()
+    with pytest.raises(DappledError, match="can't name a run"):
+        RunBook(flight.folder.path, Run(name, recipe, NAMES), lambda: 5)
+
+
+def test_a_flight_that_is_still_recorded_gets_no_run(flight: Recording, recipe: Recipe) -> None:
+    with pytest.raises(DappledError, match="still recorded"):
+        RunBook(flight.folder.path, Run("second", recipe, NAMES), lambda: 5)

@@ -1,0 +1,57 @@
+"""Messages from strangers: either they are understood, or one sentence says that they are not."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dappled.daemon.stream import wire
+from dappled.daemon.stream.wire import Message, WireError
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers(-5, 2**70) | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=8,
+)
+ENTRIES = st.fixed_dictionaries(
+    {},
+    optional={
+        "name": st.just("slices") | JSON,
+        "dtype": st.sampled_from(["<c8", "<f4", "|u1", "O", "nonsense", "V0"]) | st.integers(),
+        "shape": st.lists(st.integers(-3, 4) | st.just(2**70), max_size=3) | JSON,
+    },
+)
+
+
+@given(st.lists(st.binary(max_size=30) | JSON.map(lambda value: json.dumps(value).encode()), max_size=4))
+def test_any_parts_are_a_message_or_a_sentence(parts: list[bytes]) -> None:
+    with contextlib.suppress(WireError):
+        assert isinstance(wire.decode(parts).header, dict)
+
+
+@pytest.mark.parametrize("header", [b"[" * 200_000, b'{"seq": 1' + b"0" * 5000 + b"}", b"\xff", b"[]", b""])
+def test_a_header_that_no_parser_likes_is_told_in_a_sentence(header: bytes) -> None:
+    with pytest.raises(WireError, match="not a dappled message"):
+        wire.decode([b"slices", header])
+
+
+@given(st.lists(ENTRIES, max_size=3) | JSON, st.binary(max_size=40))
+def test_any_arrays_are_those_of_the_body_or_a_sentence(entries: object, body: bytes) -> None:
+    with contextlib.suppress(WireError):
+        found = Message("slices", {"arrays": entries}, body).arrays()
+        assert sum(array.nbytes for array in found.values()) <= len(body)
+
+
+def test_arrays_come_back_as_they_were_described() -> None:
+    a, b = np.arange(6, dtype=np.float32).reshape(2, 3), np.array([1 + 2j], dtype=np.complex64)
+    entries = [wire.describe_array("a", a, "px"), wire.describe_array("b", b, "1")]
+    found = Message("slices", {"arrays": entries}, a.tobytes() + b.tobytes()).arrays()
+    assert (found["a"] == a).all()
+    assert (found["b"] == b).all()
+    with pytest.raises(WireError, match="ends inside array 'b'"):
+        Message("slices", {"arrays": entries}, a.tobytes()).arrays()

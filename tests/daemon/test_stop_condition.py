@@ -1,0 +1,117 @@
+"""When a daemon has had its frames or its time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import pytest
+
+from dappled.daemon.pipeline.pending_shot import Story
+from dappled.daemon.stop_condition import Goal, Tally
+from dappled.flight.records import Frame
+from tests.flight.makers import shot
+
+
+def ended(index: int, problem: str = "") -> Story:
+    frame = None if problem else Frame(index, f"frames/{index:06d}.cr2", "IMG_0001.CR2", 10, "0" * 64, 5)
+    return Story(shot(index), frame=frame, problem=problem)
+
+
+@dataclass
+class Asker:
+    busy: bool = True
+
+    def running(self) -> bool:
+        return self.busy
+
+
+@dataclass
+class World:
+    """Everything that a goal looks at, turned by hand."""
+
+    tally: Tally = field(default_factory=Tally)
+    asker: Asker = field(default_factory=Asker)
+    asked: int = 0
+    ready: bool = False
+    now_s: float = 100.0
+
+    def ask(self) -> Asker:
+        self.asked += 1
+        return self.asker
+
+    def goal(self, frames: int | None = None, seconds: float | None = None, *, asks: bool = False) -> Goal:
+        return Goal(
+            self.tally,
+            frames,
+            seconds,
+            ask=self.ask if asks else None,
+            ready=lambda: self.ready,
+            clock_s=lambda: self.now_s,
+        )
+
+
+def test_without_a_goal_it_never_ends() -> None:
+    world = World()
+    goal = world.goal()
+    goal.begin(lambda: 0)
+    for index in range(5):
+        world.tally.add(ended(index))
+    world.now_s += 1e6
+    assert not goal.reached()
+    assert not goal.short
+
+
+def test_the_time_counts_from_the_first_flight() -> None:
+    world = World()
+    goal = world.goal(seconds=60.0)
+    world.now_s += 1000
+    assert not goal.reached()
+    goal.begin(lambda: 0)
+    world.now_s += 59
+    goal.begin(lambda: 0)  # another flight has begun meanwhile
+    assert not goal.reached()
+    world.now_s += 1
+    assert goal.reached()
+
+
+def test_so_many_shots_whatever_came_of_them() -> None:
+    world = World()
+    goal = world.goal(frames=3)
+    goal.begin(lambda: 3)
+    world.tally.add(ended(0))
+    world.tally.add(ended(1, "the card is full"))
+    assert not goal.reached()
+    world.tally.add(ended(2))
+    assert goal.reached()
+    assert goal.short
+    assert world.tally.summary() == "3 shots: 2 frames safe, 0 decoded, 1 with a problem"
+
+
+def test_the_ground_station_asks_once_and_only_a_ready_camera() -> None:
+    world = World()
+    goal = world.goal(frames=2, asks=True)
+    goal.begin(lambda: 0)
+    assert not goal.reached()
+    assert world.asked == 0
+    world.ready = True
+    assert not goal.reached()
+    world.ready = False
+    assert not goal.reached()
+    assert world.asked == 1
+
+
+@pytest.mark.parametrize("earlier", [0, 2])
+def test_a_ground_station_that_gave_up_ends_it_when_all_it_wished_has_ended(earlier: int) -> None:
+    """Wishes that failed were refused, say; those of flights before have ended and count no more."""
+    world = World(ready=True)
+    goal = world.goal(frames=8, asks=True)
+    for index in range(earlier):
+        world.tally.add(ended(index))
+    goal.begin(lambda: 2)
+    assert not goal.reached()
+    world.asker.busy = False
+    world.tally.add(ended(earlier))
+    assert not goal.reached()
+    world.tally.add(ended(earlier + 1))
+    assert goal.reached()
+    assert goal.short

@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from dappled.decode.errors import DecodeError
+from dappled.decode.lightfield import refocus
+from dappled.decode.lightfield.view_stack import ViewStack, centred, from_cameras
+from tests.decode.scenes import Board, paint
+
+INNER = (slice(8, -8), slice(8, -8))
+
+
+def psnr(found: np.ndarray, truth: np.ndarray) -> float:
+    return float(-10 * np.log10(np.mean((found[INNER] - truth[INNER]) ** 2)))
+
+
+def ramps(disparity: float, *, n: int = 5, side: int = 24) -> ViewStack:
+    """A quadratic picture seen at one disparity: cubic convolution is exact on it."""
+    y, x = np.mgrid[0:side, 0:side] / side
+    steps = centred(n)
+    views = [
+        [(y - disparity * sy / side) ** 2 + 0.5 * (x - disparity * sx / side) * (y - disparity * sy / side)
+         for sx in steps] for sy in steps
+    ]  # fmt: skip
+    return ViewStack(np.array(views, dtype=np.float32), steps, steps)
+
+
+@given(st.floats(-1.5, 1.5), st.sampled_from([1, 2, 3, 5]))
+@settings(deadline=None)
+def test_a_plane_in_focus_is_the_middle_view(disparity: float, n: int) -> None:
+    made = refocus.shift_and_add(ramps(disparity, n=n), disparity)
+    truth = ramps(disparity, n=1).views[0, 0]
+    np.testing.assert_allclose(made[INNER], truth[INNER], atol=2e-6)
+
+
+def test_a_textured_scene_comes_into_focus_where_it_is() -> None:
+    near, far = Board(0.7, half=(40, 40), texture=1), Board(-0.4)
+    stack, truth = paint([far, near], (120, 120), 7)
+    sharp = {d: refocus.shift_and_add(stack, d) for d in (0.7, -0.4)}
+    middle = stack.middle()
+    edge = ndimage.maximum_filter(truth, 15) != ndimage.minimum_filter(truth, 15)
+    for d, other in ((0.7, -0.4), (-0.4, 0.7)):
+        here = (np.abs(truth - d) < 0.01) & ~edge
+        rms = {name: float(np.sqrt(np.mean((made - middle)[here] ** 2))) for name, made in sharp.items()}
+        assert rms[d] < 0.01
+        assert rms[d] < rms[other] / 5
+
+
+@pytest.mark.parametrize("alpha", [0.8, 1.0, 1.2, 2.0])
+def test_alpha_is_equation_29(alpha: float) -> None:
+    """E(x, y) = Σ L(u(1 − 1/α) + x/α, v(1 − 1/α) + y/α, u, v), counted as LFToolbox counts."""
+    stack, _ = paint([Board(0.3)], (64, 64), 3)
+    views = stack.views[::-1, ::-1]  # the further right a camera, the further left what is near
+    y, x = np.mgrid[0:64, 0:64] - 31.5
+    total = np.zeros((64, 64))
+    for v in (-1, 0, 1):
+        for u in (-1, 0, 1):
+            at = [v * (1 - 1 / alpha) + y / alpha + 31.5, u * (1 - 1 / alpha) + x / alpha + 31.5]
+            total += ndimage.map_coordinates(views[v + 1, u + 1], at, order=5, mode="nearest")
+    made = refocus.by_alpha(from_cameras(views), alpha, magnify=True)
+    known = np.isfinite(made)
+    assert known[INNER].mean() > (0.4 if alpha < 1 else 0.99)
+    assert np.abs(made - total / 9)[INNER][known[INNER]].max() < 0.02
+    same_size = refocus.by_alpha(from_cameras(views), alpha)
+    assert psnr(same_size, refocus.shift_and_add(stack, 1 / alpha - 1)) > 100
+
+
+@given(st.floats(0.05, 20))
+@settings(deadline=None)
+def test_alpha_and_disparity_are_one(alpha: float) -> None:
+    assert refocus.alpha_of_disparity(refocus.disparity_of_alpha(alpha)) == pytest.approx(alpha, rel=1e-9)
+
+
+@pytest.mark.parametrize("alpha", [0.0, -1.0, math.nan, math.inf])
+def test_an_alpha_that_is_no_plane_is_told(alpha: float) -> None:
+    with pytest.raises(DecodeError, match="is no image plane"):
+        refocus.by_alpha(ramps(0), alpha)
+
+
+def test_colours_are_refocused_each() -> None:
+    grey, _ = paint([Board(0.5)], (40, 48), 3)
+    colour = ViewStack(np.stack([grey.views, 0.5 * grey.views, 1 - grey.views], axis=-1), *2 * (grey.row_steps,))
+    made, alone = refocus.shift_and_add(colour, 0.5), refocus.shift_and_add(grey, 0.5)
+    np.testing.assert_allclose(made, np.stack([alone, 0.5 * alone, 1 - alone], axis=-1), atol=1e-6)
+    along = refocus.along(colour, np.full((40, 48), 0.5, np.float32))
+    np.testing.assert_allclose(along[INNER], made[INNER], atol=0.01)
+
+
+def test_the_same_bytes_for_any_number_of_workers() -> None:
+    stack, truth = paint([Board(0.5)], (40, 48), 5)
+    assert np.array_equal(refocus.shift_and_add(stack, 0.3), refocus.shift_and_add(stack, 0.3, workers=3))
+    assert np.array_equal(refocus.along(stack, truth), refocus.along(stack, truth, workers=3))
+
+
+def test_what_no_view_has_is_unknown() -> None:
+    stack = ramps(0, n=2, side=24)
+    made = refocus.shift_and_add(stack, 30.0)
+    assert np.isnan(made).any()
+    assert np.isfinite(made).any()
+    assert np.isfinite(refocus.shift_and_add(ramps(0, n=3), 30.0)).all()
+
+
+def test_a_tilted_plane_is_sharp_all_over() -> None:
+    stack, truth = paint([Board(0.4, slope=(0.01, 0.0))], (100, 100), 5)
+    plane = refocus.FocalPlane(0.4, over_height=0.99)
+    np.testing.assert_allclose(plane.over((100, 100)), truth, atol=1e-3)
+    tilted, level = refocus.tilted(stack, plane), refocus.tilted(stack, refocus.FocalPlane(0.4))
+    assert psnr(tilted, stack.middle()) > psnr(level, stack.middle()) + 8
+
+
+def test_along_leaves_the_unknown_unknown() -> None:
+    stack, truth = paint([Board(0.4)], (40, 40), 3)
+    truth[10:20, 10:20] = np.nan
+    made = refocus.along(stack, truth)
+    assert np.array_equal(np.isnan(made), np.isnan(truth))
+
+
+def test_a_smaller_aperture_blurs_less() -> None:
+    stack, _ = paint([Board(0.8)], (80, 80), 7)
+    off = [psnr(refocus.shift_and_add(stack, 0, weights=refocus.disc(stack, d)), stack.middle()) for d in (0.2, 0.5, 1)]
+    assert off[0] > off[1] > off[2]
+    beside = refocus.disc(stack, 0.3, (0.0, 0.3))
+    assert beside[3, 5] > beside[3, 3]
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda s: refocus.disc(s, 0), "lets no light through"),
+        (lambda s: refocus.shift_and_add(s, math.nan), "is no plane"),
+        (lambda s: refocus.shift_and_add(s, 0, weights=np.zeros((5, 5))), "not all 0"),
+        (lambda s: refocus.shift_and_add(s, 0, weights=np.ones((4, 5))), r"weights of shape \(4, 5\)"),
+        (lambda s: refocus.along(s, np.zeros((3, 3))), r"the surface is \(3, 3\)"),
+        (lambda s: refocus.alpha_of_disparity(-1.0), "no α brings"),
+    ],
+)
+def test_nonsense_is_told(call, words: str) -> None:  # type: ignore[no-untyped-def]  # several signatures
+    with pytest.raises(DecodeError, match=words):
+        call(ramps(0))

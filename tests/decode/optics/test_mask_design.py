@@ -1,0 +1,156 @@
+"""Design and flight planning: the rules hold in what is designed, and what can't be done is said."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dappled.decode.errors import DecodeError
+from dappled.decode.optics import survey
+from dappled.decode.optics.carrier_tables import fresnel_number, lattice_of
+from dappled.decode.optics.carriers import Sensor
+from dappled.decode.optics.film import FILMS, film_of
+from dappled.decode.optics.mask_design import DESIGNS, FRESNEL_LIMIT, Wish
+from tests.decode.thesis_tables import S5200
+
+REFERENCE = Sensor((2776, 3688), (0.01, 0.0), (0.0, 0.01))
+
+
+def _wish(**changed: Any) -> Wish:
+    values: dict[str, Any] = {
+        "sensor": S5200,
+        "focal_length_mm": 13.0,
+        "f_number": 3.5,
+        "altitude_m": 40.0,
+        "film": FILMS["16k"],
+    }
+    return Wish(**{**values, **changed})
+
+
+def test_the_reference_camera_is_what_the_rules_give() -> None:
+    """3688 × 2776 px of 10 µm, v = 50 mm, aperture 6.7 mm: d = 0.48 mm and 15.5 periods a mm."""
+    wish = _wish(sensor=REFERENCE, focal_length_mm=50.0, f_number=7.4, film=film_of(8000, 8000, 113.8), altitude_m=1e5)
+    made = DESIGNS["geometric"](wish)
+    assert made.works
+    assert made.mask_distance_mm == pytest.approx(0.48, abs=0.005)
+    assert made.mask.frequency_per_mm == pytest.approx(15.5, abs=0.2)
+    assert made.view_shape[1] == pytest.approx(566, rel=0.02)
+
+
+@given(
+    focal=st.floats(8, 80),
+    stop=st.floats(2, 16),
+    altitude=st.floats(3, 200),
+    views=st.sampled_from([3, 5, 7]),
+    law=st.sampled_from(["fd", "geometric"]),
+)
+def test_what_works_keeps_every_rule(focal: float, stop: float, altitude: float, views: int, law: str) -> None:
+    wish = _wish(focal_length_mm=focal, f_number=stop, altitude_m=altitude, views=views, largest_distance_mm=5.0)
+    made = DESIGNS[law](wish)
+    if not made.works:
+        assert made.problem is not None
+        assert "no mask of" in made.problem
+        return
+    top = made.mask.p * made.mask.frequency_per_mm
+    assert made.mask.views_per_axis == views
+    assert made.mask_distance_mm <= 5.0
+    assert top <= wish.film.nyquist_per_mm * (1 + 1e-6)
+    assert fresnel_number(made.mask_distance_mm, top) <= FRESNEL_LIMIT * (1 + 1e-6)
+    lattice = lattice_of(law, made.mask, S5200, made.mask_distance_mm, wish.image_mm)
+    assert (made.mask.p + 0.5) * max(lattice.ky[0], lattice.kx[1]) <= 0.5 * (1 + 1e-6)
+    assert 0 < made.spectrum_used <= 1 + 1e-9
+    if law == "geometric":  # the ideal: f_m = v / (d·A)
+        assert made.mask.frequency_per_mm * made.mask_distance_mm * wish.aperture_mm == pytest.approx(wish.image_mm)
+
+
+def test_fd_fills_the_shorter_side_of_the_spectrum() -> None:
+    made = DESIGNS["fd"](_wish())
+    lattice = lattice_of("fd", made.mask, S5200, made.mask_distance_mm, 13.0)
+    assert 2.5 * lattice.ky[0] == pytest.approx(0.5)
+
+
+def test_depth_error_follows_eq_5() -> None:
+    made = DESIGNS["geometric"](_wish())
+    near, far = (DESIGNS["geometric"](_wish(altitude_m=h)).depth_sigma_m for h in (10.0, 20.0))
+    assert far / near == pytest.approx(4, rel=0.01)
+    assert made.baseline_mm == pytest.approx(13 / 3.5 / 5)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"film": film_of(200, 200, 10.0), "largest_distance_mm": 0.2}, "highest harmonic on film"),
+        ({"mask_distance_mm": 5.0, "f_number": 2.0}, "fewer than 8 a side|no mask of"),
+        ({"sensor": REFERENCE}, "height of the mask on film: 27.76 of at most 24 mm"),
+        ({"mask_distance_mm": 0.01}, "diffraction|Nyquist"),
+    ],
+)
+def test_why_no_mask_does_it(changed: dict[str, Any], said: str) -> None:
+    made = DESIGNS["geometric"](_wish(**changed))
+    if made.works:
+        pytest.fail(f"{made}")
+    assert made.problem is not None
+    assert any(word in made.problem for word in said.split("|"))
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"focal_length_mm": 0.013}, "is it given in millimetres"),
+        ({"f_number": 0.0}, "f-number = 0"),
+        ({"altitude_m": -40.0}, "distance = -40 m"),
+        ({"altitude_m": math.nan}, "nan"),
+        ({"views": 4}, "views = 4 must be odd"),
+        ({"wavelength_nm": 0.55}, "wavelength = 0.55 nm"),
+        ({"shift_sigma_px": 0.0}, "error of a shift = 0"),
+        ({"mask_distance_mm": 13.0}, "mask distance = 13 mm"),
+    ],
+)
+def test_nonsense_is_answered(changed: dict[str, Any], said: str) -> None:
+    with pytest.raises(DecodeError, match=said):
+        _wish(**changed)
+
+
+def test_a_plan_by_hand() -> None:
+    """10 µm pixels, 50 mm, 50 m: 1 cm a pixel, 36.88 × 27.76 m; 80 % overlap is 5.55 m, at 5.552 m/s a second."""
+    made = survey.plan(
+        REFERENCE,
+        focal_length_mm=50,
+        altitude_m=50.05,
+        speed_m_s=5.552,
+        exposure_s=0.002,
+        hours=0.5,
+        frame_bytes=10_000_000,
+        view_columns=461,
+    )
+    assert made.ground_sample_m == pytest.approx(0.01, rel=1e-6)
+    assert made.footprint_m == pytest.approx((27.76, 36.88), rel=1e-6)
+    assert made.view_sample_m == pytest.approx(0.08, rel=1e-3)
+    assert made.interval_s == pytest.approx(1.0, rel=1e-6)
+    assert made.blur_px == pytest.approx(1.1104, rel=1e-6)
+    assert made.frames in (1800, 1801)
+    assert made.disk_bytes == made.frames * 10_000_000
+    assert made.longest_exposure_s == pytest.approx(0.01 / 5.552, rel=1e-6)
+    assert survey.plan(REFERENCE, focal_length_mm=50, altitude_m=50.05, speed_m_s=5, sideways=True).footprint_m[
+        0
+    ] == pytest.approx(36.88, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"overlap": 80}, "overlap = 80  must lie between 0 and 0.99 ; a share, not percent"),
+        ({"speed_m_s": 0}, "ground speed = 0"),
+        ({"exposure_s": math.inf}, "exposure = inf"),
+        ({"altitude_m": 0}, "distance = 0 m"),
+    ],
+)
+def test_a_wrong_plan_is_answered(changed: dict[str, Any], said: str) -> None:
+    values: dict[str, Any] = {"focal_length_mm": 50.0, "altitude_m": 50.0, "speed_m_s": 5.0}
+    with pytest.raises(DecodeError) as caught:
+        survey.plan(REFERENCE, **{**values, **changed})
+    assert " ".join(said.split()).replace(" ;", ";") in " ".join(str(caught.value).split()).replace(" ;", ";")

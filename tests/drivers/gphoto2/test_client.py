@@ -1,0 +1,609 @@
+"""The driver with the real libgphoto2, against the PTP/IP body and against libgphoto2's own virtual USB camera."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dappled.drivers.camera import Arrival, CameraError, Companion, Fired, ShotFailed, StateChanged
+from dappled.drivers.gphoto2.before import Before
+from dappled.drivers.gphoto2.channel import Channel
+from dappled.drivers.gphoto2.client import GPhoto2Camera, Spawn, open_camera, spawn_process
+from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
+from dappled.drivers.restart_budget import RestartBudget
+from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.body.eos450d import thumbnail
+from dappled.mocks.body.pictures import pattern
+from tests.drivers.contract import (
+    CameraContract,
+    Rig,
+    arrived,
+    content,
+    failed,
+    of_shots,
+    until,
+    until_shot_ends,
+    until_state,
+)
+
+SIZE = 3_000_001
+
+Make = Callable[..., GPhoto2Camera]
+
+
+@pytest.fixture
+def body() -> Iterator[Body]:
+    with Body.start(BodyOptions(picture=f"pattern:{SIZE}:dng")) as body:
+        yield body
+
+
+@pytest.fixture
+def make(body: Body) -> Iterator[Make]:
+    """Drivers for the body, all stopped at the end."""
+    made: list[GPhoto2Camera] = []
+
+    def make(**settings: Any) -> GPhoto2Camera:
+        made.append(open_camera({"port": body.port, **settings}))
+        return made[-1]
+
+    yield make
+    for camera in made:
+        camera.stop()
+
+
+@pytest.fixture
+def ready(make: Make) -> Make:
+    """Likewise, started and ready."""
+
+    def ready(**settings: Any) -> GPhoto2Camera:
+        camera = make(**settings)
+        camera.start()
+        until_state(camera, "ready")
+        return camera
+
+    return ready
+
+
+class TestContractToTheCard(CameraContract):
+    @pytest.fixture
+    def rig(self, make: Make) -> Iterator[Rig]:
+        camera = make(capture_target="card")
+        yield Rig(camera, partial(pattern, size=SIZE))
+        camera.stop()
+
+
+@pytest.mark.slow
+class TestContractToMemory(CameraContract):
+    @pytest.fixture
+    def rig(self, make: Make) -> Iterator[Rig]:
+        camera = make(capture_target="ram")
+        yield Rig(camera, partial(pattern, size=SIZE))
+        camera.stop()
+
+
+class TestContractOfTheVirtualUsbCamera(CameraContract):
+    """libgphoto2's own simulated body: a Nikon over (pretended) USB, which shares no line with ours."""
+
+    @pytest.fixture
+    def rig(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+        picture = b"\xff\xd8\xff" + pattern(1, 200_000)
+        (tmp_path / "one.jpg").write_bytes(picture)
+        monkeypatch.setenv("VCAMERADIR", str(tmp_path))  # libgphoto2 looks for it when the camera's process starts
+        camera = open_camera({"port": "usb:"})
+        yield Rig(camera, lambda _number: picture)
+        camera.stop()
+
+
+def test_identity_is_what_the_body_says(make: Make, body: Body) -> None:
+    camera = make()
+    camera.start()
+    ready = until_state(camera, "ready")
+    assert ready.identity is not None
+    assert (ready.identity.make, ready.identity.model) == ("Canon Inc.", "Canon EOS 450D")
+    assert (ready.identity.serial, ready.identity.port) == ("0830412345", body.port)
+
+
+def test_a_file_on_the_card_keeps_its_name_and_stays_until_released(ready: Make, body: Body) -> None:
+    camera = ready(delete_after_download=True)
+    camera.fire(0)
+    arrival = arrived(camera, 0)
+    assert arrival.name == "IMG_0001.DNG"
+    assert body.card == ["IMG_0001.DNG"]
+    arrival.blob.close()
+    camera.release(arrival)
+    camera.fire(1)  # commands are obeyed in order: the deletion comes first
+    last = arrived(camera, 1)
+    last.blob.close()
+    assert body.card == ["IMG_0002.DNG"]
+
+
+def test_by_default_the_card_is_left_alone(ready: Make, body: Body) -> None:
+    camera = ready()
+    for shot in range(2):
+        camera.fire(shot)
+        arrival = arrived(camera, shot)
+        arrival.blob.close()
+        camera.release(arrival)
+    camera.stop()
+    assert body.card == ["IMG_0001.DNG", "IMG_0002.DNG"]
+
+
+def test_only_the_body_with_the_serial_number_is_taken(make: Make) -> None:
+    stranger = make(serial="0000000001", timeouts={"retry_s": 0.1})
+    stranger.start()
+    absent = until_state(stranger, "absent")
+    assert "0000000001" in absent.reason
+    assert "0830412345" in absent.reason
+    stranger.stop()
+    wanted = make(serial="0830412345")
+    wanted.start()
+    until_state(wanted, "ready")
+
+
+def test_no_camera_says_what_to_do_and_goes_on_looking() -> None:
+    with Body.start(BodyOptions(picture="pattern:1000:jpg")) as gone:
+        port = gone.port
+    camera = open_camera({"port": port, "timeouts": {"retry_s": 0.05}})
+    camera.start()
+    try:
+        assert port in until_state(camera, "absent").reason
+        camera.fire(1)
+        assert port in failed(camera, 1)
+    finally:
+        camera.stop()
+
+
+def test_a_camera_held_by_another_program_is_named_and_taken_when_it_is_free(make: Make, body: Body) -> None:
+    body.fault("refuse")
+    camera = make(timeouts={"retry_s": 0.05})
+    camera.start()
+    assert "another program" in until_state(camera, "faulted").reason
+    body.fault("clear")
+    until_state(camera, "ready")
+
+
+@pytest.mark.parametrize("target", ["card", "ram"])
+def test_a_busy_body_is_asked_again(ready: Make, body: Body, target: str) -> None:
+    camera = ready(capture_target=target)
+    body.fault("busy 0.3")
+    camera.fire(1)
+    assert of_shots(_ended(until_shot_ends(camera, 1))) == [(Fired, 1), (Arrival, 1)]
+    assert body.releases == 1
+
+
+@pytest.mark.slow
+def test_a_body_that_stays_busy_fails_the_shot_and_takes_the_next(ready: Make, body: Body) -> None:
+    camera = ready(timeouts={"busy_s": 0.2})
+    body.fault("busy")
+    camera.fire(1)
+    assert "busy" in failed(camera, 1)
+    body.fault("clear")
+    camera.fire(2)
+    assert of_shots(_ended(until_shot_ends(camera, 2))) == [(Fired, 2), (Arrival, 2)]
+
+
+def test_a_refused_release_fails_the_shot_and_takes_the_next(ready: Make, body: Body) -> None:
+    camera = ready()
+    body.fault("error")
+    camera.fire(1)
+    camera.fire(2)
+    assert of_shots(_ended(until_shot_ends(camera, 2))) == [(ShotFailed, 1), (Fired, 2), (Arrival, 2)]
+
+
+def test_a_full_card_fails_the_shot_with_a_hint() -> None:
+    with Body.start(BodyOptions(picture="pattern:1000:cr2", card_bytes=1500)) as body:
+        camera = open_camera({"port": body.port})
+        camera.start()
+        try:
+            until_state(camera, "ready")
+            camera.fire(1)
+            camera.fire(2)
+            events = _ended(until_shot_ends(camera, 2))
+            assert of_shots(events) == [(Fired, 1), (Arrival, 1), (ShotFailed, 2)]
+            assert "card" in events[-1].reason
+        finally:
+            camera.stop()
+
+
+def test_a_lost_event_s_file_is_found_on_the_card(ready: Make, body: Body) -> None:
+    camera = ready(timeouts={"complete_s": 0.2})
+    camera.fire(1)
+    _ended(until_shot_ends(camera, 1))
+    body.fault("no-event")
+    camera.fire(2)
+    arrival = arrived(camera, 2)
+    assert arrival.name == "IMG_0002.DNG"
+    assert content(arrival) == pattern(2, SIZE)
+
+
+def test_a_lost_event_s_file_in_memory_fails_the_shot(ready: Make, body: Body) -> None:
+    camera = ready(capture_target="ram", timeouts={"file_s": 0.5})
+    body.fault("no-event")
+    camera.fire(1)
+    assert "0.5 s" in failed(camera, 1)
+
+
+def test_a_file_of_the_wrong_length_is_asked_for_again(ready: Make, body: Body) -> None:
+    camera = ready()
+    body.fault("short")
+    camera.fire(1)
+    arrival = arrived(camera, 1)
+    assert content(arrival) == pattern(1, SIZE)
+
+
+def test_a_file_that_stays_of_the_wrong_length_fails_the_shot_and_stays_on_the_card(ready: Make, body: Body) -> None:
+    camera = ready()
+    body.fault("short 1000")
+    camera.fire(1)
+    reason = failed(camera, 1)
+    assert str(SIZE) in reason
+    assert "IMG_0001.DNG" in reason
+    assert body.card == ["IMG_0001.DNG"]
+
+
+def test_a_link_dropped_while_idle_comes_back(ready: Make, body: Body) -> None:
+    camera = ready()
+    body.fault("drop")
+    assert until_state(camera, "faulted").reason
+    until_state(camera, "ready")
+    camera.fire(1)
+    assert of_shots(_ended(until_shot_ends(camera, 1))) == [(Fired, 1), (Arrival, 1)]
+
+
+def test_a_link_dropped_in_mid_transfer_loses_no_file_on_the_card(ready: Make, body: Body) -> None:
+    camera = ready()
+    body.fault("drop-transfer")
+    camera.fire(1)
+    events = until_shot_ends(camera, 1)
+    arrival = events[-1]
+    assert isinstance(arrival, Arrival)
+    assert content(arrival) == pattern(1, SIZE)
+    assert any(isinstance(event, StateChanged) and event.state == "faulted" for event in events)
+    assert body.releases == 1
+
+
+def test_a_link_dropped_in_mid_exposure_loses_no_file_on_the_card() -> None:
+    with Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", delay_s=0.5)) as body:
+        camera = open_camera({"port": body.port})
+        camera.start()
+        try:
+            until_state(camera, "ready")
+            camera.fire(1)
+            until(camera, lambda event: isinstance(event, Fired))
+            body.fault("drop")
+            arrival = arrived(camera, 1)
+            assert content(arrival) == pattern(1, SIZE)
+            assert body.releases == 1
+        finally:
+            camera.stop()
+
+
+@pytest.mark.slow
+def test_a_silent_body_costs_the_shot_and_the_process_but_not_the_camera(ready: Make, body: Body) -> None:
+    camera = ready(timeouts={"answer_s": 1.5})
+    body.fault("silence")
+    camera.fire(1)
+    assert "1.5 s" in failed(camera, 1)
+    body.fault("clear")
+    until_state(camera, "ready")
+    camera.fire(2)
+    assert of_shots(_ended(until_shot_ends(camera, 2)))[-1] == (Arrival, 2)
+
+
+@pytest.mark.slow
+def test_a_silent_body_is_given_up_by_libgphoto2_itself_and_served_again(ready: Make, body: Body) -> None:
+    camera = ready()
+    body.fault("silence")
+    camera.fire(1)
+    camera.fire(2)
+    events = until_shot_ends(camera, 2)
+    reasons = {event.shot: event.reason for event in events if isinstance(event, ShotFailed)}
+    assert set(reasons) == {1, 2}
+    assert "may have opened" in reasons[1]
+    body.fault("clear")
+    until_state(camera, "ready")
+    camera.fire(3)
+    assert of_shots(_ended(until_shot_ends(camera, 3)))[-1] == (Arrival, 3)
+
+
+@pytest.mark.slow
+def test_stop_does_not_wait_for_a_silent_body(ready: Make, body: Body) -> None:
+    camera = ready()
+    body.fault("silence")
+    camera.fire(1)
+    stopper = threading.Thread(target=camera.stop)
+    stopper.start()
+    stopper.join(6.0)  # libgphoto2 alone would hold on for 7.5 s
+    assert not stopper.is_alive()
+    assert of_shots(until_shot_ends(camera, 1)) == [(ShotFailed, 1)]
+
+
+def _recorded(
+    started: list[subprocess.Popen[bytes]],
+) -> Spawn:
+    def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
+        process, channel = spawn_process(settings, before)
+        started.append(process)
+        return process, channel
+
+    return spawn
+
+
+def test_a_crash_of_the_process_fails_its_shots_and_is_made_good(body: Body) -> None:
+    body.fault("no-event")
+    started: list[subprocess.Popen[bytes]] = []
+    camera = GPhoto2Camera(parse_settings({"port": body.port}), spawn=_recorded(started))
+    camera.start()
+    try:
+        until_state(camera, "ready")
+        camera.fire(1)
+        camera.fire(2)
+        until(camera, lambda event: isinstance(event, Fired))
+        started[0].send_signal(signal.SIGKILL)
+        events = until(camera, lambda event: isinstance(event, StateChanged) and event.state == "ready")
+        assert of_shots(events) == [(ShotFailed, 1), (ShotFailed, 2)]
+        camera.fire(3)
+        assert of_shots(_ended(until_shot_ends(camera, 3))) == [(Fired, 3), (Arrival, 3)]
+        assert len(started) == 2
+    finally:
+        camera.stop()
+
+
+def test_what_a_dead_process_had_fired_is_fetched_by_the_next_one(body: Body) -> None:
+    """Also when its file was on the card before the next process looked there for the first time."""
+    started: list[subprocess.Popen[bytes]] = []
+    camera = GPhoto2Camera(parse_settings({"port": body.port}), spawn=_recorded(started))
+    camera.start()
+    try:
+        until_state(camera, "ready")
+        camera.fire(1)
+        _ended(until_shot_ends(camera, 1))
+        body.fault("no-event")
+        camera.fire(2)
+        until(camera, lambda event: isinstance(event, Fired) and event.shot == 2)
+        started[0].send_signal(signal.SIGKILL)
+        until(camera, lambda event: isinstance(event, ShotFailed) and event.shot == 2)
+        arrival = arrived(camera, 2)
+        assert content(arrival) == pattern(2, SIZE)
+        camera.fire(3)
+        arrival = arrived(camera, 3)
+        assert content(arrival) == pattern(3, SIZE)
+    finally:
+        camera.stop()
+
+
+@pytest.mark.slow
+def test_a_process_that_keeps_dying_is_not_started_for_ever(body: Body) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
+        process, channel = _recorded(started)(settings, before)
+        process.kill()
+        return process, channel
+
+    camera = GPhoto2Camera(parse_settings({"port": body.port}), spawn=spawn, budget=RestartBudget(2, 3600.0))
+    camera.start()
+    try:
+        until(camera, lambda event: isinstance(event, StateChanged) and "too often" in event.reason)
+        assert len(started) == 3  # the first start and two restarts
+    finally:
+        camera.stop()
+
+
+def test_the_process_dies_with_its_parent(body: Body) -> None:
+    """A parent that is killed can't say goodbye; its child must go all the same."""
+    script = (
+        "import sys\n"
+        "from dappled.drivers.gphoto2.client import spawn_process\n"
+        "from dappled.drivers.gphoto2.settings import parse_settings\n"
+        "from dappled.drivers.gphoto2.before import Before\n"
+        "process, channel = spawn_process(parse_settings({'port': sys.argv[1]}), Before())\n"
+        "while channel.receive(30).body.get('state') != 'ready': pass\n"
+        "print(process.pid, flush=True)\n"
+        "sys.stdin.read()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", script, body.port], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        os.kill(child, 0)
+        parent.kill()
+        parent.wait()
+    deadline = time.monotonic() + 20
+    while _lives(child):
+        assert time.monotonic() < deadline, "the camera's process outlived its parent"
+        time.sleep(0.02)
+
+
+def _lives(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+def test_a_shot_in_flight_can_not_be_fired_again(ready: Make) -> None:
+    camera = ready()
+    camera.fire(1)
+    with pytest.raises(CameraError, match="shot 1"):
+        camera.fire(1)
+    _ended(until_shot_ends(camera, 1))
+
+
+def _ended(events: list[Any]) -> list[Any]:
+    """The events, with the descriptors of arrivals closed."""
+    for event in events:
+        if isinstance(event, Arrival):
+            event.blob.close()
+    return events
+
+
+def test_budget_allows_its_number_in_any_window() -> None:
+    budget = RestartBudget(limit=2, window_s=60.0)
+    second = 1_000_000_000
+    for at in (0, 10):
+        assert budget.wait_ns(at * second) == 0
+        budget.spend(at * second)
+    assert budget.wait_ns(20 * second) == 40 * second
+    assert budget.wait_ns(60 * second) == 0
+    budget.spend(60 * second)
+    assert budget.wait_ns(61 * second) == 9 * second
+
+
+@pytest.mark.parametrize("target", ["card", "ram"])
+def test_raw_and_jpeg_are_one_frame_and_its_companion(target: str) -> None:
+    with Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", pairs=True)) as body:
+        camera = open_camera({"port": body.port, "capture_target": target, "delete_after_download": True})
+        camera.start()
+        try:
+            until_state(camera, "ready")
+            for shot in (1, 2):
+                camera.fire(shot)
+                events = until(camera, lambda event: isinstance(event, Companion))
+                assert of_shots(events) == [(Fired, shot), (Arrival, shot), (Companion, shot)]
+                raw, jpeg = [event for event in events if isinstance(event, Arrival | Companion)]
+                assert [one.name.lower().endswith(end) for one, end in ((raw, ".cr2"), (jpeg, ".jpg"))] == [True] * 2
+                assert content(raw) == pattern(shot, SIZE)
+                assert content(jpeg) == thumbnail(shot)
+                camera.release(raw)
+                camera.release(jpeg)
+            camera.fire(3)  # commands are obeyed in order: the deletions come first
+            _ended(until(camera, lambda event: isinstance(event, Companion)))
+            assert body.card == (["IMG_0003.CR2", "IMG_0003.JPG"] if target == "card" else [])
+        finally:
+            camera.stop()
+
+
+def test_no_focus_fails_the_shot_soon_and_takes_the_next(ready: Make, body: Body) -> None:
+    camera = ready(timeouts={"complete_s": 0.5})
+    body.fault("no-focus")
+    camera.fire(1)
+    assert "focus" in failed(camera, 1)
+    camera.fire(2)
+    assert of_shots(_ended(until_shot_ends(camera, 2))) == [(Fired, 2), (Arrival, 2)]
+
+
+def test_a_slow_transfer_is_waited_for(ready: Make, body: Body) -> None:
+    camera = ready(timeouts={"file_s": 1.0})
+    body.fault("slow 1.5")
+    camera.fire(1)
+    arrival = arrived(camera, 1)
+    assert content(arrival) == pattern(1, SIZE)
+
+
+@pytest.mark.parametrize("wanted", ["0000000001", "0000000002"])
+def test_of_two_bodies_of_one_model_the_one_with_the_serial_number_is_taken(wanted: str) -> None:
+    numbers = ("0000000001", "0000000002")
+    with (
+        Body.start(BodyOptions(picture="pattern:1000:cr2", serial=numbers[0])) as one,
+        Body.start(BodyOptions(picture="pattern:1000:cr2", serial=numbers[1])) as other,
+    ):
+        camera = open_camera({"port": f"{one.port},{other.port}", "serial": wanted})
+        camera.start()
+        try:
+            until_state(camera, "ready")
+            assert camera.identity is not None
+            assert camera.identity.serial == wanted
+            camera.fire(1)
+            _ended(until_shot_ends(camera, 1))
+            assert [one.releases, other.releases] == [int(wanted == number) for number in numbers]
+        finally:
+            camera.stop()
+
+
+@pytest.mark.slow
+def test_after_a_break_the_same_body_is_taken_again_and_not_its_twin() -> None:
+    with (
+        Body.start(BodyOptions(picture="pattern:1000:cr2", serial="0000000001")) as one,
+        Body.start(BodyOptions(picture="pattern:1000:cr2", serial="0000000002")) as other,
+    ):
+        one.fault("unplug")
+        camera = open_camera({"port": f"{one.port},{other.port}", "timeouts": {"retry_s": 0.1}})
+        camera.start()
+        try:
+            until_state(camera, "ready")
+            assert camera.identity is not None
+            assert camera.identity.serial == "0000000002"
+            one.fault("clear")
+            other.fault("drop")
+            until_state(camera, "faulted")
+            until_state(camera, "ready")
+            assert camera.identity.serial == "0000000002"
+        finally:
+            camera.stop()
+
+
+def test_a_process_that_can_t_be_started_now_is_tried_again(body: Body) -> None:
+    problems = [OSError(errno.EMFILE, os.strerror(errno.EMFILE)), OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))]
+
+    def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
+        if problems:
+            raise problems.pop(0)
+        return spawn_process(settings, before)
+
+    camera = GPhoto2Camera(parse_settings({"port": body.port}), spawn=spawn)
+    camera.start()
+    try:
+        assert "Too many open files" in until_state(camera, "faulted").reason
+        camera.fire(1)
+        assert of_shots(until_shot_ends(camera, 1)) == [(ShotFailed, 1)]
+        until_state(camera, "ready")
+        camera.fire(2)
+        _ended(until_shot_ends(camera, 2))
+    finally:
+        camera.stop()
+
+
+def test_a_body_that_comes_back_under_another_address_is_found() -> None:
+    with Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", addresses=2)) as body:
+        camera = open_camera({"port": body.port, "timeouts": {"retry_s": 0.1}})
+        camera.start()
+        try:
+            until_state(camera, "ready")
+            before = camera.identity
+            body.ask("move")
+            until_state(camera, "faulted")
+            until_state(camera, "ready")
+            assert before is not None
+            assert camera.identity is not None
+            assert before.serial == camera.identity.serial
+            assert before.port != camera.identity.port
+            camera.fire(1)
+            _ended(until_shot_ends(camera, 1))
+        finally:
+            camera.stop()
+
+
+@pytest.mark.slow
+def test_a_silent_body_on_usb_has_its_port_reset(body: Body) -> None:
+    resets: list[str] = []
+    settings = parse_settings({"port": body.port, "timeouts": {"answer_s": 1.5}})
+    camera = GPhoto2Camera(settings, reset=resets.append)
+    camera.start()
+    try:
+        until_state(camera, "ready")
+        body.fault("silence")
+        camera.fire(1)
+        until_state(camera, "busy")
+        assert camera.identity is not None
+        camera._identity = replace(camera.identity, port="usb:001,005")  # as if it were there
+        assert "port reset" in failed(camera, 1)
+        assert resets == ["usb:001,005"]
+        body.fault("clear")
+        until_state(camera, "ready")
+    finally:
+        camera.stop()

@@ -1,0 +1,493 @@
+"""The loop of the camera's process, with a camera made of lists and a clock that the test turns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import pytest
+
+from dappled.drivers.camera import (
+    Arrival,
+    Blob,
+    Companion,
+    Event,
+    Fired,
+    Identity,
+    Setting,
+    SettingName,
+    SettingsChanged,
+    ShotFailed,
+    StateChanged,
+)
+from dappled.drivers.gphoto2.channel import Channel, ChannelError, message_event
+from dappled.drivers.gphoto2.loop import CameraLoop
+from dappled.drivers.gphoto2.protocol import (
+    AbsentError,
+    BusyError,
+    CameraFile,
+    CameraNews,
+    CaptureComplete,
+    Fetched,
+    FileAdded,
+    LostError,
+    RefusedError,
+    SessionError,
+)
+from dappled.drivers.gphoto2.settings import GPhoto2Settings
+from tests.drivers.contract import content, of_shots
+
+FOLDER = "/store/DCIM/100CANON"
+
+
+def on_card(number: int) -> CameraFile:
+    return CameraFile(FOLDER, f"IMG_{number:04d}.CR2")
+
+
+@dataclass
+class FakeCamera:
+    """A camera and its card. `news` is what its next session call reports; `errors` are raised in turn by the call
+    that they name."""
+
+    keeps_files: bool = True
+    identity: Identity = field(default=Identity("Canon", "450D", "1", "usb:1,2"))
+    card: dict[CameraFile, bytes] = field(default_factory=dict)
+    coming: list[CameraNews] = field(default_factory=list)
+    errors: dict[str, list[SessionError]] = field(default_factory=dict)
+    taken: dict[CameraFile, int] = field(default_factory=dict)
+    shown: tuple[Setting, ...] = ()
+    triggered: int = 0
+    opened: int = 0
+    closed: int = 0
+
+    def open(self, _settings: GPhoto2Settings, _before: str | None) -> FakeCamera:
+        self._stumble("open")
+        self.opened += 1
+        return self
+
+    def trigger(self) -> None:
+        self._stumble("trigger")
+        self.triggered += 1
+
+    def news(self) -> list[CameraNews]:
+        self._stumble("news")
+        news, self.coming = self.coming, []
+        return news
+
+    def fetch(self, file: CameraFile) -> Fetched:
+        self._stumble("fetch")
+        return Fetched(Blob.of(self.card[file]), self.taken.get(file))
+
+    def delete(self, file: CameraFile) -> None:
+        self._stumble("delete")
+        del self.card[file]
+
+    def files(self) -> frozenset[CameraFile]:
+        self._stumble("files")
+        return frozenset(file for file in self.card if not file.in_memory)
+
+    def taken_s(self, file: CameraFile) -> int | None:
+        return self.taken.get(file)
+
+    def about(self, file: CameraFile) -> tuple[int, int | None]:
+        return len(self.card[file]), self.taken.get(file)
+
+    def settings(self) -> tuple[Setting, ...]:
+        self._stumble("settings")
+        return self.shown
+
+    def change(self, name: SettingName, value: str) -> None:
+        self._stumble("change")
+        self.shown = tuple(replace(each, value=value) if each.name == name else each for each in self.shown)
+
+    def close(self) -> None:
+        self.closed += 1
+
+    def adds(self, file: CameraFile, data: bytes = b"picture", *, tells: bool = True) -> None:
+        self.card[file] = data
+        if tells:
+            self.coming.append(FileAdded(file))
+
+    def _stumble(self, call: str) -> None:
+        if self.errors.get(call):
+            raise self.errors[call].pop(0)
+
+
+class Harness:
+    """The loop on one end of a channel, the test on the other."""
+
+    def __init__(self) -> None:
+        self.now_ns = 1_000_000_000_000
+        self.camera = FakeCamera()
+        self.channel, there = Channel.pair()
+        self.loop_channel = Channel(there)
+        self.loop = CameraLoop(self.loop_channel, GPhoto2Settings(), self.camera.open, lambda: self.now_ns)
+
+    def fire(self, *shots: int) -> None:
+        for shot in shots:
+            self.channel.send({"do": "fire", "shot": shot})
+
+    def turn(self, seconds: float = 0.0, steps: int = 3) -> list[Event]:
+        """Let time pass, then let the loop step; what it said."""
+        self.now_ns += round(seconds * 1e9)
+        for _ in range(steps):
+            self.channel.send({"do": "ping"})  # a waiting command: the loop need not wait for one
+            assert self.loop.step()
+        events: list[Event] = []
+        pongs = 0
+        while (message := self.channel.receive(0.0)) is not None:
+            if message.body["is"] == "pong":
+                pongs += 1
+            else:
+                events.append(message_event(message))
+        assert pongs == steps
+        return events
+
+
+@pytest.fixture
+def harness() -> Iterator[Harness]:
+    made = Harness()
+    yield made
+    made.channel.close()
+    made.loop_channel.close()
+
+
+@pytest.fixture
+def ready(harness: Harness) -> Harness:
+    """A harness whose camera is open."""
+    assert [event.state for event in harness.turn() if isinstance(event, StateChanged)] == ["starting", "ready"]
+    return harness
+
+
+def failures(events: list[Event]) -> dict[int, str]:
+    return {event.shot: event.reason for event in events if isinstance(event, ShotFailed)}
+
+
+def states(events: list[Event]) -> list[tuple[str, str]]:
+    return [(event.state, event.reason) for event in events if isinstance(event, StateChanged)]
+
+
+def arrivals(events: list[Event]) -> list[Arrival]:
+    return [event for event in events if isinstance(event, Arrival)]
+
+
+def test_absent_camera_is_looked_for_until_it_comes(harness: Harness) -> None:
+    harness.camera.errors["open"] = [AbsentError("nothing here"), AbsentError("nothing here")]
+    assert states(harness.turn()) == [("starting", ""), ("absent", "nothing here")]
+    harness.fire(1)
+    assert "nothing here" in failures(harness.turn())[1]
+    assert states(harness.turn(1.1, steps=1)) == []  # the same state isn't told twice
+    assert states(harness.turn(1.1)) == [("ready", "")]
+
+
+def test_one_shot_is_at_the_camera_at_a_time(ready: Harness) -> None:
+    ready.fire(1, 2)
+    assert of_shots(ready.turn()) == [(Fired, 1)]
+    ready.camera.adds(on_card(1), b"one")
+    events = ready.turn()
+    assert of_shots(events) == [(Arrival, 1), (Fired, 2)]
+    assert content(arrivals(events)[0]) == b"one"
+    ready.camera.adds(on_card(2), b"two")
+    assert content(arrivals(ready.turn())[0]) == b"two"
+    assert ready.camera.triggered == 2
+
+
+def test_more_than_64_waiting_shots_are_refused(ready: Harness) -> None:
+    ready.fire(*range(70))
+    assert sorted(failures(ready.turn(steps=1))) == [64, 65, 66, 67, 68, 69]
+
+
+def test_a_file_that_nobody_asked_for_has_no_shot(ready: Harness) -> None:
+    ready.camera.adds(on_card(1))
+    (arrival,) = arrivals(ready.turn())
+    assert arrival.shot is None
+    arrival.blob.close()
+
+
+def test_a_file_announced_twice_comes_once(ready: Harness) -> None:
+    ready.camera.adds(on_card(1))
+    ready.camera.coming.append(FileAdded(on_card(1)))
+    arrivals(ready.turn())[0].blob.close()
+    ready.camera.coming.append(FileAdded(on_card(1)))
+    assert ready.turn() == []
+
+
+def test_busy_is_asked_again_every_50_ms_for_busy_s(ready: Harness) -> None:
+    ready.camera.errors["trigger"] = [BusyError("busy")] * 2
+    ready.fire(1)
+    assert of_shots(ready.turn()) == []
+    assert of_shots(ready.turn(0.05)) == []
+    assert of_shots(ready.turn(0.05)) == [(Fired, 1)]
+
+
+def test_busy_for_longer_fails(ready: Harness) -> None:
+    ready.camera.errors["trigger"] = [BusyError("the camera is too busy")] * 2
+    ready.fire(1)
+    ready.turn()
+    assert "5 s" in failures(ready.turn(5.1))[1]
+
+
+def test_refused_release_fails_the_shot_only(ready: Harness) -> None:
+    ready.camera.errors["trigger"] = [RefusedError("no")]
+    ready.fire(1, 2)
+    assert of_shots(ready.turn()) == [(ShotFailed, 1), (Fired, 2)]
+
+
+def test_lost_in_the_trigger_call_fails_the_shot_and_marks_what_follows_as_doubtful(ready: Harness) -> None:
+    ready.camera.errors["trigger"] = [LostError("no answer")]
+    ready.fire(1, 2)
+    events = ready.turn(steps=1)
+    assert "may have opened" in failures(events)[1]
+    assert states(events)[-1] == ("faulted", "no answer")
+    ready.camera.adds(on_card(1), tells=False)  # it had opened
+    events = ready.turn(1.0)
+    (late,) = arrivals(events)
+    assert late.shot == 1
+    assert "shot 1" in late.facts["doubt"]
+    late.blob.close()
+
+
+@pytest.mark.parametrize(("complete", "wait_s"), [(True, 2.6), (False, 10.1)])
+def test_a_lost_event_s_file_is_searched_for_on_the_card(ready: Harness, complete: bool, wait_s: float) -> None:
+    ready.camera.adds(on_card(1))
+    arrivals(ready.turn())[0].blob.close()
+    ready.fire(1)
+    ready.turn()
+    ready.camera.adds(on_card(2), b"found", tells=False)
+    if complete:
+        ready.camera.coming.append(CaptureComplete())
+    ready.turn()
+    assert arrivals(ready.turn(wait_s - 0.2)) == []
+    (arrival,) = arrivals(ready.turn(0.2))
+    assert arrival.shot == 1
+    assert arrival.name == "IMG_0002.CR2"
+    assert content(arrival) == b"found"
+
+
+def test_no_file_anywhere_fails_after_file_s(ready: Harness) -> None:
+    ready.fire(1)
+    ready.turn()
+    assert failures(ready.turn(19.9)) == {}
+    assert "20 s" in failures(ready.turn(0.2))[1]
+
+
+def test_a_link_lost_after_the_release_brings_the_file_when_it_is_back(ready: Harness) -> None:
+    ready.fire(1, 2)
+    ready.turn()
+    ready.camera.errors["news"] = [LostError("gone")]
+    ready.camera.errors["open"] = [AbsentError("not yet")]
+    assert failures(ready.turn()) == {}
+    ready.camera.adds(on_card(1), b"kept", tells=False)
+    assert states(ready.turn(0.3))[-1] == ("absent", "not yet")
+    events = ready.turn(1.1)
+    assert of_shots(events) == [(Arrival, 1), (Fired, 2)]
+    assert content(arrivals(events)[0]) == b"kept"
+
+
+def test_a_link_lost_in_mid_transfer_fetches_the_file_once_more(ready: Harness) -> None:
+    ready.fire(1)
+    ready.turn()
+    ready.camera.adds(on_card(1), b"whole")
+    ready.camera.errors["fetch"] = [LostError("gone")]
+    assert arrivals(ready.turn(steps=1)) == []
+    (arrival,) = arrivals(ready.turn(0.3))
+    assert arrival.shot == 1
+    assert content(arrival) == b"whole"
+
+
+def test_a_link_that_stays_away_fails_the_shot_and_all_that_wait(ready: Harness) -> None:
+    ready.fire(1, 2, 3)
+    ready.turn()
+    ready.camera.errors["news"] = [LostError("gone")]
+    ready.camera.errors["open"] = [AbsentError("pulled")] * 100
+    assert failures(ready.turn()) == {}
+    ready.turn(10)
+    events = ready.turn(10.1)
+    assert sorted(failures(events)) == [1, 2, 3]
+    assert "pulled" in failures(events)[2]
+
+
+def test_a_link_lost_with_the_picture_in_memory_fails_the_shot(harness: Harness) -> None:
+    harness.camera.keeps_files = False
+    harness.turn()
+    harness.fire(1)
+    harness.turn()
+    harness.camera.errors["news"] = [LostError("gone")]
+    assert failures(harness.turn()) == {1: "gone"}
+
+
+def test_a_bad_file_is_fetched_three_times_and_then_left_on_the_card(ready: Harness) -> None:
+    ready.fire(1)
+    ready.turn()
+    ready.camera.adds(on_card(1))
+    ready.camera.errors["fetch"] = [RefusedError("announced 7 and sent 6")] * 3
+    reason = failures(ready.turn(steps=5))[1]
+    assert "announced 7 and sent 6" in reason
+    assert f"{FOLDER}/IMG_0001.CR2" in reason
+    assert arrivals(ready.turn()) == []
+
+
+def shot_on(harness: Harness, shot: int, taken_s: int | None, number: int) -> list[Event]:
+    """A shot whose file is announced at once."""
+    harness.fire(shot)
+    harness.turn()
+    file = on_card(number)
+    harness.camera.adds(file, b"%d" % number)
+    if taken_s is not None:
+        harness.camera.taken[file] = taken_s
+    return harness.turn()
+
+
+@pytest.mark.parametrize("hours_wrong", [0, 1, -24])
+def test_a_late_file_is_told_from_the_next_shot_s_by_the_body_s_own_time(ready: Harness, hours_wrong: int) -> None:
+    def body_s() -> int:
+        return ready.now_ns // 10**9 + 1_700_000_000 + hours_wrong * 3600
+
+    (first,) = arrivals(shot_on(ready, 1, body_s(), 1))
+    first.blob.close()
+    ready.turn(5.0)
+    ready.fire(2)
+    ready.turn()
+    late, taken = on_card(2), body_s()
+    assert list(failures(ready.turn(30.1))) == [2]  # no file, in time
+    ready.fire(3)
+    ready.turn()
+    ready.camera.taken[late] = taken
+    ready.camera.adds(late, b"of shot 2")
+    (came,) = arrivals(ready.turn())
+    assert (came.shot, content(came), "doubt" in came.facts) == (2, b"of shot 2", False)
+    ready.camera.taken[on_card(3)] = body_s()
+    ready.camera.adds(on_card(3), b"of shot 3")
+    (came,) = arrivals(ready.turn())
+    assert (came.shot, content(came), "doubt" in came.facts) == (3, b"of shot 3", False)
+
+
+def test_without_a_body_s_time_a_file_that_may_be_late_is_marked(ready: Harness) -> None:
+    ready.fire(1)
+    ready.turn()
+    ready.turn(30.1)
+    (came,) = arrivals(shot_on(ready, 2, None, 1))
+    assert came.shot == 2
+    assert "shot 1 or 2" in came.facts["doubt"]
+    came.blob.close()
+    (came,) = arrivals(shot_on(ready, 3, None, 2))
+    assert "doubt" not in came.facts  # files come in order
+    came.blob.close()
+
+
+RAW_AND_JPEG = (Setting("image_format", "RAW + Large Fine JPEG", ("RAW", "RAW + Large Fine JPEG")),)
+RAW, JPEG = on_card(1), CameraFile(FOLDER, "IMG_0001.JPG")
+
+
+@pytest.mark.parametrize("order", [(RAW, JPEG), (JPEG, RAW)])
+def test_raw_and_jpeg_are_one_frame_whichever_comes_first(
+    harness: Harness, order: tuple[CameraFile, CameraFile]
+) -> None:
+    harness.camera.shown = RAW_AND_JPEG
+    harness.turn()
+    harness.fire(7)
+    harness.turn()
+    events: list[Event] = []
+    for file in order:
+        harness.camera.adds(file, b"\xff\xd8\xffjpeg" if file == JPEG else b"II*\0raw bytes CR")
+        events += harness.turn()
+    arrival, companion = [event for event in events if isinstance(event, Arrival | Companion)]
+    assert isinstance(arrival, Arrival)
+    assert isinstance(companion, Companion)
+    assert (arrival.shot, arrival.name, companion.shot, companion.name) == (7, RAW.name, 7, JPEG.name)
+    arrival.blob.close()
+    companion.blob.close()
+    assert failures(events) == {}
+
+
+def test_a_jpeg_whose_raw_file_never_comes_is_a_frame(harness: Harness) -> None:
+    harness.camera.shown = RAW_AND_JPEG
+    harness.turn()
+    harness.fire(7)
+    harness.turn()
+    harness.camera.adds(JPEG, b"\xff\xd8\xffjpeg")
+    assert arrivals(harness.turn()) == []
+    (arrival,) = arrivals(harness.turn(2.6))
+    assert (arrival.shot, arrival.name) == (7, JPEG.name)
+    arrival.blob.close()
+
+
+def test_finished_without_a_file_fails_soon(ready: Harness) -> None:
+    ready.fire(1)
+    ready.camera.coming.append(CaptureComplete())
+    ready.turn()
+    ready.turn(2.6)  # the card is searched
+    assert "focus" in failures(ready.turn(2.6))[1]
+
+
+def test_settings_are_read_at_the_start_and_after_a_change(harness: Harness) -> None:
+    harness.camera.shown = (Setting("iso", "100", ("100", "200")),)
+    told = [event for event in harness.turn() if isinstance(event, SettingsChanged)]
+    assert [event.settings for event in told] == [harness.camera.shown]
+    harness.channel.send({"do": "change", "name": "iso", "value": "200"})
+    told = [event for event in harness.turn() if isinstance(event, SettingsChanged)]
+    assert [(event.settings[0].value, event.refused) for event in told] == [("200", "")]
+
+
+def test_a_setting_that_is_refused_is_told(ready: Harness) -> None:
+    ready.camera.errors["change"] = [RefusedError("the dial stands at M")]
+    ready.channel.send({"do": "change", "name": "iso", "value": "200"})
+    (told,) = [event for event in ready.turn() if isinstance(event, SettingsChanged)]
+    assert "iso" in told.refused
+    assert "the dial stands at M" in told.refused
+
+
+def test_another_body_s_card_is_not_taken_for_new(ready: Harness) -> None:
+    ready.camera.errors["news"] = [LostError("gone")]
+    ready.turn()
+    ready.camera.identity = Identity("Canon", "450D", "2", "usb:1,3")
+    ready.camera.adds(on_card(5), tells=False)
+    assert arrivals(ready.turn(0.3)) == []
+
+
+def test_delete_deletes_and_a_refusal_harms_nothing(ready: Harness) -> None:
+    ready.camera.adds(on_card(1))
+    arrivals(ready.turn())[0].blob.close()
+    ready.camera.errors["delete"] = [RefusedError("write protected")]
+    delete = {"do": "delete", "folder": FOLDER, "name": "IMG_0001.CR2"}
+    ready.channel.send(delete)
+    assert ready.turn() == []
+    assert ready.camera.card
+    ready.channel.send(delete)
+    assert ready.turn() == []
+    assert not ready.camera.card
+
+
+def test_a_name_used_again_after_deletion_is_a_new_file(ready: Harness) -> None:
+    for data in (b"first", b"second"):
+        ready.camera.adds(on_card(1), data)
+        assert content(arrivals(ready.turn())[0]) == data
+        ready.channel.send({"do": "delete", "folder": FOLDER, "name": "IMG_0001.CR2"})
+        ready.turn()
+
+
+def test_a_body_that_is_gone_when_its_card_is_searched_is_told_as_absent(ready: Harness) -> None:
+    ready.fire(1)
+    ready.turn()
+    ready.camera.errors["open"] = [AbsentError("nothing here")]
+    assert states(ready.turn(10.1, steps=1)) == [("absent", "nothing here")]
+    assert states(ready.turn(1.1)) == [("busy", "")]
+
+
+def test_stop_closes_the_camera(ready: Harness) -> None:
+    ready.channel.send({"do": "stop"})
+    ready.loop.run()
+    assert ready.camera.closed == 1
+
+
+def test_the_parent_s_end_closes_the_camera(ready: Harness) -> None:
+    ready.channel.close()
+    with pytest.raises(ChannelError):
+        ready.loop.run()
+    assert ready.camera.closed == 1
+
+
+def test_an_unknown_command_ends_the_process(ready: Harness) -> None:
+    ready.channel.send({"do": "dance"})
+    with pytest.raises(ChannelError, match="dance"):
+        ready.loop.step()

@@ -1,0 +1,302 @@
+"""Links over real sockets on loopback, and a pseudo terminal."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pty
+import socket
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+
+from dappled.drivers.mavlink import links as mavlink_links
+from dappled.drivers.mavlink.address import Address
+from dappled.drivers.mavlink.links import LinkError, MavlinkLinks, Packet, mavlink
+from dappled.drivers.mavlink.stream import Listener, Stream, over_tcp
+
+
+class Clock:
+    def utc_ns(self) -> int:
+        return time.time_ns()
+
+    def monotonic_ns(self) -> int:
+        return time.monotonic_ns()
+
+
+class Side:
+    """One end, with all that it saw and logged."""
+
+    def __init__(self, url: str, *, system_id: int = 1, on_packet: Callable[[Packet], None] | None = None) -> None:
+        self.packets: list[Packet] = []
+        self.logged: list[bytes] = []
+        self.changed = threading.Condition()
+        self._act = on_packet
+        self.links = MavlinkLinks(
+            [url], system_id=system_id, component_id=1, tap=self._tap, on_packet=self._seen, clock=Clock()
+        )
+
+    def _tap(self, stamp_us: int, raw: bytes) -> int:
+        assert abs(stamp_us - time.time_ns() // 1000) < 10**8
+        self.logged.append(raw)
+        return len(self.logged) - 1
+
+    def _seen(self, packet: Packet) -> None:
+        with self.changed:
+            self.packets.append(packet)
+            self.changed.notify_all()
+        if self._act:
+            self._act(packet)
+
+    def received(self, count: int, timeout_s: float = 10.0) -> list[Packet]:
+        with self.changed:
+            assert self.changed.wait_for(lambda: sum(not p.sent for p in self.packets) >= count, timeout_s)
+            return [p for p in self.packets if not p.sent]
+
+    def __enter__(self) -> Side:
+        self.links.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.links.stop()
+
+
+def heartbeat() -> object:
+    return mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)
+
+
+def send_until_received(sender: Side, receiver: Side, count: int = 1) -> list[Packet]:
+    deadline = time.monotonic() + 10
+    while sum(not p.sent for p in list(receiver.packets)) < count and time.monotonic() < deadline:
+        sender.links.send(heartbeat())
+        with receiver.changed:
+            receiver.changed.wait(0.1)
+    return receiver.received(count)
+
+
+@pytest.mark.parametrize(("listen", "connect"), [("udpin", "udpout"), ("tcpin", "tcp")])
+def test_both_ways_and_logged_before_acted_on(listen: str, connect: str) -> None:
+    with Side(f"{listen}:127.0.0.1:0") as server:
+        with Side(f"{connect}:127.0.0.1:{server.links.port(0)}", system_id=7) as client:
+            first = send_until_received(client, server)[0]
+            assert first.message.get_srcSystem() == 7
+            assert server.logged[first.number or 0] == first.raw
+            back = send_until_received(server, client)[0]
+            assert back.message.get_srcSystem() == 1
+            sent = next(p for p in server.packets if p.sent)
+            assert server.logged[sent.number or 0] == sent.raw == back.raw
+        assert [p.number for p in server.packets] == list(range(len(server.packets)))
+
+
+def test_mavlink_1_is_understood_and_answered_in_kind() -> None:
+    with Side("udpin:127.0.0.1:0") as server, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as old:
+        old.settimeout(10)
+        packer = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
+        old.sendto(heartbeat().pack(packer, force_mavlink1=True), ("127.0.0.1", server.links.port(0)))  # type: ignore[attr-defined]  # pymavlink's messages are untyped
+        assert server.received(1)[0].raw[0] == 0xFE
+        server.links.send(heartbeat())
+        assert old.recv(300)[0] == 0xFE
+        server.links.send(mavlink.MAVLink_camera_settings_message(0, 0, 0, 0))
+        assert old.recv(300)[0] == 0xFD
+
+
+def test_a_tcp_link_comes_back_after_its_server_was_gone() -> None:
+    server = Side("tcpin:127.0.0.1:0")
+    server.links.start()
+    port = server.links.port(0)
+    with Side(f"tcp:127.0.0.1:{port}") as client:
+        send_until_received(client, server)
+        server.links.stop()
+        with Side(f"tcpin:127.0.0.1:{port}") as again:
+            send_until_received(client, again)
+            assert client.links.statistics()[0].error is None
+
+
+def test_a_client_that_fell_silent_does_not_keep_the_next_one_waiting() -> None:
+    with Side("tcpin:127.0.0.1:0") as server:
+        address = ("127.0.0.1", server.links.port(0))
+        with socket.create_connection(address) as vanished, socket.create_connection(address) as second:
+            packer = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
+            second.sendall(heartbeat().pack(packer))  # type: ignore[attr-defined]  # as above
+            assert server.received(1)[0].message.get_srcSystem() == 9
+            server.links.send(heartbeat())
+            second.settimeout(10)
+            assert second.recv(300)[0] == 0xFD
+            vanished.settimeout(10)
+            assert vanished.recv(300) == b""  # let go: a machine that is still there comes again
+
+
+def test_a_client_is_not_let_go_while_somebody_writes_to_it() -> None:
+    """Its descriptor could be another file's by then."""
+    told: list[str] = []
+    began, go_on = threading.Event(), threading.Event()
+
+    class Slow:
+        def write(self, _data: bytes) -> bool:
+            told.append("begun")
+            began.set()
+            assert go_on.wait(20)
+            told.append("written")
+            return True
+
+        def close(self) -> None:
+            told.append("closed")
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.setblocking(False)
+        listener = Listener(server)
+        listener._client = Slow()  # type: ignore[assignment]  # all that is asked of one
+        writer = threading.Thread(target=listener.write, args=[b"x"])
+        writer.start()
+        assert began.wait(20)
+        with socket.create_connection(server.getsockname()):
+            reader = threading.Thread(target=listener.read)
+            reader.start()
+            reader.join(0.1)
+            assert told == ["begun"]
+            go_on.set()
+            for thread in (writer, reader):
+                thread.join(20)
+            assert told == ["begun", "written", "closed"]
+        listener.close()
+
+
+@pytest.mark.parametrize("number", [errno.ECONNABORTED, errno.EHOSTUNREACH])
+def test_one_who_left_before_it_was_let_in_costs_nobody_the_link(number: int) -> None:
+    class Knocked:
+        """A listening socket at which somebody knocks and runs away."""
+
+        def __init__(self, sock: socket.socket) -> None:
+            self.sock, self.away = sock, True
+
+        def accept(self) -> tuple[socket.socket, object]:
+            if self.away:
+                self.away = False
+                raise OSError(number, os.strerror(number))
+            return self.sock.accept()
+
+        def close(self) -> None:
+            self.sock.close()
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        door = Knocked(server)
+        server.setblocking(False)
+        listener = Listener(door)  # type: ignore[arg-type]  # all that it asks of one
+        with socket.create_connection(server.getsockname()) as client:
+            assert listener.read() == b""  # who ran away
+            client.sendall(b"here")
+            deadline, heard = time.monotonic() + 20, listener.read()
+            while not heard:
+                assert time.monotonic() < deadline
+                door.away = not door.away  # again and again
+                heard = listener.read()
+            assert heard == b"here"
+        listener.close()
+
+
+def test_a_connection_whose_other_side_vanished_is_given_up_within_seconds() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as client:
+        over_tcp(client)
+        # The kernel's own limits are a quarter of an hour where something was sent, and two hours where nothing was.
+        assert client.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 5000
+        assert client.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
+        assert client.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) == 2
+        assert client.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL) == 1
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # what it provokes
+def test_a_receiving_thread_that_ended_is_named() -> None:
+    class Broken:
+        def descriptors(self) -> list[int]:
+            raise SystemExit  # a bug that no handler foresaw
+
+        def close(self) -> None:
+            return
+
+    side = Side("udpin:127.0.0.1:0")
+    with side:
+        assert side.links.dead() == []
+        open_one = side.links._links[0].channel
+        assert open_one is not None
+        side.links._links[0].channel = Broken()  # type: ignore[assignment]  # all that the thread asks
+        deadline = time.monotonic() + 10
+        while side.links.dead() != ["mavlink 0"]:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        open_one.close()
+    assert side.links.dead() == []  # it was asked to end
+
+
+def test_a_channel_that_is_opened_after_the_end_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server that answers while `stop` gives up waiting for the thread that asked."""
+    near, far = socket.socketpair()
+    asked, answered = threading.Event(), threading.Event()
+
+    def late(_: Address) -> Stream:
+        asked.set()
+        assert answered.wait(20)
+        return Stream(near.fileno(), near.close)
+
+    with socket.create_server(("127.0.0.1", 0)) as gone:
+        port = gone.getsockname()[1]
+    side = Side(f"tcp:127.0.0.1:{port}")
+    side.links.open()  # nobody is there yet
+    monkeypatch.setattr(mavlink_links, "open_channel", late)
+    side.links.start()
+    assert asked.wait(20)
+    side.links.stop()
+    answered.set()
+    far.settimeout(20)
+    assert far.recv(1) == b""
+    assert side.links.port(0) == 0
+    far.close()
+
+
+def test_a_serial_device() -> None:
+    near, far = pty.openpty()
+    try:
+        with Side(f"{os.ttyname(far)},57600") as side:
+            packer = mavlink.MAVLink(None, srcSystem=3, srcComponent=1)
+            os.write(near, b"noise" + heartbeat().pack(packer))  # type: ignore[attr-defined]  # as above
+            assert side.received(1)[0].message.get_srcSystem() == 3
+            side.links.send(heartbeat())
+            assert os.read(near, 300)[0] == 0xFD
+            assert side.links.statistics()[0].packets_bad >= 1
+    finally:
+        os.close(near)
+        os.close(far)
+
+
+def test_a_port_in_use_is_said_in_one_sentence() -> None:
+    with Side("udpin:127.0.0.1:0") as server, pytest.raises(LinkError, match="in use"):
+        Side(f"udpin:127.0.0.1:{server.links.port(0)}").links.start()
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("/dev/ttyNowhere7", "there is no device /dev/ttyNowhere7"),
+        ("/dev/null", "is not a serial device"),
+        ("/dev/null,12345", "no serial port runs at 12345 baud"),
+        ("udpin:203.0.113.7:0", "is no address of this machine"),
+    ],
+)
+def test_what_can_not_be_opened_is_said_in_one_sentence(url: str, words: str) -> None:
+    with pytest.raises(LinkError, match=words):
+        Side(url).links.start()
+
+
+def test_a_log_that_fails_and_a_handler_that_raises_end_nothing() -> None:
+    def fail(packet: Packet) -> None:
+        raise RuntimeError("unforeseen")
+
+    with Side("udpin:127.0.0.1:0", on_packet=fail) as server:
+        server.links._tap = lambda _stamp, _raw: (_ for _ in ()).throw(OSError("disk full"))
+        with Side(f"udpout:127.0.0.1:{server.links.port(0)}") as client:
+            packets = send_until_received(client, server, 2)
+            assert {p.number for p in packets} == {None}
+            statistics = server.links.statistics()[0]
+            assert statistics.packets_unlogged >= 2
+            assert statistics.failures >= 1

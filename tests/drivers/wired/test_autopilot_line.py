@@ -1,0 +1,92 @@
+"""The autopilot presses the shutter, asked over MAVLink: all that a driver must do."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from dappled.drivers.camera import Identity
+from dappled.drivers.mavlink.links import MavlinkLinks, Packet, mavlink
+from dappled.drivers.wired.composed import ComposedCamera, Plan
+from dappled.drivers.wired.shutter_line import parse_line
+from dappled.drivers.wired.sources import FolderSource
+from dappled.mocks.body.finepix import FinePix, picture
+from tests.drivers.contract import CameraContract, Rig
+
+T0 = 1_700_000_000.0
+OPEN_US = 1500
+"""A servo's pulse above this closes the contact."""
+
+
+class Clock:
+    def utc_ns(self) -> int:
+        return time.time_ns()
+
+    def monotonic_ns(self) -> int:
+        return time.monotonic_ns()
+
+
+class Pixhawk:
+    """An autopilot whose outputs are wired to a body's contact: camera trigger, relay 0, servo 9."""
+
+    def __init__(self, body: FinePix) -> None:
+        self._body = body
+        self.links = links("udpin:127.0.0.1:0", self._hear)
+
+    def _hear(self, packet: Packet) -> None:
+        message = packet.message
+        if packet.sent or message.get_type() != "COMMAND_LONG":
+            return
+        if message.command == mavlink.MAV_CMD_DO_DIGICAM_CONTROL:
+            self._body.contact(message.param5 == 1)
+        elif message.command == mavlink.MAV_CMD_DO_SET_RELAY:
+            self._body.contact((message.param1, message.param2) == (0, 1))
+        elif message.command == mavlink.MAV_CMD_DO_SET_SERVO:
+            self._body.contact(message.param1 == 9 and message.param2 > OPEN_US)
+
+
+class Companion:
+    """The camera's side of the link: gives the autopilot orders."""
+
+    def __init__(self, port: int) -> None:
+        self.links = links(f"udpout:127.0.0.1:{port}", lambda _: None, component=100)
+
+    def order(self, command: int, parameters: Sequence[float]) -> str | None:
+        """See `shutter_line.Order`."""
+        seven = (*parameters, *[0.0] * (7 - len(parameters)))
+        sent = self.links.send(mavlink.MAVLink_command_long_message(1, 1, command, 0, *seven))
+        return None if sent else "the link is down"
+
+
+def links(url: str, on_packet: Callable[[Packet], None], component: int = 1) -> MavlinkLinks:
+    return MavlinkLinks(
+        [url],
+        system_id=1,
+        component_id=component,
+        tap=lambda _stamp_us, _raw: 0,
+        on_packet=on_packet,
+        clock=Clock(),
+    )
+
+
+class TestContractOfTheAutopilotAndAFolder(CameraContract):
+    @pytest.fixture(params=["autopilot", "relay:0", "servo:9:1900:1100"])
+    def rig(self, request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
+        body = FinePix(tmp_path, write_s=0.0, wall_s=lambda: T0)
+        with ExitStack() as stack:
+            pixhawk = Pixhawk(body)
+            pixhawk.links.start()
+            stack.callback(pixhawk.links.stop)
+            companion = Companion(pixhawk.links.port(0))
+            companion.links.start()
+            stack.callback(companion.links.stop)
+            plan = Plan(hold_s=0.01, poll_s=0.02)
+            identity = Identity("FUJIFILM", "FinePix S5200", "", request.param)
+            camera = ComposedCamera(identity, parse_line(request.param), FolderSource(body.card), plan)
+            camera.use_autopilot(companion.order)
+            stack.callback(camera.stop)
+            yield Rig(camera, lambda number: picture(number, 6.3, T0), loose=True)

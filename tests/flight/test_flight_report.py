@@ -1,0 +1,49 @@
+"""The books by source: every wish in one column, and the columns add up."""
+
+from __future__ import annotations
+
+import pytest
+
+from dappled.cli import main
+from dappled.flight import summary
+from dappled.flight.entries import Result
+from dappled.flight.flight_report import Account, accounts
+from dappled.flight.layout import FlightFolder
+from dappled.flight.recording import Recording
+from tests.flight.makers import deliver, tag, wish
+
+
+@pytest.fixture
+def recorded(flight: Recording) -> FlightFolder:
+    """A closed flight: shots 0 and 1 safe and tagged, 0 decoded, shot 2 failed."""
+    for index in range(3):
+        wish(flight, index)
+    for index in range(2):
+        flight.ledger.add_tag(tag(deliver(flight, index, bytes(1000))))
+    flight.ledger.add_result(Result(0, "ab", 12, 13, "geometric", "predicted"))
+    flight.ledger.failed(2, "no file came")
+    flight.close()
+    return flight.folder
+
+
+def test_a_flights_books_by_source(recorded: FlightFolder) -> None:
+    assert accounts(recorded.path) == (Account("mavlink:255/190", 3, 0, 3, 2, 1, 0, 2, 1),)
+
+
+def test_refused_wishes_stand_with_who_made_them(flight: Recording) -> None:
+    wish(flight, 0)
+    for text in ("IMAGE_START_CAPTURE from mavlink:7/1: no camera", "console from console: no camera", "gibberish"):
+        flight.ledger.add_event("refused", text)
+    books = {one.source: one for one in accounts(flight.folder.path)}
+    assert (books["mavlink:7/1"].wishes, books["mavlink:7/1"].refused) == (1, 1)
+    assert books["console"].refused == books["unknown"].refused == 1
+    balance = summary.report(flight.folder.path)
+    assert sum(one.shots for one in books.values()) == balance.wishes
+    assert sum(one.refused for one in books.values()) == balance.refused
+
+
+def test_the_report_prints_a_line_for_each_source(recorded: FlightFolder, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["flight", "report", str(recorded.path)]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[1].split() == ["source", "wishes", "refused", "shots", "safe", "failed", "open", "tagged", "decoded"]
+    assert said[2].split() == ["mavlink:255/190", "3", "0", "3", "2", "1", "0", "2", "1"]

@@ -1,0 +1,318 @@
+"""Batches: the same bytes by pool and cluster, and nothing lost when workers die, disks tear or a frame is bad."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dappled.cli import main
+from dappled.drivers.raw.darkroom import Recipe
+from dappled.errors import DappledError
+from dappled.flight import durable
+from dappled.flight.records import Frame
+from dappled.products.batch import batch, workers
+from dappled.products.batch.batch import Done, Job
+from dappled.products.batch.manifest import Manifest, ManifestError
+from dappled.products.exports import light_files
+from dappled.products.maps import photographs
+from dappled.products.maps.georeference import Options
+from tests import globe
+from tests.products.flown import Flown
+
+
+@pytest.fixture
+def flight(short_flight: Flown) -> Flown:
+    return short_flight
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): durable.hash_file(path)
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != "manifest.jsonl"
+    }
+
+
+def words(flight: Flown, output: Path, *more: str) -> list[str]:
+    recipe = flight.recipe
+    given = ["--camera", recipe.camera, "--mask", recipe.mask, "--calibration", recipe.calibration]
+    return ["batch", str(flight.folder), "-o", str(output), "--as", "npz", "cog", "kmz", *given, *more]
+
+
+def job(name: str, key: str = "") -> Job:
+    frame = Frame(0, name, name, 0, "", 0)
+    return Job("flight", frame, None, None, "", None, RECIPE, Options(), (), "out", key or name)
+
+
+RECIPE = Recipe("reference-36mm", "reference-5x5")
+
+
+def answer(one: Job) -> Done:
+    """A worker's part that does what the frame's name says."""
+    name = one.frame.name
+    if name.startswith("dies-once:") and not Path(name.removeprefix("dies-once:")).exists():
+        Path(name.removeprefix("dies-once:")).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if name == "hangs":
+        signal.pause()
+    if name == "dies":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return Done(one.key, "flight", name, (), None, 0.0, 0.0, 0.0)
+
+
+def test_a_batch_goes_on_where_it_was_stopped(
+    flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "out"
+    assert main(words(flight, output, "--workers", "2")) == 0
+    assert "2 frames made, 0 were there already" in capsys.readouterr().out
+    made = hashes(output)
+    assert sorted(Path(name).suffix for name in made) == [".kmz", ".kmz", ".npz", ".npz", ".tif", ".tif"]
+    assert main(words(flight, output)) == 0
+    assert "0 frames made, 2 were there already" in capsys.readouterr().out
+    (output / flight.folder.name / "000001.tif").unlink()
+    assert main(words(flight, output, "--workers", "1", "--json")) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert json.loads(line)["frame"] == "frames/000001.dng"
+    assert hashes(output) == made  # one worker, the same bytes
+    assert main(words(flight, output, "--gsd", "0.1", "--frames", "1")) == 0  # another wish is another job
+    assert "1 frames made" in capsys.readouterr().out
+    assert hashes(output)[f"{flight.folder.name}/000001.tif"] != made[f"{flight.folder.name}/000001.tif"]
+
+
+def test_a_light_field_of_a_batch_holds_its_pose(flight: Flown, tmp_path: Path) -> None:
+    (first, _) = batch.plan(flight.folder, flight.recipe, Options(), ["npz"], tmp_path)
+    done = batch.make(first)
+    assert done.error is None
+    attributes = light_files.load(tmp_path / done.outputs[0].name).attributes
+    assert attributes["pose"]["altitude_msl_m"] == pytest.approx(223.36, abs=0.5)
+    assert done.peak_mb > 50
+
+
+def test_a_bad_frame_is_noted_and_the_others_are_made(
+    flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A frame cut short after it was recorded, in a copy of the flight."""
+    copy = tmp_path / flight.folder.name
+    subprocess.run(["cp", "-r", str(flight.folder), str(copy)], check=True)  # noqa: S607  on PATH
+    frame = copy / "frames" / "000000.dng"
+    frame.write_bytes(frame.read_bytes()[:5000])
+    output = tmp_path / "out"
+    assert main(words(replace(flight, folder=copy), output, "--workers", "2")) == 1
+    said = capsys.readouterr()
+    assert "1 frames made, 0 were there already, 1 could not be made" in said.out
+    assert "000000.dng" in said.err
+    globe.check_archive(output / copy.name / "000001.kmz")
+    noted = [json.loads(line) for line in (output / "manifest.jsonl").read_text().splitlines()]
+    assert {row["frame"]: row["error"] is None for row in noted} == {
+        "frames/000000.dng": False,
+        "frames/000001.dng": True,
+    }
+
+
+def test_a_bad_flight_is_said_and_the_others_are_made(
+    flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = words(flight, tmp_path / "out", "--as", "npz", "--frames", "0", "--workers", "1")
+    assert main([asked[0], str(tmp_path), str(tmp_path / "none"), *asked[1:]]) == 1
+    said = capsys.readouterr()
+    assert "1 frames made" in said.out
+    lines = said.err.strip().splitlines()
+    assert len(lines) == 2
+    assert all("is not a flight folder" in line for line in lines)
+    assert main([asked[0], str(tmp_path), *asked[2:]]) == 1  # and where none is left
+    assert capsys.readouterr().err.count("is not a flight folder") == 1
+
+
+def test_a_flight_that_is_named_twice_is_made_once(
+    flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = words(flight, tmp_path / "out", "--as", "npz", "--frames", "0", "--workers", "1")
+    again = tmp_path / "link"
+    again.symlink_to(flight.folder)
+    assert main([asked[0], str(flight.folder), str(again), *asked[1:]]) == 0
+    assert "1 frames made" in capsys.readouterr().out
+
+
+def test_two_flights_of_one_name_are_refused(flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    copy = tmp_path / flight.folder.name
+    subprocess.run(["cp", "-r", str(flight.folder), str(copy)], check=True)  # noqa: S607  on PATH
+    asked = words(flight, tmp_path / "out")
+    assert main([asked[0], str(copy), *asked[1:]]) == 1
+    assert "would both be written to" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_frames_with_the_same_bytes_are_jobs_of_their_own(
+    flight: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a still scene without noise makes them, from frames that were never tagged."""
+    frames, _ = photographs.recorded(flight.folder)
+    twins = [replace(frame, sha256=frames[0].sha256) for frame in frames]
+    monkeypatch.setattr(photographs, "recorded", lambda _: (twins, {}))
+    jobs = batch.plan(flight.folder, flight.recipe, Options(), ["npz"], tmp_path)
+    assert len({one.key for one in jobs}) == 2
+
+
+def test_a_frame_without_a_place_still_becomes_a_light_field(flight: Flown, tmp_path: Path) -> None:
+    (first, _) = batch.plan(flight.folder, flight.recipe, Options(), ["npz", "cog"], tmp_path)
+    lost = replace(first, station=None, why="no position is known for frames/000000.dng")
+    assert batch.make(lost).error == "no position is known for frames/000000.dng"
+    assert batch.make(replace(lost, kinds=("npz",))).error is None
+    with pytest.raises(DappledError, match="a batch makes"):
+        batch.plan(flight.folder, flight.recipe, Options(), ["gif"], tmp_path)
+
+
+def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
+    jobs = [job(f"dies-once:{tmp_path}/a"), *(job(f"{n}") for n in range(8)), job(f"dies-once:{tmp_path}/b")]
+    done = list(workers.in_processes(jobs, answer, 2))
+    assert sorted(one.key for one in done) == sorted(one.key for one in jobs)
+    assert all(one.error is None for one in done)
+
+
+def test_a_frame_that_kills_every_worker_is_given_up(tmp_path: Path) -> None:
+    done = {one.frame: one.error for one in workers.in_processes([job("dies"), job("1"), job("2")], answer, 1)}
+    assert done["1"] is None
+    assert done["2"] is None
+    assert "ended or held up 3 workers" in str(done["dies"])
+
+
+def test_a_frame_that_hangs_every_worker_is_given_up() -> None:
+    (last,) = workers.in_processes([job("hangs")], answer, 1, job_s=0.05)
+    assert "ended or held up 3 workers" in str(last.error)
+
+
+def test_workers_end_with_the_one_who_asked(tmp_path: Path) -> None:
+    answers = workers.in_processes([job(str(n)) for n in range(20)], answer, 2)
+    next(answers)
+    answers.close()  # type: ignore[attr-defined]  # it is a generator
+    assert not [child for child in multiprocessing.active_children() if child.is_alive()]
+
+
+def test_two_batches_cant_share_a_folder(tmp_path: Path) -> None:
+    with Manifest(tmp_path), pytest.raises(ManifestError, match="another batch works in"):
+        Manifest(tmp_path)
+    with Manifest(tmp_path) as again:
+        assert again.done == {}
+
+
+def test_a_torn_manifest_keeps_its_whole_lines(tmp_path: Path) -> None:
+    with Manifest(tmp_path) as manifest:
+        manifest.add(Done("a", "flight", "frames/0.dng", (batch.Output("x", 3, "00"),), None, 1.0, 1.0, 2.0))
+    path = tmp_path / "manifest.jsonl"
+    path.write_bytes(path.read_bytes() + b'{"key": "b", "fli')
+    with Manifest(tmp_path) as manifest:
+        assert set(manifest.done) == {"a"}
+        assert not manifest.holds("a")  # what it made is not there
+        (tmp_path / "x").write_bytes(b"123")
+        assert manifest.holds("a")
+        manifest.add(Done("c", "flight", "frames/1.dng", (), "bad", 1.0, 1.0, 2.0))
+        assert not manifest.holds("c")
+    assert len(path.read_text().splitlines()) == 2
+    path.write_text("no manifest\n")
+    with pytest.raises(ManifestError, match="line 1"):
+        Manifest(tmp_path)
+
+
+def test_no_scheduler_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_PATIENCE_S", 0.5)
+    with pytest.raises(workers.ClusterError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
+        list(workers.on_cluster([job("1")], answer, "tcp://127.0.0.1:9"))
+
+
+class Cluster:
+    """A scheduler and its workers, each a process of its own, as `dask scheduler` and `dask worker` start them."""
+
+    def __init__(self, folder: Path, crew: int = 2) -> None:
+        self.folder = folder
+        self.crew = crew
+        self.processes: list[subprocess.Popen[bytes]] = []
+        self.url = ""
+
+    def __enter__(self) -> Cluster:
+        facts = self.folder / "scheduler.json"
+        self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(facts))
+        for _ in range(self.crew):
+            self.worker()
+        return self
+
+    def worker(self) -> subprocess.Popen[bytes]:
+        """One more worker, without a nanny: what is killed stays dead."""
+        return self._start(
+            "worker", "--scheduler-file", str(self.folder / "scheduler.json"), "--nthreads", "1", "--no-nanny",
+            "--no-dashboard", "--host", "127.0.0.1", "--local-directory", str(self.folder),
+        )  # fmt: skip
+
+    def _start(self, *arguments: str) -> subprocess.Popen[bytes]:
+        path = os.pathsep.join([str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")])
+        process = subprocess.Popen(
+            [sys.executable, "-m", "dask", *arguments], cwd=self.folder, env={**os.environ, "PYTHONPATH": path},
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        self.processes.append(process)
+        return process
+
+    def __exit__(self, *_: object) -> None:
+        for process in reversed(self.processes):
+            process.kill()
+            process.wait()
+
+    def address(self) -> str:
+        """The scheduler's address, once its workers are there."""
+        return str(asyncio.run(asyncio.wait_for(self._address(), 60)))
+
+    async def _address(self) -> str:
+        facts = self.folder / "scheduler.json"
+        while not facts.exists() or not facts.read_text().endswith("}"):
+            await asyncio.sleep(0.05)
+        url = str(json.loads(facts.read_text())["address"])
+        from distributed import Client  # noqa: PLC0415  slow to import, and only here
+
+        async with Client(url, asynchronous=True, set_as_default=False) as client:  # type: ignore[no-untyped-call]  # untyped
+            if self.crew:
+                await client.wait_for_workers(self.crew, timeout=50)
+        return url
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    pytest.importorskip("distributed")
+    with Cluster(tmp_path_factory.mktemp("dask")) as made:
+        yield made
+
+
+@pytest.mark.slow
+def test_a_scheduler_without_workers_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(workers, "_WORKERS_S", 0.2)
+    with Cluster(tmp_path, crew=0) as alone, pytest.raises(workers.ClusterError, match="has no workers"):
+        list(workers.on_cluster([job("1")], answer, alone.address()))
+
+
+@pytest.mark.slow
+def test_a_cluster_makes_the_same_bytes_as_the_pool(cluster: Cluster, flight: Flown, tmp_path: Path) -> None:
+    url = cluster.address()
+    assert main(words(flight, tmp_path / "pool", "--workers", "2")) == 0
+    assert main(words(flight, tmp_path / "dask", "--scheduler", url)) == 0
+    pool, dask = (hashes(tmp_path / name) for name in ("pool", "dask"))
+    assert pool == dask
+    assert len(pool) == 6
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_loses_nothing(cluster: Cluster, tmp_path: Path) -> None:
+    jobs: Sequence[Job] = [job(f"dies-once:{tmp_path}/a"), *(job(str(n)) for n in range(10))]
+    done = list(workers.on_cluster(jobs, answer, cluster.address()))
+    assert sorted(one.key for one in done) == sorted(one.key for one in jobs)
+    assert all(one.error is None for one in done)
+    assert (tmp_path / "a").exists()
