@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator
+from ctypes.util import find_library
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import libusb_package
+import usb.backend.libusb1
 import usb.core
 import usb.util
 
@@ -19,7 +22,7 @@ Mode = Literal["PTP", "mass storage", "other"]
 CANON, FUJIFILM = 0x04A9, 0x04CB
 MAKERS = {CANON: "Canon", FUJIFILM: "Fujifilm", 0x04B0: "Nikon", 0x054C: "Sony", 0x07B4: "Olympus", 0x04DA: "Panasonic"}
 _STILL_IMAGE, _MASS_STORAGE = 0x06, 0x08  # USB class codes; a still image device speaks PTP
-_NO_LIBUSB = "no libusb is on this machine: install libusb-1.0-0 (Debian, Ubuntu) or libusb1 (Fedora)"
+_NO_LIBUSB = "no libusb works on this machine: install libusb-1.0-0 (Debian, Ubuntu) or libusb1 (Fedora)"
 
 
 class UsbError(CameraError):
@@ -60,7 +63,7 @@ class UsbBody:
 def bodies(backend: Any = None) -> list[UsbBody]:
     """All cameras on the bus, in the order of their addresses. Raises UsbError without a libusb.
 
-    `backend` is PyUSB's; None: the libusb of this machine.
+    `backend` is PyUSB's; None: the libusb of this machine, or the one that the package libusb-package brings.
     """
     found = (_body(device) for device in _devices(backend))
     return sorted((body for body in found if body is not None), key=lambda body: (body.bus, body.address))
@@ -106,11 +109,16 @@ def holders(node: Path, proc: Path = Path("/proc")) -> list[str]:
 
 def _devices(backend: Any) -> Iterator[Any]:
     try:
-        yield from usb.core.find(find_all=True, backend=backend)
+        yield from usb.core.find(find_all=True, backend=backend or _libusb())
     except usb.core.NoBackendError:
         raise UsbError(_NO_LIBUSB) from None
     except usb.core.USBError as error:
         raise UsbError(f"the USB bus can't be looked at ({error})") from None
+
+
+def _libusb() -> Any:
+    """PyUSB's backend over the machine's libusb, else over the packaged one; None where neither can be loaded."""
+    return usb.backend.libusb1.get_backend(lambda name: find_library(name) or libusb_package.find_library(name))
 
 
 def _body(device: Any) -> UsbBody | None:
