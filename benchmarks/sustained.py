@@ -33,8 +33,8 @@ from dappled.decode.geometry.pose import Pose
 from dappled.drivers.camera import (
     Arrival,
     Blob,
+    CameraEvent,
     Companion,
-    Event,
     Fired,
     Identity,
     Setting,
@@ -55,14 +55,14 @@ class SteadyCamera:
         self._picture = bytearray(os.urandom(size))
         self._shots: queue.SimpleQueue[int] = queue.SimpleQueue()
         self.identity = Identity("benchmark", "steady", "", "")
-        self._events: deque[Event] = deque([StateChanged("ready", "", time.monotonic_ns(), self.identity)])
+        self._events: deque[CameraEvent] = deque([StateChanged("ready", "", time.monotonic_ns(), self.identity)])
 
     def start(self) -> None: ...
 
     def fire(self, shot: int) -> None:
         self._shots.put(shot)
 
-    def next_event(self, timeout_s: float) -> Event | None:
+    def next_event(self, timeout_s: float) -> CameraEvent | None:
         if not self._events:
             try:
                 shot = self._shots.get(timeout=timeout_s)

@@ -14,7 +14,7 @@ import pytest
 from dappled.cli.terminal import CameraRemarks, Frames, ProblemRemarks
 from dappled.daemon.health import log_format
 from dappled.daemon.pipeline.pending_shot import Story
-from dappled.drivers.camera import State, StateChanged
+from dappled.drivers.camera import BodyState, StateChanged
 from tests.daemon.health.test_log_format import read
 from tests.flight.makers import shot
 
@@ -46,7 +46,7 @@ def test_a_terminal_that_is_gone_stops_nobody(monkeypatch: pytest.MonkeyPatch) -
 def test_the_camera_is_told_of_when_it_changes() -> None:
     said: list[str] = []
     camera = CameraRemarks(lambda text, *_, **__: said.append(text))
-    states: list[tuple[State, str]] = [
+    states: list[tuple[BodyState, str]] = [
         ("ready", ""),
         ("busy", ""),
         ("ready", ""),

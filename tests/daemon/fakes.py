@@ -23,8 +23,8 @@ from dappled.drivers.camera import (
     Arrival,
     Blob,
     CameraError,
+    CameraEvent,
     Companion,
-    Event,
     Fired,
     Identity,
     Setting,
@@ -41,7 +41,7 @@ def no_pose(utc_ns: int = 0) -> Pose:
     return Pose("none", utc_ns, None, None, None, None, None, None, None, None, None, None, 0)
 
 
-Script = Callable[[int], list[Event | Exception]]
+Script = Callable[[int], list[CameraEvent | Exception]]
 
 
 def fired(shot: int) -> Fired:
@@ -57,7 +57,7 @@ def failed(shot: int, reason: str = "the mirror is stuck") -> ShotFailed:
     return ShotFailed(shot, reason, time.monotonic_ns())
 
 
-def good(shot: int) -> list[Event | Exception]:
+def good(shot: int) -> list[CameraEvent | Exception]:
     return [fired(shot), arrival(shot)]
 
 
@@ -70,7 +70,7 @@ class FakeCamera:
         self.fired: list[int] = []
         self.released: list[int | None] = []
         self.stopped = False
-        self._events: queue.SimpleQueue[Event | Exception] = queue.SimpleQueue()
+        self._events: queue.SimpleQueue[CameraEvent | Exception] = queue.SimpleQueue()
 
     def start(self) -> None:
         self._events.put(StateChanged("ready", "", time.monotonic_ns()))
@@ -85,10 +85,10 @@ class FakeCamera:
         for event in events:
             self._events.put(event)
 
-    def say(self, event: Event) -> None:
+    def say(self, event: CameraEvent) -> None:
         self._events.put(event)
 
-    def next_event(self, timeout_s: float) -> Event | None:
+    def next_event(self, timeout_s: float) -> CameraEvent | None:
         try:
             event = self._events.get(timeout=timeout_s) if timeout_s > 0 else self._events.get_nowait()
         except queue.Empty:

@@ -16,9 +16,9 @@ from dappled.drivers.camera import (
     Arrival,
     Camera,
     CameraError,
+    CameraEvent,
     Companion,
     Deferred,
-    Event,
     Fired,
     SettingsChanged,
     ShotFailed,
@@ -43,9 +43,9 @@ class Rig:
     loose: bool = False
 
 
-def until(camera: Camera, wanted: Callable[[Event], bool], patience_s: float = PATIENCE_S) -> list[Event]:
+def until(camera: Camera, wanted: Callable[[CameraEvent], bool], patience_s: float = PATIENCE_S) -> list[CameraEvent]:
     """All events up to and with the first wanted one. Fails when it doesn't come."""
-    events: list[Event] = []
+    events: list[CameraEvent] = []
     deadline = time.monotonic() + patience_s
     while time.monotonic() < deadline:
         event = camera.next_event(deadline - time.monotonic())
@@ -63,7 +63,7 @@ def until_state(camera: Camera, state: str) -> StateChanged:
     return found
 
 
-def until_shot_ends(camera: Camera, shot: int) -> list[Event]:
+def until_shot_ends(camera: Camera, shot: int) -> list[CameraEvent]:
     """All events up to and with the one that ends this shot."""
     return until(camera, lambda event: isinstance(event, Arrival | ShotFailed) and event.shot == shot)
 
@@ -96,7 +96,7 @@ def content(arrival: Arrival | Companion) -> bytes:
     return data
 
 
-def of_shots(events: list[Event], *, deferred: bool = True) -> list[tuple[type[Event], int | None]]:
+def of_shots(events: list[CameraEvent], *, deferred: bool = True) -> list[tuple[type[CameraEvent], int | None]]:
     """What the events say of shots: kind and shot."""
     others = (StateChanged, SettingsChanged) if deferred else (StateChanged, SettingsChanged, Deferred)
     return [(type(event), event.shot) for event in events if not isinstance(event, others)]  # type: ignore[union-attr]
@@ -143,7 +143,7 @@ class CameraContract:
             rig.camera.fire(shot)
         events = until_shot_ends(rig.camera, 5)
         told = of_shots(events, deferred=False)
-        in_order: list[tuple[type[Event], int | None]] = [
+        in_order: list[tuple[type[CameraEvent], int | None]] = [
             (kind, shot) for shot in (3, 4, 5) for kind in (Fired, Arrival)
         ]
         assert told == in_order or (rig.loose and sorted(told, key=in_order.index) == in_order)
@@ -208,7 +208,7 @@ class CameraContract:
         rig.camera.stop()
         rig.camera.stop()
         rig.camera.fire(9)
-        events: list[Event] = []
+        events: list[CameraEvent] = []
         while (event := rig.camera.next_event(0.0)) is not None:
             events.append(event)
         ends = [event for event in events if isinstance(event, Arrival | ShotFailed | Deferred)]

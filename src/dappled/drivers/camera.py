@@ -1,33 +1,34 @@
-"""The door that every camera comes in by.
+"""The contract of every camera driver: `Camera`, its events, and base classes and helpers to write a driver with.
 
-A driver is driven, never trusted: `fire` returns at once, and all that happens afterwards comes back as events, in
-order, each with the monotonic time at which it was seen. A driver owns no shot; it carries the shot's image index
-through so that the daemon can balance its books.
+A driver never blocks: `fire` returns at once, and everything that happens afterwards is reported as events, in order,
+each with the monotonic time at which the driver saw it. A driver keeps no record of shots; each event carries the
+image index of its shot.
 
-A camera is composed of a shutter (how it is fired), arrivals (how files come), settings (what can be read and set)
-and an identity (who it is): one small protocol each.
+A camera is composed of four small protocols: a trigger (how it is fired), arrivals (how events and files come),
+settings (what can be read and set) and an identity (which body it is).
 """
 
 from __future__ import annotations
 
 import mmap
 import os
-from collections.abc import Mapping
+import queue
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 from dappled.errors import DappledError
 
-State = Literal["absent", "starting", "ready", "busy", "faulted"]
+BodyState = Literal["absent", "starting", "ready", "busy", "faulted"]
 
 
 class CameraError(DappledError):
-    """A camera can't be had or can't be used; one clear sentence with what to do."""
+    """A camera can't be opened or used; one sentence that says what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who the camera says it is. `serial` is empty where a body has none."""
+    """What the camera says it is. `serial` is empty where a body has none."""
 
     make: str
     model: str
@@ -37,14 +38,14 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """A file's bytes behind a descriptor (a memfd, or an open file): moved between processes without a copy."""
+    """A file's bytes behind a descriptor (a memfd or an open file), which can pass between processes without a copy."""
 
     fd: int
     size: int
 
     @classmethod
     def of(cls, data: bytes | memoryview, name: str = "dappled") -> Blob:
-        """Bytes in memory as a blob of their own."""
+        """Copy bytes into a memfd."""
         fd = os.memfd_create(name, os.MFD_CLOEXEC)
         view = memoryview(data)
         while view:
@@ -52,11 +53,11 @@ class Blob:
         return cls(fd, len(data))
 
     def map(self) -> mmap.mmap:
-        """The bytes, read only and shared. Raises ValueError for an empty blob."""
+        """Map the bytes, read only and shared. Raises ValueError for an empty blob."""
         return mmap.mmap(self.fd, self.size, prot=mmap.PROT_READ)
 
     def close(self) -> None:
-        """Let go of the descriptor; maps made from it stay valid."""
+        """Close the descriptor; maps made from it stay valid."""
         os.close(self.fd)
 
 
@@ -64,7 +65,7 @@ class Blob:
 class StateChanged:
     """The camera is in another state; `reason` is a sentence where the state is absent or faulted."""
 
-    state: State
+    state: BodyState
     reason: str
     monotonic_ns: int
     identity: Identity | None = None
@@ -72,8 +73,8 @@ class StateChanged:
 
 @dataclass(frozen=True, slots=True)
 class Fired:
-    """The trigger call for a shot was made and returned without error: the exposure began between the two times,
-    or a body's latency after them."""
+    """The trigger call for a shot returned without error. The exposure began between the two times, or later by the
+    latency of the body."""
 
     shot: int
     called_monotonic_ns: int
@@ -94,7 +95,7 @@ class Arrival:
     """A file came from the camera. `shot` is None where the driver can't say which shot made it.
 
     `name` is the camera's own name for it ("IMG_0042.CR2"). The receiver closes the blob. `facts` are the driver's
-    notes; where there is a "doubt" among them, its sentence says why `shot` may be the wrong one.
+    notes; where they include a "doubt", its sentence says why `shot` may be the wrong one.
     """
 
     shot: int | None
@@ -106,7 +107,7 @@ class Arrival:
 
 @dataclass(frozen=True, slots=True)
 class Companion:
-    """One more file of a shot whose Arrival came before: the JPEG beside a raw file. The receiver closes the blob."""
+    """Another file of a shot that already had its Arrival: the JPEG beside a raw file. The receiver closes the blob."""
 
     shot: int
     name: str
@@ -117,7 +118,7 @@ class Companion:
 
 @dataclass(frozen=True, slots=True)
 class Deferred:
-    """A shot was fired, and its file stays at the camera for now. `reason` is a sentence that says how it will come.
+    """A shot was fired, and its file stays on the camera for now. `reason` is a sentence that says how it will come.
     An Arrival of the shot may follow, in this flight or by `dappled flight pickup`."""
 
     shot: int
@@ -134,7 +135,7 @@ SettingName = Literal[
 class Setting:
     """One setting of a camera, in the camera's own words ("5.6", "1/500", "RAW + Large Fine JPEG", "50%").
 
-    `choices` are what it may be set to; empty: it can only be read.
+    `choices` are the values that it accepts; empty where it can only be read.
     """
 
     name: SettingName
@@ -144,67 +145,98 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class SettingsChanged:
-    """What the camera's settings are now, all that can be read. `refused` is a sentence where a change was asked for
-    and the camera would not have it."""
+    """All settings of the camera that can be read, as they are now. `refused` is a sentence where a change was
+    requested and the camera refused it."""
 
     settings: tuple[Setting, ...]
     monotonic_ns: int
     refused: str = ""
 
 
-Event = StateChanged | Fired | ShotFailed | Deferred | Arrival | Companion | SettingsChanged
+CameraEvent = StateChanged | Fired | ShotFailed | Deferred | Arrival | Companion | SettingsChanged
 
 
-class Shutter(Protocol):
+class ShutterTrigger(Protocol):
     """How a camera is fired."""
 
     def fire(self, shot: int) -> None:
-        """Expose once for this shot; returns within milliseconds. Ends in exactly one Arrival or Deferred, after a
-        Fired, or one ShotFailed; a ShotFailed may follow a Fired. Raises CameraError only for a shot that was fired
-        before and has not ended."""
+        """Expose once for this shot; returns within milliseconds.
+
+        The shot ends in exactly one Arrival or Deferred after a Fired, or in one ShotFailed, which may also follow a
+        Fired. Raises CameraError only for a shot that was fired before and has not ended.
+        """
 
 
 class Arrivals(Protocol):
     """How events and files come."""
 
-    def next_event(self, timeout_s: float) -> Event | None:
-        """The next event, or None when there was none for that long."""
+    def next_event(self, timeout_s: float) -> CameraEvent | None:
+        """Return the next event, or None when there was none for that long."""
 
     def release(self, arrival: Arrival | Companion) -> None:
-        """The file is durable on disk: the camera's own copy may go."""
+        """The file is durable on disk: the driver may delete the camera's copy."""
 
 
-class CameraSettings(Protocol):
+class BodySettings(Protocol):
     """What can be read and set."""
 
     def settings(self) -> tuple[Setting, ...]:
-        """As they were last read, from memory; empty while none were, and for a camera that tells nothing."""
+        """The settings as last read, from memory; empty while none were read, and for a camera that has none."""
 
     def change(self, name: SettingName, value: str) -> None:
-        """Ask for another value, one of the setting's `choices`; returns at once. A SettingsChanged tells what became
-        of it. Raises CameraError where the camera has no such setting or choice."""
+        """Request another value, one of the setting's `choices`; returns at once. A SettingsChanged reports the
+        outcome. Raises CameraError where the camera has no such setting or choice."""
 
 
 class Identified(Protocol):
-    """Who a camera is."""
+    """Which body a camera is."""
 
     @property
     def identity(self) -> Identity | None:
         """The body that was opened last; None before the first."""
 
 
-class Camera(Shutter, Arrivals, CameraSettings, Identified, Protocol):
+class Camera(ShutterTrigger, Arrivals, BodySettings, Identified, Protocol):
     """What a driver does. All calls return within milliseconds, whatever the hardware does."""
 
     def start(self) -> None:
         """Begin to look for the camera and to report events."""
 
     def stop(self) -> None:
-        """Let go of the camera within two seconds."""
+        """Close the camera within two seconds."""
+
+
+class QueuedCamera:
+    """Base class with the receiver's half of `Arrivals`: any thread puts events, the receiver takes them."""
+
+    def __init__(self) -> None:
+        self._events: queue.SimpleQueue[CameraEvent] = queue.SimpleQueue()
+
+    def next_event(self, timeout_s: float) -> CameraEvent | None:
+        """See Camera. After `stop` it still returns the events that are left."""
+        try:
+            return self._events.get(timeout=timeout_s) if timeout_s > 0 else self._events.get_nowait()
+        except queue.Empty:
+            return None
+
+
+class PlainCamera(QueuedCamera):
+    """Base class of a camera that has no readable settings and never deletes its own copies of files."""
+
+    def release(self, arrival: Arrival | Companion) -> None:
+        """See Camera: the camera's copy stays where it is."""
+
+    def settings(self) -> tuple[Setting, ...]:
+        """See Camera: there are none."""
+        return ()
+
+    def change(self, name: SettingName, value: str) -> None:
+        """See Camera."""
+        check_change((), name, value)
 
 
 def check_change(settings: tuple[Setting, ...], name: str, value: str) -> None:
-    """Raises CameraError, in one sentence, unless there is such a setting that takes this value."""
+    """Raise CameraError, in one sentence, unless one of the settings has this name and accepts this value."""
     found = next((each for each in settings if each.name == name), None)
     if found is None:
         known = ", ".join(each.name for each in settings if each.choices) or "none"
@@ -212,3 +244,27 @@ def check_change(settings: tuple[Setting, ...], name: str, value: str) -> None:
     if value not in found.choices:
         takes = f"it takes {', '.join(found.choices)}" if found.choices else "it can only be read"
         raise CameraError(f"the camera's {name} can't be set to {value!r}: {takes}")
+
+
+def check_options(given: Mapping[str, Any], known: Sequence[str], where: str = "camera") -> None:
+    """Raise CameraError for an option that the driver does not know."""
+    unknown = [name for name in given if name not in known]
+    if unknown:
+        raise CameraError(f"{where} has no setting {unknown[0]!r} for this driver; it knows {', '.join(known)}")
+
+
+def text_option(given: Mapping[str, Any], name: str) -> str:
+    """Return an option that is text, "" where it is absent. Raises CameraError."""
+    value = given.get(name) or ""
+    if not isinstance(value, str):
+        raise CameraError(f"camera.{name} must be text, not {value!r}")
+    return value
+
+
+def seconds_option(given: Mapping[str, Any], name: str, default: float) -> float:
+    """Return one of `timeouts`, in seconds. Raises CameraError."""
+    table = given.get("timeouts") or {}
+    value = table.get(name, default) if isinstance(table, Mapping) else None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+        raise CameraError(f"camera.timeouts.{name} must be a number of seconds above 0, not {value!r}")
+    return float(value)

@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dappled.drivers.camera import Arrival, Blob, Fired, Identity, ShotFailed, StateChanged
-from dappled.drivers.camera_base import PlainCamera
+from dappled.drivers.camera import Arrival, Blob, Fired, Identity, PlainCamera, ShotFailed, StateChanged
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled.config.schema import ConfigError, Source, build, setting
-from dappled.drivers.camera import CameraError, Identity
-from dappled.drivers.options import only, seconds_of
+from dappled.drivers.camera import CameraError, Identity, check_options, seconds_option
 from dappled.drivers.wired.composed import ComposedCamera, Plan
 from dappled.drivers.wired.sources import FolderSource
 from dappled.mocks.body.body import BodyOptions
@@ -46,7 +45,7 @@ _KNOWN = ("timeouts", *(one.name for one in fields(_Options)))
 
 def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
     """The driver for these settings; `start` it. Raises CameraError for a wrong one."""
-    only(settings, _KNOWN)
+    check_options(settings, _KNOWN)
     given = {name: value for name, value in settings.items() if name != "timeouts"}
     try:
         wanted = asdict(build(_Options, given, Source("camera.options"), ""))
@@ -55,7 +54,7 @@ def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
     folder = wanted.pop("folder")
     options = BodyOptions(**wanted, truth=None if folder is None else Path(folder))
     card = Path(tempfile.gettempdir()) / f"dappled-card-{secrets.token_hex(8)}"
-    plan = Plan(file_s=seconds_of(settings, "file_s", 30.0), hold_s=_HOLD_S, poll_s=0.02)
+    plan = Plan(file_s=seconds_option(settings, "file_s", 30.0), hold_s=_HOLD_S, poll_s=0.02)
     identity = Identity("dappled", "Simulated Masked Camera", f"SIM{options.seed:08d}", "simulated")
     return ComposedCamera(identity, Exposing(options, card), FolderSource(card), plan)
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from dappled.daemon.navigation import camera_clock
 from dappled.daemon.pipeline import capture, tagger
-from dappled.drivers.camera import Blob, CameraError, Companion, Deferred, Event
+from dappled.drivers.camera import Blob, CameraError, CameraEvent, Companion, Deferred
 from dappled.flight import check, summary
 from dappled.flight.records import ShotState
 from tests.daemon.fakes import FakeCamera, arrival, eventually, failed, fired, good, rig
@@ -41,7 +41,7 @@ def test_a_shot_goes_all_the_way(tmp_path: Path) -> None:
 
 
 def test_a_driver_that_raises_fails_the_shot_and_the_next_works(tmp_path: Path) -> None:
-    def script(shot: int) -> list[Event | Exception]:
+    def script(shot: int) -> list[CameraEvent | Exception]:
         return [CameraError("no film")] if shot == 0 else good(shot)
 
     with rig(tmp_path, script) as one:
@@ -248,8 +248,8 @@ def test_every_wish_is_one_shot_and_every_shot_ends_once(plan: list[tuple[list[t
     """Events out of order, twice, late, missing, of nobody, exceptions: through the real street, book and shutter."""
     late: dict[int, list[tuple[str, int]]] = {}
 
-    def event(piece: str, shot: int) -> Event | Exception:
-        made: dict[str, Callable[[], Event | Exception]] = {
+    def event(piece: str, shot: int) -> CameraEvent | Exception:
+        made: dict[str, Callable[[], CameraEvent | Exception]] = {
             "fired": lambda: fired(shot),
             "file": lambda: arrival(shot),
             "other file": lambda: arrival(shot, b"other", "IMG_9999.CR2"),
@@ -260,7 +260,7 @@ def test_every_wish_is_one_shot_and_every_shot_ends_once(plan: list[tuple[list[t
         }
         return made[piece]()
 
-    def script(shot: int) -> list[Event | Exception]:
+    def script(shot: int) -> list[CameraEvent | Exception]:
         words, raises, _ = plan[shot]
         for piece, delay in words:
             late.setdefault(shot + delay, []).append((piece, shot))
@@ -290,7 +290,7 @@ def test_every_wish_is_one_shot_and_every_shot_ends_once(plan: list[tuple[list[t
             assert [ok for shot, ok in one.settled if shot == index][-1] is (state == "safe")
 
 
-def with_companion(shot: int) -> list[Event | Exception]:
+def with_companion(shot: int) -> list[CameraEvent | Exception]:
     jpeg = Companion(shot, "IMG_0001.JPG", Blob.of(b"jpeg"), time.monotonic_ns())
     return [fired(shot), arrival(shot, name="IMG_0001.CR2"), jpeg]
 
@@ -309,7 +309,7 @@ def test_a_companion_stands_beside_its_frame_in_the_record(tmp_path: Path) -> No
     assert check.check(path).problems == ()
 
 
-def deferred(shot: int) -> list[Event | Exception]:
+def deferred(shot: int) -> list[CameraEvent | Exception]:
     return [fired(shot), Deferred(shot, "it is on the card", time.monotonic_ns())]
 
 
@@ -335,7 +335,7 @@ def test_a_shot_whose_file_follows_is_told_where_it_was_and_has_failed_until_the
 def test_a_zoom_that_changed_is_told(tmp_path: Path) -> None:
     frames = [jpeg_at(10.0), jpeg_at(10.0), jpeg_at(24.0)]
 
-    def zooming(shot: int) -> list[Event | Exception]:
+    def zooming(shot: int) -> list[CameraEvent | Exception]:
         return [fired(shot), arrival(shot, frames[shot], name=f"DSCF000{shot}.JPG")]
 
     with rig(tmp_path, zooming) as one:
@@ -351,7 +351,7 @@ def test_a_zoom_that_changed_is_told(tmp_path: Path) -> None:
 def test_a_shot_in_doubt_teaches_no_time(tmp_path: Path, doubt: str, by: str) -> None:
     taken = time.strftime("%Y:%m:%d %H:%M:%S", time.gmtime())
 
-    def script(shot: int) -> list[Event | Exception]:
+    def script(shot: int) -> list[CameraEvent | Exception]:
         came = replace(arrival(shot, jpeg_at(10.0, taken), "A.JPG"), facts={"doubt": doubt} if doubt else {})
         return [fired(shot), came] if shot < 3 else [came]
 

@@ -13,7 +13,7 @@ from dappled.daemon.pipeline.pipeline import Street
 from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import Progress, RecordedTelemetry, ReplayError
-from dappled.drivers.camera import Arrival, Event, Fired, Identity, ShotFailed, StateChanged
+from dappled.drivers.camera import Arrival, CameraEvent, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.replay import ReplayCamera
 from dappled.flight.errors import FlightError
 from dappled.flight.records import Cause, Shot
@@ -82,7 +82,7 @@ def test_a_missing_frame_is_told_and_ends(tmp_path: Path) -> None:
 def test_what_was_told_of_a_shot_in_flight_is_no_difference(tmp_path: Path) -> None:
     """A driver that never says when it fired, and a file that may be another shot's: both go into the tag."""
 
-    def untold(shot: int) -> list[Event | Exception]:
+    def untold(shot: int) -> list[CameraEvent | Exception]:
         (_, arrival) = good(shot)
         assert isinstance(arrival, Arrival)
         return [dataclasses.replace(arrival, facts={"doubt": "it came late"})]

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from dappled.drivers.camera import Arrival, Blob, Event, Fired, Identity, ShotFailed, StateChanged
+from dappled.drivers.camera import Arrival, Blob, CameraEvent, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.gphoto2.channel import Channel, ChannelError, Message, event_message, message_event
 
 Ends = tuple[Channel, Channel]
@@ -34,7 +34,7 @@ events = st.one_of(
 
 
 @given(events)
-def test_events_survive_the_journey(event: Event) -> None:
+def test_events_survive_the_journey(event: CameraEvent) -> None:
     assert message_event(event_message(event)) == event
 
 

@@ -10,8 +10,8 @@ import pytest
 from dappled.drivers.camera import (
     Arrival,
     Blob,
+    CameraEvent,
     Companion,
-    Event,
     Fired,
     Identity,
     Setting,
@@ -127,13 +127,13 @@ class Harness:
         for shot in shots:
             self.channel.send({"do": "fire", "shot": shot})
 
-    def turn(self, seconds: float = 0.0, steps: int = 3) -> list[Event]:
+    def turn(self, seconds: float = 0.0, steps: int = 3) -> list[CameraEvent]:
         """Let time pass, then let the loop step; what it said."""
         self.now_ns += round(seconds * 1e9)
         for _ in range(steps):
             self.channel.send({"do": "ping"})  # a waiting command: the loop need not wait for one
             assert self.loop.step()
-        events: list[Event] = []
+        events: list[CameraEvent] = []
         pongs = 0
         while (message := self.channel.receive(0.0)) is not None:
             if message.body["is"] == "pong":
@@ -159,15 +159,15 @@ def ready(harness: Harness) -> Harness:
     return harness
 
 
-def failures(events: list[Event]) -> dict[int, str]:
+def failures(events: list[CameraEvent]) -> dict[int, str]:
     return {event.shot: event.reason for event in events if isinstance(event, ShotFailed)}
 
 
-def states(events: list[Event]) -> list[tuple[str, str]]:
+def states(events: list[CameraEvent]) -> list[tuple[str, str]]:
     return [(event.state, event.reason) for event in events if isinstance(event, StateChanged)]
 
 
-def arrivals(events: list[Event]) -> list[Arrival]:
+def arrivals(events: list[CameraEvent]) -> list[Arrival]:
     return [event for event in events if isinstance(event, Arrival)]
 
 
@@ -327,7 +327,7 @@ def test_a_bad_file_is_fetched_three_times_and_then_left_on_the_card(ready: Harn
     assert arrivals(ready.turn()) == []
 
 
-def shot_on(harness: Harness, shot: int, taken_s: int | None, number: int) -> list[Event]:
+def shot_on(harness: Harness, shot: int, taken_s: int | None, number: int) -> list[CameraEvent]:
     """A shot whose file is announced at once."""
     harness.fire(shot)
     harness.turn()
@@ -387,7 +387,7 @@ def test_raw_and_jpeg_are_one_frame_whichever_comes_first(
     harness.turn()
     harness.fire(7)
     harness.turn()
-    events: list[Event] = []
+    events: list[CameraEvent] = []
     for file in order:
         harness.camera.adds(file, b"\xff\xd8\xffjpeg" if file == JPEG else b"II*\0raw bytes CR")
         events += harness.turn()

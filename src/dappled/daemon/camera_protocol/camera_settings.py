@@ -44,7 +44,7 @@ class OwnKnob:
 
 
 class Body(Protocol):
-    """The part of a camera driver that is needed here; see `drivers.camera.CameraSettings`."""
+    """The part of a camera driver that is needed here; see `drivers.camera.BodySettings`."""
 
     def settings(self) -> tuple[Setting, ...]: ...
 

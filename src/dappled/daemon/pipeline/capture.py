@@ -12,14 +12,14 @@ from dappled.daemon.pipeline.pending_shot import Book, Story, Watchers
 from dappled.daemon.pipeline.pending_shots import Stories
 from dappled.drivers.camera import (
     Arrival,
+    BodyState,
     Camera,
+    CameraEvent,
     Companion,
     Deferred,
-    Event,
     Fired,
     SettingsChanged,
     ShotFailed,
-    State,
     StateChanged,
 )
 from dappled.errors import report, sentence
@@ -41,7 +41,7 @@ class Capture:
         self._unfired: deque[ShotFailed] = deque()
         self._stopping, self._give_up_at = threading.Event(), 0.0
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
-        self.state: State = "starting"
+        self.state: BodyState = "starting"
         self.reason = ""
 
     def dead(self) -> list[str]:
@@ -99,7 +99,7 @@ class Capture:
         self._handle(event)
         return True
 
-    def _handle(self, event: Event) -> None:
+    def _handle(self, event: CameraEvent) -> None:
         try:
             if isinstance(event, StateChanged):
                 self._state_changed(event)

@@ -17,7 +17,7 @@ from dappled.daemon.pipeline.pending_shots import Stories
 from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.pipeline.tagging import Tagging
 from dappled.daemon.stream.publisher import Publisher
-from dappled.drivers.camera import Camera, State
+from dappled.drivers.camera import BodyState, Camera
 from dappled.errors import sentence
 from dappled.flight.records import Shot
 from dappled.workers import Stage
@@ -96,7 +96,7 @@ class Street:
         self._capture.fire(index)
 
     @property
-    def camera_state(self) -> State:
+    def camera_state(self) -> BodyState:
         """The camera's state, as it told last."""
         return self._capture.state
 

@@ -18,9 +18,9 @@ from typing import Any
 from dappled.drivers.camera import (
     Arrival,
     Blob,
+    CameraEvent,
     Companion,
     Deferred,
-    Event,
     Fired,
     Identity,
     Setting,
@@ -128,7 +128,7 @@ def _parsed(raw: bytes, flags: int) -> dict[str, Any]:
     return body
 
 
-def event_message(event: Event) -> Message:
+def event_message(event: CameraEvent) -> Message:
     """An event as a message; a file's blob travels as the message's only descriptor (still the caller's)."""
     match event:
         case StateChanged(state, reason, at_ns, identity):
@@ -149,7 +149,7 @@ def event_message(event: Event) -> Message:
             return Message({**body, "facts": dict(facts)}, (blob.fd,))
 
 
-def message_event(message: Message) -> Event:
+def message_event(message: Message) -> CameraEvent:
     """The event that a message carries. Raises ChannelError for anything else; its descriptors are closed then."""
     try:
         return _event(message.body, message.fds)
@@ -159,7 +159,7 @@ def message_event(message: Message) -> Event:
         raise ChannelError(f"a message could not be understood: {error!r}") from error
 
 
-def _event(body: Mapping[str, Any], fds: tuple[int, ...]) -> Event:
+def _event(body: Mapping[str, Any], fds: tuple[int, ...]) -> CameraEvent:
     match body["is"]:
         case "state":
             who = None if body["identity"] is None else Identity(**body["identity"])

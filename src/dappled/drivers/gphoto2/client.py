@@ -19,10 +19,11 @@ from dappled.drivers import usb_bus
 from dappled.drivers.camera import (
     Arrival,
     CameraError,
+    CameraEvent,
     Companion,
-    Event,
     Fired,
     Identity,
+    QueuedCamera,
     Setting,
     SettingName,
     SettingsChanged,
@@ -30,7 +31,6 @@ from dappled.drivers.camera import (
     StateChanged,
     check_change,
 )
-from dappled.drivers.camera_base import QueuedCamera
 from dappled.drivers.gphoto2 import spawn as camera_child
 from dappled.drivers.gphoto2.before import LATE, Before
 from dappled.drivers.gphoto2.channel import Channel, ChannelError, message_event
@@ -217,7 +217,7 @@ class GPhoto2Camera(QueuedCamera):
             return f" ({error})"
         return ", the camera's USB port reset"
 
-    def _pass_on(self, event: Event) -> None:
+    def _pass_on(self, event: CameraEvent) -> None:
         if isinstance(event, Fired):
             with self._lock:
                 self._pending[event.shot] = event.called_monotonic_ns

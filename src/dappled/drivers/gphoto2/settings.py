@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
-from dappled.drivers.camera import CameraError
-from dappled.drivers.options import only
+from dappled.drivers.camera import CameraError, check_options
 
 CaptureTarget = Literal["card", "ram"]
 
@@ -50,7 +49,7 @@ class GPhoto2Settings:
 def parse_settings(settings: Mapping[str, Any]) -> GPhoto2Settings:
     """Settings from a table of a configuration file. Raises CameraError naming the key and what it may be."""
     known = [each.name for each in fields(GPhoto2Settings)]
-    only(settings, known)
+    check_options(settings, known)
     port, serial = settings.get("port"), settings.get("serial")
     for name, value in (("port", port), ("serial", serial)):
         if not (value is None or isinstance(value, str)):
@@ -67,7 +66,7 @@ def parse_settings(settings: Mapping[str, Any]) -> GPhoto2Settings:
 def _timeouts(given: object) -> Timeouts:
     if not isinstance(given, Mapping):
         raise CameraError(f"camera.timeouts must be a table, not {given!r}")
-    only(given, [each.name for each in fields(Timeouts)], "camera.timeouts")
+    check_options(given, [each.name for each in fields(Timeouts)], "camera.timeouts")
     for name, value in given.items():
         if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
             raise CameraError(f"camera.timeouts.{name} must be a number of seconds above 0, not {value!r}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 
-from dappled.drivers.camera import Setting, State
+from dappled.drivers.camera import BodyState, Setting
 from dappled.drivers.gphoto2.before import LATE
 from dappled.drivers.gphoto2.pairs import Pairs
 from dappled.drivers.gphoto2.protocol import (
@@ -34,7 +34,7 @@ class Books:
 
     session: Session | None = None
     serial: str | None = None
-    state: tuple[State, str] | None = None
+    state: tuple[BodyState, str] | None = None
     open_at_ns: int = 0
     waiting: deque[int] = field(default_factory=deque)
     flight: AtCamera | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from dappled.drivers.camera import Event, ShotFailed, State, StateChanged
+from dappled.drivers.camera import BodyState, CameraEvent, ShotFailed, StateChanged
 from dappled.drivers.gphoto2.channel import Channel, event_message
 from dappled.drivers.gphoto2.state import Books
 from dappled.drivers.wired.attribution import Claim
@@ -18,12 +18,12 @@ class Telling:
     def __init__(self, channel: Channel, books: Books, clock_ns: Callable[[], int]) -> None:
         self._channel, self._books, self._clock_ns = channel, books, clock_ns
 
-    def tell(self, event: Event) -> None:
+    def tell(self, event: CameraEvent) -> None:
         """As it is."""
         message = event_message(event)
         self._channel.send(message.body, message.fds, timeout_s=SEND_S)
 
-    def state(self, state: State, reason: str = "") -> None:
+    def state(self, state: BodyState, reason: str = "") -> None:
         """The camera's state, where it is another one than was told last."""
         books = self._books
         if books.state == (state, reason):

@@ -11,8 +11,17 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from dappled.drivers.camera import Arrival, CameraError, Companion, Deferred, Fired, Identity, ShotFailed, StateChanged
-from dappled.drivers.camera_base import PlainCamera
+from dappled.drivers.camera import (
+    Arrival,
+    CameraError,
+    Companion,
+    Deferred,
+    Fired,
+    Identity,
+    PlainCamera,
+    ShotFailed,
+    StateChanged,
+)
 from dappled.drivers.wired.attribution import Claim
 from dappled.drivers.wired.file_watch import FileWatch
 from dappled.drivers.wired.shutter_line import Order, ShutterLine, UsesAutopilot, pressing

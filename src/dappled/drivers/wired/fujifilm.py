@@ -11,8 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dappled.drivers.camera import CameraError, Identity
-from dappled.drivers.options import only, seconds_of, text_of
+from dappled.drivers.camera import CameraError, Identity, check_options, seconds_option, text_option
 from dappled.drivers.wired.composed import ComposedCamera, Plan
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.shutter_line import KINDS, hold_s, parse_line
@@ -25,16 +24,16 @@ _SLOW_POLL_S = 2.0
 
 def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
     """The driver for these settings; `start` it. Raises CameraError for a wrong or a missing one."""
-    only(settings, _KNOWN)
-    shutter = text_of(settings, "shutter")
+    check_options(settings, _KNOWN)
+    shutter = text_option(settings, "shutter")
     if not shutter:
         raise CameraError(f"this camera can't be fired over USB: set camera.shutter to one of {KINDS}")
-    pickup = text_of(settings, "pickup") or "later"
+    pickup = text_option(settings, "pickup") or "later"
     source = None if pickup == "later" else parse_source(pickup, PtpSource)
-    identity = Identity("FUJIFILM", text_of(settings, "model") or "FinePix S5200", "", shutter)
+    identity = Identity("FUJIFILM", text_option(settings, "model") or "FinePix S5200", "", shutter)
     follows = _follows(pickup, source)
     plan = Plan(
-        file_s=seconds_of(settings, "file_s", 30.0),
+        file_s=seconds_option(settings, "file_s", 30.0),
         follows=follows,
         hold_s=hold_s(settings),
         poll_s=_SLOW_POLL_S if isinstance(source, PtpSource) else 0.2,
