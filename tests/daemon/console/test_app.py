@@ -28,7 +28,7 @@ from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher, Reply
 from dappled.daemon.stream.wire import Message
 from dappled.decode.geometry import camera_pose
-from dappled.drivers.gphoto2.channel import Channel, ChannelError
+from dappled.drivers.process_channel import ChannelError, ProcessChannel
 from tests import globe
 
 STACK = (np.random.default_rng(1).random((2, 30, 40)) + 0.1).astype(np.complex64)
@@ -99,14 +99,14 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     endpoint = f"ipc://{tmp_path}/s"
     publisher = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer, capacity=1000)
     publisher.start()
-    here, there = Channel.pair()
+    here, there = ProcessChannel.pair()
     pages = Hub()
     studio = Studio(None, camera_pose.NADIR.ravel().tolist())
     feed = Feed(
         endpoint, endpoint + ".ask", tell=pages.tell, thumb=studio.thumb, corners=studio.corners,
         watched=lambda: made.parts.watched(),  # noqa: PLW0108  # it is made after
     )  # fmt: skip
-    parts = Parts(feed, pages, studio, Control(Channel(there)), Access(""), None)
+    parts = Parts(feed, pages, studio, Control(ProcessChannel(there)), Access(""), None)
     listener = socket.create_server(("127.0.0.1", 0))
     made = Rig(f"http://127.0.0.1:{listener.getsockname()[1]}", publisher, parts)
     server = uvicorn.Server(

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from dappled.daemon.pipeline.decode_process import DevelopmentError, WorkerDeveloper
+from dappled.drivers.child_process import RestartBudget
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.drivers.restart_budget import RestartBudget
 from dappled.mocks.scene.masked_camera import reference_camera
 from tests.daemon.fakes import eventually
 

@@ -18,11 +18,11 @@ from typing import Any
 import pytest
 
 from dappled.drivers.camera import Arrival, CameraError, Companion, Fired, ShotFailed, StateChanged
-from dappled.drivers.gphoto2.before import Before
-from dappled.drivers.gphoto2.channel import Channel
+from dappled.drivers.child_process import RestartBudget
 from dappled.drivers.gphoto2.client import GPhoto2Camera, Spawn, open_camera, spawn_process
+from dappled.drivers.gphoto2.messages import Before
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
-from dappled.drivers.restart_budget import RestartBudget
+from dappled.drivers.process_channel import ProcessChannel
 from dappled.mocks.body.body import Body, BodyOptions
 from dappled.mocks.body.eos450d import thumbnail
 from dappled.mocks.body.pictures import pattern
@@ -333,7 +333,7 @@ def test_stop_does_not_wait_for_a_silent_body(ready: Make, body: Body) -> None:
 def _recorded(
     started: list[subprocess.Popen[bytes]],
 ) -> Spawn:
-    def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
+    def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
         process, channel = spawn_process(settings, before)
         started.append(process)
         return process, channel
@@ -388,7 +388,7 @@ def test_what_a_dead_process_had_fired_is_fetched_by_the_next_one(body: Body) ->
 def test_a_process_that_keeps_dying_is_not_started_for_ever(body: Body) -> None:
     started: list[subprocess.Popen[bytes]] = []
 
-    def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
+    def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
         process, channel = _recorded(started)(settings, before)
         process.kill()
         return process, channel
@@ -408,7 +408,7 @@ def test_the_process_dies_with_its_parent(body: Body) -> None:
         "import sys\n"
         "from dappled.drivers.gphoto2.client import spawn_process\n"
         "from dappled.drivers.gphoto2.settings import parse_settings\n"
-        "from dappled.drivers.gphoto2.before import Before\n"
+        "from dappled.drivers.gphoto2.messages import Before\n"
         "process, channel = spawn_process(parse_settings({'port': sys.argv[1]}), Before())\n"
         "while channel.receive(30).body.get('state') != 'ready': pass\n"
         "print(process.pid, flush=True)\n"
@@ -550,7 +550,7 @@ def test_after_a_break_the_same_body_is_taken_again_and_not_its_twin() -> None:
 def test_a_process_that_can_t_be_started_now_is_tried_again(body: Body) -> None:
     problems = [OSError(errno.EMFILE, os.strerror(errno.EMFILE)), OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))]
 
-    def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
+    def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
         if problems:
             raise problems.pop(0)
         return spawn_process(settings, before)

@@ -20,8 +20,8 @@ from dappled.drivers.camera import (
     ShotFailed,
     StateChanged,
 )
-from dappled.drivers.gphoto2.channel import Channel, ChannelError, message_event
 from dappled.drivers.gphoto2.loop import CameraLoop
+from dappled.drivers.gphoto2.messages import message_event
 from dappled.drivers.gphoto2.protocol import (
     AbsentError,
     BusyError,
@@ -35,6 +35,7 @@ from dappled.drivers.gphoto2.protocol import (
     SessionError,
 )
 from dappled.drivers.gphoto2.settings import GPhoto2Settings
+from dappled.drivers.process_channel import ChannelError, ProcessChannel
 from tests.drivers.contract import content, of_shots
 
 FOLDER = "/store/DCIM/100CANON"
@@ -119,8 +120,8 @@ class Harness:
     def __init__(self) -> None:
         self.now_ns = 1_000_000_000_000
         self.camera = FakeCamera()
-        self.channel, there = Channel.pair()
-        self.loop_channel = Channel(there)
+        self.channel, there = ProcessChannel.pair()
+        self.loop_channel = ProcessChannel(there)
         self.loop = CameraLoop(self.loop_channel, GPhoto2Settings(), self.camera.open, lambda: self.now_ns)
 
     def fire(self, *shots: int) -> None:

@@ -26,7 +26,7 @@ from dappled.daemon.console.parts import Parts
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import log_format
 from dappled.daemon.pipeline.memory import CONSOLE_GOES, goes_first, reuse_large_blocks
-from dappled.drivers.gphoto2.channel import Channel
+from dappled.drivers.process_channel import ProcessChannel
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
 
@@ -41,7 +41,7 @@ def main() -> int:
     os.nice(NICENESS)
     goes_first(CONSOLE_GOES)
     reuse_large_blocks()
-    channel = Channel(socket.socket(fileno=int(sys.argv[1])))
+    channel = ProcessChannel(socket.socket(fileno=int(sys.argv[1])))
     listener = socket.socket(fileno=int(sys.argv[2]))
     first = channel.receive(10)
     if first is None:
@@ -50,7 +50,7 @@ def main() -> int:
     return 0
 
 
-async def _serve(channel: Channel, listener: socket.socket, setup: Mapping[str, Any]) -> None:
+async def _serve(channel: ProcessChannel, listener: socket.socket, setup: Mapping[str, Any]) -> None:
     recipe = setup["recipe"]
     hub, studio = Hub(), Studio(None if recipe is None else Recipe(**recipe), setup["mount"])
     parts = Parts(

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
-from dappled.drivers.gphoto2.channel import Channel, ChannelError
+from dappled.drivers.process_channel import ChannelError, ProcessChannel
 from dappled.errors import DappledError
 
 _ANSWER_S = 3.0
@@ -19,7 +19,7 @@ class ControlError(DappledError):
 class Control:
     """Questions from any thread, one after the other."""
 
-    def __init__(self, channel: Channel) -> None:
+    def __init__(self, channel: ProcessChannel) -> None:
         self._channel = channel
         self._turn = threading.Lock()
         self._number = 0

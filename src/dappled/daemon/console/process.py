@@ -22,7 +22,7 @@ from dappled.config.settings import ConsoleSettings, Settings
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.stream.curve import read_private
 from dappled.daemon.stream.endpoints import is_loopback
-from dappled.drivers.gphoto2.channel import Channel, ChannelError
+from dappled.drivers.process_channel import ChannelError, ProcessChannel
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
 
@@ -123,7 +123,7 @@ class Console:
                 report(log, "the console ended", error)
 
     def _serve(self) -> None:
-        channel, there = Channel.pair()
+        channel, there = ProcessChannel.pair()
         with there:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "dappled.daemon.console", str(there.fileno()), str(self._listener.fileno())],

@@ -19,9 +19,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
-from dappled.drivers.gphoto2.channel import Channel, ChannelError, Message
+from dappled.drivers.child_process import RestartBudget
+from dappled.drivers.process_channel import ChannelError, ChannelMessage, ProcessChannel
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.drivers.restart_budget import RestartBudget
 from dappled.errors import DappledError
 from dappled.flight.entries import Result
 
@@ -113,7 +113,7 @@ class WorkerDeveloper:
         self._budget, self._clock_ns = budget or RestartBudget(limit=6, window_s=60.0), clock_ns
         self._turn = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
-        self._channel: Channel | None = None
+        self._channel: ProcessChannel | None = None
         self._closed = False
         self.restarts = 0
 
@@ -165,7 +165,7 @@ class WorkerDeveloper:
         self._end()
         self._turn.release()
 
-    def _ask(self, question: Mapping[str, Any]) -> Message:
+    def _ask(self, question: Mapping[str, Any]) -> ChannelMessage:
         if self._closed:
             raise DevelopmentError(f"{question.get('path', 'the recipe')} was not decoded: the decoder was stopped")
         if self._process is not None and self._process.poll() is not None:
@@ -190,13 +190,13 @@ class WorkerDeveloper:
             raise DevelopmentError(str(answer.body["error"]))
         return answer
 
-    def _begin(self) -> Channel:
+    def _begin(self) -> ProcessChannel:
         if wait_ns := self._budget.wait_ns(self._clock_ns()):
             raise DevelopmentError(
                 f"the decoder keeps dying: it starts again in {wait_ns / 1e9:.0f} s; frames stay in the record"
             )
         self._budget.spend(self._clock_ns())
-        self._channel, there = Channel.pair()
+        self._channel, there = ProcessChannel.pair()
         with there:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "dappled.daemon.pipeline.decode_worker", str(there.fileno()), str(os.getpid())],
@@ -224,7 +224,7 @@ def _manner(code: int | None) -> str:
     return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
 
 
-def _developed(answer: Message) -> Developed:
+def _developed(answer: ChannelMessage) -> Developed:
     facts = dict(answer.body)
     body_fd, preview_fd = answer.fds
     try:
@@ -250,12 +250,12 @@ def _developed(answer: Message) -> Developed:
     )
 
 
-Serve = Callable[[Message], tuple[Mapping[str, Any], tuple[int, ...]]]
+Serve = Callable[[ChannelMessage], tuple[Mapping[str, Any], tuple[int, ...]]]
 
 
 def serve(end: socket.socket, answer: Serve) -> None:
     """The worker's loop: one answer a question, until the other end closes."""
-    channel = Channel(end)
+    channel = ProcessChannel(end)
     while True:
         try:
             question = channel.receive(3600)

@@ -27,7 +27,7 @@ from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.pictures import slice_mosaic
 from dappled.drivers.camera import Blob
 from dappled.drivers.child_process import end_with_parent
-from dappled.drivers.gphoto2.channel import Message
+from dappled.drivers.process_channel import ChannelMessage
 from dappled.drivers.raw.darkroom import Darkroom, Development, Recipe
 from dappled.errors import sentence
 
@@ -42,7 +42,7 @@ class Worker:
         self._darkroom: Darkroom | None = None
         self._preview_px = 1024
 
-    def __call__(self, question: Message) -> Reply:
+    def __call__(self, question: ChannelMessage) -> Reply:
         body = question.body
         if body["do"] == "set up":
             self._darkroom = Darkroom(Recipe(**body["recipe"]))

@@ -31,11 +31,10 @@ from dappled.drivers.camera import (
     StateChanged,
     check_change,
 )
-from dappled.drivers.gphoto2 import spawn as camera_child
-from dappled.drivers.gphoto2.before import LATE, Before
-from dappled.drivers.gphoto2.channel import Channel, ChannelError, message_event
+from dappled.drivers.child_process import RestartBudget, end_child, start_child
+from dappled.drivers.gphoto2.messages import LATE, Before, message_event
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
-from dappled.drivers.restart_budget import RestartBudget
+from dappled.drivers.process_channel import ChannelError, ProcessChannel
 from dappled.drivers.wired.attribution import Claim
 
 _PING_S = 1.0
@@ -43,7 +42,7 @@ _STOP_S = 1.2
 _KILL_S = 0.6
 _SPAWN_S = 1.0
 
-Spawn = Callable[[GPhoto2Settings, Before], tuple["subprocess.Popen[bytes]", Channel]]
+Spawn = Callable[[GPhoto2Settings, Before], tuple["subprocess.Popen[bytes]", ProcessChannel]]
 
 
 def open_camera(settings: Mapping[str, Any]) -> GPhoto2Camera:
@@ -51,11 +50,9 @@ def open_camera(settings: Mapping[str, Any]) -> GPhoto2Camera:
     return GPhoto2Camera(parse_settings(settings))
 
 
-def spawn_process(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], Channel]:
+def spawn_process(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
     """Start the camera's process; it dies with the calling thread. Raises OSError."""
-    return camera_child.spawn(
-        "dappled.drivers.gphoto2.process", json.dumps(settings.to_json()), json.dumps(before.to_json())
-    )
+    return start_child("dappled.drivers.gphoto2.process", json.dumps(settings.to_json()), json.dumps(before.to_json()))
 
 
 class GPhoto2Camera(QueuedCamera):
@@ -79,7 +76,7 @@ class GPhoto2Camera(QueuedCamera):
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._supervise, name="gphoto2", daemon=True)
         self._lock = threading.Lock()  # guards the three below
-        self._channel: Channel | None = None
+        self._channel: ProcessChannel | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._pending: dict[int, int | None] = {}  # the shots that the process has, in order, and when it fired them
         self._before = Before()  # the supervising thread's
@@ -172,7 +169,7 @@ class GPhoto2Camera(QueuedCamera):
             fired = [Claim(shot, fired_ns) for shot, fired_ns in pending.items() if fired_ns is not None]
             self._before = replace(self._before, late=(*self._before.late, *fired)[-LATE:])
             channel.close()
-            camera_child.end(process)
+            end_child(process)
             stopped = self._stopping.is_set()
             for shot in pending:
                 self._events.put(ShotFailed(shot, "the camera was stopped" if stopped else reason, self._clock_ns()))
@@ -181,7 +178,7 @@ class GPhoto2Camera(QueuedCamera):
                 self._await_budget()
         self._events.put(StateChanged("absent", "the camera was stopped", self._clock_ns()))
 
-    def _serve(self, process: subprocess.Popen[bytes], channel: Channel) -> str:
+    def _serve(self, process: subprocess.Popen[bytes], channel: ProcessChannel) -> str:
         """Hand events on until the process ends; returns why, as a sentence."""
         heard_ns = asked_ns = self._clock_ns()
         answer_s = self._settings.timeouts.answer_s
@@ -196,7 +193,7 @@ class GPhoto2Camera(QueuedCamera):
                     if message.body.get("is") != "pong":
                         self._pass_on(message_event(message))
                 elif now_ns - heard_ns > answer_s * 1e9:
-                    camera_child.end(process, 0.0)
+                    end_child(process, 0.0)
                     done = self._reset_port()
                     return (
                         f"the camera's process did not answer for {answer_s:g} s and was killed{done}; it starts again"

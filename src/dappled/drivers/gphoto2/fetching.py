@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 
 from dappled.drivers.camera import Arrival, Companion
-from dappled.drivers.gphoto2.before import LATE
+from dappled.drivers.gphoto2.messages import LATE
 from dappled.drivers.gphoto2.pairs import makes_pairs
 from dappled.drivers.gphoto2.protocol import (
     BusyError,

@@ -13,10 +13,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 from dappled.drivers.camera import Fired, SettingName, SettingsChanged
-from dappled.drivers.gphoto2.before import LATE, Before
-from dappled.drivers.gphoto2.channel import Channel, ChannelError
 from dappled.drivers.gphoto2.fetching import Fetching
 from dappled.drivers.gphoto2.finding import open_session
+from dappled.drivers.gphoto2.messages import LATE, Before
 from dappled.drivers.gphoto2.protocol import (
     AbsentError,
     BusyError,
@@ -29,6 +28,7 @@ from dappled.drivers.gphoto2.protocol import (
 from dappled.drivers.gphoto2.settings import GPhoto2Settings
 from dappled.drivers.gphoto2.state import AtCamera, Books
 from dappled.drivers.gphoto2.telling import SEND_S, Telling
+from dappled.drivers.process_channel import ChannelError, ProcessChannel
 from dappled.drivers.wired.attribution import BodyClock
 
 _WAITING = 64
@@ -43,7 +43,7 @@ class CameraLoop:
 
     def __init__(
         self,
-        channel: Channel,
+        channel: ProcessChannel,
         settings: GPhoto2Settings,
         open_camera: Callable[[GPhoto2Settings, str | None], Session] = open_session,
         clock_ns: Callable[[], int] = time.monotonic_ns,

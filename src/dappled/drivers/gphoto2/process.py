@@ -13,10 +13,10 @@ import socket
 import sys
 
 from dappled.drivers.child_process import die_with_parent, raise_priority
-from dappled.drivers.gphoto2.before import Before
-from dappled.drivers.gphoto2.channel import Channel, ChannelError
 from dappled.drivers.gphoto2.loop import CameraLoop
+from dappled.drivers.gphoto2.messages import Before
 from dappled.drivers.gphoto2.settings import parse_settings
+from dappled.drivers.process_channel import ChannelError, ProcessChannel
 
 
 def _quiet_library() -> None:
@@ -34,7 +34,7 @@ def main() -> None:
     raise_priority()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C reaches the whole group; the parent ends us
     _quiet_library()
-    channel = Channel(socket.socket(fileno=int(fd)))
+    channel = ProcessChannel(socket.socket(fileno=int(fd)))
     try:
         CameraLoop(channel, parse_settings(json.loads(settings)), before=Before.of_json(json.loads(before))).run()
     except ChannelError:

@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from dappled.drivers.camera import BodyState, Setting
-from dappled.drivers.gphoto2.before import LATE
+from dappled.drivers.gphoto2.messages import LATE
 from dappled.drivers.gphoto2.pairs import Pairs
 from dappled.drivers.gphoto2.protocol import (
     CameraFile,

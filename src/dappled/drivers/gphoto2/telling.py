@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from dappled.drivers.camera import BodyState, CameraEvent, ShotFailed, StateChanged
-from dappled.drivers.gphoto2.channel import Channel, event_message
+from dappled.drivers.gphoto2.messages import event_message
 from dappled.drivers.gphoto2.state import Books
+from dappled.drivers.process_channel import ProcessChannel
 from dappled.drivers.wired.attribution import Claim
 
 SEND_S = 5.0
@@ -15,7 +16,7 @@ SEND_S = 5.0
 class Telling:
     """Events to the parent, and their notes in the books. All raise ChannelError when the parent is gone."""
 
-    def __init__(self, channel: Channel, books: Books, clock_ns: Callable[[], int]) -> None:
+    def __init__(self, channel: ProcessChannel, books: Books, clock_ns: Callable[[], int]) -> None:
         self._channel, self._books, self._clock_ns = channel, books, clock_ns
 
     def tell(self, event: CameraEvent) -> None:

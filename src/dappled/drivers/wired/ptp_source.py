@@ -15,10 +15,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from dappled.drivers.camera import Blob, CameraError
-from dappled.drivers.gphoto2 import spawn
-from dappled.drivers.gphoto2.channel import Channel, ChannelError, Message
+from dappled.drivers.child_process import die_with_parent, end_child, start_child
 from dappled.drivers.gphoto2.protocol import CameraFile, Session, SessionError
 from dappled.drivers.gphoto2.settings import GPhoto2Settings
+from dappled.drivers.process_channel import ChannelError, ChannelMessage, ProcessChannel
 from dappled.drivers.wired.sources import SUFFIXES, Found
 
 _ANSWER_S = 60.0
@@ -32,7 +32,7 @@ class PtpSource:
 
     def __init__(self, port: str) -> None:
         self._port = port
-        self._child: tuple[subprocess.Popen[bytes], Channel] | None = None
+        self._child: tuple[subprocess.Popen[bytes], ProcessChannel] | None = None
         self._taken_s: dict[str, int | None] = {}
 
     def list(self) -> list[Found]:
@@ -60,11 +60,11 @@ class PtpSource:
             return
         process, channel = child
         channel.close()
-        spawn.end(process)
+        end_child(process)
 
-    def _ask(self, question: Mapping[str, Any]) -> Message:
+    def _ask(self, question: Mapping[str, Any]) -> ChannelMessage:
         try:
-            _, channel = self._child = self._child or spawn.spawn(
+            _, channel = self._child = self._child or start_child(
                 "dappled.drivers.wired.ptp_source", self._port, quiet=True
             )
         except OSError as error:  # no memory, no descriptors
@@ -128,7 +128,7 @@ class _Files:
         return session.fetch(CameraFile(folder, name)).blob
 
 
-def _serve(channel: Channel, files: _Files) -> None:
+def _serve(channel: ProcessChannel, files: _Files) -> None:
     while True:
         question = channel.receive(_REST_S)
         if question is None:
@@ -144,12 +144,10 @@ def _serve(channel: Channel, files: _Files) -> None:
 
 def main() -> None:
     """Arguments: the socket's descriptor, the parent's process id, the port."""
-    from dappled.drivers.child_process import die_with_parent  # noqa: PLC0415  # the parent doesn't need it
-
     fd, parent, port = sys.argv[1:]
     die_with_parent(int(parent))
     with contextlib.suppress(ChannelError):  # the parent is gone, or has closed
-        _serve(Channel(socket.socket(fileno=int(fd))), _Files(port))
+        _serve(ProcessChannel(socket.socket(fileno=int(fd))), _Files(port))
 
 
 if __name__ == "__main__":

@@ -9,15 +9,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dappled.drivers.camera import Arrival, Blob, CameraEvent, Fired, Identity, ShotFailed, StateChanged
-from dappled.drivers.gphoto2.channel import Channel, ChannelError, Message, event_message, message_event
+from dappled.drivers.gphoto2.messages import event_message, message_event
+from dappled.drivers.process_channel import ChannelError, ChannelMessage, ProcessChannel
 
-Ends = tuple[Channel, Channel]
+Ends = tuple[ProcessChannel, ProcessChannel]
 
 
 @pytest.fixture
 def ends() -> Iterator[Ends]:
-    here, there = Channel.pair()
-    other = Channel(there)
+    here, there = ProcessChannel.pair()
+    other = ProcessChannel(there)
     yield here, other
     here.close()
     other.close()
@@ -57,32 +58,11 @@ def test_an_arrival_brings_its_bytes(
     event.blob.close()
 
 
-def test_nothing_to_receive_is_none(ends: Ends) -> None:
-    assert ends[0].receive(0.0) is None
-
-
-def test_the_other_end_s_end_is_told(ends: Ends) -> None:
-    ends[1].close()
-    with pytest.raises(ChannelError, match="ended"):
-        ends[0].receive(5.0)
-    with pytest.raises(ChannelError, match="gone"):
-        ends[0].send({"do": "ping"})
-
-
-def test_a_full_channel_does_not_block(ends: Ends) -> None:
-    def fill() -> None:
-        for number in range(100_000):
-            ends[0].send({"do": "fire", "shot": number})
-
-    with pytest.raises(ChannelError, match="no more"):
-        fill()
-
-
 @given(st.binary(min_size=1, max_size=200))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_nonsense_is_refused_and_never_crashes(raw: bytes) -> None:
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    channel = Channel(there)
+    channel = ProcessChannel(there)
     with here:
         here.send(raw)
         try:
@@ -109,12 +89,12 @@ def test_nonsense_is_refused_and_never_crashes(raw: bytes) -> None:
 )
 def test_messages_that_are_no_events_are_refused(body: dict[str, object]) -> None:
     with pytest.raises(ChannelError):
-        message_event(Message(body))
+        message_event(ChannelMessage(body))
 
 
 def test_descriptors_of_a_refused_message_are_closed() -> None:
     blob = Blob.of(b"x")
     with pytest.raises(ChannelError):
-        message_event(Message({"is": "party"}, (blob.fd,)))
+        message_event(ChannelMessage({"is": "party"}, (blob.fd,)))
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(blob.fd)

@@ -1,0 +1,104 @@
+"""Encode camera events as messages between the driver and its process, and what a dead process leaves to the next.
+
+Both processes import this; it does not load libgphoto2.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from dappled.drivers.camera import (
+    Arrival,
+    Blob,
+    CameraEvent,
+    Companion,
+    Deferred,
+    Fired,
+    Identity,
+    Setting,
+    SettingsChanged,
+    ShotFailed,
+    StateChanged,
+)
+from dappled.drivers.process_channel import ChannelError, ChannelMessage
+from dappled.drivers.wired.attribution import Claim
+
+LATE = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Before:
+    """What a process that died leaves to the next: the body's serial number, the shots that were fired and have no file
+    yet, the offsets of the body's clock, and the (folder, name) of the files that came last."""
+
+    serial: str | None = None
+    late: tuple[Claim, ...] = ()
+    offsets_s: tuple[float, ...] = ()
+    seen: tuple[tuple[str, str], ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Convert to plain values."""
+        return asdict(self)
+
+    @classmethod
+    def of_json(cls, value: Mapping[str, Any]) -> Before:
+        """Read what `to_json` made."""
+        late = tuple(Claim(**each) for each in value["late"])
+        seen = tuple((folder, name) for folder, name in value["seen"])
+        return cls(value["serial"], late, tuple(value["offsets_s"]), seen)
+
+
+def event_message(event: CameraEvent) -> ChannelMessage:
+    """Encode an event; a file's blob is the message's only descriptor, which the caller still owns."""
+    match event:
+        case StateChanged(state, reason, at_ns, identity):
+            who = None if identity is None else asdict(identity)
+            return ChannelMessage({"is": "state", "state": state, "reason": reason, "ns": at_ns, "identity": who})
+        case Fired(shot, called_ns, returned_ns):
+            return ChannelMessage({"is": "fired", "shot": shot, "called_ns": called_ns, "returned_ns": returned_ns})
+        case ShotFailed(shot, reason, at_ns):
+            return ChannelMessage({"is": "failed", "shot": shot, "reason": reason, "ns": at_ns})
+        case Deferred(shot, reason, at_ns):
+            return ChannelMessage({"is": "deferred", "shot": shot, "reason": reason, "ns": at_ns})
+        case SettingsChanged(settings, at_ns, refused):
+            each = [asdict(one) for one in settings]
+            return ChannelMessage({"is": "settings", "settings": each, "ns": at_ns, "refused": refused})
+        case Arrival(shot_or_none, name, blob, at_ns, facts) | Companion(shot_or_none, name, blob, at_ns, facts):
+            kind = "arrival" if isinstance(event, Arrival) else "companion"
+            body = {"is": kind, "shot": shot_or_none, "name": name, "size": blob.size, "ns": at_ns}
+            return ChannelMessage({**body, "facts": dict(facts)}, (blob.fd,))
+
+
+def message_event(message: ChannelMessage) -> CameraEvent:
+    """Decode an event. Raises ChannelError for anything else, and closes the message's descriptors then."""
+    try:
+        return _event(message.body, message.fds)
+    except (KeyError, TypeError, ValueError) as error:
+        for fd in message.fds:
+            os.close(fd)
+        raise ChannelError(f"a message could not be understood: {error!r}") from error
+
+
+def _event(body: Mapping[str, Any], fds: tuple[int, ...]) -> CameraEvent:
+    match body["is"]:
+        case "state":
+            who = None if body["identity"] is None else Identity(**body["identity"])
+            return StateChanged(body["state"], body["reason"], body["ns"], who)
+        case "fired":
+            return Fired(body["shot"], body["called_ns"], body["returned_ns"])
+        case "failed":
+            return ShotFailed(body["shot"], body["reason"], body["ns"])
+        case "deferred":
+            return Deferred(body["shot"], body["reason"], body["ns"])
+        case "settings":
+            read = tuple(Setting(each["name"], each["value"], tuple(each["choices"])) for each in body["settings"])
+            return SettingsChanged(read, body["ns"], body["refused"])
+        case "arrival" | "companion" as kind:
+            (fd,) = fds
+            made = Arrival if kind == "arrival" else Companion
+            return made(body["shot"], body["name"], Blob(fd, body["size"]), body["ns"], body["facts"])
+        case other:
+            raise ValueError(f"nothing is called {other!r}")
