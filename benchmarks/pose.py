@@ -27,7 +27,7 @@ from dappled.daemon.navigation.camera_clock import CameraClock, exposure_from_ca
 from dappled.daemon.navigation.samples import AttitudeSample, PositionSample, attitude, position
 from dappled.daemon.navigation.telemetry import Telemetry
 from dappled.daemon.navigation.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
-from dappled.daemon.pipeline.tagger import BodyLatency, Exposure, mid_exposure
+from dappled.daemon.pipeline.tagger import BodyLatency, ExposureTime, mid_exposure
 from dappled.decode.geometry.interpolation import metres_per_radian, turn_rad
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Decoder, Message, mavlink
@@ -87,7 +87,7 @@ def measure(frames: int, seed: int) -> dict[str, dict[str, float]]:
     path = Path(seed, speed_m_s=SPEED_M_S, radius_m=SPEED_M_S / TURN_RAD_S)
     taken = [_take(WARM_UP_S + EVERY_S * number, rng) for number in range(frames)]
     packets = sorted(_packets(path, taken, rng), key=lambda packet: packet[0])
-    found: dict[str, list[tuple[Taken, Exposure, Pose]]] = {"hot_shoe": [], "body_latency": [], "camera_clock": []}
+    found: dict[str, list[tuple[Taken, ExposureTime, Pose]]] = {"hot_shoe": [], "body_latency": [], "camera_clock": []}
     with_shoe, without = Telemetry(), Telemetry()
     camera, told = CameraClock(), 0
     for number, (stamp_ns, message) in enumerate(packets):
@@ -227,7 +227,7 @@ def _utc_ns(t_s: float) -> int:
     return START_NS + round(t_s * 1e9)
 
 
-def _figures(path: Path, rows: Sequence[tuple[Taken, Exposure, Pose]]) -> dict[str, float]:
+def _figures(path: Path, rows: Sequence[tuple[Taken, ExposureTime, Pose]]) -> dict[str, float]:
     metres, turns, sigma_m, sigma_rad, late_ms, sigma_ms = [], [], [], [], [], []
     for one, exposure, pose in rows:
         if pose.latitude_rad is None or pose.longitude_rad is None or pose.attitude is None:

@@ -228,8 +228,8 @@ class Ears:
     def settled(self, index: int, _ok: bool) -> None:
         self.safe_ns[index] = time.monotonic_ns()
 
-    def finished(self, story: Any) -> None:
-        self.decode_ms[story.shot.index] = story.ms.get("decode", float("nan"))
+    def finished(self, pending: Any) -> None:
+        self.decode_ms[pending.shot.index] = pending.ms.get("decode", float("nan"))
 
     def listen(self) -> None:
         with Subscriber(self.endpoint, topics=["slices"]) as subscriber:
@@ -258,8 +258,8 @@ def latency(root: Path, frames: int) -> dict[str, float]:
     """A simulated flight: from "safe on disk" to "received by a subscriber", less the decode; and what a subscriber
     that was killed and started again has at the end."""
     from dappled.config import settings as configuration  # noqa: PLC0415  # the subscribers' processes load none of it
-    from dappled.daemon.pipeline.capture_requests import Wish  # noqa: PLC0415  # as above
-    from dappled.daemon.pipeline.pending_shot import Watchers  # noqa: PLC0415  # as above
+    from dappled.daemon.pipeline.capture_requests import CaptureRequest  # noqa: PLC0415  # as above
+    from dappled.daemon.pipeline.pending_shot import Observer  # noqa: PLC0415  # as above
     from dappled.daemon.service import Service  # noqa: PLC0415  # as above
     from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # as above
 
@@ -271,7 +271,7 @@ def latency(root: Path, frames: int) -> dict[str, float]:
         )
     )
     with Simulation(World(seed=2), settings, root) as simulated:
-        service = Service(simulated, watchers=Watchers(finished=ears.finished, settled=ears.settled))
+        service = Service(simulated, watchers=Observer(finished=ears.finished, settled=ears.settled))
         service.start()
         threads = [threading.Thread(target=work) for work in (service.run, ears.listen, ears.listen_die_and_come_back)]
         for thread in threads:
@@ -279,7 +279,7 @@ def latency(root: Path, frames: int) -> dict[str, float]:
         try:
             _wait(lambda: service.health()["camera"]["state"] == "ready")
             for number in range(frames + 1):  # by the last one's seq who came late sees what there was before
-                service.wish(Wish("benchmark", "console", number))
+                service.wish(CaptureRequest("benchmark", "console", number))
                 _wait(lambda: len(ears.decode_ms) > number)  # noqa: B023  # it is called before the next round
             threads[2].join(DEADLINE_S)
         finally:

@@ -23,12 +23,12 @@ from pathlib import Path
 
 from dappled.clock import SystemClock
 from dappled.daemon.navigation.pose import nothing
-from dappled.daemon.pipeline.decode_process import Developed
-from dappled.daemon.pipeline.flight_writer import LiveBook
-from dappled.daemon.pipeline.pending_shot import Names, Story, Watchers
-from dappled.daemon.pipeline.pipeline import Street
-from dappled.daemon.pipeline.shutter import Shutter, Wish
-from dappled.daemon.pipeline.tagger import BodyLatency, Exposure
+from dappled.daemon.pipeline.decode_process import DecodedFrame
+from dappled.daemon.pipeline.flight_writer import LedgerWriter
+from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
+from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
+from dappled.daemon.pipeline.tagger import BodyLatency, ExposureTime
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.camera import (
     Arrival,
@@ -91,11 +91,11 @@ class SlowDeveloper:
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
 
-    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> Developed:
+    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
         time.sleep(self._seconds)
         body = mmap.mmap(-1, 1 << 20)
         unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
-        return Developed(body, "0" * 64, [], [[0.0] * 4], "predicted", 1, 1, "geometric", unit, b"", (0, 0))
+        return DecodedFrame(body, "0" * 64, [], [[0.0] * 4], "predicted", 1, 1, "geometric", unit, b"", (0, 0))
 
 
 def main() -> None:
@@ -122,20 +122,20 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
     neither decoded nor noted as not decoded. Memory: the growth from the second quarter to the last."""
     clock, wishes_ms = SystemClock(), []
     flight = recording.begin(root, clock.utc_ns, {})
-    book, record_ms, over = LiveBook(flight, clock), [], threading.Semaphore(0)
+    book, record_ms, over = LedgerWriter(flight, clock), [], threading.Semaphore(0)
 
-    def finished(story: Story) -> None:
-        record_ms.append(story.ms.get("record", 0.0))
+    def finished(pending: PendingShot) -> None:
+        record_ms.append(pending.ms.get("record", 0.0))
         over.release()
 
-    def pose(index: int, exposure: Exposure) -> tuple[Exposure, Pose]:
+    def pose(index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
         return exposure, nothing(exposure.utc_ns, 0)
 
     def settled(index: int, ok: bool) -> None:
         shutters[0].settled(index, ok)
 
     shutters: list[Shutter] = []
-    street = Street(
+    pipeline = Pipeline(
         camera=SteadyCamera(size),
         book=book,
         poses=pose,
@@ -143,30 +143,30 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
         publisher=None,
         latency=BodyLatency(60.0, 15.0, "benchmark"),
         names=Names("benchmark", "mask", "geometric"),
-        watchers=Watchers(settled=settled, finished=finished),
+        watchers=Observer(settled=settled, finished=finished),
         decode_queue=QUEUE,
     )
 
     def note(shot: Shot) -> None:
         flight.journal.note(shot)
         book.wished(shot)
-        street.expect(shot)
+        pipeline.expect(shot)
 
-    shutters.append(Shutter(next_index=0, note=note, fire=street.fire, clock=clock, capacity=1000))
+    shutters.append(Shutter(next_index=0, note=note, fire=pipeline.fire, clock=clock, capacity=1000))
     memory = Memory()
-    street.start()
+    pipeline.start()
     count = round(seconds * rate)
     start = time.monotonic()
     for number in range(count):
         time.sleep(max(0.0, start + number / rate - time.monotonic()))
         began = time.perf_counter()
-        shutters[0].wish(Wish("benchmark", "console", number))
+        shutters[0].wish(CaptureRequest("benchmark", "console", number))
         wishes_ms.append((time.perf_counter() - began) * 1e3)
         memory.look()
     behind_s = time.monotonic() - start - (count - 1) / rate
     for _ in range(count):
         over.acquire(timeout=60 + decode_s * (QUEUE + 2))
-    street.stop(10.0)
+    pipeline.stop(10.0)
     flight.close()
     return {
         **_account(flight.folder.path, count),

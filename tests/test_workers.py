@@ -7,12 +7,12 @@ from typing import Literal
 
 import pytest
 
-from dappled.workers import Stage
+from dappled.workers import Worker
 
 
 def test_items_are_worked_off_in_order() -> None:
     seen: list[int] = []
-    stage = Stage("test", seen.append, capacity=100)
+    stage = Worker("test", seen.append, capacity=100)
     stage.start()
     for number in range(50):
         assert stage.put(number)
@@ -27,7 +27,7 @@ def test_a_full_queue_keeps_its_policy(
 ) -> None:
     seen: list[int] = []
     dropped: list[int] = []
-    stage = Stage("test", seen.append, capacity=2, policy=policy, on_drop=dropped.append)
+    stage = Worker("test", seen.append, capacity=2, policy=policy, on_drop=dropped.append)
     taken = [stage.put(number) for number in (1, 2, 3)]
     assert taken[-1] is (policy == "drop oldest")
     stage.start()
@@ -45,7 +45,7 @@ def test_one_bad_item_does_not_end_the_stage() -> None:
             raise ValueError("one")
         seen.append(item)
 
-    stage = Stage("test", work, capacity=10, on_failure=lambda item, error: failed.append((item, str(error))))
+    stage = Worker("test", work, capacity=10, on_failure=lambda item, error: failed.append((item, str(error))))
     stage.start()
     for number in range(3):
         stage.put(number)
@@ -55,7 +55,7 @@ def test_one_bad_item_does_not_end_the_stage() -> None:
 
 def test_wait_idle_waits_for_the_item_in_hand() -> None:
     gate = threading.Event()
-    stage = Stage[int]("test", lambda _: (gate.wait(5), None)[1], capacity=1)
+    stage = Worker[int]("test", lambda _: (gate.wait(5), None)[1], capacity=1)
     stage.start()
     stage.put(1)
     assert not stage.wait_idle(0.05)
@@ -65,7 +65,7 @@ def test_wait_idle_waits_for_the_item_in_hand() -> None:
 
 
 def test_a_stopped_stage_takes_nothing_more() -> None:
-    stage = Stage[int]("test", lambda _: None, capacity=1)
+    stage = Worker[int]("test", lambda _: None, capacity=1)
     stage.start()
     assert stage.stop(5)
     assert not stage.put(1)

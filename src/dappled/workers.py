@@ -29,7 +29,7 @@ class Statistics:
     failed: int
 
 
-class Stage(Generic[Item]):
+class Worker(Generic[Item]):
     """One thread that does `work` on each item, in order, behind a bounded queue.
 
     `refuse`: a full queue turns the new item away. `drop oldest`: it loses its oldest. Either way `on_drop` is told.
@@ -63,7 +63,7 @@ class Stage(Generic[Item]):
         """Begin to work."""
         self._thread.start()
 
-    def dead(self) -> list[str]:
+    def dead_threads(self) -> list[str]:
         """The thread's name where it has ended without being asked to: never, unless there is a bug."""
         return [] if self._closed or self._thread.is_alive() else [self.name]
 

@@ -13,16 +13,16 @@ import pytest
 
 from dappled.cli.terminal import CameraRemarks, Frames, ProblemRemarks
 from dappled.daemon.health import log_format
-from dappled.daemon.pipeline.pending_shot import Story
+from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.drivers.camera import BodyState, StateChanged
 from tests.daemon.health.test_log_format import read
 from tests.flight.makers import shot
 
 
 def test_a_line_for_each_frame(capsys: pytest.CaptureFixture[str]) -> None:
-    frames = Frames(lambda story: f"shot {story.shot.index}")
+    frames = Frames(lambda pending: f"shot {pending.shot.index}")
     for index in range(20):
-        frames.finished(Story(shot(index)))
+        frames.finished(PendingShot(shot(index)))
     frames.close()
     assert capsys.readouterr().out.splitlines() == [f"shot {index}" for index in range(20)]
 
@@ -36,8 +36,8 @@ def test_a_terminal_that_is_gone_stops_nobody(monkeypatch: pytest.MonkeyPatch) -
             raise BrokenPipeError
 
     monkeypatch.setattr(sys, "stdout", Gone())
-    frames = Frames(lambda story: f"shot {story.shot.index}")
-    frames.finished(Story(shot(0)))
+    frames = Frames(lambda pending: f"shot {pending.shot.index}")
+    frames.finished(PendingShot(shot(0)))
     frames.close()
     with sys.stdout as nowhere:
         assert nowhere.name == "/dev/null"
@@ -99,8 +99,8 @@ def test_in_the_journal_a_frame_can_be_asked_for(tmp_path: Path, capsys: pytest.
         root.addHandler(handler)
         root.setLevel(logging.INFO)
         try:
-            frames = Frames(lambda story: f"shot {story.shot.index}")
-            frames.finished(Story(shot(42), problem="it hangs"))
+            frames = Frames(lambda pending: f"shot {pending.shot.index}")
+            frames.finished(PendingShot(shot(42), problem="it hangs"))
             CameraRemarks().changed(StateChanged("ready", "", 0))
             frames.close()
             told = {entry["MESSAGE"]: entry for entry in (read(listener.recv(10_000)), read(listener.recv(10_000)))}

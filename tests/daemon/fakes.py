@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dappled.clock import RecordedClock, SystemClock
-from dappled.daemon.pipeline.decode_process import Developed, DevelopmentError
-from dappled.daemon.pipeline.flight_writer import LiveBook
-from dappled.daemon.pipeline.pending_shot import Names, Story, Watchers
-from dappled.daemon.pipeline.pipeline import Street
-from dappled.daemon.pipeline.shutter import Shutter, Verdict, Wish
+from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcessError
+from dappled.daemon.pipeline.flight_writer import LedgerWriter
+from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
+from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
 from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.camera import (
@@ -123,15 +123,15 @@ class FakeDeveloper:
         self.gate.set()
         self.seen: list[str] = []
 
-    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> Developed:
+    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
         self.seen.append(path)
         assert self.gate.wait(20)
         if self.problem:
-            raise DevelopmentError(self.problem)
+            raise DecodeProcessError(self.problem)
         body = mmap.mmap(-1, 16)
         arrays = [{"name": "slices", "dtype": "<c8", "shape": [1, 1, 2], "unit": "1"}]
         unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
-        return Developed(body, "0" * 64, arrays, [[0.0] * 4], "calibrated", 1, 1, "geometric", unit, b"", (0, 0))
+        return DecodedFrame(body, "0" * 64, arrays, [[0.0] * 4], "calibrated", 1, 1, "geometric", unit, b"", (0, 0))
 
 
 @dataclass
@@ -140,23 +140,23 @@ class Rig:
 
     flight: recording.Recording
     camera: FakeCamera
-    street: Street
+    pipeline: Pipeline
     shutter: Shutter
     developer: FakeDeveloper | None
-    stories: list[Story] = field(default_factory=list)
+    shots: list[PendingShot] = field(default_factory=list)
     settled: list[tuple[int, bool]] = field(default_factory=list)
     tagged: list[int] = field(default_factory=list)
 
-    def wish(self, number: int) -> Verdict:
-        return self.shutter.wish(Wish("test", "console", number))
+    def wish(self, number: int) -> ShotDecision:
+        return self.shutter.wish(CaptureRequest("test", "console", number))
 
-    def ended(self, index: int) -> Story:
+    def ended(self, index: int) -> PendingShot:
         """The story of a shot, once it is finished."""
         until = time.monotonic() + 20
         while time.monotonic() < until:
-            for story in list(self.stories):
-                if story.shot.index == index:
-                    return story
+            for pending in list(self.shots):
+                if pending.shot.index == index:
+                    return pending
             threading.Event().wait(0.002)
         raise AssertionError(f"shot {index} never ended")
 
@@ -184,7 +184,7 @@ def rig(
     """A street at work on a new flight in `flights`; stopped and closed at the end."""
     clock = SystemClock()
     flight = recording.begin(flights, clock.utc_ns, {})
-    book = LiveBook(flight, clock)
+    book = LedgerWriter(flight, clock)
     camera = camera or FakeCamera(script)
     developer = FakeDeveloper() if decode else None
     made: list[Rig] = []
@@ -196,9 +196,9 @@ def rig(
     def note(shot: Shot) -> None:
         flight.journal.note(shot)
         book.wished(shot)
-        made[0].street.expect(shot)
+        made[0].pipeline.expect(shot)
 
-    street = Street(
+    pipeline = Pipeline(
         camera=camera,
         book=book,
         poses=lambda index, exposure: (exposure, no_pose(exposure.utc_ns)),
@@ -206,20 +206,20 @@ def rig(
         publisher=None,
         latency=BodyLatency(60.0, 15.0, "test"),
         names=Names("test", "mask", "geometric"),
-        watchers=Watchers(
+        watchers=Observer(
             settled,
-            lambda story: made[0].tagged.append(story.shot.index),
-            lambda story: made[0].stories.append(story),  # noqa: PLW0108  # a test may take the list away
+            lambda pending: made[0].tagged.append(pending.shot.index),
+            lambda pending: made[0].shots.append(pending),  # noqa: PLW0108  # a test may take the list away
         ),
         decode_queue=queue_,
     )
     now_ns = clock.utc_ns()  # it stands still, so that a slow machine makes no new wish of a retry
     steady = RecordedClock(now_ns, now_ns - clock.monotonic_ns())
-    shutter = Shutter(next_index=flight.next_index, note=note, fire=street.fire, clock=steady, capacity=1000)
-    made.append(Rig(flight, camera, street, shutter, developer))
-    street.start()
+    shutter = Shutter(next_index=flight.next_index, note=note, fire=pipeline.fire, clock=steady, capacity=1000)
+    made.append(Rig(flight, camera, pipeline, shutter, developer))
+    pipeline.start()
     try:
         yield made[0]
     finally:
-        street.stop(stop_s)
+        pipeline.stop(stop_s)
         flight.close()

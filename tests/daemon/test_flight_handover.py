@@ -12,7 +12,7 @@ from dappled.config import profiles
 from dappled.config.settings import CameraSettings, DecodeSettings, MaskSettings, Settings
 from dappled.daemon import flight_handover
 from dappled.daemon.camera_protocol.camera_settings import Knobs
-from dappled.daemon.flight_handover import BY_BODY, NONE, Succession
+from dappled.daemon.flight_handover import BY_BODY, NONE, FlightHandover
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.pending_shot import Names
 from dappled.drivers.camera import CameraError, Setting, SettingName
@@ -33,22 +33,22 @@ class NoBody:
         raise AssertionError(name)
 
 
-def knobs(settings: Settings, after: Succession | None, ask: Callable[[Settings, str], None]) -> Knobs:
+def knobs(settings: Settings, after: FlightHandover | None, ask: Callable[[Settings, str], None]) -> Knobs:
     return Knobs(NoBody(), flight_handover.knobs(recipes.called(settings), after, lambda: settings, ask))
 
 
 def test_each_shipped_mask_each_law_and_no_mask_can_be_chosen() -> None:
-    after = Succession(CONFIGURED)
+    after = FlightHandover(CONFIGURED)
     assert set(after.masks()) == {*profiles.shipped("masks"), NONE}
     assert set(after.laws()) == {"fd", "geometric"}
     own = replace(CONFIGURED, mask=MaskSettings("/bench/of-my-own.toml"), camera=CameraSettings(profile="auto"))
-    assert "of-my-own" in Succession(own).masks()
-    assert BY_BODY in Succession(own).laws()
+    assert "of-my-own" in FlightHandover(own).masks()
+    assert BY_BODY in FlightHandover(own).laws()
 
 
 def test_lenslets_have_nothing_to_choose() -> None:
     lenslets = replace(CONFIGURED, mask=MaskSettings(profiles.LENSLET))
-    after = Succession(lenslets)
+    after = FlightHandover(lenslets)
     assert (after.masks(), after.laws()) == ((), ())
     found = knobs(lenslets, after, lambda *_: None)
     with pytest.raises(CameraError, match="can't be changed"):
@@ -56,7 +56,7 @@ def test_lenslets_have_nothing_to_choose() -> None:
 
 
 def test_a_calibration_counts_with_its_own_mask_and_law_alone() -> None:
-    after = Succession(CONFIGURED)
+    after = FlightHandover(CONFIGURED)
     other = after.with_mask(CONFIGURED, "mask-3")
     assert (other.mask.profile, other.decode.calibration) == ("mask-3", "")
     assert other.decode.white == CONFIGURED.decode.white
@@ -70,7 +70,7 @@ def test_a_calibration_counts_with_its_own_mask_and_law_alone() -> None:
 
 
 def test_what_was_set_is_asked_for_and_a_second_setting_comes_on_top_of_the_first() -> None:
-    after, asked = Succession(CONFIGURED), list[str]()
+    after, asked = FlightHandover(CONFIGURED), list[str]()
 
     def ask(following: Settings, text: str) -> None:
         asked.append(text)
@@ -89,7 +89,7 @@ def test_what_is_refused_is_not_shown() -> None:
     def ask(_: Settings, text: str) -> None:
         raise CameraError(f"{text}: 1 shots are under way")
 
-    found = knobs(CONFIGURED, Succession(CONFIGURED), ask)
+    found = knobs(CONFIGURED, FlightHandover(CONFIGURED), ask)
     for name, word in (("LF_MASK", "mask-2"), ("LF_LAW", "fd")):
         with pytest.raises(CameraError, match="under way"):
             found.turn(name, word)
@@ -107,7 +107,7 @@ def test_where_no_flight_can_follow_they_are_to_be_read() -> None:
 def test_flights_follow_one_another_until_one_is_the_last() -> None:
     flown: list[str] = []
 
-    def fly(settings: Settings, after: Succession) -> bool:
+    def fly(settings: Settings, after: FlightHandover) -> bool:
         flown.append(settings.mask.profile)
         after.began = True
         if len(flown) < 3:
@@ -121,7 +121,7 @@ def test_flights_follow_one_another_until_one_is_the_last() -> None:
 def test_nothing_follows_a_flight_that_was_told_to_end() -> None:
     flown: list[str] = []
 
-    def fly(settings: Settings, after: Succession) -> bool:
+    def fly(settings: Settings, after: FlightHandover) -> bool:
         flown.append(settings.mask.profile)
         after.next = after.with_mask(settings, "mask-1")
         return False
@@ -133,7 +133,7 @@ def test_nothing_follows_a_flight_that_was_told_to_end() -> None:
 def test_a_next_flight_that_can_not_begin_leaves_all_as_it_was(caplog: pytest.LogCaptureFixture) -> None:
     flown: list[str] = []
 
-    def fly(settings: Settings, after: Succession) -> bool:
+    def fly(settings: Settings, after: FlightHandover) -> bool:
         flown.append(settings.mask.profile)
         if settings.mask.profile == "mask-1":
             raise DappledError("not with this one")
@@ -152,7 +152,7 @@ def test_a_next_flight_that_can_not_begin_leaves_all_as_it_was(caplog: pytest.Lo
 def test_what_goes_wrong_in_flight_or_at_the_first_start_is_not_repeated(began: bool) -> None:
     flown: list[str] = []
 
-    def fly(settings: Settings, after: Succession) -> bool:
+    def fly(settings: Settings, after: FlightHandover) -> bool:
         flown.append(settings.mask.profile)
         after.began = began
         raise DappledError("the disk is gone")

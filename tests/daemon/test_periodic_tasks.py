@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from dappled.daemon.periodic_tasks import AGAIN_NS, Chore
+from dappled.daemon.periodic_tasks import AGAIN_NS, PeriodicTask
 from dappled.errors import DappledError
 
 S = 10**9
@@ -14,7 +14,10 @@ S = 10**9
 
 def test_every_turn_or_at_its_own_pace() -> None:
     done: list[str] = []
-    chores = [Chore("each", lambda: done.append("each")), Chore("slow", lambda: done.append("slow"), every_ns=S)]
+    chores = [
+        PeriodicTask("each", lambda: done.append("each")),
+        PeriodicTask("slow", lambda: done.append("slow"), every_ns=S),
+    ]
     for now_ns in (5 * S, 5 * S + 1, 6 * S - 1, 6 * S):
         for chore in chores:
             chore.turn(now_ns)
@@ -31,7 +34,7 @@ def test_one_that_fails_is_tried_again_and_told_once(error: Exception, caplog: p
         if broken:
             raise error
 
-    chore = Chore("events", do)
+    chore = PeriodicTask("events", do)
     with caplog.at_level(logging.WARNING):
         for now_ns in (S, S + 1, S + AGAIN_NS - 1, S + AGAIN_NS, S + 2 * AGAIN_NS):
             chore.turn(now_ns)

@@ -12,7 +12,7 @@ import pytest
 
 from dappled.daemon.navigation.telemetry import Telemetry
 from dappled.daemon.pipeline import tagger
-from dappled.daemon.pipeline.tagger import BodyLatency, Settings
+from dappled.daemon.pipeline.tagger import BodyLatency, FrameSettings
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Decoder, Message, mavlink
 from dappled.flight import recording
@@ -63,7 +63,7 @@ def fly(flights: Path, packets: Packets, exposures_s: list[float]) -> Path:
         with held(b"frame %d" % index) as blob:
             frame = begun.recorder.record(index, "IMG.DNG", blob, arrived_utc_ns=START_NS + called_ns + 10**8)
         exposure, pose = telemetry.locate(tagger.mid_exposure(START_NS + called_ns, LATENCY, None))
-        begun.ledger.add_tag(tagger.tag(frame, exposure, Settings(), camera="test", mask="mask", pose=pose))
+        begun.ledger.add_tag(tagger.tag(frame, exposure, FrameSettings(), camera="test", mask="mask", pose=pose))
         begun.ledger.add_result(Result(index, "0" * 64, 1, 1, "geometric", "calibrated"))
 
     for t_s, message in packets:

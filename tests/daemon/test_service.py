@@ -14,10 +14,10 @@ from dappled.config import settings as configuration
 from dappled.config.settings import MaskSettings, PoseSettings, PublishSettings, RecordSettings, Settings
 from dappled.daemon import flight_parts
 from dappled.daemon import service as module
-from dappled.daemon.flight_handover import Succession
+from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.navigation.telemetry import UtcCorrection
-from dappled.daemon.pipeline.pending_shot import Story, Watchers
-from dappled.daemon.pipeline.shutter import Wish
+from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
+from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import Service
 from dappled.drivers.camera import CameraError, Setting, SettingsChanged
 from dappled.errors import DappledError
@@ -47,8 +47,8 @@ def settings(tmp_path: Path) -> Iterator[Settings]:
         )
 
 
-def started(settings: Settings, stories: list[Story]) -> Service:
-    service = Service(settings, watchers=Watchers(finished=stories.append))
+def started(settings: Settings, shots: list[PendingShot]) -> Service:
+    service = Service(settings, watchers=Observer(finished=shots.append))
     service.start()
     eventually(lambda: service.health()["camera"]["state"] == "ready", "the camera is ready")
     return service
@@ -61,29 +61,29 @@ def told(flight: Path) -> list[str]:
 
 
 def test_a_wish_goes_to_the_end_and_can_be_looked_up_in_the_next_flight(camera: FakeCamera, settings: Settings) -> None:
-    stories: list[Story] = []
-    service = started(settings, stories)
-    assert service.wish(Wish("test", "console", 1)).index == 0
-    eventually(lambda: stories, "the shot's end")
+    shots: list[PendingShot] = []
+    service = started(settings, shots)
+    assert service.wish(CaptureRequest("test", "console", 1)).index == 0
+    eventually(lambda: shots, "the shot's end")
     assert service.wished == 1
     service.stop()
     assert check.check(service.folder).intact
     assert camera.stopped
-    after = started(settings, stories)
+    after = started(settings, shots)
     found = after._parts._lookup(0)
     assert found is not None
     assert (found.ok, found.url) == (True, "frames/000000.dng")
-    assert after.wish(Wish("test", "console", 1)).index == 1
+    assert after.wish(CaptureRequest("test", "console", 1)).index == 1
     after.stop()
 
 
 def test_an_old_flight_that_was_moved_away_is_unknown(camera: FakeCamera, settings: Settings) -> None:
-    stories: list[Story] = []
-    first = started(settings, stories)
-    first.wish(Wish("test", "console", 1))
-    eventually(lambda: stories, "the shot's end")
+    shots: list[PendingShot] = []
+    first = started(settings, shots)
+    first.wish(CaptureRequest("test", "console", 1))
+    eventually(lambda: shots, "the shot's end")
     first.stop()
-    second = started(settings, stories)
+    second = started(settings, shots)
     first.folder.rename(first.folder.parent.parent / "moved")
     assert second._parts._lookup(0) is None
     assert second._parts._lookup(99) is None
@@ -100,7 +100,7 @@ def test_a_disk_that_can_t_be_asked_refuses_in_words(
 
     with monkeypatch.context() as broken:
         broken.setattr(layout, "free_bytes", refuse)
-        verdict = service.wish(Wish("test", "console", 1))
+        verdict = service.wish(CaptureRequest("test", "console", 1))
     assert (verdict.outcome, verdict.reason) == ("refused", "cannot ask for the free space of the disk")
     service.stop()
     assert not camera.fired
@@ -159,18 +159,18 @@ def test_a_believed_clock_that_the_satellites_contradict_is_a_problem(camera: Fa
 def test_a_lens_that_was_zoomed_between_two_frames_is_told(
     camera: FakeCamera, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stories: list[Story] = []
-    service = started(settings, stories)
+    shots: list[PendingShot] = []
+    service = started(settings, shots)
     try:
-        service.wish(Wish("test", "console", 1))
-        eventually(lambda: stories, "the shot's end")
-        (story,) = stories
+        service.wish(CaptureRequest("test", "console", 1))
+        eventually(lambda: shots, "the shot's end")
+        (pending,) = shots
         component, said = service._parts.component, list[str]()
-        assert story.tag is not None
+        assert pending.tag is not None
         monkeypatch.setattr(component, "say", lambda text, *_: said.append(text))
         for length_mm in (35.0, None, 35.0, 55.0):
-            story.tag = replace(story.tag, focal_length_mm=length_mm)
-            service._parts.herald._tagged(story)
+            pending.tag = replace(pending.tag, focal_length_mm=length_mm)
+            service._parts.herald._tagged(pending)
         assert said == ["image 0 was zoomed from 35 to 55 mm: is it calibrated?"]
     finally:
         service.stop()
@@ -188,20 +188,20 @@ def test_a_battery_that_runs_empty_is_told_until_there_is_another(camera: FakeCa
 
 
 def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, settings: Settings) -> None:
-    after, stories = Succession(settings), list[Story]()
-    service = Service(settings, watchers=Watchers(finished=stories.append), after=after)
+    after, shots = FlightHandover(settings), list[PendingShot]()
+    service = Service(settings, watchers=Observer(finished=shots.append), after=after)
     service.start()
     eventually(lambda: service.health()["camera"]["state"] == "ready", "the camera is ready")
     knobs = service._parts.component._parameters._knobs
     camera.script = lambda _: []
-    assert service.wish(Wish("test", "console", 1)).index == 0
+    assert service.wish(CaptureRequest("test", "console", 1)).index == 0
     with pytest.raises(CameraError, match="1 shots are under way"):
         knobs.turn("LF_MASK", "mask-3")
     for event in good(0):
         assert not isinstance(event, Exception)
         camera.say(event)
-    eventually(lambda: stories, "the shot's end")
-    service._parts.shutter.start_interval(Wish("test", "console", 2), 3600, 0)
+    eventually(lambda: shots, "the shot's end")
+    service._parts.shutter.start_interval(CaptureRequest("test", "console", 2), 3600, 0)
     camera.script = good
     with pytest.raises(CameraError, match="stop the interval first"):
         knobs.turn("LF_MASK", "mask-3")
@@ -211,7 +211,7 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
         camera.say(event)
     eventually(lambda: service._parts.shutter.statistics().pending == 0, "the interval's shot's end")
     assert knobs.turn("LF_MASK", "mask-3")
-    assert "next flight begins" in str(service.wish(Wish("test", "console", 3)).reason)
+    assert "next flight begins" in str(service.wish(CaptureRequest("test", "console", 3)).reason)
     service.run()  # ends by itself
     service.stop()
     assert after.next == replace(settings, mask=MaskSettings("mask-3"))
@@ -224,10 +224,10 @@ def test_a_viewer_s_thread_that_dies_is_told_and_ends_no_flight(
     service = started(settings, [])
     try:
         with monkeypatch.context() as broken:
-            broken.setattr(service._parts.answers, "dead", lambda: ["answers"])
+            broken.setattr(service._parts.answers, "dead_threads", lambda: ["answers"])
             assert "the answers thread has ended: restart dappled" in service.health()["problems"]
-            assert service.whole()
-            broken.setattr(service._parts.street, "dead", lambda: ["capture"])
-            assert not service.whole()
+            assert service.healthy()
+            broken.setattr(service._parts.pipeline, "dead_threads", lambda: ["capture"])
+            assert not service.healthy()
     finally:
         service.stop()

@@ -6,15 +6,15 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from dappled.daemon.pipeline.pending_shot import Story
-from dappled.daemon.stop_condition import Goal, Tally
+from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.daemon.stop_condition import StopCondition, Tally
 from dappled.flight.records import Frame
 from tests.flight.makers import shot
 
 
-def ended(index: int, problem: str = "") -> Story:
+def ended(index: int, problem: str = "") -> PendingShot:
     frame = None if problem else Frame(index, f"frames/{index:06d}.cr2", "IMG_0001.CR2", 10, "0" * 64, 5)
-    return Story(shot(index), frame=frame, problem=problem)
+    return PendingShot(shot(index), frame=frame, problem=problem)
 
 
 @dataclass
@@ -39,8 +39,8 @@ class World:
         self.asked += 1
         return self.asker
 
-    def goal(self, frames: int | None = None, seconds: float | None = None, *, asks: bool = False) -> Goal:
-        return Goal(
+    def goal(self, frames: int | None = None, seconds: float | None = None, *, asks: bool = False) -> StopCondition:
+        return StopCondition(
             self.tally,
             frames,
             seconds,

@@ -12,8 +12,8 @@ from typing import Any
 from dappled.config import settings as configuration
 from dappled.config.schema import Source
 from dappled.config.settings import Settings
-from dappled.daemon.pipeline.pending_shot import Story, Watchers
-from dappled.daemon.pipeline.shutter import Verdict, Wish
+from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
+from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision
 from dappled.daemon.service import Service
 from dappled.flight import check, summary
 from dappled.flight.ledger import LedgerReader
@@ -45,8 +45,8 @@ def settings_of(folder: Path, **tables: Mapping[str, Any]) -> Settings:
 class Flying:
     """A daemon that runs, and what came down its street."""
 
-    def __init__(self, service: Service, stories: list[Story], settled: list[tuple[int, bool]]) -> None:
-        self.service, self.stories, self.settled = service, stories, settled
+    def __init__(self, service: Service, shots: list[PendingShot], settled: list[tuple[int, bool]]) -> None:
+        self.service, self.shots, self.settled = service, shots, settled
         self._wishes = 0
 
     @property
@@ -61,41 +61,41 @@ class Flying:
     def until_ready(self) -> None:
         eventually(lambda: self.camera == "ready", f"camera ready: {self.problems}")
 
-    def wish(self) -> Verdict:
+    def wish(self) -> ShotDecision:
         self._wishes += 1
-        return self.service.wish(Wish("test", "console", self._wishes))
+        return self.service.wish(CaptureRequest("test", "console", self._wishes))
 
-    def shoot(self) -> Story:
+    def shoot(self) -> PendingShot:
         """One shot to its end."""
         self.until_ready()
         verdict = self.wish()
         assert verdict.outcome == "shot", verdict.reason
-        eventually(lambda: any(one.shot.index == verdict.index for one in self.stories), f"shot {verdict.index}")
-        return next(one for one in self.stories if one.shot.index == verdict.index)
+        eventually(lambda: any(one.shot.index == verdict.index for one in self.shots), f"shot {verdict.index}")
+        return next(one for one in self.shots if one.shot.index == verdict.index)
 
 
 @contextmanager
 def flying(settings: Settings) -> Iterator[Flying]:
     """The daemon of these settings, at work; in the end it is stopped, and its record must be whole."""
-    stories: list[Story] = []
+    shots: list[PendingShot] = []
     settled: list[tuple[int, bool]] = []
     service = Service(
         settings,
-        watchers=Watchers(finished=stories.append, settled=lambda index, ok: settled.append((index, ok))),
+        watchers=Observer(finished=shots.append, settled=lambda index, ok: settled.append((index, ok))),
     )
     service.start()
     folder = service.folder
     loop = threading.Thread(target=service.run, name="daemon")
     loop.start()
     try:
-        yield Flying(service, stories, settled)
+        yield Flying(service, shots, settled)
     finally:
         service.ask_to_stop()
         loop.join(5)
         service.stop()
     assert not loop.is_alive()
     assert_whole(folder)
-    assert len({one.shot.index for one in stories}) == len(stories), "a shot ended twice"
+    assert len({one.shot.index for one in shots}) == len(shots), "a shot ended twice"
 
 
 def assert_whole(flight: Path) -> None:

@@ -144,7 +144,7 @@ def test_no_camera_on_the_bus(here: Path) -> None:
         verdict = daemon.wish()
         assert verdict.outcome == "refused"
         assert "absent" in str(verdict.reason)
-    assert not daemon.stories
+    assert not daemon.shots
 
 
 def test_without_a_camera_run_ends_0_when_its_time_is_over(here: Path, tmp_path: Path) -> None:
@@ -223,7 +223,7 @@ def test_a_body_that_dies_mid_shot_fails_the_shot(here: Path) -> None:
             eventually(lambda: daemon.settled == [(0, False)], "the shot has failed")
             eventually(lambda: "the camera is" in daemon.problems, "a problem that names the camera")
             assert daemon.wish().outcome == "refused"
-        assert daemon.stories[0].problem
+        assert daemon.shots[0].problem
 
 
 @pytest.mark.slow
@@ -246,34 +246,34 @@ def photographed(picture: str | Path, here: Path, **tables: dict[str, Any]) -> t
         Body.start(BodyOptions(picture=str(picture))) as body,
         flying(before(body, here, **MASKED, **tables)) as daemon,
     ):
-        story = daemon.shoot()
-        assert story.frame is not None
+        pending = daemon.shoot()
+        assert pending.frame is not None
         assert daemon.settled == [(0, True)]
         folder = daemon.service.folder
         if isinstance(picture, Path):
-            assert (folder / story.frame.name).read_bytes() == picture.read_bytes()
+            assert (folder / pending.frame.name).read_bytes() == picture.read_bytes()
     return daemon, folder
 
 
 def test_a_good_frame_decodes(frame: Path, here: Path) -> None:
     """What the cases below differ from; and without telemetry a tag says so."""
     daemon, _ = photographed(frame, here)
-    (story,) = daemon.stories
-    assert story.problem == ""
-    assert story.developed is not None
-    assert story.developed.carriers_found > 20
-    assert story.tag is not None
-    assert story.tag.pose.source == "none"
-    assert story.tag.pose.latitude_rad is None
+    (pending,) = daemon.shots
+    assert pending.problem == ""
+    assert pending.decoded is not None
+    assert pending.decoded.carriers_found > 20
+    assert pending.tag is not None
+    assert pending.tag.pose.source == "none"
+    assert pending.tag.pose.latitude_rad is None
 
 
 def test_a_raw_that_is_no_raw_is_kept_and_not_decoded(here: Path, caplog: pytest.LogCaptureFixture) -> None:
     daemon, flight = photographed("pattern:100000:dng", here)
-    (story,) = daemon.stories
-    assert story.problem.startswith("not decoded: ")
-    assert "000000.dng" in story.problem
-    assert story.tag is not None
-    assert story.tag.focal_length_mm is None
+    (pending,) = daemon.shots
+    assert pending.problem.startswith("not decoded: ")
+    assert "000000.dng" in pending.problem
+    assert pending.tag is not None
+    assert pending.tag.focal_length_mm is None
     assert any(line.startswith("unreadable: ") and "000000.dng" in line for line in told(flight))
     assert any(line.startswith("not decoded: ") for line in told(flight))
     assert "Traceback" not in caplog.text
@@ -285,8 +285,8 @@ def test_a_truncated_raw_is_kept_and_not_decoded(frame: Path, here: Path, tmp_pa
     data = frame.read_bytes()
     cut.write_bytes(data[: int(len(data) * share)])
     daemon, flight = photographed(cut, here)
-    assert daemon.stories[0].problem.startswith("not decoded: ")
-    assert "000000.dng" in daemon.stories[0].problem
+    assert daemon.shots[0].problem.startswith("not decoded: ")
+    assert "000000.dng" in daemon.shots[0].problem
     assert any(line.startswith("not decoded: ") for line in told(flight))
 
 
@@ -295,7 +295,7 @@ def test_a_frame_of_another_size_than_its_profile_s(here: Path, tmp_path: Path) 
     small.write_bytes(reference_camera(1, scale=0.25, scene="white").bench_frame().file)
     daemon, _ = photographed(small, here)
     for word in ("not decoded", "000000.dng", "reference-36mm", "694 × 922", "1388 × 1844"):
-        assert word in daemon.stories[0].problem
+        assert word in daemon.shots[0].problem
 
 
 def test_a_frame_without_its_focal_length(frame: Path, here: Path, tmp_path: Path) -> None:
@@ -304,41 +304,41 @@ def test_a_frame_without_its_focal_length(frame: Path, here: Path, tmp_path: Pat
     without = tmp_path / "without.dng"
     without.write_bytes(data.replace(FOCAL_LENGTH, b"\x0b\x92\x05\x00"))
     daemon, _ = photographed(without, here)
-    (story,) = daemon.stories
-    assert story.tag is not None
-    assert story.tag.focal_length_mm is None
-    assert story.tag.f_number is not None
-    assert "not decoded" in story.problem
-    assert "focal length" in story.problem
+    (pending,) = daemon.shots
+    assert pending.tag is not None
+    assert pending.tag.focal_length_mm is None
+    assert pending.tag.f_number is not None
+    assert "not decoded" in pending.problem
+    assert "focal length" in pending.problem
 
 
 def test_a_decoder_that_is_killed_loses_one_decode_at_most(frame: Path, here: Path) -> None:
     with Body.start(BodyOptions(picture=str(frame))) as body, flying(before(body, here, **MASKED)) as daemon:
-        assert daemon.shoot().developed is not None
+        assert daemon.shoot().decoded is not None
         kill_decoders()  # between two frames
-        assert daemon.shoot().developed is not None
+        assert daemon.shoot().decoded is not None
         stopped = stop_decoders()
         index = daemon.wish().index
         eventually(lambda: (index, True) in daemon.settled, "the frame is safe")
         eventually(lambda: daemon.service.health()["stages"][1]["waiting"], "the frame is with the decoder")
         for process in stopped:
             os.kill(process, signal.SIGKILL)
-        eventually(lambda: len(daemon.stories) == 3, "the end of the third shot")
-        assert "the decoder died (signal 9)" in daemon.stories[2].problem
-        assert daemon.stories[2].frame is not None
-        assert daemon.shoot().developed is not None
+        eventually(lambda: len(daemon.shots) == 3, "the end of the third shot")
+        assert "the decoder died (signal 9)" in daemon.shots[2].problem
+        assert daemon.shots[2].frame is not None
+        assert daemon.shoot().decoded is not None
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(40)  # the decode itself would be given up after 60 s
 def test_a_decoder_that_hangs_does_not_keep_the_daemon(frame: Path, here: Path) -> None:
     with Body.start(BodyOptions(picture=str(frame))) as body, flying(before(body, here, **MASKED)) as daemon:
-        assert daemon.shoot().developed is not None
+        assert daemon.shoot().decoded is not None
         stop_decoders()
         daemon.wish()
         eventually(lambda: (1, True) in daemon.settled, "the frame is safe")
-    eventually(lambda: len(daemon.stories) == 2, "the end of the second shot")
-    assert "not decoded" in daemon.stories[1].problem
+    eventually(lambda: len(daemon.shots) == 2, "the end of the second shot")
+    assert "not decoded" in daemon.shots[1].problem
 
 
 # --- links and endpoints
@@ -380,9 +380,9 @@ def test_a_subscriber_that_never_reads_costs_nothing(frame: Path, here: Path) ->
             lazy.connect(f"ipc://{here}/s")
             asker.connect(f"ipc://{here}/s.ask")
             for _ in range(3):
-                story = one.shoot()
-                assert story.problem == ""
-                asker.send(json.dumps({"get": "slices", "frame": story.shot.index}).encode())
+                pending = one.shoot()
+                assert pending.problem == ""
+                asker.send(json.dumps({"get": "slices", "frame": pending.shot.index}).encode())
     finally:
         context.destroy(linger=0)
 
@@ -397,7 +397,7 @@ def test_a_disk_that_is_nearly_full_refuses_new_shots(body: Body, here: Path) ->
         assert verdict.outcome == "refused"
         assert "the disk is nearly full" in str(verdict.reason)
         assert "disk nearly full" in daemon.problems
-    assert not daemon.stories
+    assert not daemon.shots
     balance = summary.report(daemon.service.folder)
     assert (balance.wishes, balance.refused) == (0, 1)  # a wish that was refused stands in the flight as well
 
@@ -443,9 +443,9 @@ def small_disk(here: Path) -> Iterator[Path]:
 def test_a_disk_that_fills_up_keeps_what_is_safe(small_disk: Path, here: Path) -> None:
     with Body.start(BodyOptions(picture="pattern:3000000:dng")) as body:
         with flying(before(body, here, record={"directory": str(small_disk)})) as daemon:
-            stories = [daemon.shoot() for _ in range(3)]
-            assert [story.frame is not None for story in stories] == [True, True, False]
-            assert "the disk is full" in stories[2].problem
+            shots = [daemon.shoot() for _ in range(3)]
+            assert [pending.frame is not None for pending in shots] == [True, True, False]
+            assert "the disk is full" in shots[2].problem
         assert len(check.check(daemon.service.folder).problems) == 0
 
 

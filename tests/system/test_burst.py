@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled.daemon.pipeline.shutter import Wish
+from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.records import Frame
 from dappled.mocks.body.body import Body, BodyOptions
@@ -24,9 +24,9 @@ def test_an_interval_of_0_s_is_a_burst_that_loses_and_doubles_nothing(sockets: P
         flying(settings_of(here, camera={"port": body.port})) as daemon,
     ):
         daemon.until_ready()
-        verdict = daemon.service._parts.shutter.start_interval(Wish("test", "console", 1), 0.0, SHOTS)
+        verdict = daemon.service._parts.shutter.start_interval(CaptureRequest("test", "console", 1), 0.0, SHOTS)
         assert verdict.outcome != "refused", verdict.reason
-        eventually(lambda: len(daemon.stories) == SHOTS, "the burst's end")
+        eventually(lambda: len(daemon.shots) == SHOTS, "the burst's end")
         assert body.releases == SHOTS
         with LedgerReader.open(daemon.service.folder / "flight.sqlite") as ledger:
             frames = sorted(ledger.frames(), key=lambda frame: frame.index)
@@ -52,10 +52,10 @@ def test_in_a_burst_each_shot_ends_once_whatever_the_body_does(sockets: Path, tm
         shutter = daemon.service._parts.shutter
 
         def safe() -> list[Frame]:
-            return [story.frame for story in list(daemon.stories) if story.frame is not None]
+            return [pending.frame for pending in list(daemon.shots) if pending.frame is not None]
 
-        assert shutter.start_interval(Wish("test", "console", 1), 0.0, 0).outcome == "shot"
-        eventually(lambda: len(daemon.stories) >= 2, "two shots of the burst")
+        assert shutter.start_interval(CaptureRequest("test", "console", 1), 0.0, 0).outcome == "shot"
+        eventually(lambda: len(daemon.shots) >= 2, "two shots of the burst")
         body.fault(fault)
         if fault == "unplug":
             eventually(lambda: daemon.camera == "absent", "the camera is absent")
@@ -65,7 +65,7 @@ def test_in_a_burst_each_shot_ends_once_whatever_the_body_does(sockets: Path, tm
         shutter.stop_interval()
         eventually(lambda: shutter.statistics().pending == 0, "the last shot's end")
         shots = shutter.statistics().shots
-        eventually(lambda: len(daemon.stories) == shots, "every shot's end")
-        assert len(safe()) + sum(bool(story.problem) for story in daemon.stories) == shots  # a frame, or why not
+        eventually(lambda: len(daemon.shots) == shots, "every shot's end")
+        assert len(safe()) + sum(bool(pending.problem) for pending in daemon.shots) == shots  # a frame, or why not
         pictures = {(daemon.service.folder / frame.name).read_bytes() for frame in safe()}
         assert len(pictures) == len(safe()), "one picture became two frames"

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from dappled.daemon.pipeline.pending_shot import Story
+from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.flight.ledger import LedgerReader
 from dappled.mocks.body.body import Body, BodyOptions
 from dappled.mocks.body.eos450d import thumbnail
@@ -95,10 +95,10 @@ def fired(daemon: Flying, index: int) -> None:
     eventually(was, f"shot {index} fired")
 
 
-def ended(daemon: Flying, index: int) -> Story:
+def ended(daemon: Flying, index: int) -> PendingShot:
     """The end of a shot."""
-    eventually(lambda: any(one.shot.index == index for one in daemon.stories), f"shot {index} ended")
-    return next(one for one in daemon.stories if one.shot.index == index)
+    eventually(lambda: any(one.shot.index == index for one in daemon.shots), f"shot {index} ended")
+    return next(one for one in daemon.shots if one.shot.index == index)
 
 
 def is_frame(daemon: Flying, index: int, release: int) -> None:
@@ -118,10 +118,10 @@ def is_frame(daemon: Flying, index: int, release: int) -> None:
 def back_in_service(daemon: Flying, body: Body) -> None:
     """The body is ready within the time that is asked for, and its next shot is its own."""
     eventually(lambda: daemon.camera == "ready", f"ready again: {daemon.problems}", BACK_S)
-    story = daemon.shoot()
-    assert story.problem == ""
-    assert story.doubt == ""
-    is_frame(daemon, story.shot.index, body.releases)
+    pending = daemon.shoot()
+    assert pending.problem == ""
+    assert pending.doubt == ""
+    is_frame(daemon, pending.shot.index, body.releases)
 
 
 def test_unplugged_while_idle(here: Path) -> None:

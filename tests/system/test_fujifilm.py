@@ -53,9 +53,9 @@ def by_wire(here: Path, body: FinePix, monkeypatch: pytest.MonkeyPatch, **camera
 def shoot(daemon: Flying, body: FinePix, count: int) -> None:
     for _ in range(count):
         before = body.pressed
-        story = daemon.shoot()
-        assert story.follows
-        assert story.where is not None
+        pending = daemon.shoot()
+        assert pending.follows
+        assert pending.where is not None
         assert body.pressed == before + 1
     eventually(lambda: len(list(body.card.rglob("*.RAF"))) == body.made, "the files on the card")
 
@@ -198,11 +198,11 @@ def test_fired_by_the_autopilot_s_relay_and_the_ground_station_is_told(here: Pat
             daemon.until_ready()
             link = daemon.service.health
             eventually(lambda: "nobody was heard" not in str(link()["problems"]), "the autopilot is heard")
-            story = daemon.shoot()
-            while "autopilot" in story.problem:  # its heartbeat was not there yet
-                story = daemon.shoot()
-            assert story.follows
-            index = story.shot.index
+            pending = daemon.shoot()
+            while "autopilot" in pending.problem:  # its heartbeat was not there yet
+                pending = daemon.shoot()
+            assert pending.follows
+            index = pending.shot.index
             eventually(lambda: (index, 1, "") in pixhawk.captured, "263: exposed, and no file yet")
             assert body.pressed == 1
     finally:

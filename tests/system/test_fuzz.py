@@ -67,8 +67,8 @@ def test_a_body_that_answers_with_noise(seed: int, tmp_path: Path) -> None:
         assert verdict.outcome != "shot"
         assert verdict.reason
         threading.Event().wait(3.0)  # let it try again and again
-        assert daemon.service.whole()
-        assert daemon.stories == []
+        assert daemon.service.healthy()
+        assert daemon.shots == []
 
 
 @pytest.mark.slow
@@ -85,7 +85,7 @@ def test_raw_files_of_noise_end_no_flight(tmp_path: Path) -> None:
         options = BodyOptions(picture=str(picture))
         tables = {"mask": {"profile": "reference-5x5"}, "record": {"directory": str(tmp_path / f"flights{turn}")}}
         with Body.start(options) as body, flying(settings_of(tmp_path, camera={"port": body.port}, **tables)) as daemon:
-            story = daemon.shoot()
-            assert story.frame is not None
-            assert (daemon.service.folder / story.frame.name).read_bytes() == bytes(bad)
-            assert daemon.service.whole()
+            pending = daemon.shoot()
+            assert pending.frame is not None
+            assert (daemon.service.folder / pending.frame.name).read_bytes() == bytes(bad)
+            assert daemon.service.healthy()

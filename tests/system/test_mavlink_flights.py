@@ -125,9 +125,9 @@ def test_decoding_is_switched_from_the_ground_and_the_flight_says_so(tmp_path: P
                 raw = code(value).to_bytes(4, "little")
                 peer.send(mavlink.MAVLink_param_ext_set_message(1, 100, b"LF_DECODE", raw, 5))
                 assert peer.one("PARAM_EXT_ACK").param_result == mavlink.PARAM_ACK_ACCEPTED
-                story = daemon.shoot()
-                assert (story.developed is not None) == decoded
-                assert story.problem == ""
+                pending = daemon.shoot()
+                assert (pending.decoded is not None) == decoded
+                assert pending.problem == ""
             eventually(lambda: "decoding: off" in "\n".join(told(daemon.service.folder)), "the event")
             folder = daemon.service.folder
     assert "not decoded: decoding was switched off" in told(folder)

@@ -34,7 +34,7 @@ class Camera:
 
     def iso(self) -> str:
         """As the body has it."""
-        settings = self.flying.service._parts.street._capture._camera.settings()
+        settings = self.flying.service._parts.pipeline._capture._camera.settings()
         return next(one.value for one in settings if one.name == "iso")
 
     def shots(self) -> dict[str, int]:
@@ -102,15 +102,15 @@ def test_mavsdk_as_autopilot_whose_system_is_adopted_and_whose_triggers_are_shot
     autopilot = run("mavsdk_autopilot.py", tmp_path, camera.port(0), 7, 3)
     try:
         eventually(lambda: camera.shots()["safe"] == 3, f"three shots: {camera.shots()}", 60)
-        stories = list(camera.flying.stories)
-        eventually(lambda: len(camera.flying.stories) == 3, f"three stories: {stories}")
+        shots = list(camera.flying.shots)
+        eventually(lambda: len(camera.flying.shots) == 3, f"three stories: {shots}")
     finally:
         autopilot.communicate(timeout=20)
     assert camera.shots()["wished"] == 3
-    for story in camera.flying.stories:
-        assert (story.shot.cause.source, story.shot.cause.kind) == ("mavlink:7/1", "CAMERA_TRIGGER")
-        assert story.tag is not None
-        assert story.tag.pose.source != "none"
+    for pending in camera.flying.shots:
+        assert (pending.shot.cause.source, pending.shot.cause.kind) == ("mavlink:7/1", "CAMERA_TRIGGER")
+        assert pending.tag is not None
+        assert pending.tag.pose.source != "none"
     assert summary.report(camera.flying.service.folder).by_source == {"mavlink:7/1": 3}
 
 

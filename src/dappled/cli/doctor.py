@@ -133,12 +133,12 @@ def _shoot(
     problem = ""
     with test_shot.daemon(ours, folder, place) as daemon, _hot_shoe(ours, truth):
         for _ in tqdm(range(count), unit="shot", disable=None, delay=1.0):
-            story = daemon.shoot()
-            if story.frame is None:
-                problem = story.problem or story.follows
+            pending = daemon.shoot()
+            if pending.frame is None:
+                problem = pending.problem or pending.follows
                 break
-            latencies.append(test_shot.latency(story))
-            frame = frame or daemon.flight / story.frame.name
+            latencies.append(test_shot.latency(pending))
+            frame = frame or daemon.flight / pending.frame.name
         lines: list[str] = []
         facts: dict[str, Any] = {"verdict": "go", "flight": str(daemon.flight) if arguments.keep else None}
         if problem:

@@ -15,14 +15,14 @@ from dappled.cli import shot_line
 from dappled.cli.common import positive, seconds
 from dappled.config import settings as configuration
 from dappled.daemon.pipeline import recipes
-from dappled.daemon.pipeline.decode_process import WorkerDeveloper
-from dappled.daemon.pipeline.flight_writer import ReplayBook
-from dappled.daemon.pipeline.pending_shot import Names, Story, Watchers
-from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.decode_process import DecodeProcess
+from dappled.daemon.pipeline.flight_writer import ReplayVerifier
+from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
+from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.replay import replay, runs
-from dappled.daemon.replay.replay import Progress, RecordedTelemetry, ReplayError
-from dappled.daemon.replay.runs import Run, RunBook
+from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayProgress
+from dappled.daemon.replay.runs import Run, RunWriter
 from dappled.daemon.stream import curve, headers
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher
@@ -97,11 +97,11 @@ def run(arguments: argparse.Namespace) -> int:
         keep = None
         if is_flight and recipe and (arguments.run_name or _changed(arguments)) and not arguments.verify:
             name = arguments.run_name or datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-            results = stack.enter_context(RunBook(arguments.flight, Run(name, recipe, names), time.time_ns))
+            results = stack.enter_context(RunWriter(arguments.flight, Run(name, recipe, names), time.time_ns))
             recipe, keep = results.run.recipe, results.decoded
             print(f"results stand beside the old ones as run {name}", file=sys.stderr)
         book = replay.book(recording, keep)
-        developer = WorkerDeveloper(recipe) if recipe else None
+        developer = DecodeProcess(recipe) if recipe else None
         if developer:
             stack.callback(developer.close)
             developer.warm_up()
@@ -129,19 +129,19 @@ def run(arguments: argparse.Namespace) -> int:
 def _play(
     arguments: argparse.Namespace,
     settings: configuration.Settings,
-    recording: replay.Recording,
+    recording: replay.RecordedFlight,
     *,
-    book: ReplayBook,
-    developer: WorkerDeveloper | None,
+    book: ReplayVerifier,
+    developer: DecodeProcess | None,
     flown: tuple[Names, BodyLatency, configuration.Settings],
     stack: ExitStack,
 ) -> int:
     """The recording down the street; how many frames came to a bad end."""
     names, latency, recorded = flown
-    clock, progress = replay.clock(recording), Progress.begin()
+    clock, progress = replay.clock(recording), ReplayProgress.begin()
     telemetry = RecordedTelemetry.flown(recorded, recording.telemetry, recording.horizons, recording.vehicles)
 
-    def finished(one: Story) -> None:
+    def finished(one: PendingShot) -> None:
         print(shot_line.as_json(one) if arguments.json else shot_line.line(one), flush=True)
         progress.note(one)
 
@@ -149,7 +149,7 @@ def _play(
     if publisher:
         publisher.publish("start", headers.start_header(settings, names, clock.utc_ns()))
     identity = Identity("dappled", "recording", "", str(arguments.flight))
-    street = Street(
+    pipeline = Pipeline(
         camera=ReplayCamera(recording.files, identity, clock.monotonic_ns),
         book=book,
         poses=telemetry.pose,
@@ -157,12 +157,12 @@ def _play(
         publisher=publisher,
         latency=latency,
         names=names,
-        watchers=Watchers(finished=finished),
+        watchers=Observer(finished=finished),
         decode_queue=1000,
     )
-    street.start()
-    stack.callback(street.stop, 5.0)
-    replay.play(recording, street, progress, time=clock, pace=_pace(arguments))
+    pipeline.start()
+    stack.callback(pipeline.stop, 5.0)
+    replay.play(recording, pipeline, progress, time=clock, pace=_pace(arguments))
     if publisher:
         counts = {"wished": len(recording.shots), "safe": progress.frames}
         publisher.publish("end", {"utc_ns": clock.utc_ns(), "shots": counts})
@@ -189,7 +189,7 @@ def _recipe(arguments: argparse.Namespace, facts: Mapping[str, Any], settings: c
     return Recipe(**{"camera": settings.camera.profile, "workers": settings.decode.workers, **named})
 
 
-def _recording(arguments: argparse.Namespace, is_flight: bool) -> replay.Recording:
+def _recording(arguments: argparse.Namespace, is_flight: bool) -> replay.RecordedFlight:
     if is_flight:
         return replay.of_flight(arguments.flight, (arguments.verify and arguments.run_name) or LIVE)
     if not arguments.flight.is_dir():
@@ -218,7 +218,7 @@ def _as_recorded(
 
 
 def _publisher(
-    settings: configuration.Settings, book: ReplayBook, developer: WorkerDeveloper | None, stack: ExitStack
+    settings: configuration.Settings, book: ReplayVerifier, developer: DecodeProcess | None, stack: ExitStack
 ) -> Publisher:
     answers = Answers(book, developer)
     publisher = Publisher(

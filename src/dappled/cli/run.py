@@ -17,12 +17,12 @@ from dappled.cli.common import seconds, whole
 from dappled.cli.terminal import CameraRemarks, Frames, ProblemRemarks, remark
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.daemon.flight_handover import Succession, flights
+from dappled.daemon.flight_handover import FlightHandover, flights
 from dappled.daemon.health import record as health
 from dappled.daemon.health.notify import Notifier
-from dappled.daemon.pipeline.pending_shot import Story, Watchers
+from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.service import Service
-from dappled.daemon.stop_condition import Asker, Goal, Tally
+from dappled.daemon.stop_condition import Asker, StopCondition, Tally
 from dappled.errors import DappledError
 
 
@@ -73,15 +73,15 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
     manager, camera, tally = Notifier(), CameraRemarks(), Tally()
     frames = Frames(shot_line.as_json if arguments.json else shot_line.line, for_programs=arguments.json)
     asked, hung_up = threading.Event(), threading.Event()
-    goal = Goal(tally, arguments.frames, arguments.seconds, ask=ask, ready=lambda: camera.state == "ready")
+    goal = StopCondition(tally, arguments.frames, arguments.seconds, ask=ask, ready=lambda: camera.state == "ready")
 
-    def finished(one: Story) -> None:
+    def finished(one: PendingShot) -> None:
         tally.add(one)
         frames.finished(one)
 
-    def fly(flown: Settings, after: Succession) -> bool:
+    def fly(flown: Settings, after: FlightHandover) -> bool:
         """One flight; whether another may follow."""
-        service = Service(flown, watchers=Watchers(finished=finished, camera=camera.changed), after=after)
+        service = Service(flown, watchers=Observer(finished=finished, camera=camera.changed), after=after)
         problems = ProblemRemarks(service.health, lambda record: manager.status(health.line(record)))
 
         def turn() -> bool:
@@ -89,7 +89,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
             if hung_up.is_set():
                 hung_up.clear()
                 _reload(service, arguments, manager)
-            if service.whole():
+            if service.healthy():
                 manager.working(time.monotonic_ns())
             problems.tell()
             return asked.is_set() or goal.reached()

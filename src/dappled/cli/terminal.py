@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from dappled.daemon.health.log_format import JournalHandler
-from dappled.daemon.pipeline.pending_shot import Story
+from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.drivers.camera import StateChanged
-from dappled.workers import Stage
+from dappled.workers import Worker
 
 log = logging.getLogger("dappled.run")
 _PROBLEMS_EVERY_S = 1.0
@@ -52,12 +52,12 @@ class Frames:
     """Prints a `line` for each frame on standard output, or in the journal unless `for_programs`. A terminal that
     stands still holds up nobody."""
 
-    def __init__(self, line: Callable[[Story], str], *, for_programs: bool = False) -> None:
+    def __init__(self, line: Callable[[PendingShot], str], *, for_programs: bool = False) -> None:
         self._line, self._for_programs = line, for_programs
-        self._lines: Stage[_Line] = Stage("print", self._print, capacity=1000, policy="drop oldest")
+        self._lines: Worker[_Line] = Worker("print", self._print, capacity=1000, policy="drop oldest")
         self._lines.start()
 
-    def finished(self, one: Story) -> None:
+    def finished(self, one: PendingShot) -> None:
         """A shot has come to its end."""
         fields = {"frame": one.shot.index, "state": "safe" if one.frame else "failed", "problem": one.problem}
         level = logging.WARNING if one.problem else logging.INFO

@@ -23,7 +23,7 @@ NONE = "none"  # no mask: frames are kept, not decoded
 BY_BODY = "by body"  # no law is named, and the body tells which one it is with its first frame
 
 
-class Succession:
+class FlightHandover:
     """What the next flight will be flown with, once that is asked for.
 
     `configured` are the settings that a person wrote: a calibration is of their mask and law, and counts with these
@@ -72,7 +72,7 @@ def words(names: Names) -> tuple[str, str]:
 
 
 def knobs(
-    flown: Names, after: Succession | None, now: Callable[[], Settings], ask: Callable[[Settings, str], None]
+    flown: Names, after: FlightHandover | None, now: Callable[[], Settings], ask: Callable[[Settings, str], None]
 ) -> tuple[OwnKnob, OwnKnob]:
     """LF_MASK and LF_LAW of a flight, to be read only where nothing can come `after` it.
 
@@ -99,7 +99,7 @@ def knobs(
     )
 
 
-def flights(settings: Settings, fly: Callable[[Settings, Succession], bool]) -> None:
+def flights(settings: Settings, fly: Callable[[Settings, FlightHandover], bool]) -> None:
     """One flight after the other, until one ends that nothing follows.
 
     `fly` takes a flight from its start to its end; False: it was told to end, whatever was to follow. A next flight
@@ -109,7 +109,7 @@ def flights(settings: Settings, fly: Callable[[Settings, Succession], bool]) -> 
     before: Settings | None = None
     now = settings
     while True:
-        after = Succession(settings)
+        after = FlightHandover(settings)
         try:
             goes_on = fly(now, after)
         except DappledError as error:

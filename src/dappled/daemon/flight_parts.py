@@ -11,18 +11,18 @@ from dappled.daemon import flight_handover
 from dappled.daemon.camera_protocol import distance_sensor, ground_facts
 from dappled.daemon.camera_protocol.camera_settings import Knobs, OwnKnob
 from dappled.daemon.camera_protocol.component import Captured, Component
-from dappled.daemon.flight_handover import Succession
+from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.health import record
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.health.status_text import Alarms
 from dappled.daemon.navigation.navigation import Navigation
-from dappled.daemon.pipeline.decode_process import WorkerDeveloper
-from dappled.daemon.pipeline.flight_writer import LiveBook
+from dappled.daemon.pipeline.decode_process import DecodeProcess
+from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.live_depth import LiveDepth
-from dappled.daemon.pipeline.pending_shot import Names, Watchers
-from dappled.daemon.pipeline.pipeline import Street
-from dappled.daemon.pipeline.shot_events import Herald
-from dappled.daemon.pipeline.shutter import Shutter, Wish
+from dappled.daemon.pipeline.pending_shot import Names, Observer
+from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.shot_events import ShotEvents
+from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher
@@ -36,7 +36,7 @@ from dappled.flight.records import Shot
 class Part(Protocol):
     """Something with threads."""
 
-    def dead(self) -> list[str]:
+    def dead_threads(self) -> list[str]:
         """Those that have ended without being asked to."""
 
 
@@ -59,18 +59,18 @@ class FlightParts:
         links: MavlinkLinks,
         publisher: Publisher,
         logbook: Logbook,
-        outside: Watchers,
+        outside: Observer,
         utc_known: bool,
-        after: Succession | None,
+        after: FlightHandover | None,
         end: Callable[[], None],
     ) -> None:
         self._settings, self._clock, self._recording, self._links = settings, clock, recording, links
         self._after, self._end, self._publisher = after, end, publisher
         now = settings()
         self.alarms = Alarms()
-        self.book = LiveBook(recording, clock)
+        self.book = LedgerWriter(recording, clock)
         self.navigation = Navigation(settings, clock, recording, utc_known=utc_known)
-        self.developer = None if recipe is None else WorkerDeveloper(recipe)
+        self.developer = None if recipe is None else DecodeProcess(recipe)
         self.depth = self._depth_of(recipe, publisher) if recipe is not None and now.decode.depth else None
         self.shutter = Shutter(
             next_index=recording.next_index,
@@ -90,13 +90,13 @@ class FlightParts:
             facts=lambda: self.herald.facts(),  # noqa: PLW0108  # the herald is made after the component
             storage=lambda: ground_facts.storage(recording.folder.path),
             lookup=self._lookup,
-            healthy=self.whole,
+            healthy=self.healthy,
             troubled=lambda: self.alarms.troubled,
             pose=self.navigation.pose_now,
             mount=now.pose.mount,
             feedback_is_shot=now.mavlink.feedback_is_shot,
         )
-        self.herald = Herald(
+        self.herald = ShotEvents(
             now,
             recording,
             self.shutter,
@@ -106,7 +106,7 @@ class FlightParts:
             outside=outside,
             depth=self.depth,
         )
-        self.street = Street(
+        self.pipeline = Pipeline(
             camera=camera,
             book=self.book,
             poses=self.navigation.pose,
@@ -118,19 +118,19 @@ class FlightParts:
             decode_queue=now.decode.queue,
             preview_interval_s=now.publish.preview_interval_s,
         )
-        self._vital: tuple[Part, ...] = (self.street, links, self.shutter)
-        self.answers = Answers(self.book, self.developer, self.street.decoding_idle)
+        self._vital: tuple[Part, ...] = (self.pipeline, links, self.shutter)
+        self.answers = Answers(self.book, self.developer, self.pipeline.decoding_idle)
 
-    def dead(self) -> list[str]:
+    def dead_threads(self) -> list[str]:
         """Threads that have ended without being asked to: none, unless there is a bug."""
         parts: list[Part] = [*self._vital, self._publisher, self.answers]
         if self.depth is not None:
             parts.append(self.depth)
-        return [name for part in parts for name in part.dead()]
+        return [name for part in parts for name in part.dead_threads()]
 
-    def whole(self) -> bool:
+    def healthy(self) -> bool:
         """Whether everything works that photographs are taken and kept with: no viewer's loss ends a flight."""
-        return not any(part.dead() for part in self._vital)
+        return not any(part.dead_threads() for part in self._vital)
 
     def on_packet(self, packet: Packet) -> None:
         """A packet came over a link, or went out: to the poses first, so that what it asks for finds it there."""
@@ -142,12 +142,12 @@ class FlightParts:
     def _depth_of(self, recipe: Recipe, publisher: Publisher) -> LiveDepth:
         decode = self._settings().decode
         return LiveDepth(
-            WorkerDeveloper(recipe),
+            DecodeProcess(recipe),
             method=decode.depth,
             interval_s=decode.depth_interval_s,
-            path=lambda story: self.book.path(story.frame) if story.frame else "",
+            path=lambda pending: self.book.path(pending.frame) if pending.frame else "",
             publish=publisher.publish,
-            give_way=lambda: self.street.decoding_idle(),  # noqa: PLW0108  # the street is made after depth
+            give_way=lambda: self.pipeline.decoding_idle(),  # noqa: PLW0108  # the street is made after depth
             tell=self._tell_distance if decode.depth_to_autopilot else lambda _: None,
         )
 
@@ -156,7 +156,7 @@ class FlightParts:
         decoding = OwnKnob(
             "LF_DECODE",
             "Decode in flight",
-            lambda: "on" if self.street.decoding else "off",
+            lambda: "on" if self.pipeline.decoding else "off",
             ("on", "off"),
             self._decode_in_flight if self.developer else None,
         )
@@ -167,32 +167,32 @@ class FlightParts:
     def _note(self, shot: Shot) -> None:
         self._recording.journal.note(shot)
         self.book.wished(shot)
-        self.street.expect(shot)
+        self.pipeline.expect(shot)
 
     def _fire(self, index: int) -> None:
-        self.street.fire(index)
+        self.pipeline.fire(index)
 
     def _obstacle(self) -> str | None:
         if self._after is not None and self._after.next is not None:
             return "the next flight begins in a moment, with what the ground station has set"
-        return record.obstacle(self.street, self._recording.folder.path, self._settings().record.min_free_mb)
+        return record.obstacle(self.pipeline, self._recording.folder.path, self._settings().record.min_free_mb)
 
     def _changed(self) -> None:
         self.component.state_changed()
 
-    def _refused(self, refused: tuple[Wish, str]) -> None:
+    def _refused(self, refused: tuple[CaptureRequest, str]) -> None:
         wish, reason = refused
         self.book.later("refused", f"{wish.kind} from {wish.source}: {reason}")
 
     # the ground station asks
 
     def _lookup(self, index: int) -> Captured | None:
-        if self.street.in_hand(index):
+        if self.pipeline.in_hand(index):
             return None  # its own message will come
         return ground_facts.of_record(index, self._recording.index)
 
     def _decode_in_flight(self, value: str) -> None:
-        self.street.decoding = value == "on"
+        self.pipeline.decoding = value == "on"
         self.book.later("decoding", f"{value} from now on, by the ground station")
 
     def _hand_over(self, following: Settings, text: str) -> None:

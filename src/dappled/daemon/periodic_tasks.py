@@ -11,7 +11,7 @@ log = logging.getLogger(__name__)
 AGAIN_NS = 10**9
 
 
-class Chore:
+class PeriodicTask:
     """Something to do in every turn of the loop, or every `every_ns`. Where it fails it is tried again a second later;
     the log hears of it once, until it has been well again. Times are monotonic."""
 

@@ -15,15 +15,15 @@ from dappled.daemon import links, live_record
 from dappled.daemon.cameras import open_camera
 from dappled.daemon.console import actions
 from dappled.daemon.console import process as console_process
-from dappled.daemon.flight_handover import Succession
+from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.flight_parts import FlightParts
 from dappled.daemon.health import record as health
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.navigation import utc
-from dappled.daemon.periodic_tasks import Chore
+from dappled.daemon.periodic_tasks import PeriodicTask
 from dappled.daemon.pipeline import recipes
-from dappled.daemon.pipeline.pending_shot import Names, Watchers
-from dappled.daemon.pipeline.shutter import Verdict, Wish
+from dappled.daemon.pipeline.pending_shot import Names, Observer
+from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision
 from dappled.daemon.reload import merge
 from dappled.daemon.stream import curve, headers
 from dappled.daemon.stream.publisher import Publisher, Reply
@@ -52,12 +52,12 @@ class Service:
         self,
         settings: Settings,
         *,
-        watchers: Watchers | None = None,
+        watchers: Observer | None = None,
         clock: Clock | None = None,
-        after: Succession | None = None,
+        after: FlightHandover | None = None,
     ) -> None:
         self.settings = settings
-        self._outside, self._after = watchers or Watchers(), after
+        self._outside, self._after = watchers or Observer(), after
         self._clock = clock or SystemClock()
         self._began_monotonic_ns = self._clock.monotonic_ns()
         self._logbook = Logbook(self._clock.utc_ns)
@@ -147,8 +147,8 @@ class Service:
         if parts.depth is not None:
             stack.callback(parts.depth.stop)
             parts.depth.start()
-        stack.callback(parts.street.stop, STOP_S)
-        parts.street.start()
+        stack.callback(parts.pipeline.stop, STOP_S)
+        parts.pipeline.start()
         stack.callback(parts.shutter.stop)
         parts.shutter.start()
 
@@ -177,17 +177,20 @@ class Service:
 
     # what is looked after
 
-    def _make_chores(self) -> list[Chore]:
+    def _make_chores(self) -> list[PeriodicTask]:
         """What the working loop does, in this order. Without the loop there is no heartbeat."""
         parts = self._parts
-        chores = [Chore("events", parts.book.write_later), Chore("health", self._tell_health, every_ns=HEALTH_NS)]
+        chores = [
+            PeriodicTask("events", parts.book.write_later),
+            PeriodicTask("health", self._tell_health, every_ns=HEALTH_NS),
+        ]
         if not self.settings.mavlink.url:
             return chores
         return [
-            Chore("MAVLink", parts.component.tick),
-            Chore("vehicle", lambda: parts.navigation.belongs_to(parts.component.vehicle)),
+            PeriodicTask("MAVLink", parts.component.tick),
+            PeriodicTask("vehicle", lambda: parts.navigation.belongs_to(parts.component.vehicle)),
             *chores,
-            Chore("UTC", parts.navigation.look_for_utc, every_ns=HEALTH_NS),
+            PeriodicTask("UTC", parts.navigation.look_for_utc, every_ns=HEALTH_NS),
         ]
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
@@ -201,9 +204,9 @@ class Service:
         for chore in self._chores:
             chore.turn(self._clock.monotonic_ns())
 
-    def whole(self) -> bool:
+    def healthy(self) -> bool:
         """Whether everything works that photographs are taken and kept with."""
-        return self._parts.whole()
+        return self._parts.healthy()
 
     def health(self) -> dict[str, Any]:
         """The state of everything, as published."""
@@ -214,7 +217,7 @@ class Service:
             utc_ns=self._clock.utc_ns(),
             monotonic_ns=self._clock.monotonic_ns(),
             began_monotonic_ns=self._began_monotonic_ns,
-            street=parts.street,
+            pipeline=parts.pipeline,
             shutter=parts.shutter.statistics(),
             links=self._links.statistics(),
             telemetry=navigation.telemetry.statistics(),
@@ -224,7 +227,7 @@ class Service:
             vehicle=navigation.pose_now(),
             decoding=parts.developer is not None,
             utc_known=navigation.utc.known,
-            dead=parts.dead(),
+            dead_threads=parts.dead_threads(),
             doubts=[text for text in (*doubts, *(chore.problem for chore in self._chores)) if text],
         )
 
@@ -252,7 +255,7 @@ class Service:
         """Shots so far."""
         return self._parts.shutter.statistics().shots
 
-    def wish(self, wish: Wish) -> Verdict:
+    def wish(self, wish: CaptureRequest) -> ShotDecision:
         """A wish from this side of the links: a console, or a test."""
         return self._parts.shutter.wish(wish)
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from dappled.daemon.pipeline.pending_shot import Story
+from dappled.daemon.pipeline.pending_shot import PendingShot
 
 
 class Asker(Protocol):
@@ -24,12 +24,12 @@ class Tally:
         self.count = self.safe = self.decoded = self.good = 0
         self._lock = threading.Lock()
 
-    def add(self, one: Story) -> None:
+    def add(self, one: PendingShot) -> None:
         """A shot has come to its end."""
         with self._lock:
             self.count += 1
             self.safe += one.frame is not None
-            self.decoded += one.developed is not None
+            self.decoded += one.decoded is not None
             self.good += not one.problem
 
     def summary(self) -> str:
@@ -38,7 +38,7 @@ class Tally:
         return f"{self.count} shots: {self.safe} frames safe, {self.decoded} decoded, {bad} with a problem"
 
 
-class Goal:
+class StopCondition:
     """So many shots ended, or so many seconds gone since the first flight began; None: no such end.
 
     `ask` starts who asks for the frames, once the camera is `ready`. When they have nothing more to ask, and all that

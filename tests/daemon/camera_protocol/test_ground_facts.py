@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol import ground_facts
-from dappled.daemon.pipeline.pending_shot import Story
+from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.drivers.camera import Identity
 from dappled.flight.index import ImageIndex
 from dappled.flight.records import Cause, Shot
@@ -38,7 +38,7 @@ def test_a_disk_that_does_not_say(tmp_path: Path) -> None:
 
 
 def test_a_shot_that_failed_was_not_captured() -> None:
-    captured = ground_facts.of_story(Story(SHOT, problem="no file came"), lambda utc_ns: utc_ns)
+    captured = ground_facts.of_story(PendingShot(SHOT, problem="no file came"), lambda utc_ns: utc_ns)
     assert (captured.index, captured.ok, captured.pose) == (7, False, None)
 
 

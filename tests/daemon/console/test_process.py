@@ -161,7 +161,7 @@ def test_an_answer_that_fails_ends_one_process_and_not_the_console(tmp_path: Pat
 
 
 @pytest.fixture
-def street(tmp_path: Path) -> Any:
+def pipeline(tmp_path: Path) -> Any:
     with rig(tmp_path) as one:
         one.shutter.start()
         yield one
@@ -172,12 +172,12 @@ def do(shutter: Shutter, **request: Any) -> dict[str, Any]:
     return actions.act(request, shutter, Logbook(lambda: 0))
 
 
-def test_a_number_that_comes_twice_is_one_wish(street: Rig) -> None:
-    assert do(street.shutter, do="shoot", sequence=5) == {"ok": True, "index": 0, "text": "shot 0"}
-    assert do(street.shutter, do="shoot", sequence=5)["text"] == "already shot 0"
-    assert do(street.shutter, do="shoot", sequence=6)["index"] == 1
-    street.ended(1)
-    assert street.shutter.statistics().shots == 2
+def test_a_number_that_comes_twice_is_one_wish(pipeline: Rig) -> None:
+    assert do(pipeline.shutter, do="shoot", sequence=5) == {"ok": True, "index": 0, "text": "shot 0"}
+    assert do(pipeline.shutter, do="shoot", sequence=5)["text"] == "already shot 0"
+    assert do(pipeline.shutter, do="shoot", sequence=6)["index"] == 1
+    pipeline.ended(1)
+    assert pipeline.shutter.statistics().shots == 2
 
 
 def test_an_interval_and_its_end() -> None:
@@ -195,15 +195,15 @@ def test_an_interval_and_its_end() -> None:
     shutter.stop()
 
 
-def test_a_refusal_is_told(street: Rig) -> None:
-    street.shutter.stop()
-    assert do(street.shutter, do="shoot", sequence=1)["error"] == "the daemon is stopping"
+def test_a_refusal_is_told(pipeline: Rig) -> None:
+    pipeline.shutter.stop()
+    assert do(pipeline.shutter, do="shoot", sequence=1)["error"] == "the daemon is stopping"
 
 
-def test_the_log_is_told_from_a_number_on(street: Rig) -> None:
+def test_the_log_is_told_from_a_number_on(pipeline: Rig) -> None:
     book = Logbook(lambda: 7)
     book.add("one")
     book.add("two", "warning")
-    told = actions.act({"do": "log", "after": 1}, street.shutter, book)
+    told = actions.act({"do": "log", "after": 1}, pipeline.shutter, book)
     assert told["lines"] == [{"number": 2, "utc_ns": 7, "level": "warning", "text": "two"}]
-    assert actions.act({"do": "nothing"}, street.shutter, book) == {"ok": True}
+    assert actions.act({"do": "nothing"}, pipeline.shutter, book) == {"ok": True}

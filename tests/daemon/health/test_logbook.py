@@ -6,7 +6,7 @@ import logging
 from dataclasses import replace
 
 from dappled.daemon.health.logbook import Logbook, of_story
-from dappled.daemon.pipeline.pending_shot import Story
+from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.flight.records import Cause, Frame, Shot
 
 SHOT = Shot(7, Cause("console", "console", 1), 0, 0)
@@ -43,10 +43,10 @@ def test_warnings_of_the_loggers_are_kept_and_lesser_ones_not() -> None:
 
 
 def test_a_story_in_words() -> None:
-    story = Story(SHOT, frame=FRAME)
-    assert of_story(story) == ("frame 7 is safe, 5.1 MB", "info")
-    assert of_story(replace(story, problem="not decoded: no carriers")) == (
+    pending = PendingShot(SHOT, frame=FRAME)
+    assert of_story(pending) == ("frame 7 is safe, 5.1 MB", "info")
+    assert of_story(replace(pending, problem="not decoded: no carriers")) == (
         "frame 7: not decoded: no carriers",
         "warning",
     )
-    assert of_story(Story(SHOT, problem="the mirror is stuck")) == ("shot 7: the mirror is stuck", "warning")
+    assert of_story(PendingShot(SHOT, problem="the mirror is stuck")) == ("shot 7: the mirror is stuck", "warning")

@@ -13,13 +13,13 @@ import pytest
 from dappled.config.settings import MaskSettings, MavlinkSettings, RecordSettings, Settings
 from dappled.daemon.health import record as health
 from dappled.daemon.navigation.telemetry import Telemetry
-from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.drivers.mavlink.links import LinkStatistics
 from dappled.drivers.mavlink.signing import SigningStatistics
-from dappled.workers import Stage
+from dappled.workers import Worker
 
 WELL = Settings(
     mask=MaskSettings("mask-1"),
@@ -33,23 +33,23 @@ LINK = LinkStatistics("udpin:127.0.0.1:1", 5, 5, 0, 0, 0, 0, 100 * S, None)
 def record(
     folder: Path, settings: Settings = WELL, link: LinkStatistics = LINK, state: str = "ready", **more: Any
 ) -> dict[str, Any]:
-    stage: Stage[int] = Stage("decode", lambda _: None, capacity=1)
+    stage: Worker[int] = Worker("decode", lambda _: None, capacity=1)
     for number in range(more.pop("items", 0)):
         stage.put(number)
-    street = SimpleNamespace(camera_state=state, camera_reason=more.pop("reason", ""), stages=(stage,))
+    pipeline = SimpleNamespace(camera_state=state, camera_reason=more.pop("reason", ""), stages=(stage,))
     return health.record(
         settings,
         utc_ns=1,
         monotonic_ns=101 * S,
         began_monotonic_ns=more.pop("began", 90 * S),
-        street=cast(Street, street),
+        pipeline=cast(Pipeline, pipeline),
         shutter=ShutterStatistics(3, 2, 1, 0, 0, 2, 0, 2, None),
         links=[link],
         telemetry=Telemetry().statistics(),
         publisher=PublisherStatistics({}, {}, 0, 0, 0),
         folder=folder,
         utc_known=more.pop("utc_known", True),
-        dead=more.pop("dead", ()),
+        dead_threads=more.pop("dead", ()),
         doubts=more.pop("doubts", ()),
     )
 

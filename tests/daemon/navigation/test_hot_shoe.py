@@ -15,7 +15,7 @@ from dappled.daemon.navigation.boot_clock import BootClock
 from dappled.daemon.navigation.camera_clock import CameraClock, exposure_from_camera, shown
 from dappled.daemon.navigation.hot_shoe import Feedback
 from dappled.daemon.navigation.telemetry import Telemetry
-from dappled.daemon.pipeline.tagger import BodyLatency, Exposure, mid_exposure
+from dappled.daemon.pipeline.tagger import BodyLatency, ExposureTime, mid_exposure
 from dappled.drivers.mavlink.links import Message, mavlink
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import Path as FlightPath
@@ -51,7 +51,7 @@ def test_what_is_far_off_or_of_two_minds_is_not_taken() -> None:
     assert hot_shoe.choose([event(152)], EXPECTED, CLOCK) is None
     assert hot_shoe.choose([event(50), event(71, 1)], EXPECTED, CLOCK) is None
     assert hot_shoe.choose([event(55), event(55, 1)], EXPECTED, CLOCK) == event(55)  # the same, on a second link
-    assert hot_shoe.choose([event(55)], Exposure(EXPECTED.utc_ns, 10 * MS, "given"), CLOCK) is None
+    assert hot_shoe.choose([event(55)], ExposureTime(EXPECTED.utc_ns, 10 * MS, "given"), CLOCK) is None
 
 
 def made(message: Message, component: int = 1) -> Message:
@@ -101,7 +101,7 @@ def test_the_cameras_clock_is_learnt_from_shots() -> None:
     clock, offset_ns = CameraClock(), -3_600_370 * MS
     for number in range(100):
         begin_ns = START_NS + number * 1_370 * MS
-        known = Exposure(begin_ns + MS, 10 * MS, "latency", MS)
+        known = ExposureTime(begin_ns + MS, 10 * MS, "latency", MS)
         assert (exposure_from_camera(clock, 0, 10**9, None) is None) == (number < 3)
         clock = clock.learnt((begin_ns + offset_ns) // 10**9 * 10**9, 10**9, known)
     found = clock.offset_ns()
@@ -118,7 +118,7 @@ def test_a_camera_clock_that_was_set_is_learnt_anew() -> None:
     for number in range(8):
         begin_ns = START_NS + number * 10**9
         offset_ns = 0 if number < 5 else 3_600 * 10**9
-        clock = clock.learnt(begin_ns + offset_ns, 10**9, Exposure(begin_ns, MS, "latency"))
+        clock = clock.learnt(begin_ns + offset_ns, 10**9, ExposureTime(begin_ns, MS, "latency"))
         assert (clock.offset_ns() is None) == (number in (0, 1, 5, 6))
     found = clock.offset_ns()
     assert found is not None

@@ -9,7 +9,7 @@ import pytest
 
 from dappled.config.settings import PoseSettings, Settings
 from dappled.daemon.navigation.navigation import AHEAD_NS, Navigation
-from dappled.daemon.pipeline.tagger import Exposure
+from dappled.daemon.pipeline.tagger import ExposureTime
 from dappled.flight import recording
 
 NOW_NS = 1_790_000_000 * 10**9
@@ -40,7 +40,7 @@ def test_without_telemetry_the_wait_is_bounded(tmp_path: Path, ahead_ns: int, wa
     flight = recording.begin(tmp_path, clock.utc_ns, {})
     try:
         navigation = Navigation(lambda: settings, clock, flight, utc_known=True)
-        exposure = Exposure(NOW_NS + ahead_ns, 10**6, "test")
+        exposure = ExposureTime(NOW_NS + ahead_ns, 10**6, "test")
         found, pose = navigation.pose(0, exposure)
         assert (found, pose.source) == (exposure, "none")
         assert waited_ns <= clock.now_ns - NOW_NS <= waited_ns + 10**7

@@ -18,9 +18,9 @@ from dappled.daemon.camera_protocol import identity
 from dappled.daemon.camera_protocol.identity import Identity
 from dappled.daemon.navigation.telemetry import Telemetry
 from dappled.daemon.navigation.vehicles import Vehicles
-from dappled.daemon.pipeline.pending_shot import Story, Watchers
-from dappled.daemon.pipeline.shutter import Wish
-from dappled.daemon.pipeline.tagger import Exposure
+from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
+from dappled.daemon.pipeline.shutter import CaptureRequest
+from dappled.daemon.pipeline.tagger import ExposureTime
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.daemon.service import Service
@@ -130,8 +130,8 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Settin
 
 
 def test_the_daemon_tags_with_the_place_of_its_own_vehicle(settings: Settings) -> None:
-    stories: list[Story] = []
-    service = Service(settings, watchers=Watchers(finished=stories.append))
+    shots: list[PendingShot] = []
+    service = Service(settings, watchers=Observer(finished=shots.append))
     service.start()
     loop = threading.Thread(target=service.run)
     loop.start()
@@ -151,8 +151,8 @@ def test_the_daemon_tags_with_the_place_of_its_own_vehicle(settings: Settings) -
     try:
         eventually(lambda: service._parts.component.vehicle, "it is decided whose camera this is")
         eventually(lambda: (service.health()["vehicle"] or {}).get("latitude_deg") == pytest.approx(47), "our place")
-        service.wish(Wish("test", "console", 1))
-        eventually(lambda: stories, "the shot's end")
+        service.wish(CaptureRequest("test", "console", 1))
+        eventually(lambda: shots, "the shot's end")
     finally:
         over.set()
         speaking.join(5)
@@ -161,12 +161,12 @@ def test_the_daemon_tags_with_the_place_of_its_own_vehicle(settings: Settings) -
         service.stop()
         for peer in peers:
             peer.__exit__(None, None, None)
-    tag = stories[0].tag
+    tag = shots[0].tag
     assert tag is not None
     assert math.degrees(tag.pose.latitude_rad or 0) == pytest.approx(47)
     recording = replay.of_flight(service.folder)
     assert [system for _, system in recording.vehicles] == [OURS]
-    exposure = Exposure(tag.utc_ns, tag.utc_sigma_ns, tag.time_source)
+    exposure = ExposureTime(tag.utc_ns, tag.utc_sigma_ns, tag.time_source)
     for vehicles, same in ((recording.vehicles, True), ((), False)):
         again = RecordedTelemetry(recording.telemetry, recording.horizons, wait_s=1.0, vehicles=vehicles)
         _, pose = again.pose(0, replace(exposure))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled.daemon.pipeline.decode_process import DevelopmentError, WorkerDeveloper
+from dappled.daemon.pipeline.decode_process import DecodeProcess, DecodeProcessError
 from dappled.drivers.child_process import RestartBudget
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.mocks.scene.masked_camera import reference_camera
@@ -28,22 +28,22 @@ def frame(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture
-def developer() -> Iterator[WorkerDeveloper]:
-    one = WorkerDeveloper(RECIPE)
+def developer() -> Iterator[DecodeProcess]:
+    one = DecodeProcess(RECIPE)
     yield one
     one.close()
 
 
-def pid(developer: WorkerDeveloper) -> int:
+def pid(developer: DecodeProcess) -> int:
     assert developer._process is not None
     return developer._process.pid
 
 
-def test_bad_frames_cost_nothing_but_themselves(developer: WorkerDeveloper, frame: str, tmp_path: Path) -> None:
+def test_bad_frames_cost_nothing_but_themselves(developer: DecodeProcess, frame: str, tmp_path: Path) -> None:
     junk = tmp_path / "junk.dng"
     junk.write_bytes(b"II*\0" + bytes(range(256)) * 100)
     for path in (str(junk), str(tmp_path / "nothing.dng"), str(tmp_path)):
-        with pytest.raises(DevelopmentError) as caught:
+        with pytest.raises(DecodeProcessError) as caught:
             developer.develop(path, None, None)
         assert path in str(caught.value)
         assert "\n" not in str(caught.value)
@@ -55,13 +55,13 @@ def test_bad_frames_cost_nothing_but_themselves(developer: WorkerDeveloper, fram
 
 
 def test_a_recipe_that_can_t_work_is_told_at_the_warm_up() -> None:
-    developer = WorkerDeveloper(Recipe("reference-36mm", "no-such-mask"))
-    with pytest.raises(DevelopmentError, match="no-such-mask"):
+    developer = DecodeProcess(Recipe("reference-36mm", "no-such-mask"))
+    with pytest.raises(DecodeProcessError, match="no-such-mask"):
         developer.warm_up()
     developer.close()
 
 
-def test_a_worker_that_died_between_two_frames_is_replaced_unseen(developer: WorkerDeveloper, frame: str) -> None:
+def test_a_worker_that_died_between_two_frames_is_replaced_unseen(developer: DecodeProcess, frame: str) -> None:
     first = developer.develop(frame, None, None)
     os.kill(pid(developer), signal.SIGKILL)
     assert developer._process is not None
@@ -71,11 +71,11 @@ def test_a_worker_that_died_between_two_frames_is_replaced_unseen(developer: Wor
 
 
 def test_a_worker_that_hangs_is_given_up_and_replaced(frame: str) -> None:
-    developer = WorkerDeveloper(RECIPE, timeout_s=20.0)
+    developer = DecodeProcess(RECIPE, timeout_s=20.0)
     developer.warm_up()
     os.kill(pid(developer), signal.SIGSTOP)
     developer._timeout_s = 0.2
-    with pytest.raises(DevelopmentError, match="given up"):
+    with pytest.raises(DecodeProcessError, match="given up"):
         developer.develop(frame, None, None)
     developer._timeout_s = 20.0
     assert developer.develop(frame, None, None).sha256
@@ -85,14 +85,14 @@ def test_a_worker_that_hangs_is_given_up_and_replaced(frame: str) -> None:
 def test_a_worker_that_keeps_dying_is_not_started_without_end(frame: str) -> None:
     now_ns = [0]
     budget = RestartBudget(limit=2, window_s=60.0)
-    developer = WorkerDeveloper(RECIPE, budget=budget, clock_ns=lambda: now_ns[0])
+    developer = DecodeProcess(RECIPE, budget=budget, clock_ns=lambda: now_ns[0])
     for _ in range(2):
         developer.warm_up()
         os.kill(pid(developer), signal.SIGKILL)
         assert developer._process is not None
         developer._process.wait(5)
     now_ns[0] = 20 * 10**9
-    with pytest.raises(DevelopmentError, match="keeps dying: it starts again in 40 s"):
+    with pytest.raises(DecodeProcessError, match="keeps dying: it starts again in 40 s"):
         developer.develop(frame, None, None)
     now_ns[0] = 61 * 10**9
     assert developer.develop(frame, None, None).sha256
@@ -101,7 +101,7 @@ def test_a_worker_that_keeps_dying_is_not_started_without_end(frame: str) -> Non
 
 @pytest.mark.timeout(40)  # the frame itself would take for ever
 def test_close_does_not_wait_for_a_frame_in_hand(frame: str) -> None:
-    developer = WorkerDeveloper(RECIPE, timeout_s=3600)
+    developer = DecodeProcess(RECIPE, timeout_s=3600)
     developer.warm_up()
     os.kill(pid(developer), signal.SIGSTOP)
     problems: list[Exception] = []
@@ -109,7 +109,7 @@ def test_close_does_not_wait_for_a_frame_in_hand(frame: str) -> None:
     def develop() -> None:
         try:
             developer.develop(frame, None, None)
-        except DevelopmentError as error:
+        except DecodeProcessError as error:
             problems.append(error)
 
     thread = threading.Thread(target=develop)
@@ -118,5 +118,5 @@ def test_close_does_not_wait_for_a_frame_in_hand(frame: str) -> None:
     developer.close()
     thread.join(5)
     assert len(problems) == 1
-    with pytest.raises(DevelopmentError, match="stopped"):
+    with pytest.raises(DecodeProcessError, match="stopped"):
         developer.develop(frame, None, None)

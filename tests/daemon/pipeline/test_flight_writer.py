@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from dappled.clock import SystemClock
-from dappled.daemon.pipeline.flight_writer import Expected, LiveBook, ReplayBook
+from dappled.daemon.pipeline.flight_writer import Expected, LedgerWriter, ReplayVerifier
 from dappled.drivers.camera import Blob, Fired
 from dappled.errors import DappledError
 from dappled.flight import recording
@@ -25,7 +25,7 @@ def tag(frame: Frame) -> Tag:
     return Tag(frame.index, 1, 2, "test", 50.0, 8.0, 0.001, 100.0, "camera", "mask", frame.sha256, no_pose())
 
 
-def recorded(book: LiveBook, index: int | None, data: bytes = DATA) -> Frame:
+def recorded(book: LedgerWriter, index: int | None, data: bytes = DATA) -> Frame:
     blob = Blob.of(data)
     try:
         return book.record(index, "IMG_0001.DNG", blob)
@@ -35,7 +35,7 @@ def recorded(book: LiveBook, index: int | None, data: bytes = DATA) -> Frame:
 
 def test_a_wish_is_entered_with_the_first_word_of_its_shot(tmp_path: Path) -> None:
     flight = recording.begin(tmp_path, SystemClock().utc_ns)
-    book = LiveBook(flight, SystemClock())
+    book = LedgerWriter(flight, SystemClock())
     flight.journal.note(SHOT)
     book.wished(SHOT)
     assert flight.ledger.shot(0) is None
@@ -54,7 +54,7 @@ def test_a_wish_is_entered_with_the_first_word_of_its_shot(tmp_path: Path) -> No
 
 def test_a_wish_that_the_ledger_refused_once_is_entered_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flight = recording.begin(tmp_path, SystemClock().utc_ns)
-    book = LiveBook(flight, SystemClock())
+    book = LedgerWriter(flight, SystemClock())
     flight.journal.note(SHOT)
     book.wished(SHOT)
 
@@ -73,7 +73,7 @@ def test_a_frame_is_safe_even_when_the_index_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     flight = recording.begin(tmp_path, SystemClock().utc_ns)
-    book = LiveBook(flight, SystemClock())
+    book = LedgerWriter(flight, SystemClock())
     flight.journal.note(SHOT)
     book.wished(SHOT)
 
@@ -89,14 +89,14 @@ def test_a_frame_is_safe_even_when_the_index_is_not(
 
 def test_a_file_without_a_shot_is_kept_and_told(tmp_path: Path) -> None:
     flight = recording.begin(tmp_path, SystemClock().utc_ns)
-    book = LiveBook(flight, SystemClock())
+    book = LedgerWriter(flight, SystemClock())
     with pytest.raises(DappledError, match="stray"):
         recorded(book, None)
     assert [stray.camera_name for stray in flight.ledger.strays()] == ["IMG_0001.DNG"]
     flight.close()
 
 
-def replay(tmp_path: Path, **digests: Any) -> tuple[ReplayBook, Frame]:
+def replay(tmp_path: Path, **digests: Any) -> tuple[ReplayVerifier, Frame]:
     """The book of a replay of one frame, which stands on disk."""
     blob = Blob.of(DATA)
     from dappled.flight import durable  # noqa: PLC0415  # used here only
@@ -110,10 +110,10 @@ def replay(tmp_path: Path, **digests: Any) -> tuple[ReplayBook, Frame]:
         "slices_sha256": "5" * 64,
         **digests,
     }
-    return ReplayBook(tmp_path, [Expected(row, frame, **given)]), frame
+    return ReplayVerifier(tmp_path, [Expected(row, frame, **given)]), frame
 
 
-def play(book: ReplayBook, frame: Frame, data: bytes = DATA, slices: str = "5" * 64) -> list[str]:
+def play(book: ReplayVerifier, frame: Frame, data: bytes = DATA, slices: str = "5" * 64) -> list[str]:
     blob = Blob.of(data) if data else Blob(Blob.of(b"x").fd, 0)
     book.record(0, "IMG.DNG", blob)
     blob.close()

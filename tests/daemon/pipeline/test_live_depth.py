@@ -10,11 +10,11 @@ import jsonschema
 import numpy as np
 import pytest
 
-from dappled.daemon.pipeline.decode_process import DepthFound, Developed, DevelopmentError
+from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcessError, FrameDepth
 from dappled.daemon.pipeline.live_depth import LiveDepth
-from dappled.daemon.pipeline.pending_shot import Story
-from dappled.daemon.pipeline.tagger import Exposure, tag
-from dappled.daemon.pipeline.tagger import Settings as Shown
+from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.daemon.pipeline.tagger import ExposureTime, tag
+from dappled.daemon.pipeline.tagger import FrameSettings as Shown
 from dappled.daemon.stream import wire
 from dappled.flight.records import Cause, Frame, Shot
 from tests.daemon.fakes import eventually, no_pose
@@ -34,27 +34,27 @@ class FakeMaker:
     def close(self) -> None:
         self.closed = True
 
-    def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> DepthFound:
+    def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> FrameDepth:
         self.asked.append((path, method))
         assert self.gate.wait(20)
         if self.problem:
-            raise DevelopmentError(self.problem)
+            raise DecodeProcessError(self.problem)
         body = mmap.mmap(-1, 48)
         both = np.zeros((2, 2, 3), dtype=np.float32)
         body.write(both.tobytes())
         arrays = [wire.describe_array(name, both[0], "px") for name in ("disparity", "sigma")]
-        return DepthFound(body, arrays, [-0.5, 0.5], [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]], "geometric", self.nearest_m)
+        return FrameDepth(body, arrays, [-0.5, 0.5], [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]], "geometric", self.nearest_m)
 
 
-def story(index: int, *, decoded: bool = True) -> Story:
+def shot(index: int, *, decoded: bool = True) -> PendingShot:
     frame = Frame(index, f"frames/{index}.dng", "IMG.DNG", 10, "0" * 64, 0)
-    exposure = Exposure(0, 1, "test")
+    exposure = ExposureTime(0, 1, "test")
     made = tag(frame, exposure, Shown(50.0, 8.0, 0.01, 100.0), camera="c", mask="m", pose=no_pose())
-    developed = None
+    result = None
     if decoded:
         grid = [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]
-        developed = Developed(mmap.mmap(-1, 16), "0" * 64, [], [], "measured", 0, 0, "geometric", grid, b"", (0, 0))
-    return Story(Shot(index, Cause("t", "t"), 0, 0), frame=frame, tag=made, developed=developed)
+        result = DecodedFrame(mmap.mmap(-1, 16), "0" * 64, [], [], "measured", 0, 0, "geometric", grid, b"", (0, 0))
+    return PendingShot(Shot(index, Cause("t", "t"), 0, 0), frame=frame, tag=made, decoded=result)
 
 
 class Bench:
@@ -85,7 +85,7 @@ def bench() -> Any:
 
 
 def test_a_message_as_the_schema_says(bench: Bench) -> None:
-    bench.depth.offer(story(3))
+    bench.depth.offer(shot(3))
     eventually(lambda: bench.published, "it is published")
     ((topic, facts, body),) = bench.published
     assert topic == "depth"
@@ -99,10 +99,10 @@ def test_a_message_as_the_schema_says(bench: Bench) -> None:
 
 def test_not_more_often_than_asked_for(bench: Bench) -> None:
     for index in range(5):
-        bench.depth.offer(story(index))
+        bench.depth.offer(shot(index))
     eventually(lambda: len(bench.published) == 1, "the first")
     bench.now_s = 5.0
-    bench.depth.offer(story(9))
+    bench.depth.offer(shot(9))
     eventually(lambda: len(bench.published) == 2, "the next that is due")
     assert [path for path, _ in bench.maker.asked] == ["frames/0.dng", "frames/9.dng"]
 
@@ -111,7 +111,7 @@ def test_a_slow_one_loses_the_older_frame(bench: Bench) -> None:
     bench.maker.gate.clear()
     for index in range(4):
         bench.now_s += 10
-        bench.depth.offer(story(index))
+        bench.depth.offer(shot(index))
         eventually(lambda: bench.maker.asked, "the first is in hand")
     bench.maker.gate.set()
     eventually(lambda: len(bench.published) == 2, "the first and the newest")
@@ -120,19 +120,19 @@ def test_a_slow_one_loses_the_older_frame(bench: Bench) -> None:
 
 
 def test_what_was_not_decoded_has_no_depth_and_a_failure_is_counted(bench: Bench) -> None:
-    bench.depth.offer(story(0, decoded=False))
+    bench.depth.offer(shot(0, decoded=False))
     bench.maker.problem = "no carriers"
-    bench.depth.offer(story(1))
+    bench.depth.offer(shot(1))
     eventually(lambda: bench.depth.statistics().failed == 1, "it failed")
     assert [path for path, _ in bench.maker.asked] == ["frames/1.dng"]
     assert bench.published == []
 
 
 def test_the_nearest_distance_is_told_where_it_is_known(bench: Bench) -> None:
-    bench.depth.offer(story(0))
+    bench.depth.offer(shot(0))
     eventually(lambda: len(bench.published) == 1, "without metres")
     bench.maker.nearest_m = (7.5, 0.2)
     bench.now_s = 10
-    bench.depth.offer(story(1))
+    bench.depth.offer(shot(1))
     eventually(lambda: bench.nearest, "it is told")
     assert bench.nearest == [(7.5, 0.2)]

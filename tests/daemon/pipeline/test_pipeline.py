@@ -29,11 +29,11 @@ def states(flight: Path) -> dict[int, ShotState]:
 def test_a_shot_goes_all_the_way(tmp_path: Path) -> None:
     with rig(tmp_path) as one:
         assert one.wish(1).index == 0
-        story = one.ended(0)
-        assert story.problem == ""
-        assert story.frame is not None
-        assert story.tag is not None
-        assert story.developed is not None
+        pending = one.ended(0)
+        assert pending.problem == ""
+        assert pending.frame is not None
+        assert pending.tag is not None
+        assert pending.decoded is not None
         assert (one.settled, one.tagged, one.camera.released) == ([(0, True)], [0], [0])
         assert one.flight.ledger.result(0) is not None
     assert one.camera.stopped
@@ -64,7 +64,7 @@ def test_a_file_that_comes_twice_is_one_frame(tmp_path: Path) -> None:
         one.wish(1)
         one.ended(0)
         eventually(lambda: len(one.camera.released) == 2, "the second is released too")
-        assert (len(one.stories), one.settled, one.tagged) == (1, [(0, True)], [0])
+        assert (len(one.shots), one.settled, one.tagged) == (1, [(0, True)], [0])
         assert any(line.startswith("double: ") for line in one.events())
 
 
@@ -98,16 +98,16 @@ def test_a_file_after_the_failure_is_a_frame_after_all(tmp_path: Path) -> None:
         assert one.settled == [(0, False), (0, True)]
         assert one.tagged == [0, 0]
         assert any(line.startswith("late: ") for line in one.events())
-    assert len(one.stories) == 1
+    assert len(one.shots) == 1
     assert states(one.flight.folder.path) == {0: "safe"}
 
 
 def test_a_trigger_told_after_the_file_does_not_change_the_tag(tmp_path: Path) -> None:
     with rig(tmp_path, lambda shot: [arrival(shot), fired(shot)]) as one:
         one.wish(1)
-        story = one.ended(0)
-        assert story.tag is not None
-        assert story.tag.utc_ns == story.shot.wished_utc_ns + 60_000_000
+        pending = one.ended(0)
+        assert pending.tag is not None
+        assert pending.tag.utc_ns == pending.shot.wished_utc_ns + 60_000_000
         assert any(line.startswith("untimed: ") for line in one.events())
 
 
@@ -116,7 +116,7 @@ def test_a_file_of_nobody_is_a_stray(tmp_path: Path) -> None:
         one.camera.say(arrival(None))
         one.camera.say(arrival(77))
         eventually(lambda: len(one.flight.ledger.strays()) == 2, "two strays")
-    assert not one.stories
+    assert not one.shots
     assert check.check(one.flight.folder.path).intact
 
 
@@ -158,11 +158,11 @@ def test_a_file_that_comes_as_the_camera_is_let_go_of_is_taken_though_the_driver
 
 def test_a_watcher_that_raises_stops_nobody(tmp_path: Path) -> None:
     with rig(tmp_path) as one:
-        stories = one.stories
-        one.stories = None  # type: ignore[assignment]  # as a bug in a watcher would
+        shots = one.shots
+        one.shots = None  # type: ignore[assignment]  # as a bug in a watcher would
         one.wish(1)
         eventually(lambda: one.flight.ledger.result(0), "decoded all the same")
-        one.stories = stories
+        one.shots = shots
         one.wish(2)
         assert one.ended(1).problem == ""
 
@@ -179,7 +179,7 @@ def test_a_full_decode_queue_leaves_frames_in_the_record(tmp_path: Path) -> None
         one.developer.gate.set()
         assert one.ended(1).problem == ""
     assert set(states(one.flight.folder.path).values()) == {"safe"}
-    assert len(one.stories) == 4
+    assert len(one.shots) == 4
 
 
 def test_a_frame_that_does_not_decode_is_told_and_the_next_does(tmp_path: Path) -> None:
@@ -197,10 +197,10 @@ def test_a_frame_that_does_not_decode_is_told_and_the_next_does(tmp_path: Path) 
 def test_frames_are_told_as_left_undecoded_where_that_was_switched_off(tmp_path: Path) -> None:
     with rig(tmp_path) as one:
         for number, decoding in enumerate((True, False, True)):
-            one.street.decoding = decoding
+            one.pipeline.decoding = decoding
             one.wish(number)
-            story = one.ended(number)
-            assert ((story.developed is not None), story.problem) == (decoding, "")
+            pending = one.ended(number)
+            assert ((pending.decoded is not None), pending.problem) == (decoding, "")
         assert [text for text in one.events() if text.startswith("not decoded")] == [
             "not decoded: decoding was switched off"
         ]
@@ -228,8 +228,8 @@ def test_a_ledger_that_refuses_once_costs_one_shot_at_most(
             one.ended(0)
         one.wish(2)
         assert one.ended(1).problem == ""
-        assert one.ended(1).developed is not None
-    assert len(one.stories) == 2
+        assert one.ended(1).decoded is not None
+    assert len(one.shots) == 2
     assert states(one.flight.folder.path)[1] == "safe"
 
 
@@ -281,8 +281,8 @@ def test_every_wish_is_one_shot_and_every_shot_ends_once(plan: list[tuple[list[t
         assert (balance.wishes, balance.open) == (len(plan), 0)
         assert one.camera.fired == list(range(len(plan)))
         assert set(states(flight).values()) <= {"safe", "failed"}
-        eventually(lambda: len(one.stories) == len(plan), "every story is told")
-        assert sorted(story.shot.index for story in one.stories) == list(range(len(plan)))
+        eventually(lambda: len(one.shots) == len(plan), "every story is told")
+        assert sorted(pending.shot.index for pending in one.shots) == list(range(len(plan)))
         counted = one.shutter.statistics()
         assert (counted.shots, counted.pending) == (len(plan), 0)
         assert counted.succeeded + counted.failed == len(plan)
@@ -317,17 +317,17 @@ def test_a_shot_whose_file_follows_is_told_where_it_was_and_has_failed_until_the
     with rig(tmp_path, deferred) as one:
         index = one.wish(1).index
         assert index is not None
-        story = one.ended(index)
-        assert story.where is not None
+        pending = one.ended(index)
+        assert pending.where is not None
         assert one.tagged == [index]
         assert one.settled == [(index, False)]
         assert one.flight.ledger.following() == {index}
-        assert f"follows: {story.follows}" in one.events()
+        assert f"follows: {pending.follows}" in one.events()
         one.camera.say(arrival(index))
         eventually(lambda: one.flight.ledger.tag(index), "the tag of the file that came after all")
         assert one.flight.ledger.following() == set()
         assert one.flight.ledger.frame(index) is not None
-        assert len(one.stories) == 1
+        assert len(one.shots) == 1
         path = one.flight.folder.path
     assert check.check(path).problems == ()
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dappled.clock import RecordedClock, SystemClock
 from dappled.daemon.pipeline import shutter as module
-from dappled.daemon.pipeline.shutter import Shutter, Wish
+from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.flight.records import Shot
 
 PILOT = "mavlink:255/190"
@@ -46,7 +46,7 @@ class Rig:
 
     def press(self, after_s: float = 0.0, *, sequence: int = 0, confirmation: int = 0, link: int = 0) -> str:
         self.clock.advance(after_s)
-        return self.shutter.wish(Wish(PILOT, "IMAGE_START_CAPTURE", sequence, confirmation, link)).outcome
+        return self.shutter.wish(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", sequence, confirmation, link)).outcome
 
     def tick(self, seconds: float, step_s: float = 0.05) -> None:
         for _ in range(round(seconds / step_s)):
@@ -56,7 +56,7 @@ class Rig:
 
 def test_a_wish_is_written_down_before_the_camera_is_touched() -> None:
     rig = Rig()
-    verdict = rig.shutter.wish(Wish("console", "button"))
+    verdict = rig.shutter.wish(CaptureRequest("console", "button"))
     assert (verdict.outcome, verdict.index) == ("shot", 42)
     assert rig.done == [("note", 42), ("fire", 42)]
 
@@ -99,7 +99,9 @@ def test_px4s_triple_on_several_links_is_one_shot_a_trigger(
         order.shuffle(messages)
         for kind, link in messages:
             sequence = None if kind == "DO_DIGICAM_CONTROL" else trigger + 1
-            rig.shutter.wish(Wish(VEHICLE, kind, sequence, 0, link, acknowledged=kind == "IMAGE_START_CAPTURE"))
+            rig.shutter.wish(
+                CaptureRequest(VEHICLE, kind, sequence, 0, link, acknowledged=kind == "IMAGE_START_CAPTURE")
+            )
             rig.clock.advance(0.05 / len(messages))
     assert rig.fired() == list(range(42, 42 + len(gaps)))
 
@@ -110,7 +112,7 @@ def test_broadcast_203_without_a_number_is_a_shot_each_time(gaps: list[float]) -
     rig = Rig()
     for gap in gaps:
         rig.clock.advance(gap)
-        rig.shutter.wish(Wish(VEHICLE, "DO_DIGICAM_CONTROL", None, 0, 0, acknowledged=False))
+        rig.shutter.wish(CaptureRequest(VEHICLE, "DO_DIGICAM_CONTROL", None, 0, 0, acknowledged=False))
     assert len(rig.fired()) == len(gaps)
 
 
@@ -130,7 +132,7 @@ def test_the_books_balance_and_no_index_is_used_twice(messages: list[tuple[float
     rig = Rig(capacity=5)
     for gap, source, kind, sequence, link in messages:
         rig.clock.advance(gap)
-        verdict = rig.shutter.wish(Wish(source, kind, sequence, 0, link))
+        verdict = rig.shutter.wish(CaptureRequest(source, kind, sequence, 0, link))
         assert verdict.accepted == (verdict.index is not None)
         if verdict.outcome == "shot" and (verdict.index or 0) % 2:
             rig.shutter.settled(verdict.index or 0, ok=verdict.index != 43)
@@ -145,22 +147,22 @@ def test_the_books_balance_and_no_index_is_used_twice(messages: list[tuple[float
 def test_refusals_say_why_and_use_no_index() -> None:
     rig = Rig(capacity=1)
     rig.obstacle = "no camera on the bus"
-    assert rig.shutter.wish(Wish(PILOT, "x", 1)).reason == "no camera on the bus"
+    assert rig.shutter.wish(CaptureRequest(PILOT, "x", 1)).reason == "no camera on the bus"
     rig.obstacle, rig.note_error = None, OSError(28, "No space left on device")
-    assert "No space left" in (rig.shutter.wish(Wish(PILOT, "x", 2)).reason or "")
+    assert "No space left" in (rig.shutter.wish(CaptureRequest(PILOT, "x", 2)).reason or "")
     rig.note_error = None
-    assert rig.shutter.wish(Wish(PILOT, "x", 3)).index == 42
-    assert "waiting for the camera" in (rig.shutter.wish(Wish(PILOT, "x", 4)).reason or "")
+    assert rig.shutter.wish(CaptureRequest(PILOT, "x", 3)).index == 42
+    assert "waiting for the camera" in (rig.shutter.wish(CaptureRequest(PILOT, "x", 4)).reason or "")
     rig.shutter.settled(42, ok=True)
     rig.shutter.settled(42, ok=False)
-    assert rig.shutter.wish(Wish(PILOT, "x", 5)).index == 43
+    assert rig.shutter.wish(CaptureRequest(PILOT, "x", 5)).index == 43
     rig.shutter.stop()
-    assert rig.shutter.wish(Wish(PILOT, "x", 6)).reason == "the daemon is stopping"
+    assert rig.shutter.wish(CaptureRequest(PILOT, "x", 6)).reason == "the daemon is stopping"
 
 
 def test_an_interval_counts_to_its_end_and_a_single_shot_does_not_cancel_it() -> None:
     rig = Rig()
-    wish = Wish(PILOT, "IMAGE_START_CAPTURE", 7)
+    wish = CaptureRequest(PILOT, "IMAGE_START_CAPTURE", 7)
     assert rig.shutter.start_interval(wish, 1.0, 3).index == 42
     assert rig.shutter.start_interval(wish, 1.0, 3).outcome == "duplicate"
     rig.tick(0.5)
@@ -173,7 +175,7 @@ def test_an_interval_counts_to_its_end_and_a_single_shot_does_not_cancel_it() ->
 
 def test_an_endless_interval_ends_when_told_and_late_ticks_are_not_bunched() -> None:
     rig = Rig()
-    rig.shutter.start_interval(Wish(PILOT, "IMAGE_START_CAPTURE", 1), 0.5, 0)
+    rig.shutter.start_interval(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", 1), 0.5, 0)
     rig.tick(2.0)
     assert len(rig.fired()) == 5
     rig.clock.advance(10)
@@ -187,7 +189,9 @@ def test_an_endless_interval_ends_when_told_and_late_ticks_are_not_bunched() -> 
 
 def start(rig: Rig, interval_s: float, count: int = 0, *, source: str = PILOT, link: int = 0) -> str:
     """An interval as ground stations start it, who number everything 0."""
-    return rig.shutter.start_interval(Wish(source, "IMAGE_START_CAPTURE", 0, link=link), interval_s, count).outcome
+    return rig.shutter.start_interval(
+        CaptureRequest(source, "IMAGE_START_CAPTURE", 0, link=link), interval_s, count
+    ).outcome
 
 
 @pytest.mark.parametrize("link", [0, 1])
@@ -228,7 +232,7 @@ def test_a_second_interval_takes_the_place_of_the_first_however_soon_and_the_fir
 
 def test_a_burst_takes_the_next_shot_when_the_last_one_is_settled() -> None:
     rig = Rig()
-    rig.shutter.start_interval(Wish(PILOT, "IMAGE_START_CAPTURE", 1), 0.0, 3)
+    rig.shutter.start_interval(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", 1), 0.0, 3)
     rig.tick(2)
     assert rig.fired() == [42]
     for index in (42, 43, 44):
@@ -239,7 +243,7 @@ def test_a_burst_takes_the_next_shot_when_the_last_one_is_settled() -> None:
 
 def test_a_burst_before_a_camera_that_is_gone_asks_once_a_second() -> None:
     rig = Rig()
-    rig.shutter.start_interval(Wish(PILOT, "IMAGE_START_CAPTURE", 1), 0.0, 0)
+    rig.shutter.start_interval(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", 1), 0.0, 0)
     rig.shutter.settled(42, ok=True)
     rig.obstacle = "the camera is absent"
     for _ in range(100):
@@ -253,7 +257,7 @@ def test_a_burst_before_a_camera_that_is_gone_asks_once_a_second() -> None:
 @pytest.mark.parametrize(("interval_s", "count"), [(-1.0, 0), (float("nan"), 0), (1e9, 0), (1.0, -2)])
 def test_a_senseless_interval_is_refused(interval_s: float, count: int) -> None:
     rig = Rig()
-    assert rig.shutter.start_interval(Wish(PILOT, "x"), interval_s, count).outcome == "refused"
+    assert rig.shutter.start_interval(CaptureRequest(PILOT, "x"), interval_s, count).outcome == "refused"
     assert not rig.fired()
 
 
@@ -269,7 +273,7 @@ def test_the_thread_serves_intervals_on_the_real_clock() -> None:
     shutter.start()
     try:
         began = time.monotonic()
-        shutter.start_interval(Wish(PILOT, "x"), 0.1, 3)
+        shutter.start_interval(CaptureRequest(PILOT, "x"), 0.1, 3)
         assert enough.wait(10)
         assert time.monotonic() - began > 0.19
     finally:
@@ -294,9 +298,9 @@ def test_an_interval_outlives_whoever_notes_going_wrong(monkeypatch: pytest.Monk
     shutter = Shutter(next_index=0, note=note, fire=fire, clock=SystemClock())
     shutter.start()
     try:
-        shutter.start_interval(Wish(PILOT, "x"), 0.1, 3)
+        shutter.start_interval(CaptureRequest(PILOT, "x"), 0.1, 3)
         assert enough.wait(20)
-        assert shutter.dead() == []
+        assert shutter.dead_threads() == []
     finally:
         shutter.stop()
     assert (noted, fired) == ([0, 1, 1, 2], [0, 1, 2])
@@ -312,9 +316,9 @@ def test_every_refusal_is_told() -> None:
         capacity=1,
         on_refused=lambda refused: told.append(refused[1]),
     )
-    shutter.start_interval(Wish(PILOT, "IMAGE_START_CAPTURE", 1), -1.0, 0)
+    shutter.start_interval(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", 1), -1.0, 0)
     for sequence in (2, 3):
-        shutter.wish(Wish(PILOT, "IMAGE_START_CAPTURE", sequence))
+        shutter.wish(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", sequence))
     assert len(told) == shutter.statistics().refused == 2
     assert "an interval is" in told[0]
     assert "waiting for the camera" in told[1]

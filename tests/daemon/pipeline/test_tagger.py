@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from dappled.daemon.pipeline import tagger
-from dappled.daemon.pipeline.tagger import BodyLatency, Settings
+from dappled.daemon.pipeline.tagger import BodyLatency, FrameSettings
 from dappled.flight.records import Frame
 from tests.daemon.fakes import no_pose
 
@@ -20,7 +20,9 @@ def test_mid_exposure_is_latency_and_half_the_exposure_after_the_call() -> None:
 
 def test_what_a_file_does_not_say_stays_unknown() -> None:
     frame = Frame(3, "frames/000003.dng", "IMG.DNG", 5, "ab", 9)
-    made = tagger.tag(frame, tagger.mid_exposure(0, LATENCY, None), Settings(), camera="c", mask="m", pose=no_pose())
+    made = tagger.tag(
+        frame, tagger.mid_exposure(0, LATENCY, None), FrameSettings(), camera="c", mask="m", pose=no_pose()
+    )
     assert (made.index, made.frame_sha256, made.camera, made.mask) == (3, "ab", "c", "m")
     assert (made.focal_length_mm, made.f_number, made.exposure_s, made.iso) == (None,) * 4
 

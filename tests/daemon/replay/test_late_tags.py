@@ -17,8 +17,8 @@ from dappled.cli import main
 from dappled.config import settings as configuration
 from dappled.config.settings import MavlinkSettings, PoseSettings, PublishSettings, RecordSettings, Settings
 from dappled.daemon import service as module
-from dappled.daemon.pipeline.pending_shot import Story, Watchers
-from dappled.daemon.pipeline.shutter import Wish
+from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
+from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import Service
 from dappled.drivers.mavlink.links import mavlink
 from dappled.flight import check, layout, recovery
@@ -45,8 +45,8 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Settin
 @pytest.fixture
 def killed(settings: Settings, tmp_path: Path) -> Path:
     """What stands on the disk when a daemon is killed: one frame tagged, one safe and waiting for its pose."""
-    stories: list[Story] = []
-    service = Service(settings, watchers=Watchers(finished=stories.append))
+    shots: list[PendingShot] = []
+    service = Service(settings, watchers=Observer(finished=shots.append))
     service.start()
     loop = threading.Thread(target=service.run)
     loop.start()
@@ -68,13 +68,13 @@ def killed(settings: Settings, tmp_path: Path) -> Path:
         try:
             eventually(lambda: heard(service._parts.component.vehicle), "whose camera this is")
             eventually(lambda: heard(service.health()["vehicle"]), "a position")
-            service.wish(Wish("test", "console", 1))
-            eventually(lambda: heard(stories), "the first shot's end")
-            service.wish(Wish("test", "console", 2))
+            service.wish(CaptureRequest("test", "console", 1))
+            eventually(lambda: heard(shots), "the first shot's end")
+            service.wish(CaptureRequest("test", "console", 2))
             eventually(lambda: _safe(service.folder) == 2, "the second frame is safe")
-            assert len(stories) == 1
+            assert len(shots) == 1
             shutil.copytree(service.folder, left)
-            eventually(lambda: heard(len(stories) == 2), "the second shot's end")
+            eventually(lambda: heard(len(shots) == 2), "the second shot's end")
         finally:
             service.ask_to_stop()
             loop.join(5)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from dappled.daemon.pipeline.pending_shot import Names, Story, Watchers
-from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
+from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.replay import replay
-from dappled.daemon.replay.replay import Progress, RecordedTelemetry, ReplayError
+from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayProgress
 from dappled.drivers.camera import Arrival, CameraEvent, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.replay import ReplayCamera
 from dappled.flight.errors import FlightError
@@ -33,14 +33,14 @@ def again(flight: Path, pace: replay.Pace | None = None) -> list[str]:
     """The verdict of a replay."""
     recording = replay.of_flight(flight)
     book = replay.book(recording)
-    progress = Progress.begin()
-    ended: list[Story] = []
+    progress = ReplayProgress.begin()
+    ended: list[PendingShot] = []
 
-    def finished(story: Story) -> None:
-        ended.append(story)
-        progress.note(story)
+    def finished(pending: PendingShot) -> None:
+        ended.append(pending)
+        progress.note(pending)
 
-    street = Street(
+    pipeline = Pipeline(
         camera=ReplayCamera(recording.files, Identity("dappled", "recording", "", "")),
         book=book,
         poses=RecordedTelemetry(recording.telemetry, recording.horizons, wait_s=0.0).pose,
@@ -48,14 +48,14 @@ def again(flight: Path, pace: replay.Pace | None = None) -> list[str]:
         publisher=None,
         latency=BodyLatency(60.0, 15.0, "test"),
         names=Names("test", "mask", "geometric"),
-        watchers=Watchers(finished=finished),
+        watchers=Observer(finished=finished),
         decode_queue=100,
     )
-    street.start()
+    pipeline.start()
     try:
-        replay.play(recording, street, progress, time=replay.clock(recording), pace=pace, timeout_s=20)
+        replay.play(recording, pipeline, progress, time=replay.clock(recording), pace=pace, timeout_s=20)
     finally:
-        street.stop(5)
+        pipeline.stop(5)
     assert len(ended) == len(recording.shots)
     return [text for text in book.verdict() if "unreadable" not in text]  # the fake's frames are no raw files
 
@@ -173,6 +173,6 @@ def test_a_shot_that_never_ends_is_given_up(tmp_path: Path) -> None:
 
         def fire(self, index: int) -> None: ...
 
-    deaf = Progress(threading.Semaphore(0))
+    deaf = ReplayProgress(threading.Semaphore(0))
     with pytest.raises(ReplayError, match="did not come to an end"):
         replay.play(recording, Deaf(), deaf, time=replay.clock(recording), pace=None, timeout_s=0.01)  # type: ignore[arg-type]  # a street that does nothing

@@ -11,7 +11,7 @@ import pytest
 
 from dappled.daemon.pipeline.pending_shot import Names
 from dappled.daemon.replay import runs
-from dappled.daemon.replay.runs import Run, RunBook
+from dappled.daemon.replay.runs import Run, RunWriter
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import recording
@@ -47,7 +47,7 @@ def recipe(tmp_path: Path) -> Recipe:
 def test_a_run_stands_beside_the_flight_and_can_be_had_again(flight: Recording, recipe: Recipe, tmp_path: Path) -> None:
     flight.close()
     folder = flight.folder.path
-    with RunBook(folder, Run("second", recipe, NAMES), lambda: 5) as book:
+    with RunWriter(folder, Run("second", recipe, NAMES), lambda: 5) as book:
         book.decoded(replace(RESULT, slices_sha256="b" * 64))
         assert book.run.recipe.white == str(folder / "inputs" / "second" / "white.npy")
     with LedgerReader.open(flight.folder.ledger) as ledger:
@@ -68,19 +68,19 @@ def test_a_run_stands_beside_the_flight_and_can_be_had_again(flight: Recording, 
 
 def test_a_run_replaces_nothing(flight: Recording, recipe: Recipe) -> None:
     flight.close()
-    with RunBook(flight.folder.path, Run("second", recipe, NAMES), lambda: 5):
+    with RunWriter(flight.folder.path, Run("second", recipe, NAMES), lambda: 5):
         pass
     with pytest.raises(DappledError, match="has a run 'second' already"):
-        RunBook(flight.folder.path, Run("second", recipe, NAMES), lambda: 5)
+        RunWriter(flight.folder.path, Run("second", recipe, NAMES), lambda: 5)
 
 
 @pytest.mark.parametrize("name", ["live", "", "../x", "a b", "-x"])
 def test_a_name_that_is_none(flight: Recording, recipe: Recipe, name: str) -> None:
     flight.close()
     with pytest.raises(DappledError, match="can't name a run"):
-        RunBook(flight.folder.path, Run(name, recipe, NAMES), lambda: 5)
+        RunWriter(flight.folder.path, Run(name, recipe, NAMES), lambda: 5)
 
 
 def test_a_flight_that_is_still_recorded_gets_no_run(flight: Recording, recipe: Recipe) -> None:
     with pytest.raises(DappledError, match="still recorded"):
-        RunBook(flight.folder.path, Run("second", recipe, NAMES), lambda: 5)
+        RunWriter(flight.folder.path, Run("second", recipe, NAMES), lambda: 5)

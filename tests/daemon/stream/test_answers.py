@@ -10,7 +10,7 @@ import jsonschema
 import pytest
 
 from dappled.clock import SystemClock
-from dappled.daemon.pipeline.flight_writer import LiveBook
+from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.stream import answers, wire
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.wire import Message, WireError
@@ -28,7 +28,7 @@ def flown(tmp_path: Path) -> Iterator[Rig]:
 
 def asked(flown: Rig, developer: FakeDeveloper | None, request: dict[str, Any]) -> Message:
     replies: list[Message] = []
-    one = Answers(LiveBook(flown.flight, SystemClock()), developer)
+    one = Answers(LedgerWriter(flown.flight, SystemClock()), developer)
     one.start()
     one.answer(request, replies.append)
     one.stop()
@@ -68,7 +68,7 @@ def test_a_decoder_s_sentence_is_passed_on(flown: Rig) -> None:
 
 
 def test_too_many_questions_are_refused(flown: Rig) -> None:
-    one = Answers(LiveBook(flown.flight, SystemClock()), None)  # not started: all of it waits
+    one = Answers(LedgerWriter(flown.flight, SystemClock()), None)  # not started: all of it waits
     replies: list[Message] = []
     for _ in range(answers.WAITING):
         one.answer({"get": "frame", "frame": 0}, replies.append)

@@ -481,11 +481,11 @@ def test_subscribe_ends_after_end(started: Publisher, endpoint: str) -> None:
 def test_a_thread_that_ended_by_itself_is_told(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Publisher, "_run", lambda _: None)
     one = Publisher(endpoint, "", flight="f", answer=no_answer)
-    assert one.dead() == []
+    assert one.dead_threads() == []
     one.start()
-    eventually(lambda: one.dead() == ["publisher"], "it is told")
+    eventually(lambda: one.dead_threads() == ["publisher"], "it is told")
     one.stop(0.0)
-    assert one.dead() == []
+    assert one.dead_threads() == []
 
 
 def test_an_endpoint_in_use_is_refused_and_stays_whole(started: Publisher, endpoint: str) -> None:

@@ -217,16 +217,16 @@ def test_a_receiving_thread_that_ended_is_named() -> None:
 
     side = Side("udpin:127.0.0.1:0")
     with side:
-        assert side.links.dead() == []
+        assert side.links.dead_threads() == []
         open_one = side.links._links[0].channel
         assert open_one is not None
         side.links._links[0].channel = Broken()  # type: ignore[assignment]  # all that the thread asks
         deadline = time.monotonic() + 10
-        while side.links.dead() != ["mavlink 0"]:
+        while side.links.dead_threads() != ["mavlink 0"]:
             assert time.monotonic() < deadline
             time.sleep(0.01)
         open_one.close()
-    assert side.links.dead() == []  # it was asked to end
+    assert side.links.dead_threads() == []  # it was asked to end
 
 
 def test_a_channel_that_is_opened_after_the_end_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:

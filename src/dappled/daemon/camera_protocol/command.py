@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from dappled.daemon.pipeline.shutter import Verdict
+from dappled.daemon.pipeline.shutter import ShotDecision
 from dappled.drivers.mavlink.links import Message, mavlink
 
 ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
@@ -65,7 +65,7 @@ class Answer:
     words: str | None = None
 
 
-def judged(verdict: Verdict) -> Answer:
+def judged(verdict: ShotDecision) -> Answer:
     """The answer to a wish: accepted means that it will be attempted."""
     if verdict.accepted:
         return Answer(ACCEPTED)

@@ -13,7 +13,7 @@ from dappled.daemon.camera_protocol.camera_status import ZOOM, Telling
 from dappled.daemon.camera_protocol.command import ACCEPTED, DENIED, REJECTED, UNSUPPORTED, Answer, Command, judged
 from dappled.daemon.camera_protocol.message_intervals import MessageIntervals
 from dappled.daemon.pipeline.capture_requests import Recent
-from dappled.daemon.pipeline.shutter import Shutter, Wish
+from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.drivers.camera import CameraError
 from dappled.drivers.mavlink.links import mavlink
 
@@ -54,7 +54,9 @@ class CameraCommands:
 
     def _start_capture(self, command: Command) -> Answer:
         count = command.whole(3, 1)
-        wish = Wish(command.source, "IMAGE_START_CAPTURE", command.whole(4), command.confirmation, command.link)
+        wish = CaptureRequest(
+            command.source, "IMAGE_START_CAPTURE", command.whole(4), command.confirmation, command.link
+        )
         if count == 1:
             return judged(self._shutter.wish(wish))
         return judged(self._shutter.start_interval(wish, command.number(2), count))
@@ -66,7 +68,7 @@ class CameraCommands:
     def _digicam_control(self, command: Command) -> Answer:
         if command.whole(5) != 1:
             return Answer(ACCEPTED if command.broadcast else UNSUPPORTED)
-        wish = Wish(
+        wish = CaptureRequest(
             command.source,
             "DO_DIGICAM_CONTROL",
             None,
@@ -148,7 +150,9 @@ class CameraCommands:
         if not lengths:
             return Answer(DENIED, words="no zoom: this lens is zoomed by hand")
         kind, value = command.whole(1, -1), command.number(2, math.nan)
-        step = Wish(command.source, "SET_CAMERA_ZOOM", None, command.confirmation, command.link, series=(kind, value))
+        step = CaptureRequest(
+            command.source, "SET_CAMERA_ZOOM", None, command.confirmation, command.link, series=(kind, value)
+        )
         now_ns = self._clock.monotonic_ns()
         if kind == _ZOOM_STEP and self._steps.same(step, now_ns) is not None:
             return Answer(ACCEPTED)  # its sender missed the answer

@@ -24,7 +24,7 @@ from dappled.daemon.camera_protocol.messages import CameraFacts, Captured, Stora
 from dappled.daemon.camera_protocol.packet_dedup import Copies
 from dappled.daemon.camera_protocol.parameters import Parameters, Reply
 from dappled.daemon.health.status_text import Audience, PilotLines
-from dappled.daemon.pipeline.shutter import Shutter, Wish
+from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Message, Packet, mavlink
 
@@ -156,7 +156,7 @@ class Component:
             return
         source = f"mavlink:{message.get_srcSystem()}/{message.get_srcComponent()}"
         sequence = message.seq if name == "CAMERA_TRIGGER" else message.img_idx
-        verdict = self._shutter.wish(Wish(source, name, sequence, 0, packet.link, acknowledged=False))
+        verdict = self._shutter.wish(CaptureRequest(source, name, sequence, 0, packet.link, acknowledged=False))
         if not verdict.accepted:
             self.say(f"no photo: {verdict.reason}")
             self.state_changed()

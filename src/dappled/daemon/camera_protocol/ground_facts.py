@@ -12,7 +12,7 @@ import dappled
 from dappled.config import profiles
 from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol.component import CameraFacts, Captured, Storage
-from dappled.daemon.pipeline.pending_shot import Story
+from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.drivers.camera import Identity
 from dappled.errors import DappledError, report
 from dappled.flight import layout
@@ -23,16 +23,16 @@ log = logging.getLogger(__name__)
 Chip = dict[str, Any]
 
 
-def of_story(story: Story, utc_ns: Callable[[int], int | None]) -> Captured:
+def of_story(pending: PendingShot, utc_ns: Callable[[int], int | None]) -> Captured:
     """The 263 of a shot that has just been tagged, or has failed. `utc_ns` puts a machine's time right, where that is
     known."""
-    index = story.shot.index
-    if story.tag is not None and story.frame is not None:
-        return Captured(index, True, utc_ns(story.tag.utc_ns), story.tag.pose, story.frame.name)
-    if story.where is not None:  # exposed; its file stays at the camera for now
-        exposure, pose = story.where
+    index = pending.shot.index
+    if pending.tag is not None and pending.frame is not None:
+        return Captured(index, True, utc_ns(pending.tag.utc_ns), pending.tag.pose, pending.frame.name)
+    if pending.where is not None:  # exposed; its file stays at the camera for now
+        exposure, pose = pending.where
         return Captured(index, True, utc_ns(exposure.utc_ns), pose)
-    return Captured(index, story.frame is not None, url=story.frame.name if story.frame else "")
+    return Captured(index, pending.frame is not None, url=pending.frame.name if pending.frame else "")
 
 
 def of_record(index: int, images: ImageIndex) -> Captured | None:

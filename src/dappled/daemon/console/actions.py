@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from dappled.daemon.health.logbook import Logbook
-from dappled.daemon.pipeline.capture_requests import Wish
-from dappled.daemon.pipeline.shutter import Shutter, Verdict
+from dappled.daemon.pipeline.capture_requests import CaptureRequest
+from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
 
 SOURCE = "console"
 
@@ -17,9 +17,9 @@ def act(request: Mapping[str, Any], shutter: Shutter, logbook: Logbook) -> dict[
     wishes, and a number that comes twice is one wish."""
     match request.get("do"):
         case "shoot":
-            return _told(shutter.wish(Wish(SOURCE, "console", request["sequence"])))
+            return _told(shutter.wish(CaptureRequest(SOURCE, "console", request["sequence"])))
         case "interval":
-            wish = Wish(SOURCE, "console interval", request["sequence"])
+            wish = CaptureRequest(SOURCE, "console interval", request["sequence"])
             return _told(shutter.start_interval(wish, float(request["interval_s"]), int(request["count"])))
         case "stop interval":
             ran = shutter.stop_interval()
@@ -30,7 +30,7 @@ def act(request: Mapping[str, Any], shutter: Shutter, logbook: Logbook) -> dict[
             return {"ok": True}
 
 
-def _told(verdict: Verdict) -> dict[str, Any]:
+def _told(verdict: ShotDecision) -> dict[str, Any]:
     if not verdict.accepted:
         return {"ok": False, "error": verdict.reason, "index": None}
     text = f"shot {verdict.index}" if verdict.outcome == "shot" else f"already shot {verdict.index}"

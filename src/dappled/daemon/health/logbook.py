@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from dappled.daemon.pipeline.pending_shot import Story
+from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.errors import sentence
 
 Level = Literal["info", "warning"]
@@ -57,18 +57,18 @@ class Logbook(logging.Handler):
         self.add(text, "warning")
 
 
-def of_story(story: Story) -> tuple[str, Level]:
+def of_story(pending: PendingShot) -> tuple[str, Level]:
     """What became of a shot, in words."""
-    who = f"frame {story.shot.index}" if story.frame else f"shot {story.shot.index}"
-    if story.problem:
-        return f"{who}: {story.problem}", "warning"
-    if story.frame is None and story.follows:
-        return f"{who}: {story.follows}", "info"
+    who = f"frame {pending.shot.index}" if pending.frame else f"shot {pending.shot.index}"
+    if pending.problem:
+        return f"{who}: {pending.problem}", "warning"
+    if pending.frame is None and pending.follows:
+        return f"{who}: {pending.follows}", "info"
     words = [f"{who} is safe"]
-    if story.frame:
-        words[0] += f", {story.frame.size / 1e6:.1f} MB"
-    if story.developed:
-        done = story.developed
+    if pending.frame:
+        words[0] += f", {pending.frame.size / 1e6:.1f} MB"
+    if pending.decoded:
+        done = pending.decoded
         words.append(f"{done.carriers_found} of {done.carriers_predicted} carriers ({done.carriers_from})")
-        words.append(f"decoded in {story.ms.get('decode', 0.0) / 1e3:.1f} s")
+        words.append(f"decoded in {pending.ms.get('decode', 0.0) / 1e3:.1f} s")
     return "; ".join(words), "info"

@@ -11,7 +11,7 @@ from typing import Any
 from dappled.config.settings import Settings
 from dappled.daemon.navigation.boot_clock import BootClock
 from dappled.daemon.navigation.telemetry import TelemetryStatistics
-from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
@@ -29,7 +29,7 @@ def record(
     utc_ns: int,
     monotonic_ns: int,
     began_monotonic_ns: int,
-    street: Street,
+    pipeline: Pipeline,
     shutter: ShutterStatistics,
     links: Sequence[LinkStatistics],
     telemetry: TelemetryStatistics,
@@ -39,14 +39,14 @@ def record(
     vehicle: Pose | None = None,
     decoding: bool = False,
     utc_known: bool = True,
-    dead: Sequence[str] = (),
+    dead_threads: Sequence[str] = (),
     doubts: Sequence[str] = (),
 ) -> dict[str, Any]:
     """The facts of a `health` message; `problems` are sentences, none when all is well. `doubts`: more of them,
-    of what is contradictory in the vehicle. `dead`: threads that have ended without being asked to."""
-    problems = [f"the {name} thread has ended: restart dappled" for name in dead]
-    if street.camera_state not in ("starting", "ready", "busy"):
-        problems.append(camera_sentence(street))
+    of what is contradictory in the vehicle. `dead_threads`: threads that have ended without being asked to."""
+    problems = [f"the {name} thread has ended: restart dappled" for name in dead_threads]
+    if pipeline.camera_state not in ("starting", "ready", "busy"):
+        problems.append(camera_sentence(pipeline))
     if not settings.mavlink.url:
         problems.append("no MAVLink link is configured: frames are tagged without poses")
     silent = 0
@@ -71,13 +71,13 @@ def record(
         )
     if not settings.mask.profile:
         problems.append("no mask is configured: frames are kept, not decoded (set mask.profile)")
-    stages = [asdict(stage.statistics()) for stage in street.stages]
+    stages = [asdict(stage.statistics()) for stage in pipeline.stages]
     for stage in stages:
         if stage["dropped"]:
             problems.append(f"{stage['name']} fell behind: {stage['dropped']} frames are only in the record")
     return {
         "utc_ns": utc_ns,
-        "camera": {"state": street.camera_state, "reason": street.camera_reason},
+        "camera": {"state": pipeline.camera_state, "reason": pipeline.camera_reason},
         "link": {
             "urls": len(links),
             "silent": silent,
@@ -95,7 +95,7 @@ def record(
         },
         "stages": [*stages, _publish(publisher)],
         "problems": problems,
-        "dead": list(dead),
+        "dead": list(dead_threads),
         "utc_known": utc_known,
         "interval_s": shutter.interval_s,
         "clock": None if clock is None else {"source": clock.source, "sigma_ms": clock.sigma_ns / 1e6},
@@ -166,16 +166,16 @@ def line(told: Mapping[str, Any]) -> str:
     return f"{counts}; {'; '.join(problems)}" if problems else f"{counts}; all is well"
 
 
-def camera_sentence(street: Street) -> str:
+def camera_sentence(pipeline: Pipeline) -> str:
     """Why there is no camera to fire: "the camera is absent: …"."""
-    reason = f": {street.camera_reason}" if street.camera_reason else ""
-    return f"the camera is {street.camera_state}{reason}"
+    reason = f": {pipeline.camera_reason}" if pipeline.camera_reason else ""
+    return f"the camera is {pipeline.camera_state}{reason}"
 
 
-def obstacle(street: Street, folder: Path, min_free_mb: int) -> str | None:
+def obstacle(pipeline: Pipeline, folder: Path, min_free_mb: int) -> str | None:
     """Why no shot can be taken now; None where one can."""
-    if street.camera_state not in ("ready", "busy"):
-        return camera_sentence(street)
+    if pipeline.camera_state not in ("ready", "busy"):
+        return camera_sentence(pipeline)
     try:
         free = layout.free_bytes(folder)
     except DappledError as error:

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from dappled.config.settings import Settings
 from dappled.daemon.pipeline import tagger
-from dappled.daemon.pipeline.pending_shot import Story, Watchers
-from dappled.daemon.pipeline.shutter import Wish
+from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
+from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import Service
 from dappled.errors import DappledError
 
@@ -52,20 +52,20 @@ def daemon(settings: Settings, sockets: Path, record: Path) -> Iterator[Trial]:
         publish=replace(settings.publish, slices=f"ipc://{sockets}/s", ask=f"ipc://{sockets}/a"),
         console=replace(settings.console, bind=""),
     )
-    stories: list[Story] = []
+    shots: list[PendingShot] = []
     ended = threading.Condition()
 
-    def finished(story: Story) -> None:
+    def finished(pending: PendingShot) -> None:
         with ended:
-            stories.append(story)
+            shots.append(pending)
             ended.notify_all()
 
-    service = Service(ours, watchers=Watchers(finished=finished))
+    service = Service(ours, watchers=Observer(finished=finished))
     service.start()
     loop = threading.Thread(target=service.run, name="trial")
     loop.start()
     try:
-        yield Trial(service, stories, ended)
+        yield Trial(service, shots, ended)
     finally:
         service.ask_to_stop()
         loop.join(5)
@@ -75,8 +75,8 @@ def daemon(settings: Settings, sockets: Path, record: Path) -> Iterator[Trial]:
 class Trial:
     """A running daemon to take shots with."""
 
-    def __init__(self, service: Service, stories: list[Story], ended: threading.Condition) -> None:
-        self._service, self._stories, self._ended = service, stories, ended
+    def __init__(self, service: Service, shots: list[PendingShot], ended: threading.Condition) -> None:
+        self._service, self._shots, self._ended = service, shots, ended
         self._wishes = 0
 
     @property
@@ -92,30 +92,34 @@ class Trial:
                 raise TrialError(f"the camera is not ready after {timeout_s:g} s: {state['state']} {state['reason']}")
             time.sleep(_LOOK_S)
 
-    def shoot(self, timeout_s: float = END_S) -> Story:
+    def shoot(self, timeout_s: float = END_S) -> PendingShot:
         """One shot to its end. Raises TrialError where it is refused, or does not end."""
         self.until_ready()
         self._wishes += 1
-        verdict = self._service.wish(Wish("doctor", "test shot", self._wishes, acknowledged=False))
+        verdict = self._service.wish(CaptureRequest("doctor", "test shot", self._wishes, acknowledged=False))
         if verdict.index is None or not verdict.accepted:
             raise TrialError(f"the shot was refused: {verdict.reason}")
         until = time.monotonic() + timeout_s
         with self._ended:
-            while not (found := [one for one in self._stories if one.shot.index == verdict.index]):
+            while not (found := [one for one in self._shots if one.shot.index == verdict.index]):
                 if not self._ended.wait(until - time.monotonic()):
                     raise TrialError(f"the shot did not come to an end within {timeout_s:g} s")
         return found[0]
 
 
-def latency(story: Story) -> Latency:
+def latency(pending: PendingShot) -> Latency:
     """What one shot took."""
     to_exposure = to_file = None
-    if story.fired is not None and story.tag is not None and story.tag.time_source.startswith("hot shoe"):
-        called_utc_ns = tagger.called_utc_ns(story.shot, story.fired.called_monotonic_ns)
-        opened_utc_ns = story.tag.utc_ns - round((story.tag.exposure_s or 0.0) / 2 * 1e9)
+    if pending.fired is not None and pending.tag is not None and pending.tag.time_source.startswith("hot shoe"):
+        called_utc_ns = tagger.called_utc_ns(pending.shot, pending.fired.called_monotonic_ns)
+        opened_utc_ns = pending.tag.utc_ns - round((pending.tag.exposure_s or 0.0) / 2 * 1e9)
         to_exposure = (opened_utc_ns - called_utc_ns) / 1e6
-    if "trigger to file" in story.ms and "trigger call" in story.ms:
-        to_file = story.ms["trigger call"] + story.ms["trigger to file"]
+    if "trigger to file" in pending.ms and "trigger call" in pending.ms:
+        to_file = pending.ms["trigger call"] + pending.ms["trigger to file"]
     return Latency(
-        story.ms.get("wish to trigger"), story.ms.get("trigger call"), to_exposure, to_file, story.ms.get("record")
+        pending.ms.get("wish to trigger"),
+        pending.ms.get("trigger call"),
+        to_exposure,
+        to_file,
+        pending.ms.get("record"),
     )

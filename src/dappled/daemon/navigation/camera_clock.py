@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from dappled.daemon.pipeline.tagger import Exposure
+from dappled.daemon.pipeline.tagger import ExposureTime
 
 _KEPT = 256
 _LEAST = 3
@@ -22,7 +22,7 @@ class CameraClock:
 
     shots: tuple[tuple[int, int, int], ...] = ()
 
-    def learnt(self, shown_ns: int, step_ns: int, exposure: Exposure) -> CameraClock:
+    def learnt(self, shown_ns: int, step_ns: int, exposure: ExposureTime) -> CameraClock:
         """With one more shot, whose begin is known otherwise. The last 256 count; only this one where it contradicts
         them: then the camera's clock was set in between."""
         offset_ns = shown_ns - (exposure.utc_ns - exposure.half_ns)
@@ -52,7 +52,9 @@ def _agree(shots: tuple[tuple[int, int, int], ...]) -> bool:
     return max(offsets) - min(offsets) <= step + 8 * sigma
 
 
-def exposure_from_camera(clock: CameraClock, shown_ns: int, step_ns: int, exposure_s: float | None) -> Exposure | None:
+def exposure_from_camera(
+    clock: CameraClock, shown_ns: int, step_ns: int, exposure_s: float | None
+) -> ExposureTime | None:
     """Mid-exposure by the camera's clock, the middle of the second (or `step_ns`) that it shows; None while its offset
     is not known."""
     offset = clock.offset_ns()
@@ -60,7 +62,7 @@ def exposure_from_camera(clock: CameraClock, shown_ns: int, step_ns: int, exposu
         return None
     half_ns = round((exposure_s or 0.0) / 2 * 1e9)
     sigma_ns = round(math.hypot(offset[1], step_ns / math.sqrt(12)))
-    return Exposure(shown_ns - offset[0] + step_ns // 2 + half_ns, sigma_ns, SOURCE, half_ns)
+    return ExposureTime(shown_ns - offset[0] + step_ns // 2 + half_ns, sigma_ns, SOURCE, half_ns)
 
 
 def shown(taken: str | None) -> tuple[int, int] | None:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from dappled.daemon.navigation.boot_clock import BootClock
-from dappled.daemon.pipeline.tagger import Exposure
+from dappled.daemon.pipeline.tagger import ExposureTime
 from dappled.drivers.mavlink.framing import Message
 
 CONTACT_SIGMA_NS = 1_000_000  # interrupt and contact bounce; the best bodies were measured at 0.56 ms
@@ -40,12 +40,12 @@ def boot_ns(message: Message, unix_minus_boot_ns: int | None) -> int | None:
     return None if unix_minus_boot_ns is None else time_us * 1000 - unix_minus_boot_ns
 
 
-def reach_ns(exposure: Exposure) -> int:
+def reach_ns(exposure: ExposureTime) -> int:
     """How far from its expected time an exposure may be seen."""
     return _REACH_SIGMAS * exposure.sigma_ns + _REACH_NS
 
 
-def choose(events: Sequence[Feedback], exposure: Exposure, clock: BootClock) -> Feedback | None:
+def choose(events: Sequence[Feedback], exposure: ExposureTime, clock: BootClock) -> Feedback | None:
     """The event of this exposure, or None where there is none.
 
     It is the one nearest to when the exposure was expected to begin, within 4 σ + 50 ms of that (σ of the body and of
@@ -71,7 +71,7 @@ def choose(events: Sequence[Feedback], exposure: Exposure, clock: BootClock) -> 
     return near[0][2]
 
 
-def refined(exposure: Exposure, event: Feedback, clock: BootClock) -> tuple[Exposure, int]:
+def refined(exposure: ExposureTime, event: Feedback, clock: BootClock) -> tuple[ExposureTime, int]:
     """The exposure as the hot shoe has it, and mid-exposure in time since boot."""
     middle_boot_ns = event.boot_ns + exposure.half_ns
     sigma_ns = round(math.hypot(CONTACT_SIGMA_NS, clock.sigma_ns))

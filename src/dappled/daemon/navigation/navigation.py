@@ -12,7 +12,7 @@ from dappled.config.settings import Settings
 from dappled.daemon.navigation.telemetry import Telemetry, UtcCorrection
 from dappled.daemon.navigation.utc import UtcLearner
 from dappled.daemon.navigation.vehicles import Vehicles
-from dappled.daemon.pipeline.tagger import Exposure
+from dappled.daemon.pipeline.tagger import ExposureTime
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Packet
 from dappled.flight.recording import Recording
@@ -55,7 +55,7 @@ class Navigation:
         again."""
         self.utc.look(self.telemetry.utc_correction())
 
-    def pose(self, index: int, exposure: Exposure) -> tuple[Exposure, Pose]:
+    def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
         """The pose once telemetry from after the exposure is there, or `pose.wait_ms` after it as it is then."""
         give_up_ns = min(exposure.utc_ns, self._clock.utc_ns() + AHEAD_NS) + round(self._settings().pose.wait_ms * 1e6)
         while not self.telemetry.settled(exposure) and self._clock.utc_ns() < give_up_ns:

@@ -16,7 +16,7 @@ from dappled.daemon.navigation import hot_shoe, pose
 from dappled.daemon.navigation.autopilot_time import TIMESYNC_WINDOW_NS
 from dappled.daemon.navigation.boot_clock import BootClock
 from dappled.daemon.navigation.vehicle_history import Counts, VehicleHistory
-from dappled.daemon.pipeline.tagger import Exposure
+from dappled.daemon.pipeline.tagger import ExposureTime
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Message
 
@@ -105,13 +105,13 @@ class Telemetry:
             clock = self._history.clock(self._packets)
             return clock is not None and self._history.reached(clock.boot_ns(utc_ns))
 
-    def settled(self, exposure: Exposure) -> bool:
+    def settled(self, exposure: ExposureTime) -> bool:
         """Whether waiting longer would not make this exposure's pose better: samples from after it are there; from an
         autopilot that tells of the hot shoe, also all that it could tell of this exposure."""
         later_ns = hot_shoe.reach_ns(exposure) if self._counts.feedbacks else 0
         return self.bracketed(exposure.utc_ns + later_ns)
 
-    def locate(self, exposure: Exposure, *, upto_packet: int | None = None) -> tuple[Exposure, Pose]:
+    def locate(self, exposure: ExposureTime, *, upto_packet: int | None = None) -> tuple[ExposureTime, Pose]:
         """When and where a frame was exposed, from the packets below `upto_packet` (all so far).
 
         Where the autopilot saw the hot shoe close, its word replaces the expectation (see `feedback`): that time is on

@@ -8,8 +8,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from dappled.daemon.pipeline.pending_shot import Book, Story, Watchers
-from dappled.daemon.pipeline.pending_shots import Stories
+from dappled.daemon.pipeline.pending_shot import FlightWriter, Observer, PendingShot
+from dappled.daemon.pipeline.pending_shots import PendingShots
 from dappled.drivers.camera import (
     Arrival,
     BodyState,
@@ -34,9 +34,14 @@ class Capture:
     is safe, or its file stays at the camera."""
 
     def __init__(
-        self, camera: Camera, book: Book, stories: Stories, watchers: Watchers, hand_on: Callable[[Story], object]
+        self,
+        camera: Camera,
+        book: FlightWriter,
+        shots: PendingShots,
+        watchers: Observer,
+        hand_on: Callable[[PendingShot], object],
     ) -> None:
-        self._camera, self._book, self._stories, self._watchers = camera, book, stories, watchers
+        self._camera, self._book, self._shots, self._watchers = camera, book, shots, watchers
         self._hand_on = hand_on
         self._unfired: deque[ShotFailed] = deque()
         self._stopping, self._give_up_at = threading.Event(), 0.0
@@ -44,7 +49,7 @@ class Capture:
         self.state: BodyState = "starting"
         self.reason = ""
 
-    def dead(self) -> list[str]:
+    def dead_threads(self) -> list[str]:
         """The thread's name where it has ended without being asked to: never, unless there is a bug."""
         return [] if self._stopping.is_set() or self._thread.is_alive() else [self._thread.name]
 
@@ -67,7 +72,7 @@ class Capture:
         self._stopping.set()
         if self._thread.is_alive():
             self._thread.join(timeout_s + 1)
-        self._stories.tell(self._camera.stop)
+        self._shots.tell(self._camera.stop)
         if not self._thread.is_alive():
             self._last_events()
 
@@ -76,14 +81,14 @@ class Capture:
             self._take(_LOOK_S)
 
     def _worth_waiting(self) -> bool:
-        return time.monotonic() < self._give_up_at and bool(self._stories.waiting())
+        return time.monotonic() < self._give_up_at and bool(self._shots.waiting())
 
     def _last_events(self) -> None:
         """What came while the camera was let go of; then every shot that is still open has failed."""
         until = time.monotonic() + _LAST_EVENTS_S
         while time.monotonic() < until and self._take(0.0):
             pass
-        for index in self._stories.waiting():
+        for index in self._shots.waiting():
             self._handle(ShotFailed(index, "the flight ended before its file came", time.monotonic_ns()))
 
     def _take(self, timeout_s: float) -> bool:
@@ -114,73 +119,73 @@ class Capture:
             elif isinstance(event, Deferred):
                 self._deferred(event)
             elif isinstance(event, SettingsChanged):
-                self._stories.tell(self._watchers.settings, event)
+                self._shots.tell(self._watchers.settings, event)
         except Exception as error:  # noqa: BLE001  # one event that goes wrong must not end the capture
             report(log, "capture", error)
 
     def _state_changed(self, change: StateChanged) -> None:
         self.state, self.reason = change.state, change.reason
         if not self._stopping.is_set():
-            self._stories.tell(self._watchers.camera, change)
+            self._shots.tell(self._watchers.camera, change)
 
     def _fired(self, event: Fired) -> None:
         self._book.fired(event)  # raises for a second time, or one after the file: the first word counts
-        if story := self._stories.in_hand(event.shot):
-            story.fired = event
-            story.ms["wish to trigger"] = (event.called_monotonic_ns - story.shot.wished_monotonic_ns) / 1e6
-            story.ms["trigger call"] = (event.returned_monotonic_ns - event.called_monotonic_ns) / 1e6
+        if pending := self._shots.in_hand(event.shot):
+            pending.fired = event
+            pending.ms["wish to trigger"] = (event.called_monotonic_ns - pending.shot.wished_monotonic_ns) / 1e6
+            pending.ms["trigger call"] = (event.returned_monotonic_ns - event.called_monotonic_ns) / 1e6
 
     def _shot_failed(self, index: int, reason: str) -> None:
-        story = self._stories.in_hand(index)
-        if story is not None and story.frame is not None:
-            self._stories.note("contradiction", f"its file is safe, and then the driver says: {reason}", index)
+        pending = self._shots.in_hand(index)
+        if pending is not None and pending.frame is not None:
+            self._shots.note("contradiction", f"its file is safe, and then the driver says: {reason}", index)
             return
         try:
             self._book.failed(index, reason)
         finally:
-            if story is not None:
-                self._stories.fail(story, reason)
+            if pending is not None:
+                self._shots.fail(pending, reason)
 
     def _arrived(self, arrival: Arrival) -> None:
         began = time.monotonic_ns()
         index = arrival.shot
-        story = None if index is None else self._stories.of_file(index)
+        pending = None if index is None else self._shots.of_file(index)
         try:
             frame = self._book.record(index, arrival.name, arrival.blob)
         except Exception as error:
             # The recorder has noted it as far as the disk lets it. A second file doesn't undo the first one.
-            if story is not None and story.frame is None and not story.over:
-                self._stories.fail(story, sentence(error))
+            if pending is not None and pending.frame is None and not pending.over:
+                self._shots.fail(pending, sentence(error))
             raise
         finally:
             arrival.blob.close()
-        self._stories.tell(self._camera.release, arrival)
-        if story is None or story.frame is not None:
+        self._shots.tell(self._camera.release, arrival)
+        if pending is None or pending.frame is not None:
             return
-        story = self._stories.safe(story, frame)
+        pending = self._shots.safe(pending, frame)
         if doubt := arrival.facts.get("doubt"):
-            story.doubt = str(doubt)
-            self._stories.note("doubt", story.doubt, frame.index)
-        if story.fired:
-            story.ms["trigger to file"] = (arrival.monotonic_ns - story.fired.returned_monotonic_ns) / 1e6
-        story.ms["record"] = (time.monotonic_ns() - began) / 1e6
-        self._stories.welcome(story, frame.index, arrival.name)
-        self._stories.tell(self._watchers.settled, frame.index, True)
-        self._hand_on(story)
+            pending.doubt = str(doubt)
+            self._shots.note("doubt", pending.doubt, frame.index)
+        if pending.fired:
+            pending.ms["trigger to file"] = (arrival.monotonic_ns - pending.fired.returned_monotonic_ns) / 1e6
+        pending.ms["record"] = (time.monotonic_ns() - began) / 1e6
+        self._shots.welcome(pending, frame.index, arrival.name)
+        self._shots.tell(self._watchers.settled, frame.index, True)
+        self._hand_on(pending)
 
     def _accompanied(self, companion: Companion) -> None:
         try:
             self._book.companion(companion.shot, companion.name, companion.blob)
         finally:
             companion.blob.close()
-        self._stories.tell(self._camera.release, companion)
+        self._shots.tell(self._camera.release, companion)
 
     def _deferred(self, event: Deferred) -> None:
         """The end of a shot whose file comes later: where it was exposed can be told now."""
         try:
             self._book.follows(event.shot, event.reason)
         finally:
-            story = self._stories.in_hand(event.shot)
-            if story is not None and story.frame is None:
-                self._stories.follow(story, event.reason)
-                self._hand_on(story)
+            pending = self._shots.in_hand(event.shot)
+            if pending is not None and pending.frame is None:
+                self._shots.follow(pending, event.reason)
+                self._hand_on(pending)

@@ -27,7 +27,7 @@ _Key = tuple[str, str, int | None, tuple[float, ...] | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class CaptureRequest:
     """Somebody wants a shot: one message, or one act.
 
     `source` is "mavlink:255/190", "console" …; `kind` the message or command; `sequence` the sender's own number,
@@ -65,7 +65,7 @@ class Recent:
     def __init__(self) -> None:
         self._wishes: list[_Remembered] = []
 
-    def same(self, wish: Wish, now_ns: int) -> int | None:
+    def same(self, wish: CaptureRequest, now_ns: int) -> int | None:
         """The image index of the shot that this wish already has; None for a new wish. Times are monotonic."""
         self._wishes = [w for w in self._wishes if now_ns - w.last_ns <= CONFIRMED_RETRY_NS][-_REMEMBERED:]
         found = self._retry(wish, now_ns) or self._part(wish, now_ns)
@@ -80,18 +80,18 @@ class Recent:
             )
         return found.index
 
-    def add(self, wish: Wish, now_ns: int, index: int) -> None:
+    def add(self, wish: CaptureRequest, now_ns: int, index: int) -> None:
         """A new wish became shot `index`."""
         parts = {(wish.kind, wish.link): wish.sequence}
         self._wishes.append(
             _Remembered(index, wish.source, wish.kind, wish.sequence, wish.series, now_ns, now_ns, parts)
         )
 
-    def forget(self, wish: Wish) -> None:
+    def forget(self, wish: CaptureRequest) -> None:
         """The next message like it is a new wish."""
         self._wishes = [known for known in self._wishes if known.key() != _key(wish)]
 
-    def _retry(self, wish: Wish, now_ns: int) -> _Remembered | None:
+    def _retry(self, wish: CaptureRequest, now_ns: int) -> _Remembered | None:
         if not wish.acknowledged and wish.sequence is None:
             return None
         for known in reversed(self._wishes):
@@ -103,7 +103,7 @@ class Recent:
             return known if recent else None
         return None
 
-    def _part(self, wish: Wish, now_ns: int) -> _Remembered | None:
+    def _part(self, wish: CaptureRequest, now_ns: int) -> _Remembered | None:
         if wish.series is not None:
             return None
         for known in self._wishes:
@@ -116,5 +116,5 @@ class Recent:
         return None
 
 
-def _key(wish: Wish) -> _Key:
+def _key(wish: CaptureRequest) -> _Key:
     return wish.source, wish.kind, wish.sequence, wish.series

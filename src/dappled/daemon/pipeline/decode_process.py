@@ -30,12 +30,12 @@ NICENESS = 10
 _LOOK_S = 0.1
 
 
-class DevelopmentError(DappledError):
+class DecodeProcessError(DappledError):
     """A frame can't be decoded; one sentence. The frame stays in the record."""
 
 
 @dataclass(frozen=True, slots=True)
-class Developed:
+class DecodedFrame:
     """What came out of a frame. `body` holds the arrays of `arrays` end to end, `sha256` is the body's.
 
     `carriers` are rows [ky, kx, fy, fx]; `grid` (2, 3) leads from (y, x, 1) of a slice to sensor (row, column).
@@ -73,10 +73,10 @@ class Developed:
 
 
 @dataclass(frozen=True, slots=True)
-class DepthFound:
+class FrameDepth:
     """Depth of one frame. `body` holds disparity and sigma, float32 (h, w) each, as `arrays` says; `range_px` the 2nd
-    and 98th percentile of the known disparities, None where none is known; `grid` as in Developed. `nearest_m` is the
-    nearest distance and its standard error, None where no calibration leads to metres or too little is known."""
+    and 98th percentile of the known disparities, None where none is known; `grid` as in DecodedFrame. `nearest_m` is
+    the nearest distance and its standard error, None where no calibration leads to metres or too little is known."""
 
     body: mmap.mmap
     arrays: list[dict[str, Any]]
@@ -86,14 +86,14 @@ class DepthFound:
     nearest_m: tuple[float, float] | None = None
 
 
-class Developer(Protocol):
+class FrameDecoder(Protocol):
     """What the street and the answers need."""
 
-    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> Developed:
-        """Decode the raw file at `path`. Raises DevelopmentError."""
+    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
+        """Decode the raw file at `path`. Raises DecodeProcessError."""
 
 
-class WorkerDeveloper:
+class DecodeProcess:
     """Decodes in a worker process, one frame at a time; a worker that dies or hangs is replaced.
 
     `timeout_s` bounds one frame. Threads may share it: they take turns. A worker that keeps dying is started six times
@@ -118,7 +118,7 @@ class WorkerDeveloper:
         self.restarts = 0
 
     def warm_up(self) -> None:
-        """Start the worker now, so that the first frame doesn't wait for it. Raises DevelopmentError for a recipe
+        """Start the worker now, so that the first frame doesn't wait for it. Raises DecodeProcessError for a recipe
         that can't work."""
         with self._turn:
             self._ask({"do": "warm up"})
@@ -130,18 +130,18 @@ class WorkerDeveloper:
     def _warm_up(self) -> None:
         try:
             self.warm_up()
-        except DevelopmentError as error:
+        except DecodeProcessError as error:
             log.warning("decoding will fail: %s", error)
 
-    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> Developed:
-        """See Developer."""
+    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
+        """See FrameDecoder."""
         with self._turn:
-            return _developed(
+            return _decoded(
                 self._ask({"do": "develop", "path": path, "focal_length_mm": focal_length_mm, "f_number": f_number})
             )
 
-    def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> DepthFound:
-        """Decode a frame with its views, and estimate its depth. Raises DevelopmentError."""
+    def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> FrameDepth:
+        """Decode a frame with its views, and estimate its depth. Raises DecodeProcessError."""
         facts = {"path": path, "focal_length_mm": focal_length_mm, "f_number": f_number, "method": method}
         with self._turn:
             answer = self._ask({"do": "depth", **facts})
@@ -153,7 +153,7 @@ class WorkerDeveloper:
         told = answer.body
         nearest = told["nearest_m"]
         pair = None if nearest is None else (float(nearest[0]), float(nearest[1]))
-        return DepthFound(body, told["arrays"], told["range_px"], told["grid"], told["law"], pair)
+        return FrameDepth(body, told["arrays"], told["range_px"], told["grid"], told["law"], pair)
 
     def close(self) -> None:
         """End the worker, also in the middle of a frame, which then is not decoded."""
@@ -167,7 +167,7 @@ class WorkerDeveloper:
 
     def _ask(self, question: Mapping[str, Any]) -> ChannelMessage:
         if self._closed:
-            raise DevelopmentError(f"{question.get('path', 'the recipe')} was not decoded: the decoder was stopped")
+            raise DecodeProcessError(f"{question.get('path', 'the recipe')} was not decoded: the decoder was stopped")
         if self._process is not None and self._process.poll() is not None:
             self._end()  # it died between two frames: neither is to blame
             self.restarts += 1
@@ -178,21 +178,21 @@ class WorkerDeveloper:
         except ChannelError:
             code = self._end()
             self.restarts += 1
-            raise DevelopmentError(f"the decoder died ({_manner(code)}) on {question.get('path', 'start')}") from None
+            raise DecodeProcessError(f"the decoder died ({_manner(code)}) on {question.get('path', 'start')}") from None
         except OSError as error:
             self._end()
-            raise DevelopmentError(f"the decoder's process can't be started: {error.strerror}") from None
+            raise DecodeProcessError(f"the decoder's process can't be started: {error.strerror}") from None
         if answer is None:
             self._end()
             self.restarts += 1
-            raise DevelopmentError(f"decoding {question.get('path', '')} took over {self._timeout_s:g} s: given up")
+            raise DecodeProcessError(f"decoding {question.get('path', '')} took over {self._timeout_s:g} s: given up")
         if "error" in answer.body:
-            raise DevelopmentError(str(answer.body["error"]))
+            raise DecodeProcessError(str(answer.body["error"]))
         return answer
 
     def _begin(self) -> ProcessChannel:
         if wait_ns := self._budget.wait_ns(self._clock_ns()):
-            raise DevelopmentError(
+            raise DecodeProcessError(
                 f"the decoder keeps dying: it starts again in {wait_ns / 1e9:.0f} s; frames stay in the record"
             )
         self._budget.spend(self._clock_ns())
@@ -224,7 +224,7 @@ def _manner(code: int | None) -> str:
     return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
 
 
-def _developed(answer: ChannelMessage) -> Developed:
+def _decoded(answer: ChannelMessage) -> DecodedFrame:
     facts = dict(answer.body)
     body_fd, preview_fd = answer.fds
     try:
@@ -233,7 +233,7 @@ def _developed(answer: ChannelMessage) -> Developed:
     finally:
         os.close(body_fd)
         os.close(preview_fd)
-    return Developed(
+    return DecodedFrame(
         body=body,
         sha256=facts["sha256"],
         arrays=facts["arrays"],

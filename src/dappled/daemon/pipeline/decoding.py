@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 
-from dappled.daemon.pipeline.decode_process import Developed, Developer
-from dappled.daemon.pipeline.pending_shot import Book, Story
-from dappled.daemon.pipeline.pending_shots import Stories
+from dappled.daemon.pipeline.decode_process import DecodedFrame, FrameDecoder
+from dappled.daemon.pipeline.pending_shot import FlightWriter, PendingShot
+from dappled.daemon.pipeline.pending_shots import PendingShots
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.headers import slices_header
 from dappled.daemon.stream.publisher import Publisher
@@ -19,37 +19,37 @@ class Decoding:
 
     def __init__(
         self,
-        book: Book,
-        stories: Stories,
-        developer: Developer,
+        book: FlightWriter,
+        shots: PendingShots,
+        developer: FrameDecoder,
         publisher: Publisher | None,
         preview_interval_s: float,
     ) -> None:
-        self._book, self._stories, self._developer, self._publisher = book, stories, developer, publisher
+        self._book, self._shots, self._developer, self._publisher = book, shots, developer, publisher
         self._preview_interval_s, self._last_preview_s = preview_interval_s, -1e9
 
-    def work(self, story: Story) -> None:
-        """Decode a tagged frame, enter the result, publish it: the end of its story. Raises DevelopmentError."""
-        frame, tag = story.frame, story.tag
+    def work(self, pending: PendingShot) -> None:
+        """Decode a tagged frame, enter the result, publish it: the end of its story. Raises DecodeProcessError."""
+        frame, tag = pending.frame, pending.tag
         assert frame is not None
         assert tag is not None
         began = time.monotonic_ns()
-        developed = self._developer.develop(self._book.path(frame), tag.focal_length_mm, tag.f_number)
-        story.developed = developed
-        self._book.decoded(developed.result(frame.index, (time.monotonic_ns() - began) / 1e6))
-        story.ms["decode"] = (time.monotonic_ns() - began) / 1e6
+        decoded = self._developer.develop(self._book.path(frame), tag.focal_length_mm, tag.f_number)
+        pending.decoded = decoded
+        self._book.decoded(decoded.result(frame.index, (time.monotonic_ns() - began) / 1e6))
+        pending.ms["decode"] = (time.monotonic_ns() - began) / 1e6
         began = time.monotonic_ns()
-        self._publish(tag, developed)
-        story.ms["publish"] = (time.monotonic_ns() - began) / 1e6
-        self._stories.finish(story)
+        self._publish(tag, decoded)
+        pending.ms["publish"] = (time.monotonic_ns() - began) / 1e6
+        self._shots.finish(pending)
 
-    def _publish(self, tag: Tag, developed: Developed) -> None:
+    def _publish(self, tag: Tag, decoded: DecodedFrame) -> None:
         if self._publisher is None:
             return
-        self._publisher.publish("slices", slices_header(tag, developed), developed.body)
+        self._publisher.publish("slices", slices_header(tag, decoded), decoded.body)
         now_s = time.monotonic()
-        if developed.preview and now_s - self._last_preview_s >= self._preview_interval_s:
+        if decoded.preview and now_s - self._last_preview_s >= self._preview_interval_s:
             self._last_preview_s = now_s
-            facts = wire.frame_facts(tag, developed.law)
-            size = {"width": developed.preview_size[0], "height": developed.preview_size[1]}
-            self._publisher.publish("preview", {**facts, "media_type": "image/jpeg", **size}, developed.preview)
+            facts = wire.frame_facts(tag, decoded.law)
+            size = {"width": decoded.preview_size[0], "height": decoded.preview_size[1]}
+            self._publisher.publish("preview", {**facts, "media_type": "image/jpeg", **size}, decoded.preview)

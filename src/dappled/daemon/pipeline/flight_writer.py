@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 _LATER = 1000
 
 
-class LiveBook:
+class LedgerWriter:
     """Writes one flight. A wish's row is written with the first event of its shot: until then the wish journal holds
     it, so that firing never waits for the database."""
 
@@ -37,26 +37,26 @@ class LiveBook:
             self._wished[shot.index] = shot
 
     def frame(self, index: int) -> Frame | None:
-        """See Book."""
+        """See FlightWriter."""
         return self._recording.ledger.frame(index)
 
     def tag(self, index: int) -> Tag | None:
-        """See Book."""
+        """See FlightWriter."""
         return self._recording.ledger.tag(index)
 
     def fired(self, event: Fired) -> None:
-        """See Book."""
+        """See FlightWriter."""
         self._enter(event.shot)
         self._recording.ledger.fired(event.shot, event.called_monotonic_ns, event.returned_monotonic_ns)
 
     def failed(self, index: int, reason: str) -> None:
-        """See Book."""
+        """See FlightWriter."""
         self._enter(index)
         self._recording.ledger.failed(index, reason)
         self._index(index)
 
     def record(self, index: int | None, name: str, blob: Blob) -> Frame:
-        """See Book. A file that belongs to no shot is kept as a stray, and told as an error."""
+        """See FlightWriter. A file that belongs to no shot is kept as a stray, and told as an error."""
         arrived_utc_ns = self._clock.utc_ns()
         recorder = self._recording.recorder
         if index is None:
@@ -69,30 +69,30 @@ class LiveBook:
         return frame
 
     def follows(self, index: int, reason: str) -> None:
-        """See Book."""
+        """See FlightWriter."""
         self._enter(index)
         self._recording.ledger.follows(index, reason)
         self._index(index)
 
     def companion(self, index: int, name: str, blob: Blob) -> None:
-        """See Book."""
+        """See FlightWriter."""
         recorder = self._recording.recorder
         recorder.record_companion(index, name, blob, arrived_utc_ns=self._clock.utc_ns())
 
     def path(self, frame: Frame) -> str:
-        """See Book."""
+        """See FlightWriter."""
         return str(self._recording.folder.path / frame.name)
 
     def tagged(self, tag: Tag) -> None:
-        """See Book."""
+        """See FlightWriter."""
         self._recording.ledger.add_tag(tag)
 
     def decoded(self, result: Result) -> None:
-        """See Book."""
+        """See FlightWriter."""
         self._recording.ledger.add_result(result)
 
     def event(self, kind: str, text: str, index: int | None = None) -> None:
-        """See Book."""
+        """See FlightWriter."""
         self._recording.ledger.add_event(kind, text, index)
 
     def later(self, kind: str, text: str) -> None:
@@ -142,7 +142,7 @@ class Expected:
         return self.slices_sha256 is None and "not decoded" in self.told
 
 
-class ReplayBook:
+class ReplayVerifier:
     """Holds what comes down the street against what was recorded. `differences` are sentences.
 
     `keep`, where given, takes the results of another recipe, which are not compared; else nothing is written.
@@ -158,24 +158,24 @@ class ReplayBook:
         self.differences: list[str] = []
 
     def frame(self, index: int) -> Frame | None:
-        """See Book."""
+        """See FlightWriter."""
         one = self._expected.get(index)
         return None if one is None else one.frame
 
     def tag(self, index: int) -> Tag | None:
-        """See Book."""
+        """See FlightWriter."""
         return self._tags.get(index)
 
     def fired(self, event: Fired) -> None:
-        """See Book."""
+        """See FlightWriter."""
 
     def failed(self, index: int, reason: str) -> None:
-        """See Book."""
+        """See FlightWriter."""
         if self._expected[index].frame is not None:
             self.differences.append(f"frame {index}: {reason}")
 
     def record(self, index: int | None, name: str, blob: Blob) -> Frame:
-        """See Book: the file is where it was; its bytes are hashed again."""
+        """See FlightWriter: the file is where it was; its bytes are hashed again."""
         frame = None if index is None else self._expected[index].frame
         if index is None or frame is None:
             raise DappledError(f"{name} belongs to no recorded frame")
@@ -185,24 +185,24 @@ class ReplayBook:
         return frame
 
     def follows(self, index: int, reason: str) -> None:
-        """See Book: the file has come by now, or it is replayed as failed."""
+        """See FlightWriter: the file has come by now, or it is replayed as failed."""
 
     def companion(self, index: int, name: str, blob: Blob) -> None:
-        """See Book: a replay brings frames only."""
+        """See FlightWriter: a replay brings frames only."""
 
     def path(self, frame: Frame) -> str:
-        """See Book."""
+        """See FlightWriter."""
         return str(self.root / frame.name)
 
     def tagged(self, tag: Tag) -> None:
-        """See Book."""
+        """See FlightWriter."""
         one = self._expected[tag.index]
         self._tags[tag.index] = tag
         self._compare(tag.index, "pose", one.pose_sha256, digest(tag.pose))
         self._compare(tag.index, "tag", one.tag_sha256, digest(tag))
 
     def decoded(self, result: Result) -> None:
-        """See Book."""
+        """See FlightWriter."""
         if self._keep is not None:
             self._keep(result)
             self._seen[result.index].add("slices")
@@ -214,7 +214,7 @@ class ReplayBook:
             self._compare(result.index, "slices", one.slices_sha256, result.slices_sha256)
 
     def event(self, kind: str, text: str, index: int | None = None) -> None:
-        """See Book. What was told of the shot in the flight too is no difference."""
+        """See FlightWriter. What was told of the shot in the flight too is no difference."""
         if index is not None and kind in self._expected[index].told:
             return
         self.differences.append(f"frame {index}: {kind}: {text}" if index is not None else f"{kind}: {text}")

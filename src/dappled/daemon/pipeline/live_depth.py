@@ -6,19 +6,19 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from dappled.daemon.pipeline.decode_process import DepthFound
-from dappled.daemon.pipeline.pending_shot import Story
+from dappled.daemon.pipeline.decode_process import FrameDepth
+from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.daemon.stream import wire
-from dappled.workers import Stage, Statistics
+from dappled.workers import Statistics, Worker
 
 Publish = Callable[[str, Mapping[str, Any], Any], None]
 
 
 class DepthMaker(Protocol):
-    """What makes depth of a recorded frame: `WorkerDeveloper`."""
+    """What makes depth of a recorded frame: `DecodeProcess`."""
 
-    def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> DepthFound:
-        """Raises DevelopmentError."""
+    def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> FrameDepth:
+        """Raises DecodeProcessError."""
 
     def close(self) -> None:
         """End, also in the middle of a frame."""
@@ -34,7 +34,7 @@ class LiveDepth:
         *,
         method: str,
         interval_s: float,
-        path: Callable[[Story], str],
+        path: Callable[[PendingShot], str],
         publish: Publish,
         give_way: Callable[[], object] = lambda: None,
         tell: Callable[[tuple[float, float]], object] = lambda _: None,
@@ -46,7 +46,7 @@ class LiveDepth:
         self._path, self._publish, self._give_way, self._clock = path, publish, give_way, clock
         self._tell = tell
         self._last_s = -1e9
-        self._stage: Stage[Story] = Stage("depth", self._work, capacity=1, policy="drop oldest")
+        self._stage: Worker[PendingShot] = Worker("depth", self._work, capacity=1, policy="drop oldest")
 
     def start(self) -> None:
         """Begin to work."""
@@ -57,26 +57,26 @@ class LiveDepth:
         self._stage.stop(0.5)
         self._maker.close()
 
-    def dead(self) -> list[str]:
-        """See `Stage.dead`."""
-        return self._stage.dead()
+    def dead_threads(self) -> list[str]:
+        """See `Worker.dead_threads`."""
+        return self._stage.dead_threads()
 
-    def offer(self, story: Story) -> None:
+    def offer(self, pending: PendingShot) -> None:
         """A frame is finished; taken where one is due and it was decoded."""
         now_s = self._clock()
-        if story.developed is not None and now_s - self._last_s >= self._interval_s:
+        if pending.decoded is not None and now_s - self._last_s >= self._interval_s:
             self._last_s = now_s
-            self._stage.put(story)
+            self._stage.put(pending)
 
     def statistics(self) -> Statistics:
         """Counters."""
         return self._stage.statistics()
 
-    def _work(self, story: Story) -> None:
-        tag = story.tag
+    def _work(self, pending: PendingShot) -> None:
+        tag = pending.tag
         assert tag is not None  # decoded frames have one
         self._give_way()
-        found = self._maker.depth(self._path(story), tag.focal_length_mm, tag.f_number, self._method)
+        found = self._maker.depth(self._path(pending), tag.focal_length_mm, tag.f_number, self._method)
         facts = wire.frame_facts(tag, found.law)
         header = {
             **facts,

@@ -6,15 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from dappled.daemon.pipeline.decode_process import Developed
-from dappled.daemon.pipeline.tagger import Exposure
+from dappled.daemon.pipeline.decode_process import DecodedFrame
+from dappled.daemon.pipeline.tagger import ExposureTime
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.camera import Blob, Fired, SettingsChanged, StateChanged
 from dappled.flight.entries import Result
 from dappled.flight.records import Frame, Shot, Tag
 
 
-class Book(Protocol):
+class FlightWriter(Protocol):
     """What the street writes down, or, in a replay, compares. Raises FlightError where it can't."""
 
     def frame(self, index: int) -> Frame | None:
@@ -52,11 +52,11 @@ class Book(Protocol):
 
 
 # (image index, exposure as expected) → exposure as known better, and its pose; waits, bounded
-PoseSource = Callable[[int, Exposure], tuple[Exposure, Pose]]
+PoseSource = Callable[[int, ExposureTime], tuple[ExposureTime, Pose]]
 
 
 @dataclass(slots=True)
-class Story:
+class PendingShot:
     """One shot on its way down the street, for those who watch: filled in as it goes. Times in milliseconds.
 
     `over`: its watchers were told that it is finished. `follows` says, for a shot whose file stays at the camera, how
@@ -67,11 +67,11 @@ class Story:
     fired: Fired | None = None
     frame: Frame | None = None
     tag: Tag | None = None
-    developed: Developed | None = None
+    decoded: DecodedFrame | None = None
     problem: str = ""
     doubt: str = ""
     follows: str = ""
-    where: tuple[Exposure, Pose] | None = None
+    where: tuple[ExposureTime, Pose] | None = None
     ms: dict[str, float] = field(default_factory=dict)
     over: bool = False
 
@@ -82,14 +82,14 @@ class Story:
 
 
 @dataclass(frozen=True, slots=True)
-class Watchers:
+class Observer:
     """Who is told what: `settled` when a shot is safe (True) or failed, `tagged` when its tag is known or there will be
     none, `finished` once, when nothing more is expected of it, `camera` at every change of the camera's state,
     `settings` at every change of its settings."""
 
     settled: Callable[[int, bool], None] = lambda index, ok: None
-    tagged: Callable[[Story], None] = lambda story: None
-    finished: Callable[[Story], None] = lambda story: None
+    tagged: Callable[[PendingShot], None] = lambda pending: None
+    finished: Callable[[PendingShot], None] = lambda pending: None
     camera: Callable[[StateChanged], None] = lambda change: None
     settings: Callable[[SettingsChanged], None] = lambda change: None
 

@@ -232,8 +232,8 @@ def _accompany(recorder: Recorder, source: Source, index: int, found: Found, utc
         blob.close()
 
 
-def _settings(path: Path) -> tagger.Settings:
+def _settings(path: Path) -> tagger.FrameSettings:
     try:
-        return tagger.Settings.of(reading.read_metadata(path))
+        return tagger.FrameSettings.of(reading.read_metadata(path))
     except DappledError:
-        return tagger.Settings()  # a frame that nobody can read is a frame all the same
+        return tagger.FrameSettings()  # a frame that nobody can read is a frame all the same

@@ -10,44 +10,44 @@ import time
 from collections.abc import Callable
 
 from dappled.daemon.pipeline.capture import Capture
-from dappled.daemon.pipeline.decode_process import Developer
+from dappled.daemon.pipeline.decode_process import FrameDecoder
 from dappled.daemon.pipeline.decoding import Decoding
-from dappled.daemon.pipeline.pending_shot import Book, Names, PoseSource, Story, Watchers
-from dappled.daemon.pipeline.pending_shots import Stories
+from dappled.daemon.pipeline.pending_shot import FlightWriter, Names, Observer, PendingShot, PoseSource
+from dappled.daemon.pipeline.pending_shots import PendingShots
 from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.pipeline.tagging import Tagging
 from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import BodyState, Camera
 from dappled.errors import sentence
 from dappled.flight.records import Shot
-from dappled.workers import Stage
+from dappled.workers import Worker
 
 _TAG_QUEUE = 1000
 
 
-class Street:
+class Pipeline:
     """Runs the stages. `developer` None: frames are recorded and tagged, and decoded later."""
 
     def __init__(
         self,
         *,
         camera: Camera,
-        book: Book,
+        book: FlightWriter,
         poses: PoseSource,
-        developer: Developer | None,
+        developer: FrameDecoder | None,
         publisher: Publisher | None,
         latency: BodyLatency,
         names: Names,
-        watchers: Watchers,
+        watchers: Observer,
         decode_queue: int,
         preview_interval_s: float = 0.0,
     ) -> None:
         self._decodes = developer is not None
         self.decoding = self._decodes  # off: frames are recorded and tagged, and decoded on the ground
-        self._stories = Stories(book, watchers)
+        self._shots = PendingShots(book, watchers)
         tagging = Tagging(
             book,
-            self._stories,
+            self._shots,
             watchers,
             publisher,
             poses=poses,
@@ -55,22 +55,22 @@ class Street:
             names=names,
             hand_on=self._tagged,
         )
-        decoding = developer and Decoding(book, self._stories, developer, publisher, preview_interval_s)
-        self._tag: Stage[Story] = Stage(
+        decoding = developer and Decoding(book, self._shots, developer, publisher, preview_interval_s)
+        self._tag: Worker[PendingShot] = Worker(
             "tag",
             tagging.work,
             capacity=_TAG_QUEUE,
-            on_failure=lambda story, error: tagging.failed(story, sentence(error)),
+            on_failure=lambda pending, error: tagging.failed(pending, sentence(error)),
             on_drop=self._dropped("not tagged"),
         )
-        self._decode: Stage[Story] = Stage(
+        self._decode: Worker[PendingShot] = Worker(
             "decode",
-            decoding.work if decoding else self._stories.finish,
+            decoding.work if decoding else self._shots.finish,
             capacity=decode_queue,
-            on_failure=lambda story, error: self._stories.leave(story, "not decoded", sentence(error)),
+            on_failure=lambda pending, error: self._shots.leave(pending, "not decoded", sentence(error)),
             on_drop=self._dropped("not decoded"),
         )
-        self._capture = Capture(camera, book, self._stories, watchers, self._tag.put)
+        self._capture = Capture(camera, book, self._shots, watchers, self._tag.put)
         self.stages = (self._tag, self._decode)
 
     def start(self) -> None:
@@ -89,7 +89,7 @@ class Street:
 
     def expect(self, shot: Shot) -> None:
         """A shot was wished for and written down; `fire` follows."""
-        self._stories.expect(shot)
+        self._shots.expect(shot)
 
     def fire(self, index: int) -> None:
         """Hand an expected shot to the camera. Never raises: a shot that the driver won't take has failed."""
@@ -105,9 +105,9 @@ class Street:
         """Why it is in that state; "" where there is nothing to say."""
         return self._capture.reason
 
-    def dead(self) -> list[str]:
+    def dead_threads(self) -> list[str]:
         """Which of the street's threads have ended without being asked to: none, unless there is a bug."""
-        return [name for part in (self._capture, *self.stages) for name in part.dead()]
+        return [name for part in (self._capture, *self.stages) for name in part.dead_threads()]
 
     def decoding_idle(self, timeout_s: float = 5.0) -> bool:
         """Whether no frame waits to be decoded, at the latest after `timeout_s`."""
@@ -115,17 +115,17 @@ class Street:
 
     def in_hand(self, index: int) -> bool:
         """Whether a shot is still on its way down the street, and not tagged yet."""
-        story = self._stories.in_hand(index)
-        return story is not None and story.tag is None
+        pending = self._shots.in_hand(index)
+        return pending is not None and pending.tag is None
 
-    def _tagged(self, story: Story) -> None:
+    def _tagged(self, pending: PendingShot) -> None:
         if self.decoding:
-            self._decode.put(story)
+            self._decode.put(pending)
         else:
             if self._decodes:
-                self._stories.note("not decoded", "decoding was switched off", story.shot.index)
-            self._stories.finish(story)
+                self._shots.note("not decoded", "decoding was switched off", pending.shot.index)
+            self._shots.finish(pending)
 
-    def _dropped(self, what: str) -> Callable[[Story], None]:
+    def _dropped(self, what: str) -> Callable[[PendingShot], None]:
         why = "the queue was full, or the flight ended; the frame is in the record"
-        return lambda story: self._stories.leave(story, what, why)
+        return lambda pending: self._shots.leave(pending, what, why)

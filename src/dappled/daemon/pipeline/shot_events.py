@@ -11,7 +11,7 @@ from dappled.daemon.camera_protocol.component import CameraFacts, Component
 from dappled.daemon.health import battery
 from dappled.daemon.health.logbook import Logbook, of_story
 from dappled.daemon.pipeline.live_depth import LiveDepth
-from dappled.daemon.pipeline.pending_shot import Story, Watchers
+from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Identity, SettingsChanged, StateChanged
 from dappled.drivers.mavlink.links import mavlink
@@ -21,7 +21,7 @@ from dappled.flight.recording import Recording
 log = logging.getLogger(__name__)
 
 
-class Herald:
+class ShotEvents:
     """Tells everybody; remembers which camera it is and how its lens stood last, for a ground station that asks.
 
     `utc_ns` puts a stamp of this flight right, None while that can't be done. `outside` hears last.
@@ -36,7 +36,7 @@ class Herald:
         logbook: Logbook,
         *,
         utc_ns: Callable[[int], int | None],
-        outside: Watchers,
+        outside: Observer,
         depth: LiveDepth | None,
     ) -> None:
         self._settings, self._recording, self._shutter, self._component = settings, recording, shutter, component
@@ -46,9 +46,9 @@ class Herald:
         self._chip = ground_facts.chip(settings, "")
         self._battery_doubt: str | None = None
 
-    def watchers(self) -> Watchers:
+    def watchers(self) -> Observer:
         """For the street."""
-        return Watchers(self._settled, self._tagged, self._finished, self._camera_changed, self._settings_changed)
+        return Observer(self._settled, self._tagged, self._finished, self._camera_changed, self._settings_changed)
 
     def facts(self) -> CameraFacts:
         """The camera as it is known by now."""
@@ -62,24 +62,24 @@ class Herald:
         self._shutter.settled(index, ok)
         self._outside.settled(index, ok)
 
-    def _tagged(self, story: Story) -> None:
-        captured = ground_facts.of_story(story, self._utc_ns)
+    def _tagged(self, pending: PendingShot) -> None:
+        captured = ground_facts.of_story(pending, self._utc_ns)
         self._component.announce(captured)
         if not captured.ok:
-            self._component.say(f"image {story.shot.index} failed: {story.problem}", mavlink.MAV_SEVERITY_ERROR)
-        if story.tag is not None:
-            before_mm, now_mm = self._focal_length_mm, story.tag.focal_length_mm
+            self._component.say(f"image {pending.shot.index} failed: {pending.problem}", mavlink.MAV_SEVERITY_ERROR)
+        if pending.tag is not None:
+            before_mm, now_mm = self._focal_length_mm, pending.tag.focal_length_mm
             if before_mm and now_mm and before_mm != now_mm:
-                text = f"image {story.shot.index} was zoomed from {before_mm:g} to {now_mm:g} mm: is it calibrated?"
+                text = f"image {pending.shot.index} was zoomed from {before_mm:g} to {now_mm:g} mm: is it calibrated?"
                 self._component.say(text)
             self._focal_length_mm = now_mm or before_mm
-        self._outside.tagged(story)
+        self._outside.tagged(pending)
 
-    def _finished(self, story: Story) -> None:
-        self._logbook.add(*of_story(story))
+    def _finished(self, pending: PendingShot) -> None:
+        self._logbook.add(*of_story(pending))
         if self._depth is not None:
-            self._depth.offer(story)
-        self._outside.finished(story)
+            self._depth.offer(pending)
+        self._outside.finished(pending)
 
     def _camera_changed(self, change: StateChanged) -> None:
         log.debug("camera %s %s", change.state, change.reason)  # whoever runs the daemon says it in words

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from dappled.clock import Clock
-from dappled.daemon.pipeline.capture_requests import Recent, Wish
+from dappled.daemon.pipeline.capture_requests import CaptureRequest, Recent
 from dappled.errors import report
 from dappled.flight.errors import FlightError
 from dappled.flight.records import Cause, Shot
 
-__all__ = ["Shutter", "ShutterStatistics", "Verdict", "Wish"]
+__all__ = ["CaptureRequest", "ShotDecision", "Shutter", "ShutterStatistics"]
 
 log = logging.getLogger(__name__)
 _IDLE_S = 3600.0
@@ -24,7 +24,7 @@ _AGAIN_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ShotDecision:
     """What became of a wish: a new shot, a message more of a known shot, or nothing. `reason` is a sentence."""
 
     outcome: Literal["shot", "duplicate", "refused"]
@@ -61,7 +61,7 @@ class _Interval:
     interval_ns: int
     left: int | None
     due_ns: int
-    command: Wish
+    command: CaptureRequest
     taken: int = 1
 
 
@@ -88,7 +88,7 @@ class Shutter:
         capacity: int = 8,
         obstacle: Callable[[], str | None] = lambda: None,
         on_change: Callable[[], None] = lambda: None,
-        on_refused: Callable[[tuple[Wish, str]], None] = lambda refused: None,
+        on_refused: Callable[[tuple[CaptureRequest, str]], None] = lambda refused: None,
     ) -> None:
         self._next_index = next_index
         self._note = note
@@ -120,18 +120,18 @@ class Shutter:
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join(2.0)
 
-    def dead(self) -> list[str]:
+    def dead_threads(self) -> list[str]:
         """The thread's name where it has ended without being asked to: never, unless there is a bug."""
         return [] if self._stopped or self._thread.is_alive() else [self._thread.name]
 
-    def wish(self, wish: Wish) -> Verdict:
+    def wish(self, wish: CaptureRequest) -> ShotDecision:
         """One message that asks for one shot."""
         with self._lock:
             verdict = self._judge(wish)
         self._on_change()
         return verdict
 
-    def start_interval(self, wish: Wish, interval_s: float, count: int) -> Verdict:
+    def start_interval(self, wish: CaptureRequest, interval_s: float, count: int) -> ShotDecision:
         """A shot now and then every `interval_s` (0: as soon as the last one is settled, or a second after one that was
         refused), `count` in all, 0 for ever.
 
@@ -185,7 +185,7 @@ class Shutter:
             if interval is None or (interval.interval_ns == 0 and self._pending):
                 return _IDLE_S
             if now_ns >= interval.due_ns:
-                verdict = self._judge(Wish(interval.source, "interval", interval.taken, acknowledged=False))
+                verdict = self._judge(CaptureRequest(interval.source, "interval", interval.taken, acknowledged=False))
                 taken = True
                 interval.taken += 1
                 if interval.left is not None:
@@ -223,14 +223,14 @@ class Shutter:
             self._recent.forget(self._interval.command)
         self._interval = None
 
-    def _judge(self, wish: Wish) -> Verdict:
+    def _judge(self, wish: CaptureRequest) -> ShotDecision:
         self._wishes += 1
         now_ns = self._clock.monotonic_ns()
         if wish.kind != "interval":
             known = self._recent.same(wish, now_ns)
             if known is not None:
                 self._duplicates += 1
-                return Verdict("duplicate", index=known)
+                return ShotDecision("duplicate", index=known)
         reason = self._why_not()
         if reason is None:
             shot = Shot(self._next_index, Cause(wish.source, wish.kind, wish.sequence), self._clock.utc_ns(), now_ns)
@@ -252,13 +252,13 @@ class Shutter:
             self._pending.discard(shot.index)
             self._failed += 1
             raise
-        return Verdict("shot", index=shot.index)
+        return ShotDecision("shot", index=shot.index)
 
-    def _refuse(self, wish: Wish, reason: str) -> Verdict:
+    def _refuse(self, wish: CaptureRequest, reason: str) -> ShotDecision:
         self._refused += 1
         self._on_refused((wish, reason))
         log.warning("A shot was refused (%s, %s): %s", wish.source, wish.kind, reason)
-        return Verdict("refused", reason=reason)
+        return ShotDecision("refused", reason=reason)
 
     def _why_not(self) -> str | None:
         if self._stopped:

@@ -31,7 +31,7 @@ class BodyLatency:
 
 
 @dataclass(frozen=True, slots=True)
-class Exposure:
+class ExposureTime:
     """Mid-exposure in UTC with its 1 σ, and how that was had.
 
     `half_ns` is half the exposure as far as known. `called_utc_ns` is when the trigger call was made: nothing exposes
@@ -46,7 +46,7 @@ class Exposure:
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class FrameSettings:
     """What the file says of the exposure; None where it doesn't. `taken` is the camera's own time (see EXIF)."""
 
     focal_length_mm: float | None = None
@@ -83,10 +83,10 @@ def called_utc_ns(shot: Shot, called_monotonic_ns: int) -> int:
     return called_monotonic_ns + shot.wished_utc_ns - shot.wished_monotonic_ns
 
 
-def mid_exposure(fired_utc_ns: int, latency: BodyLatency, exposure_s: float | None) -> Exposure:
+def mid_exposure(fired_utc_ns: int, latency: BodyLatency, exposure_s: float | None) -> ExposureTime:
     """The trigger call's time plus the body's latency plus half the exposure (none, where it is not known)."""
     half_ns = round((exposure_s or 0.0) / 2 * 1e9)
-    return Exposure(
+    return ExposureTime(
         fired_utc_ns + round(latency.mean_ms * 1e6) + half_ns,
         round(latency.sigma_ms * 1e6),
         latency.source,
@@ -95,7 +95,9 @@ def mid_exposure(fired_utc_ns: int, latency: BodyLatency, exposure_s: float | No
     )
 
 
-def by_wish(wished_utc_ns: int, arrived_utc_ns: int | None, latency: BodyLatency, exposure_s: float | None) -> Exposure:
+def by_wish(
+    wished_utc_ns: int, arrived_utc_ns: int | None, latency: BodyLatency, exposure_s: float | None
+) -> ExposureTime:
     """The wish's time plus the body's latency, where nobody saw the trigger call.
 
     The call may have come at any time up to the file's arrival: that goes into sigma, as an even chance from 0 on.
@@ -106,7 +108,7 @@ def by_wish(wished_utc_ns: int, arrived_utc_ns: int | None, latency: BodyLatency
     return replace(exposure, sigma_ns=sigma_ns, source=WISH_SOURCE)
 
 
-def tag(frame: Frame, exposure: Exposure, settings: Settings, *, camera: str, mask: str, pose: Pose) -> Tag:
+def tag(frame: Frame, exposure: ExposureTime, settings: FrameSettings, *, camera: str, mask: str, pose: Pose) -> Tag:
     """All that is known of a frame, in one record."""
     return Tag(
         index=frame.index,

@@ -10,9 +10,9 @@ from dataclasses import replace
 from dappled.daemon.navigation import camera_clock
 from dappled.daemon.navigation.camera_clock import CameraClock
 from dappled.daemon.pipeline import tagger
-from dappled.daemon.pipeline.pending_shot import Book, Names, PoseSource, Story, Watchers
-from dappled.daemon.pipeline.pending_shots import Stories
-from dappled.daemon.pipeline.tagger import BodyLatency, Exposure, Zoom
+from dappled.daemon.pipeline.pending_shot import FlightWriter, Names, Observer, PendingShot, PoseSource
+from dappled.daemon.pipeline.pending_shots import PendingShots
+from dappled.daemon.pipeline.tagger import BodyLatency, ExposureTime, Zoom
 from dappled.daemon.stream.headers import frame_header
 from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.raw import reading
@@ -28,75 +28,75 @@ class Tagging:
 
     def __init__(
         self,
-        book: Book,
-        stories: Stories,
-        watchers: Watchers,
+        book: FlightWriter,
+        shots: PendingShots,
+        watchers: Observer,
         publisher: Publisher | None,
         *,
         poses: PoseSource,
         latency: BodyLatency,
         names: Names,
-        hand_on: Callable[[Story], object],
+        hand_on: Callable[[PendingShot], object],
     ) -> None:
-        self._book, self._stories, self._watchers, self._publisher = book, stories, watchers, publisher
+        self._book, self._shots, self._watchers, self._publisher = book, shots, watchers, publisher
         self._poses, self._latency, self._names, self._hand_on = poses, latency, names, hand_on
         self._zoom = Zoom()
         self._camera_clock = CameraClock()
 
-    def work(self, story: Story) -> None:
+    def work(self, pending: PendingShot) -> None:
         """Tag a story's frame. Where its file stays at the camera, tell where it was exposed, and end it."""
-        if story.frame is None:
-            story.where = self._poses(story.shot.index, self._expected(story, tagger.Settings()))
-            self._stories.tell(self._watchers.tagged, story)
-            self._stories.finish(story)
+        if pending.frame is None:
+            pending.where = self._poses(pending.shot.index, self._expected(pending, tagger.FrameSettings()))
+            self._shots.tell(self._watchers.tagged, pending)
+            self._shots.finish(pending)
             return
-        self._tag(story, story.frame)
-        self._hand_on(story)
+        self._tag(pending, pending.frame)
+        self._hand_on(pending)
 
-    def failed(self, story: Story, why: str) -> None:
+    def failed(self, pending: PendingShot, why: str) -> None:
         """A frame that can't be tagged."""
-        self._stories.tell(self._watchers.tagged, story)
-        self._stories.leave(story, "not tagged", why)
+        self._shots.tell(self._watchers.tagged, pending)
+        self._shots.leave(pending, "not tagged", why)
 
-    def _tag(self, story: Story, frame: Frame) -> None:
+    def _tag(self, pending: PendingShot, frame: Frame) -> None:
         began = time.monotonic_ns()
         settings = self._settings(frame)
         if zoomed := self._zoom.look(frame.index, settings.focal_length_mm):
             log.warning("zoom: %s", zoomed)
-            self._stories.note("zoom", zoomed, frame.index)
-        exposure, pose = self._poses(frame.index, self._expected(story, settings))
+            self._shots.note("zoom", zoomed, frame.index)
+        exposure, pose = self._poses(frame.index, self._expected(pending, settings))
         # A file that may be another shot's would teach another shot's time.
-        if story.fired and not story.doubt and (told := camera_clock.shown(settings.taken)):
+        if pending.fired and not pending.doubt and (told := camera_clock.shown(settings.taken)):
             self._camera_clock = self._camera_clock.learnt(*told, exposure)
-        if story.doubt:
-            exposure = replace(exposure, source=f"{exposure.source}; in doubt: {story.doubt}")
+        if pending.doubt:
+            exposure = replace(exposure, source=f"{exposure.source}; in doubt: {pending.doubt}")
         camera = camera_name(self._names.camera, settings.model)
-        story.tag = tagger.tag(frame, exposure, settings, camera=camera, mask=self._names.mask, pose=pose)
-        self._book.tagged(story.tag)
-        story.ms["tag"] = (time.monotonic_ns() - began) / 1e6
-        self._stories.tell(self._watchers.tagged, story)
+        pending.tag = tagger.tag(frame, exposure, settings, camera=camera, mask=self._names.mask, pose=pose)
+        self._book.tagged(pending.tag)
+        pending.ms["tag"] = (time.monotonic_ns() - began) / 1e6
+        self._shots.tell(self._watchers.tagged, pending)
         if self._publisher:
-            self._publisher.publish("frame", frame_header(story.tag, frame, self._names.law or None))
+            self._publisher.publish("frame", frame_header(pending.tag, frame, self._names.law or None))
 
-    def _settings(self, frame: Frame) -> tagger.Settings:
+    def _settings(self, frame: Frame) -> tagger.FrameSettings:
         try:
-            return tagger.Settings.of(reading.read_metadata(self._book.path(frame)))
+            return tagger.FrameSettings.of(reading.read_metadata(self._book.path(frame)))
         except DappledError as error:
-            self._stories.note("unreadable", str(error), frame.index)
-            return tagger.Settings()
+            self._shots.note("unreadable", str(error), frame.index)
+            return tagger.FrameSettings()
 
-    def _expected(self, story: Story, settings: tagger.Settings) -> Exposure:
+    def _expected(self, pending: PendingShot, settings: tagger.FrameSettings) -> ExposureTime:
         """When the frame was exposed, as far as trigger call and file tell: by the trigger call and the body's latency;
         by the camera's own clock, where the driver never said when it fired; else by the wish."""
-        shot = story.shot
-        if story.fired is not None:
-            called_utc_ns = tagger.called_utc_ns(shot, story.fired.called_monotonic_ns)
+        shot = pending.shot
+        if pending.fired is not None:
+            called_utc_ns = tagger.called_utc_ns(shot, pending.fired.called_monotonic_ns)
             return tagger.mid_exposure(called_utc_ns, self._latency, settings.exposure_s)
         told = camera_clock.shown(settings.taken)
         by_camera = told and camera_clock.exposure_from_camera(self._camera_clock, *told, settings.exposure_s)
         if by_camera:
-            self._stories.note("untimed", "the driver never said when it fired: the camera's clock is used", shot.index)
+            self._shots.note("untimed", "the driver never said when it fired: the camera's clock is used", shot.index)
             return by_camera
-        self._stories.note("untimed", "the driver never said when it fired: the wish's time is used", shot.index)
-        arrived_utc_ns = story.frame.arrived_utc_ns if story.frame else None
+        self._shots.note("untimed", "the driver never said when it fired: the wish's time is used", shot.index)
+        arrived_utc_ns = pending.frame.arrived_utc_ns if pending.frame else None
         return tagger.by_wish(shot.wished_utc_ns, arrived_utc_ns, self._latency, settings.exposure_s)

@@ -11,12 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from dappled.config import settings as configuration
-from dappled.daemon.pipeline.flight_writer import ReplayBook
-from dappled.daemon.pipeline.pending_shot import Names, Watchers
-from dappled.daemon.pipeline.pipeline import Street
+from dappled.daemon.pipeline.flight_writer import ReplayVerifier
+from dappled.daemon.pipeline.pending_shot import Names, Observer
+from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.replay import replay
-from dappled.daemon.replay.replay import Progress, RecordedTelemetry, Recording
+from dappled.daemon.replay.replay import RecordedFlight, RecordedTelemetry, ReplayProgress
 from dappled.drivers.camera import Blob, Identity
 from dappled.drivers.replay import ReplayCamera
 from dappled.errors import DappledError
@@ -26,30 +26,30 @@ from dappled.flight.lock import FlightsLock
 from dappled.flight.records import Frame, Tag
 
 
-class TagBook(ReplayBook):
+class MissingTagWriter(ReplayVerifier):
     """Enters the tags that the ledger lacks, and what is told of their frames; all others stay as they are."""
 
-    def __init__(self, recording: Recording, ledger: Ledger) -> None:
+    def __init__(self, recording: RecordedFlight, ledger: Ledger) -> None:
         super().__init__(recording.root, recording.expected)
         self._ledger = ledger
         self.added: list[int] = []
 
     def record(self, index: int | None, name: str, blob: Blob) -> Frame:
-        """See Book: bytes are the business of `flight check`."""
+        """See FlightWriter: bytes are the business of `flight check`."""
         frame = None if index is None else self.frame(index)
         if frame is None:
             raise DappledError(f"{name} belongs to no recorded frame")
         return frame
 
     def tagged(self, tag: Tag) -> None:
-        """See Book."""
+        """See FlightWriter."""
         super().tagged(tag)
         if self._lacks(tag.index):
             self._ledger.add_tag(tag)
             self.added.append(tag.index)
 
     def event(self, kind: str, text: str, index: int | None = None) -> None:
-        """See Book."""
+        """See FlightWriter."""
         if index is not None and self._lacks(index) and kind not in self._expected[index].told:
             self._ledger.add_event(kind, text, index)
 
@@ -77,12 +77,12 @@ def add_missing(flight: Path, utc_ns: Callable[[], int]) -> list[int]:
     settings = configuration.of_tables(facts["settings"], str(folder.settings))
     recording = replay.of_flight(flight)
     recording = replace(recording, shots=[shot for shot in recording.shots if shot.index <= max(missing)])
-    progress, time = Progress.begin(), replay.clock(recording)
+    progress, time = ReplayProgress.begin(), replay.clock(recording)
     with ExitStack() as stack:
         stack.enter_context(FlightsLock(flight.absolute().parent))
         ledger = stack.enter_context(Ledger(folder.ledger, utc_ns))
-        book = TagBook(recording, ledger)
-        street = Street(
+        book = MissingTagWriter(recording, ledger)
+        pipeline = Pipeline(
             camera=ReplayCamera(recording.files, Identity("dappled", "recording", "", str(flight)), time.monotonic_ns),
             book=book,
             poses=RecordedTelemetry.flown(settings, recording.telemetry, recording.horizons, recording.vehicles).pose,
@@ -90,12 +90,12 @@ def add_missing(flight: Path, utc_ns: Callable[[], int]) -> list[int]:
             publisher=None,
             latency=BodyLatency.of(settings.camera),
             names=Names(**facts["names"]),
-            watchers=Watchers(finished=progress.note),
+            watchers=Observer(finished=progress.note),
             decode_queue=1,
         )
-        street.start()
-        stack.callback(street.stop, 5.0)
-        replay.play(recording, street, progress, time=time, pace=None)
+        pipeline.start()
+        stack.callback(pipeline.stop, 5.0)
+        replay.play(recording, pipeline, progress, time=time, pace=None)
         for index in book.added:
             ledger.add_event("tagged late", "the recording ended before its tag was made; it is made now", index)
     return book.added

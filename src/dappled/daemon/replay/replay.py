@@ -15,10 +15,10 @@ from dappled.clock import RecordedClock
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import vehicles
 from dappled.daemon.navigation.telemetry import Telemetry, first_position_utc_ns
-from dappled.daemon.pipeline.flight_writer import Expected, ReplayBook
-from dappled.daemon.pipeline.pending_shot import Story
-from dappled.daemon.pipeline.pipeline import Street
-from dappled.daemon.pipeline.tagger import Exposure
+from dappled.daemon.pipeline.flight_writer import Expected, ReplayVerifier
+from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.tagger import ExposureTime
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.framing import Decoder, Message
 from dappled.drivers.replay import Recorded
@@ -36,7 +36,7 @@ class ReplayError(DappledError):
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class RecordedFlight:
     """What is to be replayed: shots in order with their files, the telemetry beside them, and what was recorded of
     each. `horizons` says how many telemetry packets a frame's pose was made from; `vehicles` whose they were (see
     `Telemetry`)."""
@@ -50,7 +50,7 @@ class Recording:
     vehicles: Sequence[tuple[int, int]] = ()
 
 
-def of_flight(folder: Path, run: str = LIVE) -> Recording:
+def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
     """A recorded flight, with the slices of one run. Raises FlightError when it is none."""
     flight = layout.open_folder(folder)
     with LedgerReader.open(flight.ledger) as ledger:
@@ -84,12 +84,12 @@ def of_flight(folder: Path, run: str = LIVE) -> Recording:
         raise ReplayError(f"{folder} holds no frames: there is nothing to replay")
     telemetry = flight.telemetry if flight.telemetry.is_file() else None
     horizons = {index: pose.telemetry_packets for index, pose in poses.items()}
-    return Recording(folder, [row.shot for row in rows], files, expected, telemetry, horizons, turns)
+    return RecordedFlight(folder, [row.shot for row in rows], files, expected, telemetry, horizons, turns)
 
 
 def of_folder(
     folder: Path, match: str, telemetry: Path | None, start_utc_ns: int | None, interval_s: float
-) -> Recording:
+) -> RecordedFlight:
     """Frames in a folder, in the order of their names; the first at `start_utc_ns` (None: the telemetry's first
     position, or 1970 without telemetry), the others at `interval_s` after each other. A single .tlog in the folder is
     the telemetry, where none is named."""
@@ -112,7 +112,7 @@ def of_folder(
         shots.append(shot)
         files.append(Recorded(index, path, path.name, (utc_ns, utc_ns), utc_ns))
         expected.append(Expected(ShotRow(shot, "safe", None, utc_ns, utc_ns), frame))
-    return Recording(folder, shots, files, expected, telemetry, {})
+    return RecordedFlight(folder, shots, files, expected, telemetry, {})
 
 
 def _only_log(folder: Path) -> Path | None:
@@ -155,8 +155,8 @@ class RecordedTelemetry:
             attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
         )
 
-    def pose(self, index: int, exposure: Exposure) -> tuple[Exposure, Pose]:
-        """When and where a frame was exposed (see `Street`); frames come in the order of their exposure."""
+    def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
+        """When and where a frame was exposed (see `Pipeline`); frames come in the order of their exposure."""
         horizon = self._horizons.get(index)
         while horizon is None or self._fed < horizon:
             if horizon is None and self._telemetry.settled(exposure):
@@ -173,7 +173,7 @@ class RecordedTelemetry:
 
 
 @dataclass(slots=True)
-class Progress:
+class ReplayProgress:
     """Hands the shots to the street one by one, and knows when each has come to its end."""
 
     finished: threading.Semaphore
@@ -181,13 +181,13 @@ class Progress:
     bad: int = 0
 
     @classmethod
-    def begin(cls) -> Progress:
+    def begin(cls) -> ReplayProgress:
         return cls(threading.Semaphore(0))
 
-    def note(self, story: Story) -> None:
-        """For `Watchers.finished`: counts, and keeps nothing of the story."""
-        self.frames += story.frame is not None
-        self.bad += bool(story.problem) and story.frame is not None
+    def note(self, pending: PendingShot) -> None:
+        """For `Observer.finished`: counts, and keeps nothing of the story."""
+        self.frames += pending.frame is not None
+        self.bad += bool(pending.problem) and pending.frame is not None
         self.finished.release()
 
 
@@ -204,16 +204,16 @@ def as_recorded(rate: float, sleep: Callable[[float], None] = sleep) -> Pace:
     return wait
 
 
-def clock(recording: Recording) -> RecordedClock:
+def clock(recording: RecordedFlight) -> RecordedClock:
     """The recording's clock, at its first wish."""
     first = recording.shots[0]
     return RecordedClock(first.wished_utc_ns, first.wished_utc_ns - first.wished_monotonic_ns)
 
 
 def play(
-    recording: Recording,
-    street: Street,
-    progress: Progress,
+    recording: RecordedFlight,
+    pipeline: Pipeline,
+    progress: ReplayProgress,
     *,
     time: RecordedClock,
     pace: Pace | None,
@@ -226,8 +226,8 @@ def play(
         if pace:
             pace(shot, before)
         time.advance_to(shot.wished_utc_ns)
-        street.expect(shot)
-        street.fire(shot.index)
+        pipeline.expect(shot)
+        pipeline.fire(shot.index)
         if pace is None and not progress.finished.acquire(timeout=timeout_s):
             raise ReplayError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
         before = shot
@@ -237,9 +237,9 @@ def play(
                 raise ReplayError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
 
 
-def book(recording: Recording, keep: Callable[[Result], object] | None = None) -> ReplayBook:
+def book(recording: RecordedFlight, keep: Callable[[Result], object] | None = None) -> ReplayVerifier:
     """The book that compares this recording with what comes down the street, but for results that `keep` takes."""
-    return ReplayBook(recording.root, recording.expected, keep)
+    return ReplayVerifier(recording.root, recording.expected, keep)
 
 
 def _file(folder: Path, row: ShotRow, frame: Frame | None, doubt: str | None) -> Recorded:

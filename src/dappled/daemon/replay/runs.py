@@ -32,7 +32,7 @@ class Run:
     names: Names
 
 
-class RunBook:
+class RunWriter:
     """Writes one run's results into a closed flight's ledger."""
 
     def __init__(self, flight: Path, run: Run, utc_ns: Callable[[], int]) -> None:

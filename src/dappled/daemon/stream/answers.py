@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from dappled.daemon.pipeline.decode_process import Developer
-from dappled.daemon.pipeline.pending_shot import Book
+from dappled.daemon.pipeline.decode_process import FrameDecoder
+from dappled.daemon.pipeline.pending_shot import FlightWriter
 from dappled.daemon.stream.headers import frame_header, slices_header
 from dappled.daemon.stream.publisher import Reply
 from dappled.daemon.stream.wire import Message, WireError
 from dappled.errors import sentence
-from dappled.workers import Stage
+from dappled.workers import Worker
 
 WAITING = 32
 
@@ -19,10 +19,12 @@ WAITING = 32
 class Answers:
     """Works off questions one by one, behind a bounded queue; a question that finds it full is refused in words."""
 
-    def __init__(self, book: Book, developer: Developer | None, give_way: Callable[[], object] = lambda: None) -> None:
+    def __init__(
+        self, book: FlightWriter, developer: FrameDecoder | None, give_way: Callable[[], object] = lambda: None
+    ) -> None:
         """`give_way` waits, bounded, while the flight itself has something to decode: viewing comes after it."""
         self._book, self._developer, self._give_way = book, developer, give_way
-        self._stage: Stage[tuple[Mapping[str, Any], Reply]] = Stage(
+        self._stage: Worker[tuple[Mapping[str, Any], Reply]] = Worker(
             "answers", self._work, capacity=WAITING, on_failure=self._failed
         )
 
@@ -34,9 +36,9 @@ class Answers:
         """Answer what waits, within a second."""
         self._stage.stop(1.0)
 
-    def dead(self) -> list[str]:
-        """See `Stage.dead`."""
-        return self._stage.dead()
+    def dead_threads(self) -> list[str]:
+        """See `Worker.dead_threads`."""
+        return self._stage.dead_threads()
 
     def answer(self, request: Mapping[str, Any], reply: Reply) -> None:
         """For `Publisher`: raises WireError when too many questions wait already."""
@@ -58,8 +60,8 @@ class Answers:
         if self._developer is None:
             raise WireError("this flight is not decoded: no mask is configured")
         self._give_way()
-        developed = self._developer.develop(self._book.path(frame), tag.focal_length_mm, tag.f_number)
-        return Message("slices", slices_header(tag, developed), developed.body)
+        decoded = self._developer.develop(self._book.path(frame), tag.focal_length_mm, tag.f_number)
+        return Message("slices", slices_header(tag, decoded), decoded.body)
 
     def _failed(self, item: tuple[Mapping[str, Any], Reply], error: Exception) -> None:
         item[1](Message("error", {"error": sentence(error)}))

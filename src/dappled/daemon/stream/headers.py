@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dappled import __version__
 from dappled.config.settings import Settings
-from dappled.daemon.pipeline.decode_process import Developed
+from dappled.daemon.pipeline.decode_process import DecodedFrame
 from dappled.daemon.pipeline.pending_shot import Names
 from dappled.daemon.stream import wire
 from dappled.flight.records import Frame, Tag
@@ -22,17 +22,17 @@ def start_header(settings: Settings, names: Names, utc_ns: int) -> dict[str, obj
     }
 
 
-def slices_header(tag: Tag, developed: Developed) -> dict[str, object]:
+def slices_header(tag: Tag, decoded: DecodedFrame) -> dict[str, object]:
     """The facts of a `slices` message, live or asked for."""
     return {
-        **wire.frame_facts(tag, developed.law),
-        "carriers": developed.carriers,
-        "carriers_from": developed.carriers_from,
-        "carriers_found": developed.carriers_found,
-        "grid": developed.grid,
-        **developed.seen,
-        "slices_sha256": developed.sha256,
-        "arrays": developed.arrays,
+        **wire.frame_facts(tag, decoded.law),
+        "carriers": decoded.carriers,
+        "carriers_from": decoded.carriers_from,
+        "carriers_found": decoded.carriers_found,
+        "grid": decoded.grid,
+        **decoded.seen,
+        "slices_sha256": decoded.sha256,
+        "arrays": decoded.arrays,
     }
 
 

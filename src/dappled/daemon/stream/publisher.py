@@ -137,7 +137,7 @@ class Publisher:
                 self._doors.wrong_keys,
             )
 
-    def dead(self) -> list[str]:
+    def dead_threads(self) -> list[str]:
         """Its thread, where it has ended without being asked to."""
         begun = self._thread.ident is not None
         return [self._thread.name] if begun and not self._thread.is_alive() and not self._stopping.is_set() else []

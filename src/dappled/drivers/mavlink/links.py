@@ -123,7 +123,7 @@ class MavlinkLinks:
         """Counters of every link, in the order of the urls."""
         return tuple(link.statistics() for link in self._links)
 
-    def dead(self) -> list[str]:
+    def dead_threads(self) -> list[str]:
         """Which receiving threads have ended without being asked to: none, unless there is a bug."""
         if self._stop.is_set():
             return []
