@@ -12,7 +12,7 @@ import pytest
 
 from dappled.cli import main
 from dappled.cli.calibrate_target import from_frames
-from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Development, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, DecodeResult, Recipe
 from dappled.mocks.scene.masked_camera import reference_camera
 from tests.system.test_depth import target
 
@@ -52,7 +52,7 @@ def test_frames_of_several_zooms_are_no_targets(folder: Path, tmp_path: Path, mo
     recipe = Recipe("reference-36mm", "reference-5x5", calibration=str(folder / "c.toml"))
     honest = Darkroom.develop
 
-    def zoomed(self: Darkroom, path: Path, **asked: Any) -> Development:
+    def zoomed(self: Darkroom, path: Path, **asked: Any) -> DecodeResult:
         done = honest(self, path, **asked)
         said = {**done.light_field.attributes, "focal_length_mm": 50.0 if path.stem == "2" else 70.0}
         return replace(done, light_field=replace(done.light_field, attributes=said))

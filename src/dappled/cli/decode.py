@@ -10,7 +10,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from dappled.cli import common
-from dappled.drivers.raw.darkroom import Darkroom, Development
+from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.errors import DappledError
 from dappled.products.exports import light_files
 
@@ -65,7 +65,7 @@ def _refuse_same_names(frames: Sequence[Path], folder: Path) -> None:
             )
 
 
-def summary(made: Development) -> str:
+def summary(made: DecodeResult) -> str:
     """Slices, views, and where both came from."""
     field = made.light_field
     rows, columns = field.views.shape[:2]

@@ -33,8 +33,8 @@ from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.refocus import FocalPlane
 from dappled.decode.lightfield.stereo_pair import StereoPair, eyes
 from dappled.decode.lightfield.view_stack import ViewStack
-from dappled.drivers.raw import kept_recipe
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.recipe import of_flight
 from dappled.errors import DappledError
 from dappled.flight import layout, summary
 from dappled.flight.records import Tag
@@ -244,7 +244,7 @@ def open(path: str | Path, *, focus_m: float | None = None, **recipe: Any) -> Op
         return OpenedFrame(found, darkroom, focus_m=focus_m)
     if layout.FlightFolder(found).ledger.exists():
         record = summary.show(found)
-        own = kept_recipe.of_flight(found, record.settings, recipe)
+        own = of_flight(found, record.settings, recipe)
         return OpenedFlight(found, record, None if own is None else Darkroom(own), focus_m)
     _refuse(recipe, found)
     return OpenedLightField(view_folders.read(found), found, focus_m)

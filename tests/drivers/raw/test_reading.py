@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
 
-from dappled.drivers.raw import exif, reading
+from dappled.drivers.raw import raw_file, reading
 from dappled.drivers.raw.reading import RawFileError, read, read_metadata
 
 RGGB, BGGR = bytes((0, 1, 1, 2)), bytes((2, 1, 1, 0))
@@ -107,7 +107,7 @@ def test_zero_in_exif_is_unknown() -> None:
 
 @pytest.mark.parametrize("value", [0, -1, float("nan"), float("inf"), None, "x", b"", (), [], object()])
 def test_only_numbers_above_zero_are_known(value: object) -> None:
-    assert exif.positive(value) is None
+    assert raw_file.positive(value) is None
 
 
 def test_bytes_come_in_any_form(tmp_path: Path) -> None:

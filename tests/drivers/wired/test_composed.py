@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from dappled.drivers.camera import Arrival, CameraError, Companion, Deferred, Fired, Identity, ShotFailed, StateChanged
-from dappled.drivers.raw import exif
+from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.replay import Recorded, ReplayCamera
 from dappled.drivers.wired import composed, folder, fujifilm, matching
 from dappled.drivers.wired.composed import ComposedCamera, Plan
@@ -627,6 +627,6 @@ def test_the_mock_s_raf_tells_its_exposure(tmp_path: Path) -> None:
     path = tmp_path / "one.RAF"
     path.write_bytes(picture(1, 12.5, T0))
     with path.open("rb") as file:
-        found = exif.read(file)
+        found = read_exif(file)
     assert (found.make, found.model, found.focal_length_mm) == ("FUJIFILM", "FinePix S5200", 12.5)
     assert found.taken == time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(T0))

@@ -25,7 +25,7 @@ from dappled.decode.geometry import camera_pose
 from dappled.decode.geometry.camera_pose import FORWARD, NADIR, Angles
 from dappled.decode.geometry.interpolation import from_euler
 from dappled.decode.geometry.pose import Gnss, Pose
-from dappled.drivers.raw import exif
+from dappled.drivers.raw.raw_file import read_exif
 from dappled.errors import DappledError
 from dappled.flight import recording
 from dappled.flight.check import check
@@ -262,7 +262,7 @@ def test_copies_of_raws_open_as_before(shared_data: Path, file: str) -> None:
     copy = exif_gps.tagged(original, exif_gps.Place(41.6, -91.5, 215.0, START_NS))
     with rawpy.imread(io.BytesIO(original)) as before, rawpy.imread(io.BytesIO(copy)) as after:
         assert np.array_equal(before.raw_image, after.raw_image)
-    assert exif.read(io.BytesIO(copy)) == exif.read(io.BytesIO(original))
+    assert read_exif(io.BytesIO(copy)) == read_exif(io.BytesIO(original))
     if file.endswith("CR2"):
         told = Image.Exif()
         told.load_from_fp(io.BytesIO(copy))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dappled.config import profiles
 from dappled.daemon.health.go_no_go import State
 from dappled.drivers.raw import reading
-from dappled.drivers.raw.darkroom import Darkroom, Development, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
 
@@ -74,7 +74,7 @@ def _exposure(raw: RawFile) -> Finding:
     return Finding("exposure", "go", f"{clipped:.2%} clipped, {mean:.0%} of white on average", measured)
 
 
-def _carriers(made: Development, recipe: Recipe) -> Finding:
+def _carriers(made: DecodeResult, recipe: Recipe) -> Finding:
     seen, predicted = made.carriers_found, made.carriers_predicted
     measured = {"seen": seen, "predicted": predicted, "from": made.report.carriers_from}
     if recipe.mask == profiles.LENSLET or predicted == 0:

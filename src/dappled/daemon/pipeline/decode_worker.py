@@ -28,7 +28,7 @@ from dappled.decode.lightfield.pictures import slice_mosaic
 from dappled.drivers.camera import Blob
 from dappled.drivers.child_process import end_with_parent
 from dappled.drivers.process_channel import ChannelMessage
-from dappled.drivers.raw.darkroom import Darkroom, Development, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import sentence
 
 DEPTH_NICENESS = 14
@@ -130,7 +130,7 @@ def nearest(field: LightField, found: DepthMap) -> tuple[float, float] | None:
     return metres.distances(found, view_stack.of(field)).nearest()
 
 
-def _seen(done: Development) -> dict[str, Any]:
+def _seen(done: DecodeResult) -> dict[str, Any]:
     """What a viewer needs to draw the spectrum and make views: see the schema of `slices`."""
     report = done.report
     named = report.carriers_from != "found"

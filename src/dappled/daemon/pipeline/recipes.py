@@ -16,7 +16,7 @@ from dappled.config import profiles
 from dappled.config.settings import Settings
 from dappled.daemon.pipeline.pending_shot import Names
 from dappled.drivers.raw.darkroom import Darkroom, Recipe, camera_name
-from dappled.drivers.raw.kept_recipe import FILES, FOLDER, of_flight
+from dappled.drivers.raw.recipe import FILES, FOLDER, of_flight
 from dappled.errors import DappledError
 from dappled.flight import durable
 

@@ -8,7 +8,7 @@ from typing import Self
 
 from dappled.config.settings import CameraSettings
 from dappled.decode.geometry.pose import Pose
-from dappled.drivers.raw import exif
+from dappled.drivers.raw.raw_file import ExposureSettings
 from dappled.flight.records import Frame, Shot, Tag
 
 LATENCY_SOURCE = "trigger call + body latency"
@@ -57,7 +57,7 @@ class FrameSettings:
     taken: str | None = None
 
     @classmethod
-    def of(cls, facts: exif.Exposure) -> Self:
+    def of(cls, facts: ExposureSettings) -> Self:
         """From a file's metadata."""
         return cls(facts.focal_length_mm, facts.f_number, facts.exposure_s, facts.iso, facts.model or "", facts.taken)
 

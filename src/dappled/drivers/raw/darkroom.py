@@ -20,15 +20,15 @@ from dappled.decode.report import DecodeReport
 from dappled.decode.spectrum.colours import coloured
 from dappled.decode.spectrum.plane import Plane
 from dappled.drivers.raw import calibration_files, reading
-from dappled.drivers.raw.lineariser import Lineariser
+from dappled.drivers.raw.lineariser import FrameLineariser
 from dappled.drivers.raw.reading import RawFile
-from dappled.drivers.raw.recipe import DarkroomError, Recipe, camera_name, naming, read
+from dappled.drivers.raw.recipe import DarkroomError, Recipe, camera_name, camera_profile, naming, read
 
-__all__ = ["Darkroom", "DarkroomError", "Development", "Recipe", "camera_name", "known_to"]
+__all__ = ["Darkroom", "DarkroomError", "DecodeResult", "Recipe", "camera_name", "known_to"]
 
 
 @dataclass(frozen=True, slots=True)
-class Development:
+class DecodeResult:
     """A decoded frame, what was decided on the way, and what took how many milliseconds."""
 
     light_field: LightField
@@ -53,7 +53,7 @@ class Darkroom:
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
         self._decoders: dict[tuple[tuple[int, int], str, bool], Decoder] = {}
-        self._lineariser = Lineariser(recipe, self.camera)
+        self._lineariser = FrameLineariser(recipe)
 
     def check(self) -> None:
         """Raises DappledError when the recipe names something that isn't there or isn't right."""
@@ -78,7 +78,7 @@ class Darkroom:
         focal_length_mm: float | None = None,
         f_number: float | None = None,
         views: bool = True,
-    ) -> Development:
+    ) -> DecodeResult:
         """Decode a frame; what is not given is taken from its file. Without `views` only the slices are made.
 
         Raises DappledError with the file's name and what is wrong.
@@ -110,7 +110,7 @@ class Darkroom:
             "decoded_from": "grey" if raw.cfa is None else "mosaic",
             **(self._ranging() if views else {}),
         }
-        return Development(replace(light_field, attributes=attributes), report, raw, ms)
+        return DecodeResult(replace(light_field, attributes=attributes), report, raw, ms)
 
     def plane(self, raw: RawFile) -> Plane:
         """The linear plane of a frame: black, white, dark frame; for masks also colours evened out, and white frame."""
@@ -139,14 +139,8 @@ class Darkroom:
         return naming(path)
 
     def camera(self, model: str) -> CameraProfile:
-        """The camera's profile: the recipe's, or by model."""
-        if self.recipe.camera != "auto":
-            return profiles.camera(self.recipe.camera)
-        found = profiles.camera_for_model(model)
-        if found is None:
-            said = f"the frame says {model!r}" if model else "the frame names no camera"
-            raise DarkroomError(f"which camera? {said}, and no profile knows it: name one with --camera")
-        return found
+        """The camera's profile: the recipe's, or by model. Raises DappledError."""
+        return camera_profile(self.recipe, model)
 
     def camera_name(self, model: str | None) -> str:
         """The profile's name, or the model, or "unknown": what tags and headers call the camera."""

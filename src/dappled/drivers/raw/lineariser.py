@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config import profiles
-from dappled.config.profiles import CameraProfile
 from dappled.decode.errors import DecodeError
 from dappled.decode.latest import Latest
 from dappled.decode.spectrum import plane as planes
@@ -23,17 +21,16 @@ from dappled.decode.spectrum.plane import Plane
 from dappled.decode.spectrum.stagger import spread
 from dappled.decode.spectrum.transform import Source
 from dappled.drivers.raw.reading import RawFile
-from dappled.drivers.raw.recipe import Recipe, naming, read, said
+from dappled.drivers.raw.recipe import Recipe, camera_profile, naming, read, said
 
 _KEPT = 4  # developers: some bodies say another black level with every frame
 
 
-class Lineariser:
+class FrameLineariser:
     """Makes frames of one recipe linear. What every frame needs (dark and white frame, gains) is made once and kept."""
 
-    def __init__(self, recipe: Recipe, camera: Callable[[str], CameraProfile]) -> None:
-        """`camera` knows the profile of a camera's model."""
-        self._recipe, self._camera = recipe, camera
+    def __init__(self, recipe: Recipe) -> None:
+        self._recipe = recipe
         self._dark: NDArray[Any] | None = None
         self._defects: Places | None = None
         self._gains: dict[tuple[int, int], Plane] = {}
@@ -53,7 +50,7 @@ class Lineariser:
             return exposure
         key = exposure.shape, raw.camera_model or ""
         if key not in self._staggered:
-            self._staggered[key] = self._camera(key[1]).staggered(key[0])
+            self._staggered[key] = camera_profile(self._recipe, key[1]).staggered(key[0])
         return spread(exposure.plane(self._recipe.workers)) if self._staggered[key] else exposure
 
     def expose(self, raw: RawFile, *, colour: bool) -> tuple[Exposure, NDArray[np.float32] | None]:

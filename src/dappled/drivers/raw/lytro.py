@@ -1,21 +1,24 @@
 """Lytro's own files: containers (.lfp, .lfr) and bare packed sensors (.raw), of the first camera and of the Illum.
 
 A container is a table in JSON that names other parts by their SHA-1: one part is the packed mosaic, another the
-metadata that says how it is packed. Layout and packing as LFToolbox and lfpsplitter know them. Pure: bytes in, values
-out; every error is a ValueError in words.
+metadata that says how it is packed. Layout and packing as in LFToolbox and lfpsplitter. A bare file holds pixels only:
+its metadata lies beside it, or its size says which camera made it. Every error is a ValueError with a sentence.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, Source
 
 START = b"\x89LFP\r\n\x1a\n"
 _PART = re.compile(rb"\x89LF[A-Z]\r\n\x1a\n")
@@ -25,30 +28,6 @@ _MOST_PARTS = 10_000
 _MOST_PIXELS = 200_000_000
 _COLOURS = ("r", "gr", "b", "gb")
 _NAMES = {"r": "R", "gr": "G", "gb": "G", "b": "B"}
-
-
-@dataclass(frozen=True, slots=True)
-class Lytro:
-    """A frame and what its metadata says; unknown is None.
-
-    `mosaic` uint16 (H, W). `cfa` (2, 2) indices into `colour_names` (red, green, blue, and the blue rows' green).
-    `black` and `balance` (green 1) by those indices. `taken_utc` as ISO 8601 without a zone.
-    """
-
-    mosaic: NDArray[np.uint16]
-    cfa: NDArray[np.int64]
-    colour_names: tuple[str, ...]
-    black: tuple[float, ...]
-    white: float
-    balance: tuple[float, ...] | None
-    make: str | None
-    model: str | None
-    focal_length_mm: float | None
-    f_number: float | None
-    exposure_s: float | None
-    iso: float | None
-    taken_utc: str | None
-
 
 # Bare .raw files name nothing; the cameras' own sizes in bytes tell them apart.
 _FIRST = {
@@ -71,29 +50,34 @@ _ILLUM = {
         "mosaic": {"tile": "r,gr:gb,b", "upperLeftPixel": "gr"},
     },
 }
-BARE: dict[int, Mapping[str, Any]] = {3280 * 3280 * 3 // 2: _FIRST, 7728 * 5368 * 5 // 4: _ILLUM}
+_BARE: dict[int, Mapping[str, Any]] = {3280 * 3280 * 3 // 2: _FIRST, 7728 * 5368 * 5 // 4: _ILLUM}
 
 
-def read_container(data: bytes | memoryview) -> Lytro:
-    """The frame of an .lfp or .lfr file. Raises ValueError where it is cut short or holds no raw frame."""
-    told, mosaic = _parts(data)
-    return _frame(told, mosaic)
+def find(source: Source, label: str, file: BinaryIO, *, pixels: bool = True) -> RawFile | None:
+    """The frame of a Lytro camera's file; None for other files. Without `pixels` its mosaic has the shape (0, 0).
+
+    Raises ValueError where the file is cut short or holds no raw frame.
+    """
+    start = file.read(len(START))
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    if start == START:
+        metadata, packed = _parts(file.read())
+        return _frame(metadata, packed if pixels else None)
+    bare = _beside(source) or _BARE.get(size) if label.lower().endswith(".raw") else None
+    return None if bare is None else _frame(_imaging(bare), file.read() if pixels else None)
 
 
-def read_container_metadata(data: bytes | memoryview) -> Lytro:
-    """The same without the pixels: `mosaic` has the shape (0, 0)."""
-    told, _ = _parts(data)
-    return _frame(told, None)
-
-
-def read_bare(data: bytes | memoryview, metadata: Mapping[str, Any]) -> Lytro:
-    """The frame of a bare .raw file by its metadata (`BARE` has the cameras' own by size)."""
-    return _frame(_imaging(metadata), data)
-
-
-def read_bare_metadata(metadata: Mapping[str, Any]) -> Lytro:
-    """What the metadata of a bare file says, without the pixels: `mosaic` has the shape (0, 0)."""
-    return _frame(_imaging(metadata), None)
+def _beside(source: Source) -> Mapping[str, Any] | None:
+    """The JSON beside a bare .raw file, of the same name and .json or .txt; None without."""
+    if not isinstance(source, Path | str):
+        return None
+    for suffix in (".json", ".JSON", ".txt", ".TXT"):
+        path = Path(source).with_suffix(suffix)
+        if path.is_file():
+            told = json.loads(path.read_bytes())
+            return told if isinstance(told, dict) else None
+    return None
 
 
 def _parts(data: bytes | memoryview) -> tuple[Mapping[str, Any], memoryview]:
@@ -166,7 +150,7 @@ def _imaging(told: Any) -> Mapping[str, Any]:
     raise ValueError("its metadata doesn't say how wide the image is")
 
 
-def _frame(told: Mapping[str, Any], packed: bytes | memoryview | None) -> Lytro:
+def _frame(told: Mapping[str, Any], packed: bytes | memoryview | None) -> RawFile:
     image = told["image"]
     details = image.get("rawDetails") if isinstance(image.get("rawDetails"), dict) else image
     width, height = _whole(image, "width"), _whole(image, "height")
@@ -186,20 +170,23 @@ def _frame(told: Mapping[str, Any], packed: bytes | memoryview | None) -> Lytro:
     mosaic = np.empty((0, 0), dtype=np.uint16)
     if packed is not None:
         mosaic = unpacked(packed, width * height, bits, order).reshape(height, width)
-    return Lytro(
-        mosaic=mosaic,
-        cfa=cfa,
-        colour_names=tuple(_NAMES[colour] for colour in _COLOURS),
-        black=black,
-        white=white,
-        balance=_gains(_maybe(_maybe(details, "color") or _maybe(image, "color"), "whiteBalanceGain")),
+    settings = ExposureSettings(
         make=_text(camera.get("make")),
         model=_text(camera.get("model")),
         focal_length_mm=None if metres is None else float(f"{metres * 1e3:.6g}"),
         f_number=_number(lens.get("fNumber")),
         exposure_s=_number(shutter.get("pixelExposureDuration")) or _number(shutter.get("frameExposureDuration")),
         iso=_number(image.get("iso")),
-        taken_utc=_time(clock.get("zuluTime")),
+        taken=_time(clock.get("zuluTime")),
+    )
+    return RawFile.of(
+        settings,
+        mosaic,
+        black=black[0] if len(set(black)) == 1 else black,
+        white=white,
+        cfa=cfa,
+        colour_names=tuple(_NAMES[colour] for colour in _COLOURS),
+        balance=_gains(_maybe(_maybe(details, "color") or _maybe(image, "color"), "whiteBalanceGain")),
     )
 
 

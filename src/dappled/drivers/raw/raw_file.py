@@ -1,19 +1,47 @@
-"""What every kind of frame is read as: values, and what they mean."""
+"""A frame as its file gives it: the sensor's values, and camera and exposure settings from EXIF.
+
+EXIF is read from TIFF-like raws, RAF, JPEG, PNG and TIFF. Zero, infinite and negative values mean "unknown" there, and
+are None here.
+"""
 
 from __future__ import annotations
 
+import io
+import math
 import mmap
+import re
+import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-
-from dappled.drivers.raw.exif import Exposure
+from PIL import Image, UnidentifiedImageError
 
 Source = Path | str | bytes | memoryview | mmap.mmap
 Values = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.float64]
+
+_EXIF_IFD = 0x8769
+_MAKE, _MODEL, _DATETIME = 0x010F, 0x0110, 0x0132
+_EXPOSURE, _F_NUMBER, _ISO, _TAKEN, _SUBSECONDS, _FOCAL = 0x829A, 0x829D, 0x8827, 0x9003, 0x9291, 0x920A
+_RAF_JPEG = 84  # offset and length of the embedded JPEG, big-endian, in a Fujifilm RAF header
+_BAD = (OSError, ValueError, SyntaxError, KeyError, TypeError, IndexError, struct.error, EOFError, ZeroDivisionError)
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureSettings:
+    """Camera and exposure as the file tells them; None where it does not. `taken` is local time without a zone, ISO
+    8601 ("2008-04-15T13:11:23" or with a fraction). `focal_sigma_mm` is half of what the focal length is rounded to."""
+
+    make: str | None = None
+    model: str | None = None
+    focal_length_mm: float | None = None
+    f_number: float | None = None
+    exposure_s: float | None = None
+    iso: float | None = None
+    taken: str | None = None
+    focal_sigma_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,18 +70,108 @@ class RawFile:
     balance: tuple[float, ...] | None
     focal_sigma_mm: float | None = None
 
+    @classmethod
+    def of(cls, settings: ExposureSettings, mosaic: Values, **known: Any) -> RawFile:
+        """A frame of these values with what its file says of the exposure; `known` are the other fields."""
+        return cls(
+            mosaic=mosaic,
+            camera_make=settings.make,
+            camera_model=settings.model,
+            focal_length_mm=settings.focal_length_mm,
+            f_number=settings.f_number,
+            exposure_s=settings.exposure_s,
+            iso=settings.iso,
+            taken=settings.taken,
+            focal_sigma_mm=settings.focal_sigma_mm,
+            **known,
+        )
 
-def made(exposure: Exposure, mosaic: Values, **known: Any) -> RawFile:
-    """A frame of these values, with what its file says of the exposure; `known` are the other fields."""
-    return RawFile(
-        mosaic=mosaic,
-        camera_make=exposure.make,
-        camera_model=exposure.model,
-        focal_length_mm=exposure.focal_length_mm,
-        f_number=exposure.f_number,
-        exposure_s=exposure.exposure_s,
-        iso=exposure.iso,
-        taken=exposure.taken,
-        focal_sigma_mm=exposure.focal_sigma_mm,
-        **known,
+    def exposure_settings(self) -> ExposureSettings:
+        """Camera and exposure alone."""
+        return ExposureSettings(
+            self.camera_make,
+            self.camera_model,
+            self.focal_length_mm,
+            self.f_number,
+            self.exposure_s,
+            self.iso,
+            self.taken,
+            self.focal_sigma_mm,
+        )
+
+
+def read_exif(file: BinaryIO) -> ExposureSettings:
+    """The EXIF of an open file, from its start. Damaged or missing EXIF is no error: what can't be read is None."""
+    try:
+        start = file.read(16)
+        file.seek(0)
+        if start.startswith(b"FUJIFILMCCD-RAW"):
+            file.seek(_RAF_JPEG)
+            offset, length = struct.unpack(">II", file.read(8))
+            file.seek(offset)
+            return _from(Image.open(io.BytesIO(file.read(length))).getexif())
+        if start[:4] in (b"II*\0", b"MM\0*"):
+            exif = Image.Exif()
+            exif.load_from_fp(file)
+            return _from(exif)
+        image = Image.open(file)
+        if image.format == "PNG" and "exif" not in image.info:
+            return ExposureSettings()  # getexif would unpack all pixels to look behind them
+        return _from(image.getexif())
+    except (*_BAD, UnidentifiedImageError, Image.DecompressionBombError):
+        return ExposureSettings()  # a frame without EXIF is still a frame
+
+
+def _from(exif: Image.Exif) -> ExposureSettings:
+    try:
+        detail = exif.get_ifd(_EXIF_IFD)
+    except _BAD:
+        detail = {}
+    return ExposureSettings(
+        make=_text(exif.get(_MAKE)),
+        model=_text(exif.get(_MODEL)),
+        focal_length_mm=positive(detail.get(_FOCAL, exif.get(_FOCAL))),
+        f_number=positive(detail.get(_F_NUMBER, exif.get(_F_NUMBER))),
+        exposure_s=positive(detail.get(_EXPOSURE, exif.get(_EXPOSURE))),
+        iso=positive(detail.get(_ISO, exif.get(_ISO))),
+        taken=_time(detail.get(_TAKEN) or exif.get(_TAKEN) or exif.get(_DATETIME), detail.get(_SUBSECONDS)),
+        focal_sigma_mm=_rounding(detail.get(_FOCAL, exif.get(_FOCAL))),
+    )
+
+
+def _rounding(focal: object) -> float | None:
+    """Half of the last decimal that a body writes: 33/1 is known to 0.5 mm, 148/10 to 0.05 mm; not below 0.05 mm.
+
+    Bodies step their zoom coarser than finer fractions say. None for an unknown length.
+    """
+    if positive(focal) is None:
+        return None
+    denominator = getattr(focal, "denominator", 1)
+    return 0.5 if denominator == 1 else 0.05
+
+
+def positive(value: object) -> float | None:
+    """A number above zero, else None. Of several numbers the first counts."""
+    if isinstance(value, tuple | list):
+        value = value[0] if value else None
+    try:
+        number = float(value)  # type: ignore[arg-type]  # whatever EXIF holds; what is no number is caught
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def _text(value: object) -> str | None:
+    if isinstance(value, bytes):
+        value = value.decode("ascii", "replace")
+    return (value.split("\0")[0].strip() or None) if isinstance(value, str) else None
+
+
+def _time(value: object, subseconds: object) -> str | None:
+    match = re.match(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)", _text(value) or "")
+    if match is None or match[1] == "0000":
+        return None
+    fraction = _text(subseconds) or ""
+    return f"{match[1]}-{match[2]}-{match[3]}T{match[4]}" + (
+        f".{fraction}" if fraction.isascii() and fraction.isdigit() else ""
     )

@@ -1,9 +1,9 @@
-"""A frame's file as numbers: the sensor's values as they were stored, and what they mean.
+"""Read a frame's file: the sensor's values as they are stored, and what they mean.
 
-What the bytes are decides, not the name: camera raws (RAF, CR2, DNG …) through LibRaw, Lytro's containers, TIFF, PNG,
-JPEG and NPY by their own readers. (Lytro's bare .raw files hold nothing but pixels: there the name and the size decide,
-or metadata that lies beside them.) Values are not made linear, scaled or balanced here. A colour image has no mosaic;
-its values become (R + 2G + B)/4, the mean of a Bayer cell.
+The content decides how a file is read, not its name: camera raws (RAF, CR2, DNG …) through LibRaw; Lytro's containers,
+TIFF, PNG, JPEG and NPY by readers of their own. (Lytro's bare .raw files hold only pixels: for them the name and the
+size decide, or metadata that lies beside them.) Values are not made linear, scaled or balanced here. A colour image has
+no mosaic; its values become (R + 2G + B)/4, the mean of a Bayer cell.
 """
 
 from __future__ import annotations
@@ -12,21 +12,25 @@ import io
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import rawpy
+import tifffile
+from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from dappled.drivers.raw import exif, libraw, lytro_frames, pictures
-from dappled.drivers.raw.exif import Exposure
-from dappled.drivers.raw.raw_file import RawFile, Source
+from dappled.drivers.raw import lytro
+from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, Source, positive, read_exif
 from dappled.errors import DappledError
 
-__all__ = ["RawFile", "RawFileError", "Source", "read", "read_metadata"]
+__all__ = ["ExposureSettings", "RawFile", "RawFileError", "Source", "read", "read_metadata"]
 
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_DNG_VERSION, _MAX_SAMPLE = 50706, 281  # TIFF tags
 
 
 class RawFileError(DappledError):
@@ -43,16 +47,16 @@ def read(source: Source, name: str | None = None) -> RawFile:
         start = file.read(16)
         file.seek(0)
         if start.startswith(b"\x93NUMPY"):
-            return pictures.plain(np.load(file, allow_pickle=False), Exposure())
+            return _plain(np.load(file, allow_pickle=False), ExposureSettings())
         if start.startswith((b"\x89PNG", b"\xff\xd8\xff")):
-            return pictures.read_picture(file)
-        if start.startswith(_TIFF_STARTS) and pictures.is_plain_tiff(file, label):
-            return pictures.read_tiff(file)
-        frame = lytro_frames.find(source, label, file)
-        return libraw.read(file) if frame is None else lytro_frames.frame_of(frame)
+            return _read_picture(file)
+        if start.startswith(_TIFF_STARTS) and _is_plain_tiff(file, label):
+            return _read_tiff(file)
+        frame = lytro.find(source, label, file)
+        return _read_libraw(file) if frame is None else frame
 
 
-def read_metadata(source: Source, name: str | None = None) -> Exposure:
+def read_metadata(source: Source, name: str | None = None) -> ExposureSettings:
     """Camera and exposure alone, without unpacking the pixels (milliseconds). Raises RawFileError as `read` does for
     a file that can't be opened; a file of a kind that has no metadata gives None throughout."""
     label = _label(source, name)
@@ -60,19 +64,19 @@ def read_metadata(source: Source, name: str | None = None) -> Exposure:
         start = file.read(16)
         file.seek(0)
         if start.startswith(b"\x93NUMPY"):
-            return Exposure()
+            return ExposureSettings()
         if start.startswith((b"\x89PNG", b"\xff\xd8\xff")):
             Image.open(file)  # refuses what is no picture
             file.seek(0)
-            return exif.read(file)
-        if start.startswith(_TIFF_STARTS) and pictures.is_plain_tiff(file, label):
-            return exif.read(file)
-        frame = lytro_frames.find(source, label, file, pixels=False)
-        told = exif.read(file) if frame is None else lytro_frames.exposure_of(frame)
+            return read_exif(file)
+        if start.startswith(_TIFF_STARTS) and _is_plain_tiff(file, label):
+            return read_exif(file)
+        frame = lytro.find(source, label, file, pixels=False)
+        told = read_exif(file) if frame is None else frame.exposure_settings()
         if told.make is not None:
             return told
         file.seek(0)
-        return libraw.read_metadata(file)
+        return _read_libraw_settings(file)
 
 
 def _label(source: Source, name: str | None) -> str:
@@ -115,3 +119,147 @@ def _sentences(label: str) -> Iterator[None]:
 def _words(error: BaseException) -> str:
     text = error.args[0] if error.args else type(error).__name__
     return text.decode("ascii", "replace") if isinstance(text, bytes) else str(text)
+
+
+# --- camera raws (RAF, CR2, DNG …), through LibRaw
+
+
+def _read_libraw(file: BinaryIO) -> RawFile:
+    """A raw file with a mosaic. Raises what LibRaw and EXIF raise, and ValueError for one without."""
+    with rawpy.imread(file) as raw:
+        if raw.raw_type != rawpy.RawType.Flat:
+            raise ValueError("it holds no mosaic (linear or demosaiced raws have no masked light field to decode)")
+        mosaic = np.array(raw.raw_image_visible)
+        cfa = None if raw.num_colors == 1 or raw.raw_pattern is None else _visible_pattern(raw)
+        count = 1 if cfa is None else int(cfa.max()) + 1
+        blacks = tuple(float(level) for level in raw.black_level_per_channel[:count])
+        names = "W" if cfa is None else raw.color_desc.decode("ascii", "replace")[:count]
+        return RawFile.of(
+            _libraw_settings(file, raw),
+            mosaic,
+            black=blacks[0] if len(set(blacks)) == 1 else blacks,
+            white=float(raw.white_level),
+            cfa=cfa,
+            colour_names=tuple(names),
+            balance=None if cfa is None else _balance(raw.camera_whitebalance, names),
+        )
+
+
+def _read_libraw_settings(file: BinaryIO) -> ExposureSettings:
+    """What it says of the exposure. Raises what LibRaw raises."""
+    with rawpy.imread(file) as raw:
+        return _libraw_settings(file, raw)
+
+
+def _libraw_settings(file: BinaryIO, raw: Any) -> ExposureSettings:
+    """EXIF first; LibRaw's own reading where EXIF is silent (CRW, ORF variants …)."""
+    file.seek(0)
+    told = read_exif(file)
+    other = raw.other
+    stamp = other.timestamp
+    taken = stamp.isoformat() if isinstance(stamp, datetime) and stamp.year > 1970 else None
+    return replace(
+        told,
+        focal_length_mm=told.focal_length_mm or _short(other.focal_length),
+        f_number=told.f_number or _short(other.aperture),
+        exposure_s=told.exposure_s or _short(other.shutter_speed),
+        iso=told.iso or _short(other.iso_speed),
+        taken=told.taken or taken,
+    )
+
+
+def _short(value: float) -> float | None:
+    """LibRaw's single-precision numbers as the decimal that was meant: 14.8, not 14.800000190734863."""
+    return positive(str(np.float32(value)))
+
+
+def _visible_pattern(raw: Any) -> NDArray[np.int64]:
+    """LibRaw's pattern, which starts at the first masked pixel, as the smallest block that repeats over the mosaic."""
+    pattern = np.asarray(raw.raw_pattern, dtype=np.int64)
+    visible = np.roll(pattern, (-raw.sizes.top_margin, -raw.sizes.left_margin), axis=(0, 1))
+
+    def period(lines: NDArray[np.int64]) -> int:
+        count = len(lines)
+        return next(n for n in range(1, count + 1) if count % n == 0 and np.array_equal(lines, np.roll(lines, n, 0)))
+
+    return visible[: period(visible), : period(visible.T)].copy()
+
+
+def _balance(gains: list[float], names: str) -> tuple[float, ...] | None:
+    """By colour index, green 1; LibRaw gives 0 for a second green that is as the first."""
+    known = [float(gain) for gain in gains[: len(names)]]
+    green = names.find("G")
+    if green < 0 or positive(known[green]) is None:
+        return None
+    filled = [known[green] if name == "G" and gain == 0 else gain for name, gain in zip(names, known, strict=True)]
+    if any(positive(gain) is None for gain in filled):
+        return None
+    return tuple(gain / known[green] for gain in filled)
+
+
+# --- pictures without a mosaic: PNG, JPEG, TIFF, NPY
+
+
+def _read_picture(file: BinaryIO) -> RawFile:
+    """A PNG or a JPEG. Raises what Pillow raises, and ValueError for one that holds no frame."""
+    image: Image.Image = Image.open(file)
+    if image.format == "PNG" and image.mode != "I;16" and _png_is_deep_colour(file):
+        raise ValueError("it is a colour PNG of 16 bits, which would lose its lower 8; save it as TIFF or as grey PNG")
+    if image.mode in ("P", "PA", "CMYK", "YCbCr", "LAB", "HSV"):
+        image = image.convert("RGB")
+    elif image.mode in ("1", "LA"):
+        image = image.convert("L")
+    values = np.asarray(image)
+    if values.dtype == np.int32:  # Pillow's mode "I": a 16-bit PNG in some versions
+        values = values.astype(np.uint16)
+    file.seek(0)
+    return _plain(values, read_exif(file))
+
+
+def _png_is_deep_colour(file: BinaryIO) -> bool:
+    place = file.tell()
+    file.seek(24)  # IHDR: bit depth, colour type
+    depth, colour_type = file.read(2)
+    file.seek(place)
+    return depth == 16 and colour_type in (2, 6)
+
+
+def _is_plain_tiff(file: BinaryIO, label: str) -> bool:
+    """Whether tifffile should read it: named a TIFF, and no DNG. Other files that begin as TIFF are camera raws."""
+    if not label.lower().endswith((".tif", ".tiff")):
+        return False
+    try:
+        with tifffile.TiffFile(file) as tiff:
+            if len(tiff.pages) == 0:
+                raise ValueError("it has no pages")
+            return _DNG_VERSION not in tiff.pages.first.tags
+    finally:
+        file.seek(0)
+
+
+def _read_tiff(file: BinaryIO) -> RawFile:
+    """The first page of a TIFF. Raises what tifffile raises, and ValueError."""
+    with tifffile.TiffFile(file) as tiff:
+        page = tiff.pages.first
+        values = page.asarray()
+        tag = page.tags.get(_MAX_SAMPLE)
+        limit = positive(None if tag is None else tag.value)
+        if page.planarconfig == 2 and values.ndim == 3:
+            values = np.moveaxis(values, 0, -1)
+    file.seek(0)
+    frame = _plain(values, read_exif(file))
+    return frame if limit is None or values.dtype.kind != "u" else replace(frame, white=limit)
+
+
+def _plain(values: NDArray[Any], settings: ExposureSettings) -> RawFile:
+    """An array without a mosaic: whole numbers reach to their type's largest, floats to 1. Raises ValueError."""
+    if values.dtype.kind == "b":
+        values = values.astype(np.uint8) * np.uint8(255)
+    if values.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
+        raise ValueError(f"its values are {values.dtype}; a frame has 8 or 16 bits unsigned, or floats")
+    white = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
+    if values.ndim == 3 and values.shape[2] in (3, 4):
+        values = values[..., :3].astype(np.float32) @ np.array([0.25, 0.5, 0.25], dtype=np.float32)
+    if values.ndim != 2 or 0 in values.shape:
+        raise ValueError(f"its shape is {values.shape}; a frame has rows and columns, and 3 colours at most")
+    return RawFile.of(settings, np.array(values), black=0.0, white=white, cfa=None, colour_names=("W",), balance=None)

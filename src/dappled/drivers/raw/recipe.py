@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,10 +12,16 @@ from typing import Any
 import numpy as np
 
 from dappled.config import profiles
+from dappled.config.profiles import CameraProfile
 from dappled.decode.errors import DecodeError
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
+
+FOLDER = "inputs"
+"""The folder of a flight that keeps copies of the recipe's files and profiles."""
+FILES = ("calibration", "white", "dark")
+"""The fields of a recipe that name files."""
 
 
 class DarkroomError(DappledError):
@@ -73,12 +79,48 @@ def said(raw: RawFile, recipe: Recipe) -> RawFile:
     return replace(raw, **changed) if changed else raw
 
 
+def of_flight(flight: Path, facts: Mapping[str, Any], overrides: Mapping[str, Any]) -> Recipe | None:
+    """The recipe that a recorded flight was decoded by, its files from the flight's own copies; overrides on top."""
+    settings = facts.get("settings", {})
+    decode, folder = settings.get("decode", {}), flight / FOLDER
+    files: dict[str, Any] = {name: _kept(decode.get(name, ""), folder, name) for name in FILES}
+    made = Recipe(
+        camera=_kept_profile(settings.get("camera", {}).get("profile", "auto"), folder, "cameras"),
+        mask=_kept_profile(settings.get("mask", {}).get("profile", ""), folder, "masks"),
+        law=decode.get("law", ""),
+        workers=decode.get("workers", 1),
+        **files,
+    )
+    made = replace(made, **{name: value for name, value in overrides.items() if value is not None})
+    return made if made.mask else None
+
+
+def _kept(named: str, folder: Path, name: str) -> str:
+    return str(folder / f"{name}{Path(named).suffix}") if named else ""
+
+
+def _kept_profile(profile: str, folder: Path, kind: str) -> str:
+    copy = folder / kind / f"{Path(profile).stem}.toml"
+    return str(copy) if copy.is_file() else profile
+
+
 def camera_name(camera: str, model: str | None) -> str:
     """What a camera is called: its profile, by name or by model; else the model, or "unknown"."""
     if camera != "auto":
         return Path(camera).stem if camera.endswith(".toml") else camera
     found = profiles.camera_for_model(model or "")
     return found.name if found else model or "unknown"
+
+
+def camera_profile(recipe: Recipe, model: str) -> CameraProfile:
+    """The camera's profile: the recipe's, or by model. Raises DarkroomError where no profile knows the model."""
+    if recipe.camera != "auto":
+        return profiles.camera(recipe.camera)
+    found = profiles.camera_for_model(model)
+    if found is None:
+        said = f"the frame says {model!r}" if model else "the frame names no camera"
+        raise DarkroomError(f"which camera? {said}, and no profile knows it: name one with --camera")
+    return found
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Protocol
 
 from dappled.drivers.camera import Blob, CameraError
-from dappled.drivers.raw import exif
+from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.wired.matching import seconds
 
 RAW_SUFFIXES = (".raf", ".cr2", ".dng", ".nef", ".arw", ".crw", ".tif", ".tiff", ".npy", ".png")
@@ -122,7 +122,7 @@ class FolderSource:
         """See Source: from EXIF."""
         try:
             with (self.folder / found.name).open("rb") as file:
-                return seconds(exif.read(file).taken)
+                return seconds(read_exif(file).taken)
         except OSError as error:
             raise self._lost(found, error) from None
 

@@ -51,7 +51,7 @@ def metadata(
 
 
 def packed(values: NDArray[np.uint16], bits: int, endianness: str) -> bytes:
-    """Pixels as the cameras pack them; see `drivers.lytro.unpacked`."""
+    """Pixels as the cameras pack them; see `drivers.raw.lytro.unpacked`."""
     flat = values.reshape(-1).astype(np.uint32)
     if bits == 16:
         return flat.astype(">u2" if endianness == "big" else "<u2").tobytes()

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from dappled.drivers.raw.darkroom import Darkroom, Development, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import DappledError
 from dappled.flight import durable
 from dappled.flight.records import Frame, Tag
@@ -180,7 +180,7 @@ def refined(
     return replace(made, photographs=tuple(photos), facts=facts, notes=(*made.notes, *unseen, *kept))
 
 
-def develop(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, options: Options) -> Development:
+def develop(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, options: Options) -> DecodeResult:
     """One frame of a flight, decoded. Raises DappledError."""
     return darkroom.develop(
         flight / frame.name,
@@ -190,7 +190,7 @@ def develop(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, opt
 
 
 def place(
-    station: Station, made: Development, darkroom: Darkroom, projection: Projection, options: Options
+    station: Station, made: DecodeResult, darkroom: Darkroom, projection: Projection, options: Options
 ) -> Photograph:
     """A decoded frame as a photograph on the map. Raises DappledError."""
     field, gains = made.light_field, photographs.true_colours(made.raw)
