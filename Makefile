@@ -34,7 +34,7 @@ test-slow: setup ## the tests that take longer
 	@$(BIN)/pytest -q --no-header -m slow --durations=25
 
 soak: setup ## half an hour in which something goes wrong every few seconds; MINUTES=n for another time
-	@$(BIN)/python -m dappled.mocks.soak.soak --minutes $(or $(MINUTES),30)
+	@$(BIN)/python -m dappled.mocks.soak --minutes $(or $(MINUTES),30)
 
 faults: setup ## every camera fault against the daemon, again and again; ROUNDS=n for another number
 	@for round in $$(seq $(or $(ROUNDS),20)); do echo "== round $$round"; \

@@ -33,7 +33,7 @@ from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Decoder, Message, mavlink
 from dappled.flight import telemetry_log
 from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
-from dappled.mocks.autopilot.path import Path
+from dappled.mocks.autopilot.path import FlightPath
 
 START_NS = 1_790_000_000 * 10**9
 SPEED_M_S = 15.0
@@ -84,7 +84,7 @@ def main() -> None:
 def measure(frames: int, seed: int) -> dict[str, dict[str, float]]:
     """By the source of the exposure's time: rms errors, rms reported sigmas, and their ratio."""
     rng = random.Random(seed)  # noqa: S311  a simulation
-    path = Path(seed, speed_m_s=SPEED_M_S, radius_m=SPEED_M_S / TURN_RAD_S)
+    path = FlightPath(seed, speed_m_s=SPEED_M_S, radius_m=SPEED_M_S / TURN_RAD_S)
     taken = [_take(WARM_UP_S + EVERY_S * number, rng) for number in range(frames)]
     packets = sorted(_packets(path, taken, rng), key=lambda packet: packet[0])
     found: dict[str, list[tuple[Taken, ExposureTime, Pose]]] = {"hot_shoe": [], "body_latency": [], "camera_clock": []}
@@ -177,7 +177,7 @@ def _take(called_s: float, rng: random.Random) -> Taken:
     return Taken(called_s, called_s + latency_s + EXPOSURE_S / 2)
 
 
-def _packets(path: Path, taken: Sequence[Taken], rng: random.Random) -> Iterator[tuple[int, Message]]:
+def _packets(path: FlightPath, taken: Sequence[Taken], rng: random.Random) -> Iterator[tuple[int, Message]]:
     """(arrival UTC, message): telemetry, TIMESYNC at 5 Hz, a hot-shoe feedback for each frame."""
     boot = BootTime(drift=DRIFT)
     end_s = taken[-1].middle_s + 2
@@ -227,7 +227,7 @@ def _utc_ns(t_s: float) -> int:
     return START_NS + round(t_s * 1e9)
 
 
-def _figures(path: Path, rows: Sequence[tuple[Taken, ExposureTime, Pose]]) -> dict[str, float]:
+def _figures(path: FlightPath, rows: Sequence[tuple[Taken, ExposureTime, Pose]]) -> dict[str, float]:
     metres, turns, sigma_m, sigma_rad, late_ms, sigma_ms = [], [], [], [], [], []
     for one, exposure, pose in rows:
         if pose.latitude_rad is None or pose.longitude_rad is None or pose.attitude is None:

@@ -21,7 +21,7 @@ from dappled.flight.entries import Result
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.records import Cause, Shot
 from dappled.mocks.autopilot.autopilot import BootTime, flight
-from dappled.mocks.autopilot.path import Path as FlightPath
+from dappled.mocks.autopilot.path import FlightPath
 from tests.daemon.fakes import rig
 from tests.daemon.replay.test_replay import again
 from tests.flight.makers import held

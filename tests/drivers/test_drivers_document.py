@@ -14,7 +14,7 @@ import pytest
 
 from dappled.config.settings import CameraSettings
 from dappled.daemon import cameras
-from dappled.mocks.body.pictures import pattern
+from dappled.mocks.body.body import pattern
 from tests.drivers.contract import CameraContract, Rig
 
 PAGE = Path(__file__).parents[2] / "docs" / "drivers.md"

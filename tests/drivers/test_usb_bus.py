@@ -9,7 +9,7 @@ import pytest
 import usb.core
 
 from dappled.drivers.usb_bus import UsbError, bodies, changes, holders, reset
-from dappled.mocks.body.usb_devices import EOS_450D, FINEPIX_DISK, MOUSE, UsbDevices
+from tests.simulated.usb_devices import EOS_450D, FINEPIX_DISK, MOUSE, UsbDevices
 
 
 def test_cameras_are_told_from_mice() -> None:

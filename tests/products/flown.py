@@ -19,14 +19,13 @@ from dappled.decode.geometry.pose import Pose, Quaternion
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.flight import recording
 from dappled.flight.records import Tag
-from dappled.mocks.autopilot.path import Path as FlightPath
-from dappled.mocks.autopilot.path import TruePose
-from dappled.mocks.scene import bench_calibration, terrain
-from dappled.mocks.scene.bench_calibration import CAMERA, MASK
+from dappled.mocks import simulation
+from dappled.mocks.autopilot.path import FlightPath, TruePose
+from dappled.mocks.scene import terrain
 from dappled.mocks.scene.flyover import Terrain
-from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
+from dappled.mocks.scene.masked_camera import MaskedCamera, Truth, reference_camera
 from dappled.mocks.scene.terrain import DETAIL_TEXEL_M, EXTENT_M, TEXEL_M
-from dappled.mocks.scene.truth import Truth
+from dappled.mocks.simulation import CAMERA, MASK
 from tests.flight.makers import deliver, wish
 
 START_NS = 1_795_256_103_000_000_000
@@ -94,7 +93,7 @@ def fly(
             Tag(index, pose.utc_ns, 10_000, "hot shoe", 50.0, F_NUMBER, 0.001, 100, CAMERA, MASK, frame.sha256, pose)
         )
     begun.close()
-    calibration = bench_calibration.write(camera, folder)
+    calibration = simulation.write_calibration(camera, folder)
     recipe = Recipe(camera=CAMERA, mask=MASK, calibration=str(calibration))
     return Flown(begun.folder.path, recipe, path, tuple(truths), scene.ground)
 

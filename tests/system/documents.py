@@ -20,9 +20,9 @@ from PIL import Image
 
 from dappled.config import settings as configuration
 from dappled.daemon.camera_protocol.ground_client import GroundClient, GroundError
-from dappled.mocks.scene import lytro
 from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.mocks.simulation import Simulation, World
+from tests.simulated import lytro
 
 ROOT = Path(__file__).resolve().parents[2]
 FENCED = re.compile(r"^```(sh|console|bash)\n(.*?)^```", re.MULTILINE | re.DOTALL)

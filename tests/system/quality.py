@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from dappled.decode.lightfield.light_field import LightField
-from dappled.mocks.scene.truth import Truth
+from dappled.mocks.scene.masked_camera import Truth
 
 GREEN = 1  # what a mosaic is balanced to
 BORDER = 12  # px of a view left out: the lens' blur of the truth wraps around there

@@ -9,8 +9,7 @@ import pytest
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.records import Frame
-from dappled.mocks.body.body import Body, BodyOptions
-from dappled.mocks.body.pictures import pattern
+from dappled.mocks.body.body import Body, BodyOptions, pattern
 from tests.system.flying import eventually, flying, settings_of
 
 SIZE, SHOTS = 1_000_001, 5

@@ -19,9 +19,8 @@ import pytest
 
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.flight.ledger import LedgerReader
-from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.body.body import Body, BodyOptions, pattern
 from dappled.mocks.body.eos450d import thumbnail
-from dappled.mocks.body.pictures import pattern
 from tests.system.flying import Flying, eventually, flying, settings_of, told
 
 SIZE = 2_000_001

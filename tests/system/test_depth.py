@@ -24,9 +24,8 @@ from dappled.cli.calibrate import from_frames
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.mocks.scene.bench import Bench, Plane
-from dappled.mocks.scene.masked_camera import LEVEL, MaskedCamera, reference_camera
+from dappled.mocks.scene.masked_camera import LEVEL, MaskedCamera, Truth, reference_camera
 from dappled.mocks.scene.synthesis import PASS, Grid
-from dappled.mocks.scene.truth import Truth
 from dappled.products.opened import OpenedFrame, OpenedLightField, with_ranging
 
 CAMERA, MASK = "reference-36mm", "reference-5x5"

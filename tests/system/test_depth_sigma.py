@@ -16,7 +16,7 @@ import tomli_w
 import dappled
 from dappled.cli.calibrate import from_frames
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
-from dappled.mocks.autopilot.path import Path as FlightPath
+from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.scene.bench import Bench, Plane
 from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 from dappled.mocks.scene.synthesis import PASS, Grid

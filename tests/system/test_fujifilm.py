@@ -18,11 +18,10 @@ from dappled.drivers.mavlink.links import mavlink
 from dappled.drivers.wired import shutter_line
 from dappled.flight import check, summary
 from dappled.flight.ledger import LedgerReader
-from dappled.mocks.body.body import Body, BodyOptions
-from dappled.mocks.body.finepix import FinePix
-from dappled.mocks.body.pictures import pattern
+from dappled.mocks.body.body import Body, BodyOptions, pattern
 from dappled.mocks.simulation import free_port
 from tests.drivers.contract import content, until_shot_ends, until_state
+from tests.simulated.finepix import FinePix
 from tests.system.flying import Flying, eventually, flying, settings_of
 
 Wrong = tuple[list[str], str]

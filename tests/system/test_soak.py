@@ -16,7 +16,7 @@ from dappled.mocks.soak.supervised import Resources
 def test_the_books_balance_after_two_minutes_of_trouble() -> None:
     with tempfile.TemporaryDirectory(prefix="soak-") as folder:
         told: list[str] = []
-        account = soak.soak(soak.Plan(seconds=120, seed=4), Path(folder), told.append)
+        account = soak.soak(soak.SoakPlan(seconds=120, seed=4), Path(folder), told.append)
         log = (Path(folder) / "daemon.log").read_text(encoding="utf-8", errors="replace")
     assert account.problems == [], "\n".join([*account.problems, *told, log[-5000:]])
     assert account.accepted <= account.shots <= account.asked  # unanswered wishes may have been shots

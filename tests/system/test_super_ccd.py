@@ -11,8 +11,8 @@ from scipy import ndimage
 
 from dappled.cli import main
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
-from dappled.mocks.scene.super_ccd import Finepix
 from dappled.mocks.scene.synthesis import Grid
+from tests.simulated.super_ccd import Finepix
 
 MASK = "mask-2-full"
 MARGINS = 30, 4  # samples of the whole file outside of the active area, above and to the left

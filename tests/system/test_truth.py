@@ -14,7 +14,7 @@ from dappled.config.settings import Settings, resolve
 from dappled.daemon.service import Service
 from dappled.decode.geometry.interpolation import metres_per_radian
 from dappled.flight import summary
-from dappled.mocks.autopilot.path import Path as FlightPath
+from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.simulation import Simulation, World
 
 SEED, FRAMES = 8, 3

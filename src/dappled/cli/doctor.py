@@ -244,7 +244,7 @@ def _hot_shoe(settings: Settings, truth: Path | None) -> Iterator[None]:
     if truth is None:
         yield
         return
-    from dappled.mocks.autopilot.hot_shoe import HotShoe  # noqa: PLC0415  # as above
+    from dappled.mocks.autopilot.autopilot import HotShoe  # noqa: PLC0415  # as above
 
     shoe = HotShoe(truth, settings.mavlink.url[0])
     try:

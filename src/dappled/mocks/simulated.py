@@ -21,8 +21,7 @@ from dappled.config.schema import ConfigError, Source, build, setting
 from dappled.drivers.camera import CameraError, Identity, check_options, seconds_option
 from dappled.drivers.wired.composed import ComposedCamera, Plan
 from dappled.drivers.wired.sources import FolderSource
-from dappled.mocks.body.body import BodyOptions
-from dappled.mocks.body.pictures import exposer
+from dappled.mocks.body.body import BodyOptions, exposer
 
 _HOLD_S = 0.02
 

@@ -15,13 +15,17 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import tomli_w
+
+from dappled.config import profiles
 from dappled.config.settings import Settings
+from dappled.decode.calibration.fit import CalibrationFrame, calibrate
+from dappled.decode.spectrum.plane import to_plane
+from dappled.drivers.raw import reading
 from dappled.mocks.autopilot.autopilot import Autopilot
 from dappled.mocks.autopilot.ground_station import GroundStation
 from dappled.mocks.body.body import Body, BodyOptions
-from dappled.mocks.scene import bench_calibration
-from dappled.mocks.scene.bench_calibration import CAMERA, MASK
-from dappled.mocks.scene.masked_camera import reference_camera
+from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 
 LATENCY_MS, LATENCY_SIGMA_MS = 60.0, 15.0 / 3**0.5  # the body's is spread evenly over 60 ± 15 ms
 
@@ -52,7 +56,7 @@ class Simulation:
         """Start camera body and autopilot; the settings that make a daemon use them."""
         world = self.world
         camera = reference_camera(world.seed, scale=world.scale, scene="white")
-        calibration = bench_calibration.write(camera, self._folder)
+        calibration = write_calibration(camera, self._folder)
         with ExitStack() as stack:
             self.body = body = Body.start(
                 BodyOptions(
@@ -149,3 +153,26 @@ def _keys(given: Settings) -> tuple[str, ...]:
     if not keys:
         return ()
     return ("", "", *(keys * links if len(keys) == 1 else keys))
+
+
+CAMERA, MASK = "reference-36mm", "reference-5x5"
+"""The shipped profiles of the reference camera."""
+
+
+def write_calibration(camera: MaskedCamera, folder: Path) -> Path:
+    """What `dappled calibrate` makes of the bench frame of a reference camera; the file that it wrote."""
+    raw = reading.read(camera.bench_frame().file, "bench frame")
+    profile = profiles.camera(CAMERA)
+    plane = to_plane(raw.mosaic, black=raw.black, white=raw.white, cfa=raw.cfa)
+    assert raw.focal_length_mm is not None  # the simulated camera writes both into its files
+    assert raw.f_number is not None
+    found = calibrate(
+        [CalibrationFrame(plane, raw.focal_length_mm, raw.f_number)],
+        sensor=profile.sensor((plane.shape[0], plane.shape[1])),
+        mask=profiles.mask(MASK).mask,
+        law=profile.law,
+        mask_distance_mm=profile.mask_distance_mm,
+    )
+    path = folder / "calibration.toml"
+    path.write_text(tomli_w.dumps(found.to_dict()), encoding="utf-8")
+    return path

@@ -18,7 +18,7 @@ from dappled.daemon.navigation.telemetry import Telemetry
 from dappled.daemon.pipeline.tagger import BodyLatency, ExposureTime, mid_exposure
 from dappled.drivers.mavlink.links import Message, mavlink
 from dappled.mocks.autopilot.autopilot import BootTime, flight
-from dappled.mocks.autopilot.path import Path as FlightPath
+from dappled.mocks.autopilot.path import FlightPath
 
 MS = 10**6
 START_NS = 1_790_000_000 * 10**9

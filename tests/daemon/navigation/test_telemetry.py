@@ -22,7 +22,7 @@ from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Decoder, Message, mavlink
 from dappled.flight.records import digest
 from dappled.mocks.autopilot.autopilot import BootTime, flight
-from dappled.mocks.autopilot.path import Path, TruePose
+from dappled.mocks.autopilot.path import FlightPath, TruePose
 
 START_NS = 1_790_000_000 * 10**9
 BOOT = BootTime()
@@ -40,7 +40,13 @@ def made(message: Message, component: int = 1) -> Message:
 
 
 def recording(
-    path: Path, seconds: float, *, latency_s: float = 0.0, jitter_s: float = 0.0, timesync: bool = True, seed: int = 1
+    path: FlightPath,
+    seconds: float,
+    *,
+    latency_s: float = 0.0,
+    jitter_s: float = 0.0,
+    timesync: bool = True,
+    seed: int = 1,
 ) -> list[Stamped]:
     """What the daemon would log of a simulated flight that began at START_NS."""
     rng = random.Random(seed)  # noqa: S311 (a simulation)
@@ -90,7 +96,7 @@ def rms(values: list[float]) -> float:
 )
 def test_poses_match_the_true_path(latency_s: float, jitter_s: float, speed_m_s: float) -> None:
     """Exact exposure times, 10 Hz position, 50 Hz attitude, 50 ppm drift."""
-    path = Path(3, speed_m_s=speed_m_s, radius_m=60 if speed_m_s > 10 else 25)
+    path = FlightPath(3, speed_m_s=speed_m_s, radius_m=60 if speed_m_s > 10 else 25)
     telemetry = fed(recording(path, 40, latency_s=latency_s, jitter_s=jitter_s))
     times = np.random.default_rng(5).uniform(33, 39, 60)
     errors, angles, sigmas = [], [], []
@@ -108,7 +114,7 @@ def test_poses_match_the_true_path(latency_s: float, jitter_s: float, speed_m_s:
 
 
 def test_a_replay_gets_the_same_pose_whether_it_stops_at_the_limit_or_read_on() -> None:
-    packets = recording(Path(3), 20, latency_s=0.02, jitter_s=0.01)
+    packets = recording(FlightPath(3), 20, latency_s=0.02, jitter_s=0.01)
     utc_ns = START_NS + 11 * 10**9
     telemetry = Telemetry()
     live = None
@@ -125,7 +131,7 @@ def test_a_replay_gets_the_same_pose_whether_it_stops_at_the_limit_or_read_on() 
 
 
 def test_an_instant_after_the_last_sample_is_nearest_and_far_away_none() -> None:
-    telemetry = fed(recording(Path(3), 10))
+    telemetry = fed(recording(FlightPath(3), 10))
     assert not telemetry.bracketed(START_NS + 11 * 10**9)
     near = telemetry.pose_at(START_NS + 12 * 10**9, 0)
     assert near.source == "nearest"
@@ -139,12 +145,12 @@ def test_an_instant_after_the_last_sample_is_nearest_and_far_away_none() -> None
 def test_a_gap_in_the_telemetry_at_the_exposure_is_marked_and_counted() -> None:
     """4 s without a packet around the exposure: nothing is bridged, the nearest sample stands, and sigma says so."""
     around_us = START_NS // 1000 + 20 * 10**6
-    packets = [p for p in recording(Path(3, speed_m_s=8.0), 40) if abs(p[1] - around_us) > 2 * 10**6]
+    packets = [p for p in recording(FlightPath(3, speed_m_s=8.0), 40) if abs(p[1] - around_us) > 2 * 10**6]
     pose = fed(packets).pose_at(START_NS + 20 * 10**9, 0)
     assert pose.source == "nearest"
     assert pose.age_ms == pytest.approx(2000, abs=200)
     assert pose.position_sigma_m is not None
-    assert pose.position_sigma_m >= position_error_m(pose, Path(3, speed_m_s=8.0).pose(20.0)) / 3
+    assert pose.position_sigma_m >= position_error_m(pose, FlightPath(3, speed_m_s=8.0).pose(20.0)) / 3
     assert pose.position_sigma_m > 10
     beside = fed(packets).pose_at(START_NS + 30 * 10**9, 0)
     assert beside.source == "interpolated"
@@ -157,7 +163,7 @@ def test_without_telemetry_there_is_no_pose_and_no_zero() -> None:
 
 
 def test_a_reboot_drops_clock_and_history_but_a_late_packet_does_not() -> None:
-    before = recording(Path(3), 60)
+    before = recording(FlightPath(3), 60)
     telemetry = fed(before)
     late = before[len(before) // 3][2]
     number, stamp_us = before[-1][0] + 1, before[-1][1]
@@ -165,7 +171,7 @@ def test_a_reboot_drops_clock_and_history_but_a_late_packet_does_not() -> None:
     assert telemetry.statistics().reboots == 0
     assert telemetry.boot_clock() is not None
     again = BootTime(offset_s=1.0)
-    for t_s, message in flight(Path(3), again, 0, 5):
+    for t_s, message in flight(FlightPath(3), again, 0, 5):
         number += 1
         telemetry.feed(number, stamp_us + 10**6 + round(t_s * 1e6), made(message))
     assert telemetry.statistics().reboots == 1
@@ -177,7 +183,7 @@ def test_a_reboot_drops_clock_and_history_but_a_late_packet_does_not() -> None:
 
 
 def test_answers_meant_for_others_are_not_taken() -> None:
-    packets = recording(Path(3), 5, timesync=False)
+    packets = recording(FlightPath(3), 5, timesync=False)
     number, stamp_us = packets[-1][0], packets[-1][1]
     telemetry = fed(packets)
     for step in range(10):
@@ -303,7 +309,7 @@ def test_history_is_bounded_in_time_whatever_stands_between_its_packets() -> Non
 
 
 def test_a_flood_of_one_kind_keeps_the_newest_and_the_rest_of_the_history() -> None:
-    packets = recording(Path(3), 5)
+    packets = recording(FlightPath(3), 5)
     telemetry = fed(packets)
     number, stamp_us = packets[-1][0], packets[-1][1]
     flood = made(mavlink.MAVLink_gps_raw_int_message(0, 3, 10**7, 10**7, 0, 100, 100, 0, 0, 9))

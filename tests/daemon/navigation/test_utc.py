@@ -12,7 +12,7 @@ from dappled.daemon.navigation.utc import FLOOR_NS, UtcLearner
 from dappled.drivers.mavlink.links import mavlink
 from dappled.errors import DappledError
 from dappled.mocks.autopilot.autopilot import BootTime, flight
-from dappled.mocks.autopilot.path import Path as FlightPath
+from dappled.mocks.autopilot.path import FlightPath
 
 NOW_NS = FLOOR_NS + 10**18
 

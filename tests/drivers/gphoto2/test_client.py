@@ -23,9 +23,8 @@ from dappled.drivers.gphoto2.client import GPhoto2Camera, Spawn, open_camera, sp
 from dappled.drivers.gphoto2.messages import Before
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
 from dappled.drivers.process_channel import ProcessChannel
-from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.body.body import Body, BodyOptions, pattern
 from dappled.mocks.body.eos450d import thumbnail
-from dappled.mocks.body.pictures import pattern
 from tests.drivers.contract import (
     CameraContract,
     Rig,

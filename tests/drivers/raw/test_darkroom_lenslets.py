@@ -16,7 +16,7 @@ from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.views import from_lenslet_slices
 from dappled.decode.optics.carriers import Carrier
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
-from dappled.mocks.scene.lytro import container, metadata
+from tests.simulated.lytro import container, metadata
 
 LFTOOLBOX_DB = (41.9, 42.4, 42.8, 42.9, 43.2, 41.8, 39.4)
 PITCH_PX = 5  # of the truth

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dappled.drivers.raw import lytro, reading
 from dappled.drivers.raw.reading import RawFileError
-from dappled.mocks.scene.lytro import container, metadata, packed
+from tests.simulated.lytro import container, metadata, packed
 
 SHAPE = (12, 16)
 

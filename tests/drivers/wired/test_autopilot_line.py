@@ -14,8 +14,8 @@ from dappled.drivers.mavlink.links import MavlinkLinks, Packet, mavlink
 from dappled.drivers.wired.composed import ComposedCamera, Plan
 from dappled.drivers.wired.shutter_line import parse_line
 from dappled.drivers.wired.sources import FolderSource
-from dappled.mocks.body.finepix import FinePix, picture
 from tests.drivers.contract import CameraContract, Rig
+from tests.simulated.finepix import FinePix, picture
 
 T0 = 1_700_000_000.0
 OPEN_US = 1500

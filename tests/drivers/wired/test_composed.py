@@ -19,9 +19,8 @@ from dappled.drivers.wired.composed import ComposedCamera, Plan
 from dappled.drivers.wired.shutter_line import GpioLine, OutsideLine
 from dappled.drivers.wired.sources import FolderSource, Found, StorageSource
 from dappled.mocks import simulated
+from dappled.mocks.body.body import pattern
 from dappled.mocks.body.eos450d import thumbnail
-from dappled.mocks.body.finepix import FinePix, picture
-from dappled.mocks.body.pictures import pattern
 from tests.drivers.contract import (
     CameraContract,
     Rig,
@@ -33,6 +32,7 @@ from tests.drivers.contract import (
     until_shot_ends,
     until_state,
 )
+from tests.simulated.finepix import FinePix, picture
 
 WHO = Identity("FUJIFILM", "FinePix S5200", "", "gpio")
 FAST = Plan(file_s=20.0, hold_s=0.01, poll_s=0.02, retry_s=0.02)

@@ -12,8 +12,7 @@ from dappled.drivers.camera import CameraError, Identity
 from dappled.drivers.wired import composed
 from dappled.drivers.wired.composed import ComposedCamera, Plan
 from dappled.drivers.wired.ptp_source import PtpSource
-from dappled.mocks.body.body import Body, BodyOptions
-from dappled.mocks.body.pictures import pattern
+from dappled.mocks.body.body import Body, BodyOptions, pattern
 from tests.drivers.contract import CameraContract, Rig
 
 SIZE = 100_001

@@ -10,7 +10,7 @@ from gpiod.line import Value
 
 from dappled.drivers.camera import CameraError
 from dappled.drivers.wired.shutter_line import GpioLine, OutsideLine, UsesAutopilot, hold_s, parse_line, pressing
-from dappled.mocks.body.finepix import Contact, FinePix
+from tests.simulated.finepix import Contact, FinePix
 
 
 class Wire:

@@ -13,10 +13,9 @@ from dappled.drivers.camera import CameraError
 from dappled.drivers.gphoto2.client import open_camera
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import FolderSource, Found, Source, StorageSource, groups, parse_source
-from dappled.mocks.body.body import Body, BodyOptions
-from dappled.mocks.body.finepix import FinePix, picture
-from dappled.mocks.body.pictures import pattern
+from dappled.mocks.body.body import Body, BodyOptions, pattern
 from tests.drivers.contract import content, until_shot_ends, until_state
+from tests.simulated.finepix import FinePix, picture
 
 
 def read(source: Source, found: Found) -> bytes:

@@ -13,7 +13,7 @@ from dappled.daemon.navigation.boot_clock import BootClock
 from dappled.decode.geometry.interpolation import turn_rad
 from dappled.mocks.autopilot.autopilot import Autopilot, BootTime
 from dappled.mocks.autopilot.ground_station import GroundStation
-from dappled.mocks.autopilot.path import Path
+from dappled.mocks.autopilot.path import FlightPath
 from tests.daemon.camera_protocol.rig import Camera
 
 
@@ -66,7 +66,7 @@ def test_the_autopilot_process_flies_the_path_in_its_own_time(camera: Camera) ->
         pose = camera.telemetry.pose_at(utc_ns, 0)
         offset_ns = camera.clock.utc_ns() - camera.clock.monotonic_ns()
         t_s = (utc_ns - offset_ns - start_ns) / 1e9
-        truth = Path(4).pose(t_s)
+        truth = FlightPath(4).pose(t_s)
         assert pose.source == "interpolated"
         assert pose.attitude is not None
         assert pose.latitude_rad is not None

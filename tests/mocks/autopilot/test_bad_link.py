@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import pytest
 
-from dappled.mocks.autopilot.bad_link import BadLink, Faults
 from dappled.mocks.autopilot.ground_station import GroundStation
 from tests.daemon.camera_protocol.rig import Camera
 from tests.daemon.fakes import eventually
+from tests.simulated.bad_link import BadLink, Faults
 
 
 @pytest.mark.parametrize(

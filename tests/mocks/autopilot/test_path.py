@@ -9,7 +9,7 @@ from pyproj import Geod
 from scipy.spatial.transform import Rotation
 
 from dappled.decode.geometry import interpolation
-from dappled.mocks.autopilot.path import Path, TruePose
+from dappled.mocks.autopilot.path import FlightPath, TruePose
 
 TIMES_S = (0.0, 3.7, 61.2, 599.0)
 
@@ -22,7 +22,7 @@ def turn(pose: TruePose) -> Rotation:
 @pytest.mark.parametrize("t_s", TIMES_S)
 @pytest.mark.parametrize("seed", [1, 5])
 def test_velocity_and_rates_lead_to_the_next_pose(seed: int, t_s: float) -> None:
-    path, span_s = Path(seed), 0.02
+    path, span_s = FlightPath(seed), 0.02
     here, there, middle = path.pose(t_s), path.pose(t_s + span_s), path.pose(t_s + span_s / 2)
     for axis in range(3):
         moved = here.position_ned_m[axis] + middle.velocity_ned_m_s[axis] * span_s
@@ -33,7 +33,7 @@ def test_velocity_and_rates_lead_to_the_next_pose(seed: int, t_s: float) -> None
 
 @pytest.mark.parametrize("t_s", TIMES_S)
 def test_its_place_is_the_ellipsoids(t_s: float) -> None:
-    path = Path(2, home_altitude_msl_m=0.0)
+    path = FlightPath(2, home_altitude_msl_m=0.0)
     pose = path.pose(t_s)
     azimuth_deg, _, metres = Geod(ellps="WGS84").inv(
         path.home_longitude_deg, path.home_latitude_deg, pose.longitude_deg, pose.latitude_deg
@@ -46,7 +46,7 @@ def test_its_place_is_the_ellipsoids(t_s: float) -> None:
 
 @pytest.mark.parametrize("t_s", TIMES_S)
 def test_the_daemons_mathematics_is_another_and_says_the_same(t_s: float) -> None:
-    path = Path(3)
+    path = FlightPath(3)
     pose = path.pose(t_s)
     yaw, pitch, roll = turn(pose).as_euler("ZYX")
     assert interpolation.turn_rad(interpolation.from_euler(roll, pitch, yaw), pose.attitude) < 1e-7

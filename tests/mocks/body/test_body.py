@@ -9,8 +9,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from dappled.mocks.body.body import Body, BodyError, BodyOptions
-from dappled.mocks.body.pictures import exposer, pattern
+from dappled.mocks.body.body import Body, BodyError, BodyOptions, exposer, pattern
 
 
 def test_a_body_listens_obeys_and_ends() -> None:
@@ -39,7 +38,7 @@ def test_a_wire_fires_a_body_that_nobody_is_connected_to_and_not_while_it_works(
 
 
 def test_a_body_ends_with_its_input() -> None:
-    command = [sys.executable, "-m", "dappled.mocks.body.body_process", "--picture", "pattern:1000:jpg"]
+    command = [sys.executable, "-m", "dappled.mocks.body.body", "--picture", "pattern:1000:jpg"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdin is not None

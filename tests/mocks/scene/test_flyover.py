@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dappled.decode.geometry.interpolation import from_euler
-from dappled.mocks.autopilot.path import Path, TruePose
+from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.scene import flyover
 from dappled.mocks.scene.flyover import Terrain
 from dappled.mocks.scene.lens import Rays
@@ -74,7 +74,7 @@ def test_the_top_of_the_picture_is_the_nose_and_the_right_is_the_right() -> None
 
 
 def test_depth_times_ray_lies_on_the_ground(terrain: Terrain) -> None:
-    pose = Path(3).pose(12.0)
+    pose = FlightPath(3).pose(12.0)
     look = rays(step_mm=0.2)
     depth = terrain.render(look, pose).depth_m
     assert depth is not None

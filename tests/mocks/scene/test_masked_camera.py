@@ -12,9 +12,7 @@ import pytest
 import rawpy
 from numpy.typing import NDArray
 
-from dappled.mocks.scene.chip import SensorModel
-from dappled.mocks.scene.masked_camera import Exposure, MaskedCamera, reference_camera
-from dappled.mocks.scene.truth import Truth
+from dappled.mocks.scene.masked_camera import Exposure, MaskedCamera, SensorModel, Truth, reference_camera
 
 
 def quiet(sensor: SensorModel) -> SensorModel:

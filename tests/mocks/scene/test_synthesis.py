@@ -13,9 +13,8 @@ from dappled.decode.optics.carriers import Lattice
 from dappled.decode.optics.masks import Mask
 from dappled.mocks.autopilot.path import TruePose
 from dappled.mocks.scene import lens
-from dappled.mocks.scene.chip import SensorModel
 from dappled.mocks.scene.lens import Installation, Optics, Rays, Rendering
-from dappled.mocks.scene.masked_camera import MaskedCamera
+from dappled.mocks.scene.masked_camera import MaskedCamera, SensorModel
 from dappled.mocks.scene.synthesis import MARGIN, SITES, Grid, band_limited
 
 Array = NDArray[np.floating]

@@ -25,8 +25,8 @@ from dappled.errors import DappledError
 from dappled.flight import recording
 from dappled.flight.records import Tag
 from dappled.mocks.autopilot.path import TruePose
-from dappled.mocks.scene.bench_calibration import CAMERA, MASK
-from dappled.mocks.scene.truth import Truth
+from dappled.mocks.scene.masked_camera import Truth
+from dappled.mocks.simulation import CAMERA, MASK
 from dappled.products.maps import difference, georeference, photographs
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.georeference import Options, Survey

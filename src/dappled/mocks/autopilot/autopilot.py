@@ -1,4 +1,4 @@
-"""A simulated autopilot that flies `Path`, with a boot clock of its own, over real MAVLink.
+"""A simulated autopilot that flies `FlightPath`, with a boot clock of its own, over real MAVLink.
 
 `python -m dappled.mocks.autopilot.autopilot --url udpout:127.0.0.1:14550 --seed 1 --start-monotonic-ns N`
 """
@@ -6,9 +6,11 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import random
 import select
+import socket
 import subprocess
 import sys
 import threading
@@ -16,10 +18,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from dappled.clock import SystemClock
 from dappled.drivers.mavlink.links import LinkError, MavlinkLinks, Message, Packet, mavlink
-from dappled.mocks.autopilot.path import Path, TruePose
+from dappled.mocks.autopilot.path import FlightPath, TruePose
 
 RATES_HZ: dict[int, float] = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
@@ -75,7 +78,7 @@ def telemetry_message(message_id: int, pose: TruePose, boot_ns: int, unix_us: in
     raise ValueError(f"the simulated autopilot has no message {message_id}")
 
 
-def flight(path: Path, boot: BootTime, start_s: float, stop_s: float) -> Iterator[tuple[float, Message]]:
+def flight(path: FlightPath, boot: BootTime, start_s: float, stop_s: float) -> Iterator[tuple[float, Message]]:
     """All telemetry of a stretch of flight, (simulation time, message) in order, without a link."""
     events = sorted(
         (start_s + step / rate, message_id)
@@ -90,7 +93,7 @@ def flight(path: Path, boot: BootTime, start_s: float, stop_s: float) -> Iterato
 class Flyer:
     """The running autopilot: what is due, answers to TIMESYNC and to message interval requests, a slow link."""
 
-    path: Path
+    path: FlightPath
     start_monotonic_ns: int
     boot: BootTime
     send: Callable[[Message], object]
@@ -177,7 +180,9 @@ class Autopilot:
         jitter_s: float = 0.0,
         booted_s: float = BootTime().offset_s,
     ) -> Autopilot:
-        """Start one that flies `Path(seed)` since `start_monotonic_ns` and speaks on `url` (udpout:HOST:PORT). It was
+        """Start one that flies `FlightPath(seed)` since `start_monotonic_ns` and speaks on `url` (udpout:HOST:PORT).
+
+        It was
         booted `booted_s` before the flight began; less than zero: in flight."""
         command = [
             sys.executable,
@@ -227,7 +232,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--with-parent", action="store_true", help="end when standard input is closed")
     wanted = parser.parse_args(arguments)
     start_ns = time.monotonic_ns() if wanted.start_monotonic_ns is None else wanted.start_monotonic_ns
-    flyer = Flyer(Path(wanted.seed), start_ns, BootTime(wanted.booted), lambda _: None, wanted.jitter, wanted.system_id)
+    flyer = Flyer(
+        FlightPath(wanted.seed), start_ns, BootTime(wanted.booted), lambda _: None, wanted.jitter, wanted.system_id
+    )
 
     def received(packet: Packet) -> None:
         if not packet.sent:
@@ -262,3 +269,43 @@ def main(arguments: list[str] | None = None) -> int:
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+_LOOK_S = 0.005
+
+
+class HotShoe:
+    """At work until `close`. `url` is the daemon's own "udpin:HOST:PORT"."""
+
+    def __init__(self, truth: Path, url: str) -> None:
+        _, host, port = url.split(":")
+        self._truth = truth
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect((host, int(port)))
+        self._speech = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="hot shoe", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Cut the wire."""
+        self._stop.set()
+        self._thread.join(5)
+        self._socket.close()
+
+    def _run(self) -> None:
+        told: set[str] = set()
+        while not self._stop.wait(_LOOK_S):
+            for path in sorted(self._truth.glob("*.json")):
+                if path.name not in told:
+                    try:
+                        times = json.loads(path.read_text())
+                    except ValueError:
+                        continue  # it is still written
+                    told.add(path.name)
+                    self._tell(int(path.stem), times["trigger_t_s"] + times["latency_s"])
+
+    def _tell(self, number: int, opened_t_s: float) -> None:
+        boot_us = BootTime().ns(opened_t_s) // 1000
+        message = mavlink.MAVLink_camera_feedback_message(boot_us, 1, 0, number, 0, 0, 0.0, 0.0, 0, 0, 0, 0, 0, number)
+        self._socket.send(message.pack(self._speech))

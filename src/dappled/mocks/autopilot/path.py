@@ -34,7 +34,7 @@ class TruePose:
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class FlightPath:
     """A racetrack over home at a constant mean height, with the sway of a small helicopter.
 
     `t_s` counts seconds from the simulation's start. The home altitude is that of the ground at home, above mean sea

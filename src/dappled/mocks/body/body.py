@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import argparse
+import json
 import os
 import select
+import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.errors import DappledError
-from dappled.mocks.body.eos450d import SERIAL
+from dappled.mocks.body.eos450d import SERIAL, Eos450d, Expose
 from dappled.mocks.body.eos_card import CARD_BYTES
+from dappled.mocks.body.faults import Faults
+from dappled.mocks.body.ptpip import Responder
 
 _START_S = 30.0
 _ANSWER_S = 5.0
@@ -84,7 +90,7 @@ class Body:
     @classmethod
     def start(cls, options: BodyOptions | None = None) -> Body:
         """Start a body's process. Raises BodyError where it doesn't listen within 30 s."""
-        command = [sys.executable, "-m", "dappled.mocks.body.body_process", *(options or BodyOptions()).arguments()]
+        command = [sys.executable, "-m", "dappled.mocks.body.body", *(options or BodyOptions()).arguments()]
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         assert process.stdout is not None  # asked for above
         lines = _Lines(process.stdout.fileno())
@@ -176,3 +182,136 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait(5)
+
+
+def pattern(shot_number: int, size: int) -> bytes:
+    """Bytes that differ from shot to shot and from page to page, so that nothing lost or swapped goes unseen."""
+    page = bytes(range(256)) * 16
+    stamps = (f"shot {shot_number:06d} page {number:08d} ".encode() for number in range(size // len(page) + 1))
+    return b"".join(stamp + page[len(stamp) :] for stamp in stamps)[:size]
+
+
+def exposer(options: BodyOptions) -> Expose:
+    """The source of pictures that the options name. Raises ValueError for one that isn't there."""
+    if options.picture == "simulated":
+        return _simulated(options)
+    if options.picture.startswith("pattern:"):
+        _, size, extension = options.picture.split(":")
+        return _delayed(options.delay_s, lambda number: pattern(number, int(size)), extension)
+    path = Path(options.picture)
+    if not path.is_file():
+        raise ValueError(f"picture {options.picture!r} is neither simulated, nor pattern:SIZE:EXT, nor a file")
+    data = path.read_bytes()
+    return _delayed(options.delay_s, lambda _number: data, path.suffix[1:])
+
+
+def _delayed(delay_s: float, make: Callable[[int], bytes], extension: str) -> Expose:
+    def expose(_trigger_monotonic_ns: int, shot_number: int) -> tuple[bytes, str]:
+        data = make(shot_number)
+        time.sleep(delay_s)
+        return data, extension
+
+    return expose
+
+
+def _simulated(options: BodyOptions) -> Expose:
+    # Imported here: it brings the whole renderer, which a body that shows patterns doesn't need.
+    from dappled.mocks.scene.masked_camera import reference_camera  # noqa: PLC0415  # reason above
+
+    start_ns = time.monotonic_ns() if options.start_monotonic_ns is None else options.start_monotonic_ns
+    camera = reference_camera(
+        options.seed,
+        scale=options.scale,
+        scene=options.scene,
+        law=options.law,
+        epoch_utc_s=time.time() + options.clock_offset_s - (time.monotonic_ns() - start_ns) / 1e9,
+    )
+
+    def expose(trigger_monotonic_ns: int, shot_number: int) -> tuple[bytes, str]:
+        trigger_t_s = (trigger_monotonic_ns - start_ns) / 1e9
+        made = camera.expose(trigger_t_s, shot_number, f_number=options.f_number)
+        if options.truth is not None:
+            made.truth.save(options.truth / f"{shot_number:06d}.npz")
+            times = {"trigger_t_s": trigger_t_s, "mid_exposure_t_s": made.mid_exposure_t_s, "latency_s": made.latency_s}
+            (options.truth / f"{shot_number:06d}.json").write_text(json.dumps(times), encoding="utf-8")
+        return made.file, made.name_suffix.lstrip(".")
+
+    return expose
+
+
+def _obey(line: str, eos: Eos450d, responder: Responder, faults: Faults) -> str:
+    if line == "releases":
+        return f"ok {eos.releases}"
+    if line == "contact":
+        return f"ok {int(eos.contact())}"
+    if line == "card":
+        return f"ok {' '.join(eos.names)}"
+    if line == "move":
+        responder.move()
+        return "ok"
+    try:
+        faults.command(line)
+    except ValueError as error:
+        return f"error {error}"
+    return "ok"
+
+
+def _options(arguments: Sequence[str] | None) -> BodyOptions:
+    parser = argparse.ArgumentParser(prog="python -m dappled.mocks.body.body", description=__doc__.partition("\n")[0])
+    parser.add_argument("--picture", default="simulated", help="simulated, pattern:SIZE:EXT, or a file")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--scale", type=float, default=1.0, help="share of the reference sensor's side")
+    parser.add_argument("--scene", default="terrain", help="terrain, bench, white, or a folder of views")
+    parser.add_argument("--law", default="geometric", help="geometric or fd: where the carriers stand")
+    parser.add_argument("--f-number", type=float, help="the simulated lens' aperture; open without it")
+    parser.add_argument("--start-monotonic-ns", type=int, help="CLOCK_MONOTONIC at the simulation's start")
+    parser.add_argument("--truth", type=Path, help="folder for what the simulation knows of each shot")
+    parser.add_argument("--delay", dest="delay_s", type=float, default=0.0, help="seconds that a pattern or file takes")
+    parser.add_argument("--serial", default=SERIAL)
+    parser.add_argument("--card-bytes", type=int, default=CARD_BYTES, help="the card lies in memory")
+    parser.add_argument("--clock-offset", dest="clock_offset_s", type=float, default=0.0, help="s the body is wrong by")
+    parser.add_argument("--pairs", action="store_true", help="raw and JPEG of each picture")
+    parser.add_argument("--addresses", type=int, default=1, help="ports that it can be moved between")
+    parser.add_argument("--fault", dest="faults", action="append", default=[], help='in force from the start: "busy 2"')
+    found = vars(parser.parse_args(arguments))
+    return BodyOptions(**{**found, "faults": tuple(found["faults"])})
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def serve(options: BodyOptions, lines: Iterable[str]) -> None:
+    """Be a body until the lines end."""
+    faults = Faults(time.monotonic_ns)
+    for fault in options.faults:
+        faults.command(fault)
+    eos = Eos450d(
+        exposer(options),
+        faults,
+        serial=options.serial,
+        card_bytes=options.card_bytes,
+        wall_s=lambda: time.time() + options.clock_offset_s,
+        pairs=options.pairs,
+    )
+    responder = Responder(eos, faults, addresses=options.addresses)
+    _say(f"port {' '.join(map(str, responder.ports))}")
+    for line in lines:
+        _say(_obey(line.strip(), eos, responder, faults))
+    responder.close()
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The process' entry point."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C reaches the whole group; the starter ends us by our input
+    try:
+        serve(_options(arguments), sys.stdin)
+    except ValueError as error:
+        sys.exit(f"body: {error}")
+    except BrokenPipeError:
+        os._exit(0)  # the starter is gone; nothing is left to be said, not even at the exit
+
+
+if __name__ == "__main__":
+    main()

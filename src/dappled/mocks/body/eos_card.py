@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from dappled.mocks.body import ptp_data
+from dappled.mocks.body import ptp
 from dappled.mocks.body.faults import Faults
 from dappled.mocks.body.ptp import Answer, Code, Format, Handler, Op, Request
 
@@ -90,20 +90,20 @@ class Card:
         return max(self._size - used, 0)
 
     def _storage_ids(self, _request: Request, _data: bytes) -> Answer:
-        return Answer(data=ptp_data.array32((STORAGE,)))
+        return Answer(data=ptp.array32((STORAGE,)))
 
     def _storage_info(self, _request: Request, _data: bytes) -> Answer:
-        return Answer(data=ptp_data.storage_info(self._size, self._free()))
+        return Answer(data=ptp.storage_info(self._size, self._free()))
 
     def _children(self, parent: int) -> list[StoredObject]:
-        folder = 0 if parent == ptp_data.ROOT else parent
+        folder = 0 if parent == ptp.ROOT else parent
         return [each for each in self._objects.values() if each.parent == folder and each.handle >= DCIM]
 
     def _found(self, parent: int) -> list[StoredObject]:
         return list(self._objects.values()) if parent == 0 else self._children(parent)
 
     def _handles(self, request: Request, _data: bytes) -> Answer:
-        return Answer(data=ptp_data.array32(each.handle for each in self._found(request.parameter(2))))
+        return Answer(data=ptp.array32(each.handle for each in self._found(request.parameter(2))))
 
     def _count(self, request: Request, _data: bytes) -> Answer:
         return Answer(parameters=(len(self._found(request.parameter(2))),))
@@ -113,7 +113,7 @@ class Card:
         if found is None:
             return Answer(Code.INVALID_OBJECT_HANDLE)
         return Answer(
-            data=ptp_data.object_info(
+            data=ptp.object_info(
                 storage=STORAGE,
                 code=found.code,
                 size=len(found.data),
@@ -126,7 +126,7 @@ class Card:
     def _folder(self, request: Request, _data: bytes) -> Answer:
         rows = self._children(request.parameter(1))
         return Answer(
-            data=ptp_data.eos_folder(
+            data=ptp.eos_folder(
                 (each.handle, STORAGE, each.code, len(each.data), each.parent, each.name, each.unix_s) for each in rows
             )
         )

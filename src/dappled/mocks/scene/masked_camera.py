@@ -6,25 +6,24 @@ is for tests and pictures only.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.optics.carriers import Lattice
+from dappled.decode.optics.carriers import Lattice, Sensor
 from dappled.decode.optics.masks import Mask
-from dappled.mocks.autopilot.path import Path, TruePose
+from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.body import dng
 from dappled.mocks.scene import lens, synthesis
 from dappled.mocks.scene.bench import RealViews, WhiteCard, boards
-from dappled.mocks.scene.chip import SensorModel
 from dappled.mocks.scene.flyover import Terrain, finest_period_m
 from dappled.mocks.scene.lens import Floats, Installation, Optics, Rays, Rendering, Scene
 from dappled.mocks.scene.synthesis import PASS, Grid
-from dappled.mocks.scene.truth import Truth
 
 MAKE, MODEL = "dappled", "Simulated Masked Camera"
 ISO = 100
@@ -63,7 +62,7 @@ class MaskedCamera:
     scene: Scene
     optics: Optics
     sensor: SensorModel
-    path: Path | None = None
+    path: FlightPath | None = None
     installation: Installation | None = None
     epoch_utc_s: float = 1_781_517_600.0
 
@@ -214,9 +213,9 @@ def reference_camera(
     seed: int,
     *,
     scale: float = 1.0,
-    scene: str | FilePath = "terrain",
+    scene: str | Path = "terrain",
     law: str = "geometric",
-    path: Path | None = None,
+    path: FlightPath | None = None,
     epoch_utc_s: float = 1_781_517_600.0,
 ) -> MaskedCamera:
     """The camera of the demo and of the tests.
@@ -236,8 +235,120 @@ def reference_camera(
     if scene == "bench":
         return replace(camera, scene=boards(seed, optics, size_mm, sensor.pitch_mm, sensor.pitch_mm / finest))
     if scene == "terrain":
-        flown = path or Path(seed)
+        flown = path or FlightPath(seed)
         period_m = finest_period_m(flown.height_m, sensor.pitch_mm, optics.focal_length_mm, finest)
         return replace(camera, scene=Terrain.of(seed, period_m), path=flown)
-    views = RealViews.read(FilePath(scene), size_mm)
+    views = RealViews.read(Path(scene), size_mm)
     return replace(camera, scene=views, optics=replace(optics, aperture_samples=len(views.views)))
+
+
+@dataclass(frozen=True, slots=True)
+class SensorModel:
+    """The chip: an RGGB mosaic whose three colours are balanced (`mono`: without colour filters), 14 bits in 16.
+
+    `shot_noise` and `read_noise_e` (electrons rms) are there to be switched off.
+    """
+
+    shape: tuple[int, int] = (2776, 3688)
+    pitch_mm: float = 0.01
+    black: int = 1024
+    white: int = 15360
+    full_well_e: float = 30_000.0
+    shot_noise: bool = True
+    read_noise_e: float = 6.0
+    mono: bool = False
+
+    @property
+    def chip(self) -> Sensor:
+        """Shape and pitch in the decoder's words."""
+        return Sensor(self.shape, (self.pitch_mm, 0.0), (0.0, self.pitch_mm))
+
+    def develop(self, plane: Floats, rng: np.random.Generator) -> NDArray[np.uint16]:
+        """Light (1.0 = white) as the numbers of the raw file, with noise, clipped at white."""
+        electrons = plane * np.float32(self.full_well_e)
+        variance = np.full((), self.read_noise_e**2, dtype=np.float32)
+        if self.shot_noise:
+            variance = variance + np.maximum(electrons, 0)
+        if self.shot_noise or self.read_noise_e:
+            electrons += np.sqrt(variance) * rng.standard_normal(plane.shape, dtype=np.float32)
+        electrons *= np.float32((self.white - self.black) / self.full_well_e)
+        electrons += np.float32(self.black + 0.5)
+        return np.asarray(np.clip(electrons, 0, self.white), dtype=np.uint16)
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What really was in front of the mask.
+
+    `views` float32 (n, n, h, w, 3): what each aperture point saw, band-limited to a slice, in the plane's scale
+    (1.0 = sensor white), scaled so that their mean is the frame's local mean. `aperture_points_mm` (n, n, 2) are
+    those points (θy, θx). `depth_m` (h, w) along the axis and `disparity_mm_per_mm` (h, w), dx/dθ on the sensor, are
+    None where the scene does not know them. `grid` (2, 3) leads from (y, x, 1) of a view to sensor (row, column).
+    `kappa` = f_m·α·A: the used aperture in periods of the mask; 1 is the ideal. `lattice`: where the carriers lie.
+    """
+
+    views: Floats
+    aperture_points_mm: NDArray[np.float64]
+    depth_m: Floats | None
+    disparity_mm_per_mm: Floats | None
+    pose: TruePose | None
+    mid_exposure_t_s: float
+    kappa: float
+    mask: Mask
+    mask_rotation_rad: float
+    mask_shift_mm: tuple[float, float]
+    mask_distance_mm: float
+    angular_frequency_per_mm: float
+    lattice: Lattice
+    grid: NDArray[np.float64]
+
+    def view_points_mm(self, n: int) -> NDArray[np.float64]:
+        """(n, n, 2): centres of n × n cells over the mask's own aperture 1/(f_m·α), turned as the mask is."""
+        axis = (np.arange(n) - (n - 1) / 2) / n / self.angular_frequency_per_mm
+        points = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+        c, s = math.cos(self.mask_rotation_rad), math.sin(self.mask_rotation_rad)
+        return np.asarray(points @ np.array([[c, s], [-s, c]]))  # Rᵀ applied to each point
+
+    def project(self, points_mm: NDArray[np.float64]) -> Floats:
+        """(..., h, w, 3): the light field at aperture points (..., 2), as far as the mask's carriers can tell.
+
+        The views' angular spectrum is taken at the carriers' orders and summed back: what a perfect decoder gets that
+        transforms slices to views. Where κ is not 1 an aperture of one brightness does not give views of one
+        brightness: beyond 1 its rim is seen twice, below 1 the outer views see past it.
+        """
+        orders = np.array(self.mask.orders(), dtype=np.float64)
+        c, s = math.cos(self.mask_rotation_rad), math.sin(self.mask_rotation_rad)
+        k = orders @ np.array([[c, s], [-s, c]]) * self.angular_frequency_per_mm
+        here = np.exp(2j * np.pi * self.aperture_points_mm.reshape(-1, 2) @ k.T)  # (J, K)
+        there = np.exp(-2j * np.pi * np.asarray(points_mm).reshape(-1, 2) @ k.T)  # (U, K)
+        weights = (there @ here.T).real.astype(np.float32) / len(here)
+        n = self.views.shape[0]
+        flat = weights @ self.views.reshape(n * n, -1)
+        return np.asarray(flat.reshape(*np.shape(points_mm)[:-1], *self.views.shape[2:]))
+
+    def band_views(self, n: int) -> Floats:
+        """(n, n, h, w, 3): `project` at `view_points_mm`. With n = 2p+1, as many samples, and κ = 1, the views."""
+        return self.project(self.view_points_mm(n))
+
+    def save(self, path: Path) -> None:
+        """All of it as an .npz file; what is None is left out."""
+        arrays = {
+            "views": self.views,
+            "aperture_points_mm": self.aperture_points_mm,
+            "grid": self.grid,
+            "mid_exposure_t_s": self.mid_exposure_t_s,
+            "kappa": self.kappa,
+            "mask_rotation_rad": self.mask_rotation_rad,
+            "mask_shift_mm": self.mask_shift_mm,
+            "mask_distance_mm": self.mask_distance_mm,
+            "lattice": self.lattice.matrix(),
+        }
+        if self.depth_m is not None and self.disparity_mm_per_mm is not None:
+            arrays |= {"depth_m": self.depth_m, "disparity_mm_per_mm": self.disparity_mm_per_mm}
+        if self.pose is not None:
+            arrays |= {
+                "position_ned_m": self.pose.position_ned_m,
+                "attitude": self.pose.attitude,
+                "geodetic": (self.pose.latitude_deg, self.pose.longitude_deg, self.pose.altitude_msl_m),
+            }
+        np.savez(path, **arrays)  # type: ignore[arg-type]  # savez takes whatever asarray takes

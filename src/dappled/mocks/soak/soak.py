@@ -1,25 +1,19 @@
-"""A long flight in which something goes wrong every few seconds, and the books that must balance at its end.
-
-    python -m dappled.mocks.soak.soak --minutes 30 --seed 1
+"""Fly a long simulated flight in which something goes wrong every few seconds, and check what is left of it.
 
 The daemon runs in a process of its own as a service manager would run it (restarted when it dies), in front of the
-simulated body, autopilot and ground station. At the end every wish that was acknowledged is exactly one shot, every
-shot a frame or failed with a reason, each flight intact, and the daemon's memory, files and threads where they were.
+simulated body, autopilot and ground station. At the end every request that was acknowledged is exactly one shot, every
+shot is a frame or failed with a reason, each flight is intact, and the daemon's memory, open files and threads are
+what they were.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import random
-import signal
 import socket
-import sys
-import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,7 +24,6 @@ from dappled.config import settings as configuration
 from dappled.daemon.camera_protocol.ground_client import GroundClient
 from dappled.drivers.mavlink.links import mavlink
 from dappled.flight import check, summary
-from dappled.flight.errors import FlightError
 from dappled.mocks.simulation import Simulation, World, free_port
 from dappled.mocks.soak.supervised import Resources, Supervised
 from dappled.mocks.soak.troubles import Troubles
@@ -40,7 +33,7 @@ START_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class SoakPlan:
     """A soak: how long, how often a wish, how often a fault. `scale` is that of the simulated sensor."""
 
     seconds: float = 1800.0
@@ -51,7 +44,7 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True)
-class Account:
+class SoakReport:
     """What came of it. `problems` are sentences, none when all is well; wishes are counted by what the ground heard."""
 
     asked: int
@@ -69,7 +62,7 @@ class Account:
     problems: list[str] = field(default_factory=list)
 
 
-def soak(plan: Plan, folder: Path, tell: Callable[[str], None] = lambda _: None) -> Account:
+def soak(plan: SoakPlan, folder: Path, tell: Callable[[str], None] = lambda _: None) -> SoakReport:
     """Fly the plan in `folder` and settle the account."""
     chance = random.Random(plan.seed)  # noqa: S311  # which fault comes when: no secret
     root = folder / "flights"
@@ -131,7 +124,7 @@ def _settle(
     resources: tuple[Resources | None, Resources | None],
     lives: int,
     faults: Counter[str],
-) -> Account:
+) -> SoakReport:
     """Compare what the ground was told with what stands in the flights."""
     shots: Counter[int] = Counter()
     safe = failed = flights = 0
@@ -158,7 +151,7 @@ def _settle(
     before, after = resources
     if before is not None and after is not None:
         problems += before.grown(after)
-    return Account(
+    return SoakReport(
         asked=len(answers),
         accepted=results[accepted],
         refused=len(answers) - results[accepted] - results[None],
@@ -200,33 +193,3 @@ class _Wisher:
             self._answers[sequence] = None
             result, _ = self._ground.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, sequence)
             self._answers[sequence] = result
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The process' entry point: exit 1 when a book doesn't balance or something has grown."""
-    parser = argparse.ArgumentParser(prog="python -m dappled.mocks.soak.soak", description=__doc__.partition("\n")[0])
-    parser.add_argument("--minutes", type=float, default=30.0)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--keep", type=Path, help="folder for flights and the daemon's log (default: a temporary one)")
-    wanted = parser.parse_args(arguments)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with tempfile.TemporaryDirectory(prefix="soak-") as temporary:
-        folder = wanted.keep or Path(temporary)
-        folder.mkdir(parents=True, exist_ok=True)
-        began = time.monotonic()
-        account = soak(
-            Plan(wanted.minutes * 60, wanted.seed),
-            folder.absolute(),
-            lambda text: print(f"{time.monotonic() - began:7.1f} s  {text}", file=sys.stderr),  # noqa: T201  # a tool that prints
-        )
-    told = {name: getattr(account, name) for name in Account.__slots__ if name not in ("before", "after")}
-    told |= {"before": account.before and account.before.told(), "after": account.after and account.after.told()}
-    print(json.dumps(told, indent=1))  # noqa: T201  # as above
-    return 1 if account.problems else 0
-
-
-if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except FlightError as error:
-        sys.exit(f"soak: {error}")

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import io
+import struct
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from dappled.config import profiles
 from dappled.decode.optics.carriers import Lattice, Sensor
 from dappled.decode.optics.masks import Mask
 from dappled.decode.spectrum.stagger import spread_sensor
-from dappled.mocks.body import super_ccd_file
 from dappled.mocks.body.dng import Exif
 from dappled.mocks.scene import lens, synthesis
 from dappled.mocks.scene.bench import Bench, WhiteCard, boards
@@ -42,7 +46,7 @@ class Finepix:
     @property
     def chip(self) -> Sensor:
         """The whole file's samples, spread to where they stand."""
-        return spread_sensor(profiles.camera("fujifilm-s5200").sensor(super_ccd_file.SHAPE))
+        return spread_sensor(profiles.camera("fujifilm-s5200").sensor(SHAPE))
 
     @property
     def installed(self) -> Installation:
@@ -92,10 +96,10 @@ class Finepix:
         if self.electrons is not None:
             noise = np.sqrt(np.maximum(light, 0) / self.electrons) * rng.standard_normal(light.shape, dtype=np.float32)
             light = light + noise
-        raw = np.clip(light * super_ccd_file.WHITE + 0.5, 0, super_ccd_file.WHITE).astype(np.uint16)
+        raw = np.clip(light * WHITE + 0.5, 0, WHITE).astype(np.uint16)
         exif = Exif("FUJIFILM", "FinePix S5200", "", self.focal_length_mm, f_number, 1e-3, 64, 0)
         views = synthesis.band_limited(radiance, grid).reshape(5, 5, 3, *_inner(grid))
-        return super_ccd_file.encode(raw, exif), views
+        return encode(raw, exif), views
 
 
 def _inner(grid: Grid) -> tuple[int, int]:
@@ -104,10 +108,56 @@ def _inner(grid: Grid) -> tuple[int, int]:
 
 
 def _stored(blue: Floats, red: Floats) -> NDArray[np.float32]:
-    """(2948, 1856) the samples that exist, row by row as in the file, in the colours of `super_ccd_file.PATTERN`."""
+    """(2948, 1856) the samples that exist, row by row as in the file, in the colours of `PATTERN`."""
     out = np.empty((blue.shape[0], blue.shape[1] // 2), dtype=np.float32)
     out[1::2] = blue[1::2, 1::2]
     for first, (even, odd) in ((0, (blue, red)), (2, (red, blue))):
         out[first::4, 0::2] = even[first::4, 0::4]
         out[first::4, 1::2] = odd[first::4, 2::4]
     return out
+
+
+SHAPE = (2948, 1856)
+WHITE = 15_564
+PATTERN = np.array([[2, 0, 2, 0], [1, 1, 1, 1], [0, 2, 0, 2], [1, 1, 1, 1]])  # red 0, green 1, blue 2
+_HEAD = 148
+_EXIF_IFD = 0x8769
+
+
+def encode(raw: NDArray[np.uint16], exif: Exif) -> bytes:
+    """The file of a mosaic (2948, 1856) in `PATTERN`'s colours. Raises ValueError for another shape."""
+    if raw.shape != SHAPE:
+        raise ValueError(f"a FinePix S5200 has {SHAPE[0]} × {SHAPE[1]} samples, not {raw.shape}")
+    jpeg = _jpeg(exif)
+    tags = [
+        (0x100, struct.pack(">HH", *SHAPE)),
+        (0x121, struct.pack(">HH", 1444, 3696)),
+        (0x130, bytes((0x8C, 0, 0, 0))),  # the lattice's direction
+        (0x2FF0, struct.pack(">4H", 320, 521, 320, 379)),  # white balance: green, red, green, blue
+    ]
+    table = struct.pack(">I", len(tags)) + b"".join(struct.pack(">HH", tag, len(v)) + v for tag, v in tags)
+    samples = raw.astype("<u2").tobytes()
+    at_table = _HEAD + len(jpeg)
+    at_samples = at_table + len(table)
+    places = (_HEAD, len(jpeg), at_table, len(table), at_samples, len(samples))
+    head = b"FUJIFILMCCD-RAW 0201FF389501" + b"FinePix S5200".ljust(32, b"\0") + b"0100"
+    head = head.ljust(84, b"\0") + struct.pack(">6I", *places)
+    return head.ljust(_HEAD, b"\0") + jpeg + table + samples
+
+
+def _jpeg(exif: Exif) -> bytes:
+    taken = datetime.fromtimestamp(exif.taken_utc_ns // 1_000_000_000, UTC).strftime("%Y:%m:%d %H:%M:%S")
+    told = Image.Exif()
+    told.endian = "<"  # LibRaw reads the samples in this order, too
+    told[0x010F], told[0x0110], told[0x0132] = exif.make, exif.model, taken
+    detail = told.get_ifd(_EXIF_IFD)
+    detail[0x829A] = IFDRational(round(exif.exposure_s * 1e6), 1_000_000)
+    detail[0x829D] = IFDRational(round(exif.f_number * 10), 10)
+    detail[0x8827] = exif.iso
+    detail[0x9003] = taken
+    detail[0x920A] = IFDRational(round(exif.focal_length_mm * 10), 10)
+    body = told.tobytes()
+    file = io.BytesIO()
+    Image.new("RGB", (64, 48), (90, 100, 90)).save(file, "JPEG")
+    # LibRaw looks for the EXIF twelve bytes on: before the JFIF segment that Pillow begins with.
+    return b"\xff\xd8\xff\xe1" + struct.pack(">H", len(body) + 2) + body + file.getvalue()[2:]
