@@ -23,7 +23,7 @@ from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.replay import replay, runs
 from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayProgress
 from dappled.daemon.replay.runs import Run, RunWriter
-from dappled.daemon.stream import curve, headers
+from dappled.daemon.stream import curve, wire
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import Identity
@@ -147,7 +147,8 @@ def _play(
 
     publisher = _publisher(settings, book, developer, stack) if arguments.publish else None
     if publisher:
-        publisher.publish("start", headers.start_header(settings, names, clock.utc_ns()))
+        header = wire.start_header(settings.publish, clock.utc_ns(), camera=names.camera, mask=names.mask)
+        publisher.publish("start", header)
     identity = Identity("dappled", "recording", "", str(arguments.flight))
     pipeline = Pipeline(
         camera=ReplayCamera(recording.files, identity, clock.monotonic_ns),

@@ -49,8 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
     with Subscriber(endpoint, ask, from_start=arguments.from_start, keys=keys) as subscriber:
         seen = watch.watch(
             subscriber,
-            heard=lambda message: _show(message, arguments.json),
-            new_frame=lambda message: watch.keep(message, arguments.save) if arguments.save else None,
+            received=lambda message: _show(message, arguments.json),
+            new_frame=lambda message: watch.save(message, arguments.save) if arguments.save else None,
             count=arguments.count,
             silence_s=arguments.timeout,
         )

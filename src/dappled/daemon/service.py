@@ -25,7 +25,7 @@ from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.pending_shot import Names, Observer
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision
 from dappled.daemon.reload import merge
-from dappled.daemon.stream import curve, headers
+from dappled.daemon.stream import curve, wire
 from dappled.daemon.stream.publisher import Publisher, Reply
 from dappled.drivers.camera import Camera
 from dappled.drivers.mavlink.links import Packet
@@ -142,7 +142,8 @@ class Service:
         stack.callback(parts.answers.stop)
         parts.answers.start()
         self._publisher.start(self._recording.folder.name)
-        self._publisher.publish("start", headers.start_header(self.settings, names, self._clock.utc_ns()))
+        header = wire.start_header(self.settings.publish, self._clock.utc_ns(), camera=names.camera, mask=names.mask)
+        self._publisher.publish("start", header)
         stack.callback(self._say_end)
         if parts.depth is not None:
             stack.callback(parts.depth.stop)

@@ -56,7 +56,7 @@ def watched(script: Script, **options: float) -> tuple[Watched, list[str], list[
     new: list[int] = []
     seen = watch.watch(
         script,
-        heard=lambda message: heard.append(message.topic),
+        received=lambda message: heard.append(message.topic),
         new_frame=lambda message: new.append(message.header["frame"]),
         clock_s=lambda: script.now_s,
         **options,  # type: ignore[arg-type]  # count is whole
@@ -96,7 +96,7 @@ def test_silence_ends_it_where_that_is_wished(first: list[Message]) -> None:
 
 
 def test_a_frame_is_kept_as_header_slices_and_picture(tmp_path: Path) -> None:
-    watch.keep(slices(42), tmp_path)
+    watch.save(slices(42), tmp_path)
     np.testing.assert_array_equal(np.load(tmp_path / "000042.npy"), STACK)
     assert json.loads((tmp_path / "000042.json").read_text())["frame"] == 42
     with Image.open(tmp_path / "000042.png") as picture:

@@ -55,3 +55,30 @@ def test_arrays_come_back_as_they_were_described() -> None:
     assert (found["b"] == b).all()
     with pytest.raises(WireError, match="ends inside array 'b'"):
         Message("slices", {"arrays": entries}, a.tobytes()).arrays()
+
+
+@given(
+    st.binary(max_size=200)
+    | st.builds(
+        lambda value: json.dumps(value).encode(),
+        st.recursive(
+            st.none()
+            | st.floats()
+            | st.booleans()
+            | st.integers()
+            | st.sampled_from(["start", "frame", "slices", "get"]),
+            lambda inner: (
+                st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["get", "frame", "seq"]), inner)
+            ),
+        ),
+    )
+)
+def test_any_question_is_understood_or_refused(data: bytes) -> None:
+    try:
+        request = wire.parse_question([data])
+    except WireError:
+        return
+    assert request["get"] in ("start", "frame", "slices")
+    asked = json.loads(data)
+    assert request == {name: asked[name] for name in wire.QUESTION_KEYS if name in asked}
+    wire.encode(request)  # as the answer's header repeats it

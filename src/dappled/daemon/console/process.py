@@ -21,7 +21,7 @@ from dappled.config import settings as configuration
 from dappled.config.settings import ConsoleSettings, Settings
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.stream.curve import read_private
-from dappled.daemon.stream.endpoints import is_loopback
+from dappled.daemon.stream.sockets import is_loopback
 from dappled.drivers.process_channel import ChannelError, ProcessChannel
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report

@@ -8,8 +8,8 @@ from dappled.daemon.pipeline.decode_process import DecodedFrame, FrameDecoder
 from dappled.daemon.pipeline.pending_shot import FlightWriter, PendingShot
 from dappled.daemon.pipeline.pending_shots import PendingShots
 from dappled.daemon.stream import wire
-from dappled.daemon.stream.headers import slices_header
 from dappled.daemon.stream.publisher import Publisher
+from dappled.daemon.stream.wire import slices_header
 from dappled.flight.records import Tag
 
 

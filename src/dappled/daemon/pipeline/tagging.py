@@ -13,8 +13,8 @@ from dappled.daemon.pipeline import tagger
 from dappled.daemon.pipeline.pending_shot import FlightWriter, Names, Observer, PendingShot, PoseSource
 from dappled.daemon.pipeline.pending_shots import PendingShots
 from dappled.daemon.pipeline.tagger import BodyLatency, ExposureTime, Zoom
-from dappled.daemon.stream.headers import frame_header
 from dappled.daemon.stream.publisher import Publisher
+from dappled.daemon.stream.wire import frame_header
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
 from dappled.errors import DappledError

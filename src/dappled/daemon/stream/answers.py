@@ -1,48 +1,74 @@
-"""Answers to questions about recorded frames: tags from the ledger, slices decoded again from the record."""
+"""Answer questions about recorded frames: tags from the ledger, slices decoded again from the record."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
-from dappled.daemon.pipeline.decode_process import FrameDecoder
-from dappled.daemon.pipeline.pending_shot import FlightWriter
-from dappled.daemon.stream.headers import frame_header, slices_header
 from dappled.daemon.stream.publisher import Reply
-from dappled.daemon.stream.wire import Message, WireError
+from dappled.daemon.stream.wire import DecodedSlices, Message, WireError, frame_header, slices_header
 from dappled.errors import sentence
+from dappled.flight.records import Frame, Tag
 from dappled.workers import Worker
 
 WAITING = 32
 
 
+class FrameRecord(Protocol):
+    """The recorded frames of a flight."""
+
+    def frame(self, index: int) -> Frame | None:
+        """A frame that is safe, None for an index without one."""
+
+    def tag(self, index: int) -> Tag | None:
+        """The tag of a frame, None while there is none."""
+
+    def path(self, frame: Frame) -> str:
+        """The path of the frame's file."""
+
+
+class DecodedSlicesWithBody(DecodedSlices, Protocol):
+    """A decoded frame: header entries and arrays."""
+
+    @property
+    def body(self) -> Any:
+        """The arrays, end to end."""
+
+
+class SlicesDecoder(Protocol):
+    """Decodes a recorded frame again."""
+
+    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedSlicesWithBody:
+        """Decode the raw file at `path`. Raises DappledError."""
+
+
 class Answers:
-    """Works off questions one by one, behind a bounded queue; a question that finds it full is refused in words."""
+    """Answers questions one by one, behind a bounded queue; a question that finds it full is refused."""
 
     def __init__(
-        self, book: FlightWriter, developer: FrameDecoder | None, give_way: Callable[[], object] = lambda: None
+        self, record: FrameRecord, decoder: SlicesDecoder | None, give_way: Callable[[], object] = lambda: None
     ) -> None:
-        """`give_way` waits, bounded, while the flight itself has something to decode: viewing comes after it."""
-        self._book, self._developer, self._give_way = book, developer, give_way
-        self._stage: Worker[tuple[Mapping[str, Any], Reply]] = Worker(
+        """`give_way` waits, up to a limit, while the flight itself has frames to decode."""
+        self._record, self._decoder, self._give_way = record, decoder, give_way
+        self._worker: Worker[tuple[Mapping[str, Any], Reply]] = Worker(
             "answers", self._work, capacity=WAITING, on_failure=self._failed
         )
 
     def start(self) -> None:
-        """Begin to answer."""
-        self._stage.start()
+        """Start the thread that answers."""
+        self._worker.start()
 
     def stop(self) -> None:
-        """Answer what waits, within a second."""
-        self._stage.stop(1.0)
+        """Answer what waits, for a second at most, and end the thread."""
+        self._worker.stop(1.0)
 
     def dead_threads(self) -> list[str]:
         """See `Worker.dead_threads`."""
-        return self._stage.dead_threads()
+        return self._worker.dead_threads()
 
     def answer(self, request: Mapping[str, Any], reply: Reply) -> None:
-        """For `Publisher`: raises WireError when too many questions wait already."""
-        if not self._stage.put((request, reply)):
+        """Queue a question of `Publisher`. Raises WireError when too many wait already."""
+        if not self._worker.put((request, reply)):
             raise WireError(f"{WAITING} questions wait already: ask again later")
 
     def _work(self, item: tuple[Mapping[str, Any], Reply]) -> None:
@@ -52,15 +78,15 @@ class Answers:
     def _message(self, topic: str, index: int | None) -> Message:
         if index is None:
             raise WireError("the flight has not started yet: ask again")
-        frame, tag = self._book.frame(index), self._book.tag(index)
+        frame, tag = self._record.frame(index), self._record.tag(index)
         if frame is None or tag is None:
             raise WireError(f"there is no frame {index} in this flight")
         if topic == "frame":
             return Message("frame", frame_header(tag, frame, None))
-        if self._developer is None:
+        if self._decoder is None:
             raise WireError("this flight is not decoded: no mask is configured")
         self._give_way()
-        decoded = self._developer.develop(self._book.path(frame), tag.focal_length_mm, tag.f_number)
+        decoded = self._decoder.develop(self._record.path(frame), tag.focal_length_mm, tag.f_number)
         return Message("slices", slices_header(tag, decoded), decoded.body)
 
     def _failed(self, item: tuple[Mapping[str, Any], Reply], error: Exception) -> None:

@@ -1,8 +1,8 @@
-"""The one thread that owns the sockets: PUB for the stream, ROUTER for questions. It never makes anybody wait.
+"""Publish the stream and receive questions, in one thread that owns both sockets (PUB and ROUTER).
 
-Messages wait in one bounded queue. When it is full the oldest preview goes first, then the oldest slices, and the
-header's `dropped` says how many; `start`, `frame` and `end` are small and always sent. `seq` counts what was really
-sent, topic by topic, so a gap at a subscriber is that subscriber's own loss, and it can ask for it.
+Messages wait in one bounded queue. When it is full the oldest preview is dropped first, then health, depth and slices,
+and the header's `dropped` counts them; `start`, `frame` and `end` are small and always sent. `seq` counts the messages
+of a topic that were really sent, so a gap at a subscriber is that subscriber's own loss, and it can ask for it.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import os
 import select
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -20,10 +21,9 @@ from typing import Any
 
 import zmq
 
-from dappled.daemon.stream import questions, wire
+from dappled.daemon.stream import wire
 from dappled.daemon.stream.curve import ServerKeys
-from dappled.daemon.stream.in_flight_limit import Kept
-from dappled.daemon.stream.sockets import Doors
+from dappled.daemon.stream.sockets import Sockets
 from dappled.daemon.stream.wire import Message, WireError
 from dappled.errors import report
 
@@ -34,15 +34,15 @@ Answer = Callable[[Mapping[str, Any], Reply], None]
 DROP_ORDER = ("preview", "health", "depth", "slices")
 REMEMBERED = 65536  # slices whose frame number is known by sequence
 UNREAD_ANSWERS = 4  # with a body, of all askers together
-UNREAD_STACKS = 8  # of all subscribers together: those who hang at different times hold different ones
+UNREAD_STACKS = 8  # of all subscribers together: those that stop at different times hold different ones
 _LARGE_BYTES = 1_000_000
-_PATIENCE_S, _LARGE_PATIENCE_S = 0.02, 0.1  # after a message, while its bytes are on their way to those who read
+_PATIENCE_S, _LARGE_PATIENCE_S = 0.02, 0.1  # after a message, while its bytes are on their way to readers
 _GIVE_WAY_S = 0.25  # how long a large message waits while a frame is made safe
 
 
 @dataclass(frozen=True, slots=True)
 class PublisherStatistics:
-    """Counters so far, by topic; `questions` and `refused` of the ROUTER; peers that came with a wrong key."""
+    """Counters by topic; `questions` and `refused` of the ROUTER; peers with a wrong key."""
 
     sent: Mapping[str, int]
     dropped: Mapping[str, int]
@@ -52,12 +52,31 @@ class PublisherStatistics:
     wrong_keys: int = 0
 
 
-class Publisher:
-    """Publishes messages and hands questions to `answer(request, reply)`, which replies from any thread, once.
+class InFlightLimit:
+    """Counts bodies that were sent and that ZeroMQ still holds. One thread calls it.
 
-    `slices` and `ask` are the endpoints; `ask` "" answers nobody. `keys` turn CURVE on for those that are tcp, `mode`
-    is that of ipc sockets. `private` is one more endpoint, ipc, for processes of the daemon itself, its questions on
-    "`private`.ask". Raises WireError when an endpoint can't be bound.
+    ZeroMQ releases a body when every peer that it went to has read it, or was disconnected.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._bodies: list[weakref.ref[memoryview]] = []
+
+    def admit(self, body: memoryview) -> bool:
+        """Whether there is room for one more; then `body` counts until it is released."""
+        self._bodies = [one for one in self._bodies if one() is not None]
+        if len(self._bodies) >= self._most:
+            return False
+        self._bodies.append(weakref.ref(body))
+        return True
+
+
+class Publisher:
+    """Publishes messages and passes questions to `answer(request, reply)`, which replies once, from any thread.
+
+    `slices` and `ask` are the endpoints; with `ask` "" no question is answered. `keys` turn CURVE on for tcp, `mode`
+    is the file mode of ipc sockets. `private` is a further ipc endpoint for processes of the daemon itself; its
+    questions go to "`private`.ask". Raises WireError when an endpoint can't be bound.
     """
 
     def __init__(
@@ -77,36 +96,36 @@ class Publisher:
         self._answer = answer
         self._capacity = capacity
         self._lock = threading.Lock()
-        self._waiting: deque[tuple[bytes, Message]] = deque()  # (peer of a reply, or b"" for everybody; message)
+        self._waiting: deque[tuple[bytes, Message]] = deque()  # (peer of a reply, or b"" for the stream; message)
         self._sent = dict.fromkeys(wire.TOPICS, 0)
         self._dropped = dict.fromkeys(wire.TOPICS, 0)
         self._frame_of: dict[int, int] = {}
         self._questions = self._refused = self._open_questions = 0
         self._grace_s = self._patient_until_s = 0.0
         self._start: Message | None = None
-        self._unread_stacks, self._unread_answers = Kept(UNREAD_STACKS), Kept(UNREAD_ANSWERS)
+        self._unread_stacks, self._unread_answers = InFlightLimit(UNREAD_STACKS), InFlightLimit(UNREAD_ANSWERS)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._stopping = threading.Event()
         self._way_is_free = threading.Event()
         self._way_is_free.set()
         self._closed = False
-        self._doors = Doors(keys, mode)
+        self._sockets = Sockets(keys, mode)
         try:
-            self._pub = self._doors.open(zmq.PUB, [private, slices], high_water_mark)
+            self._pub = self._sockets.open(zmq.PUB, [private, slices], high_water_mark)
             asked_at = [private and f"{private}.ask", ask]
-            self._router = self._doors.open(zmq.ROUTER, asked_at, high_water_mark) if any(asked_at) else None
+            self._router = self._sockets.open(zmq.ROUTER, asked_at, high_water_mark) if any(asked_at) else None
         except WireError:
             os.close(self._wake)
             raise
         self._thread = threading.Thread(target=self._run, name="publisher", daemon=True)
 
     def start(self, flight: str = "") -> None:
-        """Begin to send and to listen; headers name the flight."""
+        """Start to send and to listen. `flight` is the name in the headers."""
         self._flight = flight or self._flight
         self._thread.start()
 
     def publish(self, topic: str, facts: Mapping[str, Any], body: Any = None) -> None:
-        """Hand over a message; `seq`, `dropped` and the envelope are added when it is sent. Never waits.
+        """Queue a message; `seq`, `dropped` and the rest of the envelope are added when it is sent. Never waits.
 
         `body` must not be changed afterwards: it is sent without a copy.
         """
@@ -134,16 +153,16 @@ class Publisher:
                 len(self._waiting),
                 self._questions,
                 self._refused,
-                self._doors.wrong_keys,
+                self._sockets.wrong_keys,
             )
 
     def dead_threads(self) -> list[str]:
-        """Its thread, where it has ended without being asked to."""
+        """The thread's name if it has ended without a call of `stop`."""
         begun = self._thread.ident is not None
         return [self._thread.name] if begun and not self._thread.is_alive() and not self._stopping.is_set() else []
 
     def stop(self, grace_s: float = 2.0) -> None:
-        """Send what waits, go on answering until nobody has asked for half a second (at most `grace_s`), then close."""
+        """Send what waits, answer questions until none has come for half a second (at most `grace_s`), then close."""
         if self._stopping.is_set():
             return
         self._grace_s = grace_s
@@ -151,9 +170,9 @@ class Publisher:
         self._ring()
         if self._thread.is_alive():
             self._thread.join(grace_s + 3)
-        self._doors.close(grace_s)
+        self._sockets.close(grace_s)
         with self._lock:
-            self._closed = True  # an answer may still be on its way: it must not ring a descriptor that is another's
+            self._closed = True  # a late answer must not write to a descriptor that is reused by then
             os.close(self._wake)
 
     def _ring(self) -> None:
@@ -174,13 +193,13 @@ class Publisher:
         poller.register(self._wake, select.POLLIN)
         if self._router is not None:
             poller.register(self._router.FD, select.POLLIN)
-        for descriptor in self._doors.fds:
+        for descriptor in self._sockets.fds:
             poller.register(descriptor, select.POLLIN)
         quiet_rounds = 0
         while True:
-            self._doors.let_in()
+            self._sockets.let_in()
             self._send_waiting()
-            self._hear_questions()
+            self._read_questions()
             if self._stopping.is_set():
                 quiet_rounds = 0 if self._open_questions or self._waiting else quiet_rounds + 1
                 if quiet_rounds > 5 or self._grace_s <= 0:
@@ -198,10 +217,10 @@ class Publisher:
                 peer, message = self._waiting.popleft()
             try:
                 self._send_reply(peer, message) if peer else self._send(message)
-            except Exception as error:  # noqa: BLE001  # one message that can't be sent must not end the stream
+            except Exception as error:  # noqa: BLE001  # a message that can't be sent must not end the stream
                 report(log, f"{message.topic} was not sent", error)
                 if peer:  # the stream itself lost nothing
-                    self._say_so(peer)
+                    self._reply_unsendable(peer)
                     continue
                 with self._lock:
                     self._dropped[message.topic] = self._dropped.get(message.topic, 0) + 1
@@ -215,20 +234,20 @@ class Publisher:
         if body is not None and body.nbytes >= _LARGE_BYTES:
             patience_s = _LARGE_PATIENCE_S
             self._way_is_free.wait(_GIVE_WAY_S)
-            if not self._unread_stacks.take(body):
+            if not self._unread_stacks.admit(body):
                 with self._lock:
                     self._dropped[message.topic] += 1
                 return
-        self._give_out(_parts(message.topic, header, body))
+        self._send_patiently(_parts(message.topic, header, body))
         self._patient_until_s = max(self._patient_until_s, time.monotonic() + patience_s)
         with self._lock:
             self._sent[message.topic] += 1
             self._remember(message, header)
 
-    def _give_out(self, parts: list[Any]) -> None:
-        """Wait a little for a reader whose queue is full because of what came just before, then go on without it.
+    def _send_patiently(self, parts: list[Any]) -> None:
+        """Send to all subscribers; wait briefly for one whose queue is full because of the messages just before.
 
-        So queues can be short, in stacks of slices, and what follows at once is not lost.
+        So queues can be short, and what follows a stack of slices at once is not lost.
         """
         while (left_s := self._patient_until_s - time.monotonic()) > 0:
             self._pub.setsockopt(zmq.XPUB_NODROP, 1)
@@ -242,10 +261,10 @@ class Publisher:
         self._pub.send_multipart(parts, copy=False)
 
     def _send_reply(self, peer: bytes, message: Message) -> None:
-        assert self._router is not None  # a reply can only be to a question
+        assert self._router is not None  # replies answer questions, which come from there
         self._open_questions -= 1
         header, body = message.header, None if message.body is None else memoryview(message.body)
-        if body is not None and not self._unread_answers.take(body):
+        if body is not None and not self._unread_answers.admit(body):
             self._refused += 1
             text = f"{UNREAD_ANSWERS} answers wait to be read already: ask again later"
             message, body = Message("error", {}), None
@@ -253,14 +272,14 @@ class Publisher:
         parts = [peer, *_parts(message.topic, header, body)]
         try:
             self._router.send_multipart(parts, flags=zmq.NOBLOCK, copy=False)
-        except zmq.ZMQError as error:  # the asker is gone or does not read: its loss
-            log.info("an answer found nobody: %s", error)
+        except zmq.ZMQError as error:  # the peer is gone or does not read
+            log.info("an answer could not be delivered: %s", error)
 
-    def _say_so(self, peer: bytes) -> None:
+    def _reply_unsendable(self, peer: bytes) -> None:
         assert self._router is not None
         self._refused += 1
         header = self._envelope(Message("error", {"error": "the answer can't be sent: see the daemon's log"}), None)
-        with contextlib.suppress(zmq.ZMQError):  # the asker is gone or does not read: its loss
+        with contextlib.suppress(zmq.ZMQError):  # the peer is gone or does not read
             self._router.send_multipart([peer, b"error", wire.encode({**header, "asked": None})], flags=zmq.NOBLOCK)
 
     def _envelope(self, message: Message, seq: int | None) -> dict[str, Any]:
@@ -280,10 +299,10 @@ class Publisher:
         elif message.topic == "start":
             self._start = Message("start", header)
 
-    def _hear_questions(self) -> None:
+    def _read_questions(self) -> None:
         if self._router is None:
             return
-        for _ in range(100):  # a flood is taken in portions, so that sending goes on
+        for _ in range(100):  # at most 100 at a time, so that sending goes on in a flood
             try:
                 parts = self._router.recv_multipart(flags=zmq.NOBLOCK)
             except zmq.Again:
@@ -293,7 +312,7 @@ class Publisher:
             self._questions += 1
             self._open_questions += 1
             try:
-                request = questions.parse(payload)
+                request = wire.parse_question(payload)
             except WireError as error:
                 self._refused += 1
                 self._reply_to(peer, None)(Message("error", {"error": str(error)}))

@@ -1,53 +1,59 @@
-"""The sockets that strangers come to: bound safely, their keys judged, and who reads nothing is cut off in the end."""
+"""Open the sockets that other programs connect to: safe endpoints, key checks, limits for peers that do not read."""
 
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import logging
 import os
 import socket
 import stat
+import threading
+import urllib.parse
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from dappled.daemon.stream import curve, endpoints
+from dappled.daemon.stream import curve
 from dappled.daemon.stream.curve import ServerKeys
 from dappled.daemon.stream.wire import WireError
 
 log = logging.getLogger(__name__)
+NICENESS = 12  # below the decoder's 10
 QUESTION_BYTES = 4096
 ROOM_BYTES = (
     1 << 20
-)  # in the kernel, for a reader over ipc: with its 208 kB the two ends wait for each other all the time
-_HEARTBEAT_MS, _DEAF_MS = 5_000, 30_000  # a peer that reads nothing for so long is cut off; it may come again
+)  # of kernel memory for a reader over ipc: the default of 208 kB makes both ends wait for each other
+_HEARTBEAT_MS, _DEAF_MS = 5_000, 30_000  # a peer that reads nothing for so long is disconnected; it may come again
+_PATH_BYTES = 107  # of sockaddr_un
 
 
-class Doors:
-    """Opens sockets of one context and closes them all. `keys` turn CURVE on for those that are tcp, `mode` is that of
-    ipc sockets. One thread calls it."""
+class Sockets:
+    """Opens sockets of one context and closes them all. `keys` turn CURVE on for tcp, `mode` is the file mode of ipc
+    sockets. One thread calls it."""
 
     def __init__(self, keys: ServerKeys | None, mode: int) -> None:
         self._keys, self._mode = keys, mode
-        self._context = endpoints.niced_context()
+        self._context = niced_context()
         self._bound: list[str] = []
         self._sockets: list[zmq.Socket[Any]] = []
         self.wrong_keys = 0
-        self._newcomers: list[zmq.Socket[Any]] = []
+        self._monitors: list[zmq.Socket[Any]] = []
         self._judge: zmq.Socket[Any] | None = None
-        if keys is not None:  # whoever judges keys is there before the first door is opened
+        if keys is not None:  # ZeroMQ asks this socket about keys: it must be bound before the first endpoint
             self._judge = self._context.socket(zmq.REP)
             self._judge.bind(curve.ZAP_ENDPOINT)
 
     @property
     def fds(self) -> list[int]:
-        """What to wait on for `let_in`."""
-        return [int(one.FD) for one in (*self._newcomers, *([self._judge] if self._judge else []))]
+        """The descriptors to poll before `let_in`."""
+        return [int(one.FD) for one in (*self._monitors, *([self._judge] if self._judge else []))]
 
     def open(self, kind: int, wanted: Sequence[str], high_water_mark: int) -> zmq.Socket[Any]:
-        """A socket bound to all of the `wanted` endpoints that are not "". Raises WireError; then all are closed."""
+        """A socket bound to all of the `wanted` endpoints that are not "". Raises WireError; all are closed then."""
         one: zmq.Socket[Any] = self._context.socket(kind)
         self._sockets.append(one)
         one.setsockopt(zmq.LINGER, 0)
@@ -59,11 +65,11 @@ class Doors:
         if kind == zmq.ROUTER:
             one.setsockopt(zmq.ROUTER_MANDATORY, 1)
         else:
-            self._newcomers.append(one.get_monitor_socket(zmq.EVENT_ACCEPTED))
+            self._monitors.append(one.get_monitor_socket(zmq.EVENT_ACCEPTED))
         try:
             for endpoint in filter(None, wanted):
-                endpoints.prepare(endpoint, keyed=self._keys is not None)
-                endpoints.bind(one, endpoint, keys=self._keys, mode=self._mode)
+                prepare(endpoint, keyed=self._keys is not None)
+                bind(one, endpoint, keys=self._keys, mode=self._mode)
                 self._bound.append(endpoint)
         except WireError:
             self.close(0.0)
@@ -71,10 +77,10 @@ class Doors:
         return one
 
     def let_in(self) -> None:
-        """Judge the keys of those who connect, and give those who read room."""
-        for door in self._newcomers:
-            while door.poll(0):
-                _give_room(recv_monitor_message(door)["value"])
+        """Answer ZeroMQ about the keys of new peers, and give new readers more kernel memory."""
+        for monitor in self._monitors:
+            while monitor.poll(0):
+                _give_room(recv_monitor_message(monitor)["value"])
         while self._judge is not None:
             try:
                 request = self._judge.recv_multipart(flags=zmq.NOBLOCK)
@@ -83,20 +89,20 @@ class Doors:
             answer, name = curve.judge(request, self._keys.allowed if self._keys else {})
             self._judge.send_multipart(answer)
             if name is not None:
-                log.info("%s came with its key", name)
+                log.info("%s connected with its key", name)
                 continue
             self.wrong_keys += 1
-            if self.wrong_keys == 1 or self.wrong_keys % 100 == 0:  # such a peer tries again and again
-                log.warning("a peer whose key is not on the list was turned away (%d times)", self.wrong_keys)
+            if self.wrong_keys == 1 or self.wrong_keys % 100 == 0:  # such a peer keeps trying
+                log.warning("a peer whose key is not in publish.clients was refused (%d times)", self.wrong_keys)
 
     def close(self, linger_s: float) -> None:
-        """Close all; what was sent may still go out for so long."""
+        """Close all; messages already sent have this long to go out."""
         for endpoint in self._bound:
-            endpoints.unlink(endpoint)
+            unlink(endpoint)
         for one in self._sockets:
             one.disable_monitor()
-        for door in self._newcomers:
-            door.close(linger=0)
+        for monitor in self._monitors:
+            monitor.close(linger=0)
         for one in self._sockets:
             one.close(linger=round(linger_s * 1000))
         if self._judge is not None:
@@ -104,11 +110,110 @@ class Doors:
         self._context.term()
 
 
-def _give_room(descriptor: int) -> None:
-    """More of the kernel's memory for a connection over ipc, as far as net.core.wmem_max lets it.
+def prepare(endpoint: str, *, keyed: bool = False) -> None:
+    """Make an endpoint safe to bind: ipc folders exist and are private; tcp off loopback only with keys.
 
-    ZeroMQ's own option is for TCP alone. Where the peer is gone again, the number may be another socket's by now: then
-    that one has more room.
+    Raises WireError with what to do.
+    """
+    url = urllib.parse.urlsplit(endpoint)
+    if url.scheme == "ipc":
+        path = Path(endpoint.removeprefix("ipc://"))
+        if not path.is_absolute() or len(str(path).encode()) > _PATH_BYTES:
+            raise WireError(f"{endpoint} must be an absolute path of at most {_PATH_BYTES} bytes")
+        _prepare_folder(path.parent, endpoint)
+        if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
+            raise WireError(f"{endpoint}: there is a file of this name that is not a socket; choose another endpoint")
+    elif url.scheme == "tcp":
+        if not keyed and not is_loopback(url.hostname or ""):
+            raise WireError(
+                f"{endpoint} would be open to the network without keys: make some with `dappled keys make`, and name "
+                "them in publish.keys and publish.clients; or use ipc:// or tcp://127.0.0.1:PORT"
+            )
+    else:
+        raise WireError(f"{endpoint} is neither ipc:// nor tcp://")
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach a host by this name or address."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def bind(one: zmq.Socket[Any], endpoint: str, *, keys: ServerKeys | None = None, mode: int = 0o660) -> None:
+    """Bind a socket to an endpoint that `prepare` has checked; `keys` hold for tcp, `mode` for an ipc socket's file.
+
+    Raises WireError where it is in use or can't be bound.
+    """
+    ipc = endpoint.startswith("ipc://")
+    if ipc and _answers(endpoint.removeprefix("ipc://")):
+        raise WireError(f"{endpoint} is in use by another program; stop it, or choose another endpoint")
+    one.curve_server = keys is not None and not ipc
+    if keys is not None and not ipc:
+        one.curve_secretkey, one.curve_publickey = keys.own.secret, keys.own.public
+    if not ipc and "[" in endpoint:
+        one.setsockopt(zmq.IPV6, 1)
+    try:
+        one.bind(endpoint)
+    except zmq.ZMQError as error:
+        if error.errno == zmq.EADDRINUSE:
+            raise WireError(f"{endpoint} is in use by another program; stop it, or choose another endpoint") from None
+        raise WireError(f"{endpoint} can't be bound ({error.strerror}); choose another endpoint") from None
+    if ipc:  # it was 0755 until now: no other user could connect
+        Path(endpoint.removeprefix("ipc://")).chmod(mode)
+
+
+def niced_context() -> zmq.Context[Any]:
+    """A context whose own thread, which does the copying, runs at a lower priority than decoding.
+
+    The thread is made with the first socket, and inherits the niceness of the thread that makes it.
+    """
+    made: zmq.Context[Any] = zmq.Context()
+
+    def begin() -> None:
+        me = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, me, os.getpriority(os.PRIO_PROCESS, me) + NICENESS)
+        made.socket(zmq.PAIR).close()
+
+    starter = threading.Thread(target=begin, name="publisher context")
+    starter.start()
+    starter.join()
+    return made
+
+
+def unlink(endpoint: str) -> None:
+    """Remove the file of an ipc socket, which ZeroMQ leaves behind. Call it while the socket is still bound."""
+    if endpoint.startswith("ipc://"):
+        Path(endpoint.removeprefix("ipc://")).unlink(missing_ok=True)
+
+
+def _prepare_folder(folder: Path, endpoint: str) -> None:
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise WireError(
+            f"{endpoint}: its folder can't be created ({error.strerror}); choose another endpoint"
+        ) from None
+    if folder.stat().st_uid not in (0, os.getuid()):
+        raise WireError(f"{endpoint}: {folder} belongs to another user; choose another endpoint")
+
+
+def _answers(path: str) -> bool:
+    """Whether a program listens on this UNIX socket: ZeroMQ would replace it silently."""
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(1)
+        try:
+            probe.connect(path)
+        except OSError:
+            return False
+        return True
+
+
+def _give_room(descriptor: int) -> None:
+    """Enlarge the send buffer of an ipc connection, up to net.core.wmem_max. ZeroMQ's own option works for TCP only.
+
+    Where the peer has already gone, the descriptor may belong to another socket by now; that one is enlarged then.
     """
     with contextlib.suppress(OSError):
         if stat.S_ISSOCK(os.fstat(descriptor).st_mode):

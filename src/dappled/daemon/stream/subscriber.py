@@ -1,152 +1,102 @@
-"""The other end of the stream: a small client that notices what it lost, and asks for it again."""
+"""Subscribe to the stream, from a thread or from asyncio; notice lost slices and ask for them again."""
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import AsyncIterator, Callable, Collection, Iterator, Mapping
+from collections import deque
+from collections.abc import AsyncIterator, Collection, Generator, Iterator, Mapping
 from types import TracebackType
-from typing import Any
+from typing import Any, ClassVar
 
 import zmq
 import zmq.asyncio
 
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.curve import ClientKeys
-from dappled.daemon.stream.gaps import Gaps
 from dappled.daemon.stream.wire import Message, WireError
 
+MOST_MISSING = 2**16  # as many as a publisher remembers; a header that claims more is not believed
+AT_ONCE = 4  # questions under way; the others wait
 _LOOK_S = 0.5
 
-
-class _Sockets:
-    """A SUB for the stream, and a DEALER for questions where there is somebody to ask."""
-
-    def __init__(
-        self,
-        context: zmq.Context[Any],
-        endpoint: str,
-        ask: str,
-        *,
-        topics: Collection[str],
-        high_water_mark: int,
-        keys: ClientKeys | None,
-    ) -> None:
-        self.context = context
-        self.sub = context.socket(zmq.SUB)
-        self.sub.setsockopt(zmq.RCVHWM, high_water_mark)
-        for topic in topics:
-            self.sub.setsockopt(zmq.SUBSCRIBE, topic.encode())
-        self.dealer = context.socket(zmq.DEALER) if ask else None
-        try:
-            _connect(self.sub, endpoint, keys)
-            if self.dealer is not None:
-                _connect(self.dealer, ask, keys)
-        except WireError:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        self.context.destroy(linger=0)
+_Key = tuple[str, int]  # flight, seq of its slices
+_Steps = Generator[Any, Any, Message | None]
 
 
-class Subscriber:
-    """Receives messages in order of arrival; lost `slices` are asked for on `ask` and handed out when they come.
+class Gaps:
+    """Decides which slices to ask for again; has neither a socket nor a clock. Times are seconds of any one clock.
 
-    `endpoint` and `ask` are ZeroMQ endpoints; without `ask` gaps are only counted. With `from_start` the slices that a
-    flight sent before this subscriber came count as a gap too. `gaps` counts slices that were missed, `recovered` those
-    had by asking, `lost` those not had. `keys` are for a tcp endpoint that wants CURVE. `clock` is monotonic seconds.
+    `gaps` counts the slices that were missed, `recovered` those received by asking, `lost` those given up. Without
+    `can_ask` all missed ones are lost. With `from_start` what a flight sent before the first message counts as missed.
     """
 
-    def __init__(
-        self,
-        endpoint: str,
-        ask: str = "",
-        *,
-        topics: Collection[str] = wire.TOPICS,
-        from_start: bool = False,
-        high_water_mark: int = 8,
-        answer_timeout_s: float = 30.0,
-        keys: ClientKeys | None = None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._clock = clock
-        self._gaps = Gaps(can_ask=bool(ask), from_start=from_start, answer_timeout_s=answer_timeout_s)
-        self._sockets = _Sockets(
-            zmq.Context(), endpoint, ask, topics=topics, high_water_mark=high_water_mark, keys=keys
-        )
-        self._poller = zmq.Poller()
-        self._poller.register(self._sockets.sub, zmq.POLLIN)
-        if self._sockets.dealer is not None:
-            self._poller.register(self._sockets.dealer, zmq.POLLIN)
-
-    def __enter__(self) -> Subscriber:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
-
-    @property
-    def gaps(self) -> int:
-        """Slices that were missed."""
-        return self._gaps.gaps
-
-    @property
-    def recovered(self) -> int:
-        """Of them, those had by asking."""
-        return self._gaps.recovered
-
-    @property
-    def lost(self) -> int:
-        """Of them, those not had."""
-        return self._gaps.lost
+    def __init__(self, *, can_ask: bool, from_start: bool = False, answer_timeout_s: float = 30.0) -> None:
+        self._can_ask, self._from_start, self._answer_timeout_s = can_ask, from_start, answer_timeout_s
+        self._next: dict[str, int] = {}
+        self._missing: deque[_Key] = deque()
+        self._asked: dict[_Key, float] = {}  # the deadline of each
+        self.gaps = self.recovered = self.lost = 0
 
     @property
     def waiting_for(self) -> int:
-        """How many answers are still to come."""
-        return self._gaps.waiting_for
+        """How many answers are outstanding."""
+        return len(self._asked) + len(self._missing)
 
-    def close(self) -> None:
-        """Let go of the sockets."""
-        self._sockets.close()
+    def received(self, message: Message) -> None:
+        """Take note of a message of the stream."""
+        header = message.header
+        flight, seq = str(header.get("flight", "")), header.get("seq")
+        if message.topic == "slices" and isinstance(seq, int):
+            until, after = seq, seq + 1
+        elif message.topic == "end" and isinstance(sent := _sent(header), int):
+            until = after = sent
+        else:
+            return
+        first = self._next.get(flight, 0 if self._from_start else until)
+        missed = max(0, until - first)
+        wanted = min(missed, MOST_MISSING) if self._can_ask else 0
+        self._missing.extend((flight, each) for each in range(until - wanted, until))
+        too_many = max(0, len(self._missing) - MOST_MISSING)
+        for _ in range(too_many):
+            self._missing.popleft()
+        self.gaps += missed
+        self.lost += missed - wanted + too_many
+        self._next[flight] = max(after, self._next.get(flight, 0))
 
-    def ask(self, request: Mapping[str, Any]) -> None:
-        """Put a question of one's own; the answer comes by `receive`."""
-        if self._sockets.dealer is None:
-            raise WireError("no endpoint to ask was given")
-        self._sockets.dealer.send(json.dumps(request).encode())
+    def answered(self, answer: Message) -> None:
+        """Take note of an answer; one to another question changes nothing."""
+        question = answer.header.get("asked")
+        key = (str(question.get("flight")), question.get("seq")) if isinstance(question, Mapping) else None
+        if key in self._asked:
+            del self._asked[key]
+            if answer.topic == "error":
+                self.lost += 1
+            else:
+                self.recovered += 1
 
-    def receive(self, timeout_s: float) -> Message | None:
-        """The next message, live or asked for; None when there was none for that long."""
-        deadline = self._clock() + timeout_s
-        dealer, sub = self._sockets.dealer, self._sockets.sub
-        while True:
-            self._ask_next()
-            left = max(0.0, deadline - self._clock())
-            ready = dict(self._poller.poll(round(min(left, _LOOK_S) * 1000)))
-            if dealer is not None and dealer in ready:
-                answer = _message(dealer.recv_multipart(copy=False))
-                self._gaps.answered(answer)
-                self._ask_next()
-                return answer
-            if sub in ready:
-                message = _message(sub.recv_multipart(copy=False))
-                self._gaps.heard(message)
-                self._ask_next()
-                return message
-            if self._clock() >= deadline:
-                return None
-
-    def _ask_next(self) -> None:
-        for question in self._gaps.questions(self._clock()):
-            self.ask(question)
+    def questions(self, now_s: float) -> list[dict[str, Any]]:
+        """The questions to send now. Questions past their deadline are given up."""
+        for key in [key for key, deadline in self._asked.items() if deadline < now_s]:
+            del self._asked[key]
+            self.lost += 1
+        found = []
+        while self._missing and len(self._asked) < AT_ONCE:
+            flight, seq = key = self._missing.popleft()
+            self._asked[key] = now_s + self._answer_timeout_s
+            found.append({"get": "slices", "seq": seq, "flight": flight})
+        return found
 
 
-class AsyncSubscriber:
-    """The same for asyncio: `async with AsyncSubscriber(endpoint, ask) as stream`, `await stream.receive(1.0)`.
+class _SubscriberCore:
+    """What `Subscriber` and `AsyncSubscriber` share: a SUB for the stream, a DEALER for questions, and the counters.
 
-    Without `recover` gaps are only counted, also where there is somebody to ask.
+    A call of a socket returns a value with one and an awaitable with the other. `_receive` yields what the call
+    returned, and is sent the value.
     """
+
+    _context: ClassVar[type[zmq.Context[Any]]]
+    _poller_of: ClassVar[type[zmq.Poller]]
 
     def __init__(
         self,
@@ -159,17 +109,125 @@ class AsyncSubscriber:
         high_water_mark: int = 8,
         answer_timeout_s: float = 30.0,
         keys: ClientKeys | None = None,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._clock = clock
-        self.gaps = Gaps(can_ask=bool(ask) and recover, from_start=from_start, answer_timeout_s=answer_timeout_s)
-        self._sockets = _Sockets(
-            zmq.asyncio.Context(), endpoint, ask, topics=topics, high_water_mark=high_water_mark, keys=keys
-        )
-        self._poller = zmq.asyncio.Poller()
-        self._poller.register(self._sockets.sub, zmq.POLLIN)
-        if self._sockets.dealer is not None:
-            self._poller.register(self._sockets.dealer, zmq.POLLIN)
+        """`endpoint` and `ask` are ZeroMQ endpoints; without `ask`, or without `recover`, gaps are only counted.
+
+        With `from_start` the slices that a flight sent before count as a gap too. `keys` are for a tcp endpoint with
+        CURVE. Raises WireError for an endpoint that is none.
+        """
+        self.ended = False
+        self._gaps = Gaps(can_ask=bool(ask) and recover, from_start=from_start, answer_timeout_s=answer_timeout_s)
+        self._zmq = self._context()
+        self._poller = self._poller_of()
+        self._sub = self._zmq.socket(zmq.SUB)
+        self._sub.setsockopt(zmq.RCVHWM, high_water_mark)
+        for topic in topics:
+            self.listen(topic, True)
+        self._dealer = self._zmq.socket(zmq.DEALER) if ask else None
+        try:
+            for one, where in ((self._sub, endpoint), (self._dealer, ask)):
+                if one is not None:
+                    _connect(one, where, keys)
+                    self._poller.register(one, zmq.POLLIN)
+        except WireError:
+            self.close()
+            raise
+
+    @property
+    def gaps(self) -> int:
+        """Slices that were missed."""
+        return self._gaps.gaps
+
+    @property
+    def recovered(self) -> int:
+        """Missed slices that came when they were asked for."""
+        return self._gaps.recovered
+
+    @property
+    def lost(self) -> int:
+        """Missed slices that were given up."""
+        return self._gaps.lost
+
+    @property
+    def waiting_for(self) -> int:
+        """How many answers are outstanding."""
+        return self._gaps.waiting_for
+
+    @property
+    def finished(self) -> bool:
+        """Whether the flight's `end` has come, and no answer is outstanding."""
+        return self.ended and not self.waiting_for
+
+    def listen(self, topic: str, wanted: bool) -> None:
+        """Subscribe to a topic from now on, or unsubscribe."""
+        self._sub.setsockopt(zmq.SUBSCRIBE if wanted else zmq.UNSUBSCRIBE, topic.encode())
+
+    def close(self) -> None:
+        """Close the sockets."""
+        self._zmq.destroy(linger=0)
+
+    def _send(self, request: Mapping[str, Any]) -> Any:
+        if self._dealer is None:
+            raise WireError("no endpoint to ask was given")
+        return self._dealer.send(json.dumps(request).encode())
+
+    def _receive(self, timeout_s: float) -> _Steps:
+        deadline = time.monotonic() + timeout_s
+        while True:
+            for question in self._gaps.questions(time.monotonic()):
+                yield self._send(question)
+            left = max(0.0, deadline - time.monotonic())
+            ready = dict((yield self._poller.poll(round(min(left, _LOOK_S) * 1000))))
+            for one in (self._dealer, self._sub):
+                if one is not None and one in ready:
+                    message = wire.decode([part.buffer for part in (yield one.recv_multipart(copy=False))])
+                    self._take(message, answered=one is self._dealer)
+                    for question in self._gaps.questions(time.monotonic()):
+                        yield self._send(question)
+                    return message
+            if time.monotonic() >= deadline:
+                return None
+
+    def _take(self, message: Message, *, answered: bool) -> None:
+        if answered:
+            self._gaps.answered(message)
+        else:
+            self._gaps.received(message)
+            self.ended = self.ended or message.topic == "end"
+
+
+class Subscriber(_SubscriberCore):
+    """Receives messages in order of arrival; lost `slices` are asked for on `ask`, and received like the others."""
+
+    _context = zmq.Context
+    _poller_of = zmq.Poller
+
+    def __enter__(self) -> Subscriber:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def ask(self, request: Mapping[str, Any]) -> None:
+        """Send a question of your own; `receive` returns the answer. Raises WireError without `ask`."""
+        self._send(request)
+
+    def receive(self, timeout_s: float) -> Message | None:
+        """The next message or answer; None when there was none for that long."""
+        steps, value = self._receive(timeout_s), None
+        try:
+            while True:
+                value = steps.send(value)
+        except StopIteration as end:
+            message: Message | None = end.value
+            return message
+
+
+class AsyncSubscriber(_SubscriberCore):
+    """The same for asyncio: `async with AsyncSubscriber(endpoint, ask) as stream`, `await stream.receive(1.0)`."""
+
+    _context = zmq.asyncio.Context
+    _poller_of = zmq.asyncio.Poller
 
     async def __aenter__(self) -> AsyncSubscriber:
         return self
@@ -177,44 +235,19 @@ class AsyncSubscriber:
     async def __aexit__(self, *_: object) -> None:
         self.close()
 
-    def close(self) -> None:
-        """Let go of the sockets."""
-        self._sockets.close()
-
-    def listen(self, topic: str, wanted: bool) -> None:
-        """Subscribe to a topic from now on, or no more."""
-        self._sockets.sub.setsockopt(zmq.SUBSCRIBE if wanted else zmq.UNSUBSCRIBE, topic.encode())
-
     async def ask(self, request: Mapping[str, Any]) -> None:
-        """Put a question of one's own; the answer comes by `receive`."""
-        if self._sockets.dealer is None:
-            raise WireError("no endpoint to ask was given")
-        await self._sockets.dealer.send(json.dumps(request).encode())
+        """Send a question of your own; `receive` returns the answer. Raises WireError without `ask`."""
+        await self._send(request)
 
     async def receive(self, timeout_s: float) -> Message | None:
-        """The next message, live or asked for; None when there was none for that long."""
-        deadline = self._clock() + timeout_s
-        dealer, sub = self._sockets.dealer, self._sockets.sub
-        while True:
-            await self._ask_next()
-            left = max(0.0, deadline - self._clock())
-            ready = dict(await self._poller.poll(round(min(left, _LOOK_S) * 1000)))
-            if dealer is not None and dealer in ready:
-                answer = _message(await dealer.recv_multipart(copy=False))
-                self.gaps.answered(answer)
-                await self._ask_next()
-                return answer
-            if sub in ready:
-                message = _message(await sub.recv_multipart(copy=False))
-                self.gaps.heard(message)
-                await self._ask_next()
-                return message
-            if self._clock() >= deadline:
-                return None
-
-    async def _ask_next(self) -> None:
-        for question in self.gaps.questions(self._clock()):
-            await self.ask(question)
+        """The next message or answer; None when there was none for that long."""
+        steps, value = self._receive(timeout_s), None
+        try:
+            while True:
+                value = await steps.send(value)
+        except StopIteration as end:
+            message: Message | None = end.value
+            return message
 
 
 def subscribe(
@@ -225,17 +258,14 @@ def subscribe(
     idle_s: float | None = None,
     keys: ClientKeys | None = None,
 ) -> Iterator[Message]:
-    """Messages until the daemon says `end` and nothing asked for is still to come, or nothing came for `idle_s`."""
+    """Messages until the flight has ended and no answer is outstanding, or none came for `idle_s`."""
     with Subscriber(endpoint, ask, topics=topics, keys=keys) as subscriber:
-        ended = False
-        while not (ended and not subscriber.waiting_for):
-            message = subscriber.receive(idle_s if idle_s is not None else 1.0)
-            if message is None:
-                if idle_s is not None or ended:
-                    return
-                continue
-            ended = ended or message.topic == "end"
-            yield message
+        while not subscriber.finished:
+            message = subscriber.receive(1.0 if idle_s is None else idle_s)
+            if message is not None:
+                yield message
+            elif idle_s is not None or subscriber.ended:
+                return
 
 
 async def subscribe_async(
@@ -248,15 +278,18 @@ async def subscribe_async(
 ) -> AsyncIterator[Message]:
     """As `subscribe`, for `async for`."""
     async with AsyncSubscriber(endpoint, ask, topics=topics, keys=keys) as subscriber:
-        ended = False
-        while not (ended and not subscriber.gaps.waiting_for):
-            message = await subscriber.receive(idle_s if idle_s is not None else 1.0)
-            if message is None:
-                if idle_s is not None or ended:
-                    return
-                continue
-            ended = ended or message.topic == "end"
-            yield message
+        while not subscriber.finished:
+            message = await subscriber.receive(1.0 if idle_s is None else idle_s)
+            if message is not None:
+                yield message
+            elif idle_s is not None or subscriber.ended:
+                return
+
+
+def _sent(header: Mapping[str, Any]) -> Any:
+    """How many slices a flight sent, by its `end`."""
+    sent = header.get("sent")
+    return sent.get("slices", 0) if isinstance(sent, Mapping) else None
 
 
 def _connect(one: zmq.Socket[Any], endpoint: str, keys: ClientKeys | None) -> None:
@@ -268,7 +301,3 @@ def _connect(one: zmq.Socket[Any], endpoint: str, keys: ClientKeys | None) -> No
         one.connect(endpoint)
     except zmq.ZMQError as error:
         raise WireError(f"{endpoint}: not a ZeroMQ endpoint ({error.strerror})") from None
-
-
-def _message(parts: Collection[zmq.Frame]) -> Message:
-    return wire.decode([part.buffer for part in parts])

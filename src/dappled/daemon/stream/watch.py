@@ -1,4 +1,4 @@
-"""Watching a stream to its end: each frame counted once, however often it comes, and kept as files."""
+"""Watch a stream to its end: count each frame once, however often it comes, and save its slices."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from dappled.decode.lightfield.pictures import slice_mosaic
 _LOOK_S = 0.5
 
 
-class Stream(Protocol):
-    """What is watched; a `Subscriber`."""
+class StreamView(Protocol):
+    """The part of `Subscriber` that `watch` uses."""
 
     @property
     def waiting_for(self) -> int:
-        """How many answers are still to come."""
+        """How many answers are outstanding."""
 
     def receive(self, timeout_s: float) -> Message | None:
         """The next message; None when there was none for that long."""
@@ -31,29 +31,29 @@ class Stream(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """How many frames' slices came, and whether the flight ended meanwhile."""
+    """For how many frames slices came, and whether the flight has ended."""
 
     frames: int
     ended: bool
 
     def short_of(self, count: int | None) -> bool:
-        """Whether frames are missing of those asked for; without a count, whether the flight broke off at nothing."""
+        """Whether fewer than `count` frames came; without a count, whether none came and the flight has not ended."""
         if count is None:
             return not self.ended and not self.frames
         return self.frames < count
 
 
 def watch(
-    stream: Stream,
+    stream: StreamView,
     *,
-    heard: Callable[[Message], None],
+    received: Callable[[Message], None],
     new_frame: Callable[[Message], None],
     count: int | None = None,
     silence_s: float | None = None,
     clock_s: Callable[[], float] = time.monotonic,
 ) -> Watched:
-    """Receive until `count` frames' slices have come, the flight has ended and nothing asked for is still to come, or
-    nothing came for `silence_s`. `heard` gets every message, `new_frame` the first slices of each frame."""
+    """Receive until the slices of `count` frames have come, the flight has ended and no answer is outstanding, or no
+    message came for `silence_s`. `received` gets every message, `new_frame` the first slices of each frame."""
     frames: set[tuple[str, int]] = set()
     ended = False
     last_s = clock_s()
@@ -65,7 +65,7 @@ def watch(
             continue
         last_s = clock_s()
         ended = ended or message.topic == "end"
-        heard(message)
+        received(message)
         if message.topic == "slices":
             frame = (message.header["flight"], message.header["frame"])
             if frame not in frames:
@@ -74,8 +74,8 @@ def watch(
     return Watched(len(frames), ended)
 
 
-def keep(message: Message, folder: Path) -> None:
-    """Header as JSON, slices as NPY, and the mosaic of the slices as PNG (Fig 43), named by the frame."""
+def save(message: Message, folder: Path) -> None:
+    """Save the header as JSON, the slices as NPY and their mosaic (Fig 43) as PNG, named by the frame."""
     stem = folder / f"{message.header['frame']:06d}"
     slices = message.arrays()["slices"]
     carriers = np.array(message.header["carriers"])

@@ -1,4 +1,8 @@
-"""What goes over ZeroMQ: multipart [topic, header, body?], the header one JSON object, the body arrays end to end."""
+"""The messages of the stream: multipart [topic, header, body?], their headers, and the questions of subscribers.
+
+A header is one JSON object, a body holds the arrays that the header describes, end to end. docs/wire.md is the
+description for other programs.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +11,21 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import __version__
+from dappled.config.settings import PublishSettings
 from dappled.errors import DappledError
-from dappled.flight.records import Tag
+from dappled.flight.records import Frame, Tag
 
 VERSION = 1
 TOPICS = ("start", "frame", "slices", "depth", "preview", "health", "end")
+CAN_BE_ASKED = ("start", "frame", "slices")
+QUESTION_KEYS = ("get", "frame", "seq", "flight")
+_FLIGHT_CHARACTERS = 200
 
 
 class WireError(DappledError):
@@ -60,8 +69,83 @@ def describe_array(name: str, array: NDArray[Any], unit: str) -> dict[str, Any]:
     return {"name": name, "dtype": array.dtype.newbyteorder("<").str, "shape": list(array.shape), "unit": unit}
 
 
+class DecodedSlices(Protocol):
+    """What the header of a `slices` message says of a decoded frame."""
+
+    @property
+    def law(self) -> str:
+        """The carrier law's name."""
+
+    @property
+    def carriers(self) -> list[list[float]]:
+        """Rows [ky, kx, fy, fx]."""
+
+    @property
+    def carriers_from(self) -> str:
+        """How the carriers' frequencies were found."""
+
+    @property
+    def carriers_found(self) -> int:
+        """How many of the predicted carriers were seen in the frame."""
+
+    @property
+    def grid(self) -> list[list[float]]:
+        """(2, 3), from (y, x, 1) of a slice to sensor (row, column)."""
+
+    @property
+    def seen(self) -> Mapping[str, Any]:
+        """Further entries of the `slices` schema, for viewers."""
+
+    @property
+    def sha256(self) -> str:
+        """Of the body."""
+
+    @property
+    def arrays(self) -> list[dict[str, Any]]:
+        """As `describe_array` gives them."""
+
+
+def start_header(publish: PublishSettings, utc_ns: int, *, camera: str, mask: str) -> dict[str, object]:
+    """The header of a `start` message."""
+    return {
+        "utc_ns": utc_ns,
+        "software": f"dappled {__version__}",
+        "camera": camera,
+        "mask": mask,
+        "slices": publish.slices,
+        "ask": publish.ask,
+    }
+
+
+def slices_header(tag: Tag, decoded: DecodedSlices) -> dict[str, object]:
+    """The header of a `slices` message, live or in an answer."""
+    return {
+        **frame_facts(tag, decoded.law),
+        "carriers": decoded.carriers,
+        "carriers_from": decoded.carriers_from,
+        "carriers_found": decoded.carriers_found,
+        "grid": decoded.grid,
+        **decoded.seen,
+        "slices_sha256": decoded.sha256,
+        "arrays": decoded.arrays,
+    }
+
+
+def frame_header(tag: Tag, frame: Frame, law: str | None) -> dict[str, object]:
+    """The header of a `frame` message, live or in an answer."""
+    return {
+        **frame_facts(tag, law),
+        "utc_sigma_ns": tag.utc_sigma_ns,
+        "time_source": tag.time_source,
+        "exposure_s": tag.exposure_s,
+        "iso": tag.iso,
+        "name": frame.name,
+        "size": frame.size,
+    }
+
+
 def frame_facts(tag: Tag, law: str | None) -> dict[str, Any]:
-    """What every header that speaks of one frame holds."""
+    """The entries that all headers about one frame share."""
     return {
         "frame": tag.index,
         "utc_ns": tag.utc_ns,
@@ -76,7 +160,7 @@ def frame_facts(tag: Tag, law: str | None) -> dict[str, Any]:
 
 
 def pose_face(tag: Tag) -> dict[str, Any]:
-    """The pose as people and maps read it: degrees, and roll, pitch, yaw of the vehicle beside the quaternion."""
+    """A pose for people and maps: degrees, and the vehicle's roll, pitch and yaw beside the quaternion."""
     pose = tag.pose
     roll, pitch, yaw = euler(pose.attitude) if pose.attitude else (None, None, None)
     return {
@@ -99,7 +183,7 @@ def pose_face(tag: Tag) -> dict[str, Any]:
 
 
 def degrees(angle_rad: float | None) -> float | None:
-    """An angle as people read it; unknown stays unknown."""
+    """Radians to degrees; None stays None."""
     return None if angle_rad is None else math.degrees(angle_rad)
 
 
@@ -113,7 +197,7 @@ def euler(q: Sequence[float]) -> tuple[float, float, float]:
 
 
 def encode(header: Mapping[str, Any]) -> bytes:
-    """A header's bytes. NaN has no place in JSON: unknown is null."""
+    """A header's bytes. Raises ValueError for NaN, which JSON does not have: an unknown value is null."""
     return json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
 
 
@@ -126,6 +210,33 @@ def decode(parts: Sequence[Any]) -> Message:
     if not isinstance(header, dict):
         raise WireError("not a dappled message: the header is no JSON object")
     return Message(topic, header, parts[2] if len(parts) > 2 else None)
+
+
+def parse_question(payload: Sequence[bytes]) -> dict[str, Any]:
+    """A subscriber's question: one JSON object with `get` and, except for the start, `frame` or `seq`.
+
+    Returns its known keys only, because the answer's header repeats them. Raises WireError.
+    """
+    try:
+        request = json.loads(payload[0], parse_constant=_refuse_constant) if len(payload) == 1 else None
+    except (ValueError, RecursionError):
+        request = None
+    if not isinstance(request, dict):
+        raise WireError('a question is one JSON object such as {"get": "slices", "frame": 42}')
+    if request.get("get") not in CAN_BE_ASKED:
+        raise WireError(f'a question\'s "get" is one of {", ".join(CAN_BE_ASKED)}')
+    if request["get"] != "start":
+        number = request.get("frame", request.get("seq"))
+        if not isinstance(number, int) or isinstance(number, bool) or number < 0:
+            raise WireError("a question names a frame (or, for slices, a seq) by a whole number from 0")
+    flight = request.get("flight")
+    if flight is not None and not (isinstance(flight, str) and len(flight) <= _FLIGHT_CHARACTERS):
+        raise WireError("a question's flight is a name")
+    return {name: request[name] for name in QUESTION_KEYS if name in request}
+
+
+def _refuse_constant(text: str) -> object:
+    raise ValueError(text)  # NaN and Infinity
 
 
 def schema(topic: str) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.daemon.stream.gaps import AT_ONCE, MOST_MISSING, Gaps
+from dappled.daemon.stream.subscriber import AT_ONCE, MOST_MISSING, Gaps
 from dappled.daemon.stream.wire import Message
 
 
@@ -23,8 +23,8 @@ def test_whatever_is_lost_is_asked_for_once_and_had(flight: tuple[int, set[int]]
     heard = {seq for seq in heard if seq < sent}
     gaps = Gaps(can_ask=True, from_start=True)
     for seq in sorted(heard):
-        gaps.heard(slices(seq))
-    gaps.heard(end(sent))
+        gaps.received(slices(seq))
+    gaps.received(end(sent))
     asked: list[int] = []
     while questions := gaps.questions(0.0):
         assert len(questions) <= AT_ONCE
@@ -37,15 +37,15 @@ def test_whatever_is_lost_is_asked_for_once_and_had(flight: tuple[int, set[int]]
 
 def test_without_anybody_to_ask_it_is_lost() -> None:
     gaps = Gaps(can_ask=False)
-    gaps.heard(slices(3))
-    gaps.heard(slices(6))
+    gaps.received(slices(3))
+    gaps.received(slices(6))
     assert (gaps.gaps, gaps.lost, gaps.questions(0.0)) == (2, 2, [])
 
 
 def test_an_answer_that_never_comes_is_given_up() -> None:
     gaps = Gaps(can_ask=True, answer_timeout_s=10)
-    gaps.heard(slices(0))
-    gaps.heard(slices(2))
+    gaps.received(slices(0))
+    gaps.received(slices(2))
     assert [question["seq"] for question in gaps.questions(0.0)] == [1]
     assert gaps.questions(9.0) == []
     assert gaps.lost == 0
@@ -55,8 +55,8 @@ def test_an_answer_that_never_comes_is_given_up() -> None:
 
 def test_an_error_is_a_loss_and_a_stranger_s_answer_is_nothing() -> None:
     gaps = Gaps(can_ask=True)
-    gaps.heard(slices(0))
-    gaps.heard(slices(2))
+    gaps.received(slices(0))
+    gaps.received(slices(2))
     (question,) = gaps.questions(0.0)
     gaps.answered(Message("slices", {"asked": {"get": "slices", "frame": 7}}))
     gaps.answered(Message("slices", {"asked": None}))
@@ -67,29 +67,29 @@ def test_an_error_is_a_loss_and_a_stranger_s_answer_is_nothing() -> None:
 
 def test_flights_are_counted_apart() -> None:
     gaps = Gaps(can_ask=True)
-    gaps.heard(slices(7, "one"))
-    gaps.heard(slices(0, "two"))
-    gaps.heard(slices(1, "two"))
+    gaps.received(slices(7, "one"))
+    gaps.received(slices(0, "two"))
+    gaps.received(slices(1, "two"))
     assert gaps.gaps == 0
 
 
 def test_a_header_that_claims_the_impossible_costs_no_memory() -> None:
     gaps = Gaps(can_ask=True)
-    gaps.heard(slices(0))
-    gaps.heard(slices(10**12))
+    gaps.received(slices(0))
+    gaps.received(slices(10**12))
     assert gaps.gaps == 10**12 - 1
     assert gaps.waiting_for == MOST_MISSING
     assert gaps.gaps == gaps.lost + gaps.waiting_for
     assert gaps.questions(0.0)[0]["seq"] == 10**12 - MOST_MISSING
-    gaps.heard(slices(10**12 + 3))
+    gaps.received(slices(10**12 + 3))
     assert gaps.waiting_for == MOST_MISSING + AT_ONCE - 2  # four were asked for, and two more are missing
     assert gaps.gaps == gaps.lost + gaps.waiting_for
 
 
 def test_an_end_without_a_count_is_no_gap() -> None:
     gaps = Gaps(can_ask=True)
-    gaps.heard(slices(0))
+    gaps.received(slices(0))
     ends: list[object] = [None, [], {"slices": "many"}, {"slices": None}]
     for sent in ends:
-        gaps.heard(Message("end", {"flight": "f", "sent": sent}))
+        gaps.received(Message("end", {"flight": "f", "sent": sent}))
     assert gaps.gaps == 0
