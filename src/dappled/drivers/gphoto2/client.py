@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import Any
 
 from dappled.drivers import usb_bus
+from dappled.drivers.attribution import Claim
 from dappled.drivers.camera import (
     Arrival,
     CameraError,
@@ -35,7 +36,6 @@ from dappled.drivers.child_process import RestartBudget, end_child, start_child
 from dappled.drivers.gphoto2.messages import LATE, Before, message_event
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
 from dappled.drivers.process_channel import ChannelError, ProcessChannel
-from dappled.drivers.wired.attribution import Claim
 
 _PING_S = 1.0
 _STOP_S = 1.2

@@ -6,6 +6,7 @@ import os
 from collections import deque
 from collections.abc import Callable
 
+from dappled.drivers.attribution import Claim, attribute, true_name
 from dappled.drivers.camera import Arrival, Companion
 from dappled.drivers.gphoto2.messages import LATE
 from dappled.drivers.gphoto2.pairs import makes_pairs
@@ -20,8 +21,6 @@ from dappled.drivers.gphoto2.protocol import (
 from dappled.drivers.gphoto2.settings import Timeouts
 from dappled.drivers.gphoto2.state import Books
 from dappled.drivers.gphoto2.telling import Telling
-from dappled.drivers.wired.attribution import Claim, attribute
-from dappled.drivers.wired.file_names import true_name
 
 _HEAD_BYTES = 65536
 _TRIES = 3

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
+from dappled.drivers.attribution import BodyClock
 from dappled.drivers.camera import Fired, SettingName, SettingsChanged
 from dappled.drivers.gphoto2.fetching import Fetching
 from dappled.drivers.gphoto2.finding import open_session
@@ -29,7 +30,6 @@ from dappled.drivers.gphoto2.settings import GPhoto2Settings
 from dappled.drivers.gphoto2.state import AtCamera, Books
 from dappled.drivers.gphoto2.telling import SEND_S, Telling
 from dappled.drivers.process_channel import ChannelError, ProcessChannel
-from dappled.drivers.wired.attribution import BodyClock
 
 _WAITING = 64
 _POLL_BUSY_S = 0.005

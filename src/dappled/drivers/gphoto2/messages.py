@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from dappled.drivers.attribution import Claim
 from dappled.drivers.camera import (
     Arrival,
     Blob,
@@ -24,7 +25,6 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.drivers.process_channel import ChannelError, ChannelMessage
-from dappled.drivers.wired.attribution import Claim
 
 LATE = 16
 

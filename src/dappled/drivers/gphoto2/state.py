@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 
+from dappled.drivers.attribution import BodyClock, Claim
 from dappled.drivers.camera import BodyState, Setting
 from dappled.drivers.gphoto2.messages import LATE
 from dappled.drivers.gphoto2.pairs import Pairs
@@ -12,7 +13,6 @@ from dappled.drivers.gphoto2.protocol import (
     CameraFile,
     Session,
 )
-from dappled.drivers.wired.attribution import BodyClock, Claim
 
 
 @dataclass(slots=True)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from dappled.drivers.attribution import Claim
 from dappled.drivers.camera import BodyState, CameraEvent, ShotFailed, StateChanged
 from dappled.drivers.gphoto2.messages import event_message
 from dappled.drivers.gphoto2.state import Books
 from dappled.drivers.process_channel import ProcessChannel
-from dappled.drivers.wired.attribution import Claim
 
 SEND_S = 5.0
 

@@ -53,19 +53,24 @@ _ILLUM = {
 _BARE: dict[int, Mapping[str, Any]] = {3280 * 3280 * 3 // 2: _FIRST, 7728 * 5368 * 5 // 4: _ILLUM}
 
 
-def find(source: Source, label: str, file: BinaryIO, *, pixels: bool = True) -> RawFile | None:
-    """The frame of a Lytro camera's file; None for other files. Without `pixels` its mosaic has the shape (0, 0).
+def read_container(data: bytes, *, pixels: bool = True) -> RawFile:
+    """The frame of an .lfp or .lfr file; without `pixels` its mosaic has the shape (0, 0).
 
     Raises ValueError where the file is cut short or holds no raw frame.
     """
-    start = file.read(len(START))
+    metadata, packed = _parts(data)
+    return _frame(metadata, packed if pixels else None)
+
+
+def find_bare(source: Source, file: BinaryIO, *, pixels: bool = True) -> RawFile | None:
+    """The frame of a bare .raw file; None where neither metadata beside it nor its size names a Lytro camera.
+
+    Raises ValueError as `read_container`.
+    """
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
-    if start == START:
-        metadata, packed = _parts(file.read())
-        return _frame(metadata, packed if pixels else None)
-    bare = _beside(source) or _BARE.get(size) if label.lower().endswith(".raw") else None
-    return None if bare is None else _frame(_imaging(bare), file.read() if pixels else None)
+    metadata = _beside(source) or _BARE.get(size)
+    return None if metadata is None else _frame(_imaging(metadata), file.read() if pixels else None)
 
 
 def _beside(source: Source) -> Mapping[str, Any] | None:

@@ -52,7 +52,7 @@ def read(source: Source, name: str | None = None) -> RawFile:
             return _read_picture(file)
         if start.startswith(_TIFF_STARTS) and _is_plain_tiff(file, label):
             return _read_tiff(file)
-        frame = lytro.find(source, label, file)
+        frame = _find_lytro(source, label, file, start)
         return _read_libraw(file) if frame is None else frame
 
 
@@ -71,12 +71,19 @@ def read_metadata(source: Source, name: str | None = None) -> ExposureSettings:
             return read_exif(file)
         if start.startswith(_TIFF_STARTS) and _is_plain_tiff(file, label):
             return read_exif(file)
-        frame = lytro.find(source, label, file, pixels=False)
+        frame = _find_lytro(source, label, file, start, pixels=False)
         told = read_exif(file) if frame is None else frame.exposure_settings()
         if told.make is not None:
             return told
         file.seek(0)
         return _read_libraw_settings(file)
+
+
+def _find_lytro(source: Source, label: str, file: BinaryIO, start: bytes, *, pixels: bool = True) -> RawFile | None:
+    """The frame of a Lytro container, or of a bare file that is named .raw; None for other files."""
+    if start.startswith(lytro.START):
+        return lytro.read_container(file.read(), pixels=pixels)
+    return lytro.find_bare(source, file, pixels=pixels) if label.lower().endswith(".raw") else None
 
 
 def _label(source: Source, name: str | None) -> str:

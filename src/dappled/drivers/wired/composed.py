@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from dappled.drivers.attribution import Claim
 from dappled.drivers.camera import (
     Arrival,
     CameraError,
@@ -22,7 +23,6 @@ from dappled.drivers.camera import (
     ShotFailed,
     StateChanged,
 )
-from dappled.drivers.wired.attribution import Claim
 from dappled.drivers.wired.file_watch import FileWatch
 from dappled.drivers.wired.shutter_line import Order, ShutterLine, UsesAutopilot, pressing
 from dappled.drivers.wired.sources import Source

@@ -9,9 +9,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
+from dappled.drivers.attribution import BodyClock, Claim, attribute
 from dappled.drivers.camera import Arrival, CameraError, Companion
 from dappled.drivers.wired import matching
-from dappled.drivers.wired.attribution import BodyClock, Claim, attribute
 from dappled.drivers.wired.sources import Found, Group, Source, groups
 
 _LATE = 64

@@ -1,4 +1,4 @@
-"""What of the session can be tested without a camera: names. The rest is tested through the driver."""
+"""Names of files by their content."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.drivers.wired.file_names import (
+from dappled.drivers.attribution import (
     true_name,
 )
 

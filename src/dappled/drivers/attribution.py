@@ -1,10 +1,12 @@
-"""Which shot made a file, when more than one may have: told by the body's own clock, else marked as doubtful.
+"""Attribute a camera's file to the shot that made it, and correct its name by its content.
 
-A file may come after its shot was given up. It must not become the next shot's frame.
+A file may come after its shot was given up; it must not become the next shot's frame. The body's own clock tells the
+shots apart. Where it can't, the file is marked as doubtful.
 """
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -12,6 +14,7 @@ from statistics import median
 TOLERANCE_S = 3.0
 """A body's time has whole seconds, and is that of the exposure or of the writing of the file."""
 _KEPT = 16
+_DNG_VERSION = 50706
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +26,7 @@ class Claim:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Attribution:
     """The shot that made a file, None where that can't be said; a sentence where there is doubt."""
 
     shot: int | None
@@ -46,25 +49,56 @@ class BodyClock:
         return abs(taken_s - claim.fired_ns / 1e9 - median(self.offsets_s)) <= TOLERANCE_S
 
 
-def attribute(late: Sequence[Claim], current: Claim | None, taken_s: int | None, clock: BodyClock) -> Verdict:
+def attribute(late: Sequence[Claim], current: Claim | None, taken_s: int | None, clock: BodyClock) -> Attribution:
     """Whose file it is. `late` are shots that were given up after they had been fired, `current` the one that is waited
     for. Without rivals, and without a time that says otherwise, the file is the current shot's."""
     claims = [*late, *([] if current is None else [current])]
     if not claims:
-        return Verdict(None)
+        return Attribution(None)
     if taken_s is not None and clock.offsets_s:
         fitting = [claim for claim in claims if clock.fits(claim, taken_s)]
         if len(fitting) == 1:
-            return Verdict(fitting[0].shot)
+            return Attribution(fitting[0].shot)
         if not fitting and current is None:
-            return Verdict(None, "by the body's clock it is no shot's")
+            return Attribution(None, "by the body's clock it is no shot's")
         claims = fitting or claims
     if len(claims) == 1:
         told = current is not None and not late
-        return Verdict(claims[0].shot, "" if told else _rivals(claims))
-    return Verdict(current.shot if current in claims and current is not None else None, _rivals(claims))
+        return Attribution(claims[0].shot, "" if told else _rivals(claims))
+    return Attribution(current.shot if current in claims and current is not None else None, _rivals(claims))
 
 
 def _rivals(claims: Sequence[Claim]) -> str:
     shots = " or ".join(str(claim.shot) for claim in claims)
     return f"it may be the file of shot {shots}: one had been given up, and the body's clock doesn't tell them apart"
+
+
+def true_name(name: str, head: bytes) -> str:
+    """The file's name with the extension that its first bytes call for.
+
+    For pictures from the camera's memory libgphoto2 makes the name up, from a format code that knows no DNG.
+    """
+    suffix = _suffix(head)
+    stem, dot, given = name.rpartition(".")
+    if suffix is None or not dot or given.lower() == suffix:
+        return name
+    return f"{stem}.{suffix.upper() if given.isupper() else suffix}"
+
+
+def _suffix(head: bytes) -> str | None:
+    if head.startswith(b"\xff\xd8\xff"):
+        return "jpg"
+    if head.startswith(b"FUJIFILMCCD-RAW"):
+        return "raf"
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(head[:4])
+    if order is None or len(head) < 16:
+        return None
+    if head[8:10] == b"CR":
+        return "cr2"
+    (first,) = struct.unpack_from(order + "I", head, 4)
+    if first + 2 > len(head):
+        return None
+    (count,) = struct.unpack_from(order + "H", head, first)
+    last = min(first + 2 + 12 * count, len(head) - 1)
+    tags = {struct.unpack_from(order + "H", head, at)[0] for at in range(first + 2, last, 12)}
+    return "dng" if _DNG_VERSION in tags else None
