@@ -32,7 +32,7 @@ from dappled.decode.geometry.pose import Pose
 from dappled.decode.spectrum.plane import to_plane
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.flight.records import Frame, Tag
+from dappled.flight import Frame, Tag
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.products.batch import batch, workers

@@ -30,8 +30,7 @@ from typing import Any
 from dappled.clock import SystemClock
 from dappled.drivers.camera import Arrival, Fired, ShotFailed, StateChanged
 from dappled.drivers.gphoto2.client import GPhoto2Camera, open_camera
-from dappled.flight import durable, recording
-from dappled.flight.records import Cause, Shot
+from dappled.flight import Cause, Shot, durable, recording
 from dappled.mocks.body.body import Body, BodyOptions
 
 SIZE = 17_582_091  # of a real EOS 450D's CR2

@@ -32,7 +32,7 @@ import tomli_w
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
 from dappled.drivers.mavlink.framing import Message, mavlink, pack
-from dappled.flight import summary
+from dappled.flight import flight_report
 from dappled.mocks.simulation import Simulation, World, free_port
 
 SO_TIMESTAMPNS = 35
@@ -120,7 +120,7 @@ def under_load(folder: Path, seconds: float, nice: int) -> dict[str, float]:
         sender.join()
         end(process)
         (flight,) = (path for path in (folder / "flights").iterdir() if path.is_dir())
-        rows = [line.row for line in summary.show(flight).lines]
+        rows = [line.row for line in flight_report.show(flight).lines]
     calls = sorted(
         (row.fired_called_monotonic_ns - row.shot.wished_monotonic_ns) / 1e6
         for row in rows

@@ -160,8 +160,7 @@ def hung(root: Path, rounds: int) -> dict[str, float]:
         os.setpriority(os.PRIO_PROCESS, 0, UNIT_NICENESS)
     when = np.random.default_rng(1)
     from dappled.drivers.camera import Blob  # noqa: PLC0415  # the subscribers' processes load none of it
-    from dappled.flight import recording  # noqa: PLC0415  # as above
-    from dappled.flight.records import Cause, Shot  # noqa: PLC0415  # as above
+    from dappled.flight import Cause, Shot, recording  # noqa: PLC0415  # as above
 
     flight = recording.begin(root / "flights", time.time_ns)
     data = os.urandom(RAW_BYTES)

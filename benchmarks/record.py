@@ -20,8 +20,7 @@ from pathlib import Path
 import sustained
 
 from dappled.drivers.camera import Blob
-from dappled.flight import recording
-from dappled.flight.records import Cause, Shot
+from dappled.flight import Cause, Shot, recording
 
 
 def main() -> None:

@@ -42,8 +42,7 @@ from dappled.drivers.camera import (
     StateChanged,
     check_change,
 )
-from dappled.flight import check, recording, summary
-from dappled.flight.records import Shot
+from dappled.flight import Shot, check, flight_report, recording
 
 QUEUE = 4
 
@@ -205,8 +204,8 @@ def _is_memfd(path: Path) -> bool:
 
 
 def _account(flight: Path, count: int) -> dict[str, float]:
-    balance, found = summary.report(flight), check.check(flight)
-    skipped = sum(event.kind == "not decoded" for event in summary.show(flight).events)
+    balance, found = flight_report.balance(flight), check.check(flight)
+    skipped = sum(event.kind == "not decoded" for event in flight_report.show(flight).events)
     missing = count - balance.safe + max(0, balance.frames - balance.decoded - skipped)
     shutil.rmtree(flight / "frames")
     return {

@@ -14,7 +14,7 @@ import pytest
 from dappled.cli import main
 from dappled.cli import run as verb
 from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
-from dappled.flight import summary
+from dappled.flight import flight_report
 from dappled.mocks.simulation import free_port
 from tests.daemon.fakes import eventually
 
@@ -64,7 +64,7 @@ def test_it_ends_when_it_has_its_frames(
     said = capsys.readouterr()
     assert json.loads(said.out)["index"] == 0
     assert said.err.splitlines()[-1] == "1 shots: 1 frames safe, 0 decoded, 0 with a problem"
-    (flight,) = summary.list_flights(tmp_path / "flights")
+    (flight,) = flight_report.list_flights(tmp_path / "flights")
     assert f"flight {flight.path}" in said.err
     assert flight.balance is not None
     assert flight.balance.balanced

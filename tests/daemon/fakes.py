@@ -33,8 +33,7 @@ from dappled.drivers.camera import (
     StateChanged,
     check_change,
 )
-from dappled.flight import recording
-from dappled.flight.records import Shot
+from dappled.flight import Shot, recording
 
 
 def no_pose(utc_ns: int = 0) -> Pose:

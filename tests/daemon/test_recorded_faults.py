@@ -15,11 +15,8 @@ from dappled.daemon.pipeline import tagger
 from dappled.daemon.pipeline.tagger import BodyLatency, FrameSettings
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Decoder, Message, mavlink
-from dappled.flight import recording
+from dappled.flight import Cause, LedgerReader, Result, Shot, recording
 from dappled.flight.check import check
-from dappled.flight.entries import Result
-from dappled.flight.ledger import LedgerReader
-from dappled.flight.records import Cause, Shot
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath
 from tests.daemon.fakes import rig

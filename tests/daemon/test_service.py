@@ -21,9 +21,7 @@ from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import Service
 from dappled.drivers.camera import CameraError, Setting, SettingsChanged
 from dappled.errors import DappledError
-from dappled.flight import check, layout
-from dappled.flight.errors import FlightError
-from dappled.flight.ledger import LedgerReader
+from dappled.flight import FlightError, LedgerReader, check, layout
 from tests.daemon.fakes import FakeCamera, eventually, good
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.daemon.stop_condition import StopCondition, Tally
-from dappled.flight.records import Frame
+from dappled.flight import Frame
 from tests.flight.makers import shot
 
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled.flight import recording
-from dappled.flight.recording import Recording
+from dappled.flight import Recording, recording
 
 
 @pytest.fixture

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.decode.geometry.pose import Pose
-from dappled.flight.recording import Recording
-from dappled.flight.records import Cause, Frame, Shot, Tag
+from dappled.flight import Cause, Frame, Recording, Shot, Tag
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,13 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from dappled.flight import durable, summary
+from dappled.flight import FlightError, FlightFolder, LedgerReader, Recording, Result, durable, flight_report
 from dappled.flight.check import check
-from dappled.flight.entries import Result
-from dappled.flight.errors import FlightError
-from dappled.flight.layout import FlightFolder
-from dappled.flight.ledger import LedgerReader
-from dappled.flight.recording import Recording
 from tests.flight.makers import deliver, flip, mavlink_2, shot, tag, wish
 
 
@@ -140,24 +135,24 @@ def test_a_crash_while_flight_toml_is_written_anew_is_no_fault(
 
 
 def test_what_is_no_flight_is_told(tmp_path: Path) -> None:
-    for ask in (check, summary.report, summary.show):
+    for ask in (check, flight_report.balance, flight_report.show):
         with pytest.raises(FlightError, match="not a flight folder"):
             ask(tmp_path)
 
 
 def test_the_books_balance(recorded: FlightFolder) -> None:
-    books = summary.report(recorded.path)
+    books = flight_report.balance(recorded.path)
     assert (books.wishes, books.safe, books.failed, books.open) == (3, 2, 1, 0)
     assert (books.frames, books.tagged, books.decoded, books.strays, books.size) == (2, 2, 1, 0, 2000)
     assert books.by_source == {"mavlink:255/190": 3}
     assert books.closed
     assert books.balanced
     alter(recorded, "UPDATE shots SET state = 'fired' WHERE idx = 2")
-    assert not summary.report(recorded.path).balanced
+    assert not flight_report.balance(recorded.path).balanced
 
 
 def test_a_flight_is_shown_line_by_line(recorded: FlightFolder) -> None:
-    shown = summary.show(recorded.path)
+    shown = flight_report.show(recorded.path)
     assert [line.row.shot for line in shown.lines] == [shot(0), shot(1), shot(2)]
     assert [line.row.state for line in shown.lines] == ["safe", "safe", "failed"]
     assert [line.result is not None for line in shown.lines] == [True, False, False]
@@ -168,10 +163,10 @@ def test_a_flight_is_shown_line_by_line(recorded: FlightFolder) -> None:
 
 def test_flights_are_listed_with_what_is_wrong(recorded: FlightFolder) -> None:
     (other := recorded.path.with_name("20260101T000000Z-00000000")).mkdir()
-    listed = summary.list_flights(recorded.path.parent)
+    listed = flight_report.list_flights(recorded.path.parent)
     assert [each.name for each in listed] == [other.name, recorded.name]
     assert listed[0].problem is not None
     assert listed[0].balance is None
-    assert listed[1].balance == summary.report(recorded.path)
+    assert listed[1].balance == flight_report.balance(recorded.path)
     with pytest.raises(FlightError, match="no flights folder"):
-        summary.list_flights(recorded.path / "missing")
+        flight_report.list_flights(recorded.path / "missing")

@@ -16,11 +16,8 @@ from typing import Any
 
 import pytest
 
-from dappled.flight import durable, layout, recording
+from dappled.flight import FlightError, Frame, Recording, durable, layout, recording
 from dappled.flight.check import check
-from dappled.flight.errors import FlightError
-from dappled.flight.recording import Recording
-from dappled.flight.records import Frame
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, flip, shot, tag, wish
 

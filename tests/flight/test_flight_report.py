@@ -5,11 +5,8 @@ from __future__ import annotations
 import pytest
 
 from dappled.cli import main
-from dappled.flight import summary
-from dappled.flight.entries import Result
-from dappled.flight.flight_report import Account, accounts
-from dappled.flight.layout import FlightFolder
-from dappled.flight.recording import Recording
+from dappled.flight import FlightFolder, Recording, Result, flight_report
+from dappled.flight.flight_report import SourceReport, by_source
 from tests.flight.makers import deliver, tag, wish
 
 
@@ -27,17 +24,17 @@ def recorded(flight: Recording) -> FlightFolder:
 
 
 def test_a_flights_books_by_source(recorded: FlightFolder) -> None:
-    assert accounts(recorded.path) == (Account("mavlink:255/190", 3, 0, 3, 2, 1, 0, 2, 1),)
+    assert by_source(recorded.path) == (SourceReport("mavlink:255/190", 3, 0, 3, 2, 1, 0, 2, 1),)
 
 
 def test_refused_wishes_stand_with_who_made_them(flight: Recording) -> None:
     wish(flight, 0)
     for text in ("IMAGE_START_CAPTURE from mavlink:7/1: no camera", "console from console: no camera", "gibberish"):
         flight.ledger.add_event("refused", text)
-    books = {one.source: one for one in accounts(flight.folder.path)}
+    books = {one.source: one for one in by_source(flight.folder.path)}
     assert (books["mavlink:7/1"].wishes, books["mavlink:7/1"].refused) == (1, 1)
     assert books["console"].refused == books["unknown"].refused == 1
-    balance = summary.report(flight.folder.path)
+    balance = flight_report.balance(flight.folder.path)
     assert sum(one.shots for one in books.values()) == balance.wishes
     assert sum(one.refused for one in books.values()) == balance.refused
 

@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.flight import journal as wishes
-from dappled.flight.errors import FlightError
-from dappled.flight.records import Cause, Shot
+from dappled.flight import Cause, FlightError, Shot
+from dappled.flight import journal as journals
 from tests.flight.makers import shot
 
 SHOTS = st.builds(
@@ -30,31 +29,31 @@ def test_wishes_come_back_and_a_torn_end_is_told(
     tmp_path_factory: pytest.TempPathFactory, shots: list[Shot], torn: bytes
 ) -> None:
     path = tmp_path_factory.mktemp("journal") / "shots.jsonl"
-    journal = wishes.WishJournal(path)
+    journal = journals.ShotJournal(path)
     for each in shots:
         journal.note(each)
     journal.close()
-    assert wishes.read(path) == wishes.Wishes(tuple(shots), ())
+    assert journals.read(path) == journals.JournalContents(tuple(shots), ())
 
     torn = torn.replace(b"\n", b"")
     with path.open("ab") as file:
         file.write(torn)
-    found = wishes.read(path)
+    found = journals.read(path)
     assert found.shots == tuple(shots)
     assert len(found.problems) == (1 if torn else 0)
 
-    again = wishes.WishJournal(path)  # closes the torn line off
+    again = journals.ShotJournal(path)  # closes the torn line off
     new = shot(2**31 + 1)
     again.note(new)
     again.close()
-    assert wishes.read(path).shots == (*shots, new)
+    assert journals.read(path).shots == (*shots, new)
 
 
 @given(st.binary(max_size=300))
 def test_any_bytes_are_read_without_a_crash(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
     path = tmp_path_factory.mktemp("journal") / "shots.jsonl"
     path.write_bytes(data)
-    found = wishes.read(path)
+    found = journals.read(path)
     lines = data.split(b"\n")
     assert len(found.shots) + len(found.problems) == len(lines) - (lines[-1] == b"")
 
@@ -73,22 +72,22 @@ def test_any_bytes_are_read_without_a_crash(tmp_path_factory: pytest.TempPathFac
 def test_a_line_that_is_no_wish_is_told(tmp_path: Path, line: bytes) -> None:
     path = tmp_path / "shots.jsonl"
     path.write_bytes(line + b"\n")
-    assert wishes.read(path) == wishes.Wishes((), (f"line 1 of {path} is not a wish",))
+    assert journals.read(path) == journals.JournalContents((), (f"line 1 of {path} is not a wish",))
 
 
 def test_a_shot_noted_twice_is_told(tmp_path: Path) -> None:
     path = tmp_path / "shots.jsonl"
-    journal = wishes.WishJournal(path)
+    journal = journals.ShotJournal(path)
     journal.note(shot(1))
     journal.note(shot(1))
     journal.close()
-    assert wishes.read(path) == wishes.Wishes((shot(1),), (f"line 2 of {path} notes shot 1 again",))
+    assert journals.read(path) == journals.JournalContents((shot(1),), (f"line 2 of {path} notes shot 1 again",))
 
 
 def test_no_journal_is_an_empty_one(tmp_path: Path) -> None:
-    assert wishes.read(tmp_path / "missing") == wishes.Wishes((), ())
+    assert journals.read(tmp_path / "missing") == journals.JournalContents((), ())
     with pytest.raises(FlightError, match="is a folder"):
-        wishes.read(tmp_path)
+        journals.read(tmp_path)
 
 
 def test_a_note_is_one_write_and_reaches_the_disk_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,7 +105,7 @@ def test_a_note_is_one_write_and_reaches_the_disk_soon(tmp_path: Path, monkeypat
 
     monkeypatch.setattr(os, "write", watched_write)
     monkeypatch.setattr(os, "fdatasync", watched_fdatasync)
-    journal = wishes.WishJournal(tmp_path / "shots.jsonl", flush_interval_s=0.01)
+    journal = journals.ShotJournal(tmp_path / "shots.jsonl", flush_interval_s=0.01)
     journal.note(shot(3))
     assert len(writes) == 1
     assert writes[0].endswith(b"\n")
@@ -124,18 +123,18 @@ def test_a_note_that_the_disk_refuses_raises(tmp_path: Path, monkeypatch: pytest
             return write(fd, data[:5])
         raise OSError(errno.ENOSPC, "full")
 
-    journal = wishes.WishJournal(tmp_path / "shots.jsonl")
+    journal = journals.ShotJournal(tmp_path / "shots.jsonl")
     monkeypatch.setattr(os, "write", refuse)
     with pytest.raises(FlightError, match=r"cannot note shot 3 in .*disk"):
         journal.note(shot(3))
     monkeypatch.undo()
     journal.note(shot(4))
     journal.close()
-    assert wishes.read(tmp_path / "shots.jsonl").shots == (shot(4),)
+    assert journals.read(tmp_path / "shots.jsonl").shots == (shot(4),)
 
 
 def test_what_is_noted_after_the_end_gets_into_no_other_file(tmp_path: Path) -> None:
-    journal = wishes.WishJournal(tmp_path / "shots.jsonl")
+    journal = journals.ShotJournal(tmp_path / "shots.jsonl")
     journal.close()
     journal.close()
     told = r"cannot note shot 3 in .*shots\.jsonl: the flight is closed"
@@ -148,7 +147,7 @@ def test_a_flush_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     def refuse(_: int) -> None:
         raise OSError(errno.EIO, "io")
 
-    journal = wishes.WishJournal(tmp_path / "shots.jsonl")
+    journal = journals.ShotJournal(tmp_path / "shots.jsonl")
     monkeypatch.setattr(os, "fdatasync", refuse)
     journal.note(shot(3))
     journal.close()
@@ -159,10 +158,10 @@ def test_a_flush_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_a_note_survives_the_process(tmp_path: Path) -> None:
     path = tmp_path / "shots.jsonl"
     code = (
-        "import os, sys; from pathlib import Path; from dappled.flight.journal import WishJournal;"
+        "import os, sys; from pathlib import Path; from dappled.flight.journal import ShotJournal;"
         "from tests.flight.makers import shot;"
-        f"WishJournal(Path({str(path)!r}), 60.0).note(shot(5)); os.kill(os.getpid(), 9)"
+        f"ShotJournal(Path({str(path)!r}), 60.0).note(shot(5)); os.kill(os.getpid(), 9)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=False, timeout=60)
     assert done.returncode == -9
-    assert wishes.read(path).shots == (shot(5),)
+    assert journals.read(path).shots == (shot(5),)

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.flight import layout
-from dappled.flight.errors import FlightError
+from dappled.flight import FlightError, layout
 from tests.flight.conftest import START_UTC_NS
 
 

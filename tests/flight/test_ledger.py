@@ -12,11 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from dappled.flight.entries import Result, ShotRow, Stray
-from dappled.flight.errors import FlightError
-from dappled.flight.ledger import Ledger, LedgerReader
-from dappled.flight.records import Frame, ShotState
-from dappled.flight.states import TRANSITIONS, IllegalTransitionError, advance
+from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Result, ShotRow, ShotState, Stray
+from dappled.flight.records import TRANSITIONS, IllegalTransitionError, advance
 from tests.flight.makers import shot, tag
 
 

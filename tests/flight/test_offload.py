@@ -8,11 +8,8 @@ from pathlib import Path
 import pytest
 
 from dappled.cli import main
-from dappled.flight import durable, layout, offload
+from dappled.flight import FlightError, Ledger, Recording, durable, layout, offload
 from dappled.flight.check import check
-from dappled.flight.errors import FlightError
-from dappled.flight.ledger import Ledger
-from dappled.flight.recording import Recording
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, flip, mavlink_2, wish
 

@@ -13,14 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from dappled.flight import durable
+from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Recording, Stray, durable
 from dappled.flight.check import check
-from dappled.flight.entries import Stray
-from dappled.flight.errors import FlightError
-from dappled.flight.ledger import Ledger, LedgerReader
-from dappled.flight.recorder import StrayFileError
-from dappled.flight.recording import Recording
-from dappled.flight.records import Frame
+from dappled.flight.recording import StrayFileError
 from tests.flight.makers import deliver, held, wish
 
 DATA = b"raw bytes" * 1000

@@ -12,14 +12,20 @@ from types import ModuleType
 
 import pytest
 
-from dappled.flight import journal as wishes
-from dappled.flight import layout, lock, recording, recovery, summary
+from dappled.flight import (
+    FlightError,
+    ImageIndex,
+    LedgerReader,
+    Recording,
+    Stray,
+    flight_report,
+    layout,
+    recording,
+    recovery,
+)
+from dappled.flight import journal as journals
 from dappled.flight.check import check
-from dappled.flight.entries import Stray
-from dappled.flight.errors import FlightError
-from dappled.flight.index import Entry, ImageIndex, in_order
-from dappled.flight.ledger import LedgerReader
-from dappled.flight.recording import Recording
+from dappled.flight.index import IndexEntry, in_order
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, held, logged, mavlink_1, mavlink_2, shot, wish
 
@@ -46,7 +52,7 @@ def test_a_flight_from_first_to_last(flights: Path, flight: Recording) -> None:
     frame = deliver(flight, 0, b"raw")
     flight.note_image(0)
     flight.note_image(99)  # a shot that nobody wished for has no entry
-    assert flight.index.lookup(0) == Entry(0, flight.folder.name, frame.name, "safe")
+    assert flight.index.lookup(0) == IndexEntry(0, flight.folder.name, frame.name, "safe")
     assert flight.index.lookup(99) is None
     flight.telemetry.append(1, mavlink_1(b"a"))
     flight.add_facts({"identity": {"model": "450D"}})
@@ -67,7 +73,7 @@ def test_a_flight_from_first_to_last(flights: Path, flight: Recording) -> None:
 
     second = begin_later(flights)
     assert (second.next_index, second.recovered) == (1, ())
-    assert second.index.lookup(0) == Entry(0, flight.folder.name, frame.name, "safe")
+    assert second.index.lookup(0) == IndexEntry(0, flight.folder.name, frame.name, "safe")
     assert list(second.index.flights().values()) == [START_UTC_NS, LATER_UTC_NS]
     second.close()
 
@@ -134,7 +140,7 @@ def test_a_wish_that_only_the_ledger_kept_is_noted_again(flights: Path, flight: 
     crash(flight)
     flight.folder.journal.write_bytes(b'{"torn')  # a power cut took what was not flushed
     begin_later(flights).close()
-    assert wishes.read(flight.folder.journal).shots == (shot(0),)
+    assert journals.read(flight.folder.journal).shots == (shot(0),)
     assert check(flight.folder.path).problems == ()
 
 
@@ -193,7 +199,7 @@ def test_the_index_is_made_anew_from_the_flights(flights: Path, flight: Recordin
             db.close()
     second = begin_later(flights)
     assert ("index.sqlite.damaged" in " ".join(second.recovered)) == (harm != "gone")
-    assert second.index.lookup(0) == Entry(0, flight.folder.name, frame.name, "safe")
+    assert second.index.lookup(0) == IndexEntry(0, flight.folder.name, frame.name, "safe")
     assert second.next_index == 1
     second.close()
 
@@ -203,9 +209,9 @@ def test_an_image_index_in_two_flights_is_told_and_the_first_counts(flights: Pat
     with ImageIndex(flights) as index:
         for name in ("a", "b"):
             index.add_flight(name, None)
-        index.put(Entry(1, "a", None, "failed"))
+        index.put(IndexEntry(1, "a", None, "failed"))
         with pytest.raises(FlightError, match="image 1 is in flight a and again in b"):
-            index.put(Entry(1, "b", None, "failed"))
+            index.put(IndexEntry(1, "b", None, "failed"))
         index.add_flight("a", 5)  # UTC was learnt
         index.add_flight("a", None)
         assert index.flights() == {"a": 5, "b": None}
@@ -216,10 +222,10 @@ def test_the_next_index_is_beyond_all_that_an_unindexed_flight_mentions(flights:
     with ImageIndex(flights) as index:
         assert index.next_index() == 0
         index.add_flight("a", None)
-        index.put(Entry(10, "a", None, "failed"))
+        index.put(IndexEntry(10, "a", None, "failed"))
         assert index.next_index() == 11
         folder = layout.create(flights, START_UTC_NS)
-        journal = wishes.WishJournal(folder.journal)
+        journal = journals.ShotJournal(folder.journal)
         journal.note(shot(20))
         journal.close()
         assert index.next_index() == 21
@@ -230,15 +236,15 @@ def test_the_next_index_is_beyond_all_that_an_unindexed_flight_mentions(flights:
 def test_two_daemons_in_one_folder(flights: Path, flight: Recording) -> None:
     with pytest.raises(FlightError, match=rf"another dappled \(process {os.getpid()}\) records into .*; stop it"):
         begin_later(flights)
-    assert lock.is_held(flights)
+    assert layout.is_locked(flights)
     code = (
         f"from dappled.flight import recording; from pathlib import Path; recording.begin(Path({str(flights)!r}), int)"
     )
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
     assert "another dappled" in other.stderr
     flight.close()
-    assert not lock.is_held(flights)
-    assert not lock.is_held(flights / "missing")
+    assert not layout.is_locked(flights)
+    assert not layout.is_locked(flights / "missing")
     begin_later(flights).close()
 
 
@@ -253,7 +259,7 @@ def test_a_beginning_that_fails_leaves_no_lock_no_flight_and_no_thread(
     threads = set(threading.enumerate())
     with pytest.raises(FlightError, match="no"):
         recording.begin(flights, lambda: START_UTC_NS)
-    assert not lock.is_held(flights)
+    assert not layout.is_locked(flights)
     assert layout.flights(flights) == []
     assert set(threading.enumerate()) <= threads
 
@@ -295,9 +301,9 @@ def test_a_flight_without_utc_is_named_by_boot_and_put_right_later(flights: Path
     assert second.index.flights() == {name: START_UTC_NS, second.folder.name: LATER_UTC_NS}
     assert second.index.utc_correction_ns(name) == correction_ns
     assert second.index.utc_correction_ns(second.folder.name) == 0
-    assert second.index.lookup(0) == Entry(0, name, frame.name, "safe")
+    assert second.index.lookup(0) == IndexEntry(0, name, frame.name, "safe")
     second.close()
-    assert summary.report(flight.folder.path).began_utc_ns == START_UTC_NS
+    assert flight_report.balance(flight.folder.path).began_utc_ns == START_UTC_NS
     with LedgerReader.open(flight.folder.ledger) as ledger:
         assert [event.kind for event in ledger.events()] == ["utc"]
 
@@ -305,8 +311,8 @@ def test_a_flight_without_utc_is_named_by_boot_and_put_right_later(flights: Path
 def test_a_flight_that_never_learnt_utc_says_so(flights: Path) -> None:
     flight = recording.begin(flights, lambda: 5, utc_known=False)
     flight.close()
-    assert summary.report(flight.folder.path).began_utc_ns is None
-    assert summary.show(flight.folder.path).utc_correction_ns is None
+    assert flight_report.balance(flight.folder.path).began_utc_ns is None
+    assert flight_report.show(flight.folder.path).utc_correction_ns is None
     assert check(flight.folder.path).problems == ()
 
 

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.flight import telemetry_log
-from dappled.flight.errors import FlightError
+from dappled.flight import FlightError, telemetry_log
 from dappled.flight.telemetry_log import TelemetryLog, packet_length, split
 from tests.flight.makers import logged, mavlink_1, mavlink_2
 

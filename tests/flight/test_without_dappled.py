@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 
 from dappled.decode.geometry.pose import Pose
-from dappled.flight import ledger_schema, recording
-from dappled.flight.ledger import LedgerReader
-from dappled.flight.records import Tag
+from dappled.flight import LedgerReader, Tag, recording
+from dappled.flight.ledger import SCHEMA
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, flip, pose, tag, wish
 
@@ -57,7 +56,7 @@ def test_the_reader_in_the_document_reads_a_flight(flight: Path) -> None:
 
 def test_the_document_names_every_table_and_every_key(flight: Path) -> None:
     text = DOCUMENT.read_text()
-    for table, columns in re.findall(r"CREATE TABLE (\w+) \((.*?)\n?\) STRICT", ledger_schema.SCHEMA, re.DOTALL):
+    for table, columns in re.findall(r"CREATE TABLE (\w+) \((.*?)\n?\) STRICT", SCHEMA, re.DOTALL):
         assert f"`{table}`" in text
         for column in re.findall(r"(?:^|,)\s*(\w+) (?:TEXT|INTEGER)", re.sub(r"--.*", "", columns)):
             assert re.search(rf"`[^`]*\b{column}\b[^`]*`", text), f"{table}.{column}"

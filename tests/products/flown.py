@@ -17,8 +17,7 @@ from dappled.decode.geometry import camera_pose
 from dappled.decode.geometry.interpolation import metres_per_radian
 from dappled.decode.geometry.pose import Pose, Quaternion
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.flight import recording
-from dappled.flight.records import Tag
+from dappled.flight import Tag, recording
 from dappled.mocks import simulation
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.scene import terrain

@@ -15,8 +15,7 @@ from dappled.config.settings import Settings
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision
 from dappled.daemon.service import Service
-from dappled.flight import check, summary
-from dappled.flight.ledger import LedgerReader
+from dappled.flight import LedgerReader, check, flight_report
 
 DEADLINE_S = 30.0
 
@@ -101,7 +100,7 @@ def flying(settings: Settings) -> Iterator[Flying]:
 def assert_whole(flight: Path) -> None:
     """`flight check` is good, the books balance, and every shot is safe or failed."""
     assert check.check(flight).problems == ()
-    balance = summary.report(flight)
+    balance = flight_report.balance(flight)
     assert balance.balanced
     assert balance.closed
     assert balance.open == 0

@@ -22,8 +22,7 @@ from dappled.config.settings import Settings
 from dappled.daemon.service import Service
 from dappled.drivers.mavlink.links import LinkError
 from dappled.errors import DappledError
-from dappled.flight import check, summary
-from dappled.flight.ledger import LedgerReader
+from dappled.flight import LedgerReader, check, flight_report
 from dappled.mocks.body.body import Body, BodyOptions
 from dappled.mocks.scene.masked_camera import reference_camera
 from tests.system.flying import Flying, assert_whole, eventually, flying, settings_of, told
@@ -398,7 +397,7 @@ def test_a_disk_that_is_nearly_full_refuses_new_shots(body: Body, here: Path) ->
         assert "the disk is nearly full" in str(verdict.reason)
         assert "disk nearly full" in daemon.problems
     assert not daemon.shots
-    balance = summary.report(daemon.service.folder)
+    balance = flight_report.balance(daemon.service.folder)
     assert (balance.wishes, balance.refused) == (0, 1)  # a wish that was refused stands in the flight as well
 
 
@@ -553,7 +552,7 @@ def test_sigterm_in_the_middle_of_a_shot_finishes_the_frame(here: Path) -> None:
         assert "000000" in out
     (flight,) = flights(here)
     assert_whole(flight)
-    assert summary.report(flight).safe == 1
+    assert flight_report.balance(flight).safe == 1
 
 
 def test_a_killed_daemon_is_put_in_order_by_the_next(here: Path) -> None:
@@ -573,7 +572,7 @@ def test_a_killed_daemon_is_put_in_order_by_the_next(here: Path) -> None:
             with LedgerReader.open(after.service.folder / "flight.sqlite") as ledger:
                 assert any(killed.name in event.text for event in ledger.events() if event.kind == "recovery")
     assert_whole(killed)
-    balance = summary.report(killed)
+    balance = flight_report.balance(killed)
     assert (balance.wishes, balance.safe, balance.failed) == (2, 1, 1)
     assert balance.closed
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from dappled.daemon.pipeline.shutter import CaptureRequest
-from dappled.flight.ledger import LedgerReader
-from dappled.flight.records import Frame
+from dappled.flight import Frame, LedgerReader
 from dappled.mocks.body.body import Body, BodyOptions, pattern
 from tests.system.flying import eventually, flying, settings_of
 

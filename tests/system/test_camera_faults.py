@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from dappled.daemon.pipeline.pending_shot import PendingShot
-from dappled.flight.ledger import LedgerReader
+from dappled.flight import LedgerReader
 from dappled.mocks.body.body import Body, BodyOptions, pattern
 from dappled.mocks.body.eos450d import thumbnail
 from tests.system.flying import Flying, eventually, flying, settings_of, told

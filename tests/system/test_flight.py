@@ -13,13 +13,12 @@ import pytest
 import rawpy
 
 from dappled.daemon.stream import wire
-from dappled.flight import check, summary
-from dappled.flight.ledger import LedgerReader
+from dappled.flight import LedgerReader, check, flight_report
 from tests.system.conftest import FRAMES, Flown, dappled, flip
 
 
 def test_every_wish_became_one_frame(flown: Flown) -> None:
-    balance = summary.report(flown.flight)
+    balance = flight_report.balance(flown.flight)
     assert (balance.wishes, balance.safe, balance.failed, balance.open) == (FRAMES, FRAMES, 0, 0)
     assert (balance.tagged, balance.decoded, balance.strays) == (FRAMES, FRAMES, 0)
     assert balance.balanced
@@ -51,7 +50,7 @@ def test_frames_are_raw_files_that_libraw_opens(flown: Flown) -> None:
 
 
 def test_the_subscriber_has_what_the_ledger_says(flown: Flown) -> None:
-    results = {line.row.shot.index: line.result for line in summary.show(flown.flight).lines}
+    results = {line.row.shot.index: line.result for line in flight_report.show(flown.flight).lines}
     saved = sorted(flown.received.glob("*.json"))
     assert len(saved) == FRAMES
     for file in saved:

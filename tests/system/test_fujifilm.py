@@ -16,8 +16,7 @@ from dappled.cli import main
 from dappled.drivers.gphoto2 import client
 from dappled.drivers.mavlink.links import mavlink
 from dappled.drivers.wired import shutter_line
-from dappled.flight import check, summary
-from dappled.flight.ledger import LedgerReader
+from dappled.flight import LedgerReader, check, flight_report
 from dappled.mocks.body.body import Body, BodyOptions, pattern
 from dappled.mocks.simulation import free_port
 from tests.drivers.contract import content, until_shot_ends, until_state
@@ -72,7 +71,7 @@ def test_fired_by_a_wire_and_picked_up_after_landing(
     assert "flight pickup" in str(reasons)
     pickup = ["flight", "pickup", str(flight), "--from", str(body.card), "--json"]
     assert main([*pickup, "--dry-run"]) == 0
-    assert (summary.report(flight).frames, summary.report(flight).following) == (0, 4)
+    assert (flight_report.balance(flight).frames, flight_report.balance(flight).following) == (0, 4)
     assert main(["flight", "report", str(flight)]) == 0
     assert "4 of the failed were fired" in capfd.readouterr().out
     assert main(pickup) == 0
@@ -81,7 +80,7 @@ def test_fired_by_a_wire_and_picked_up_after_landing(
     assert abs(told["camera_clock_minus_utc_s"] - 3600) < 2
     assert len(told["zooms"]) == 1
     assert "12.6 mm" in told["zooms"][0]
-    balance = summary.report(flight)
+    balance = flight_report.balance(flight)
     assert (balance.safe, balance.failed, balance.tagged) == (4, 0, 4)
     assert check.check(flight).problems == ()
     with LedgerReader.open(flight / "flight.sqlite") as ledger:
@@ -243,7 +242,7 @@ def test_files_are_picked_up_over_ptp_after_landing(here: Path, capfd: pytest.Ca
         (0, "IMG_0001.CR2"), (1, "IMG_0002.CR2"), (2, "IMG_0003.CR2"),
     ]  # fmt: skip
     assert check.check(flight).problems == ()
-    assert (summary.report(flight).safe, summary.report(flight).companions) == (3, 3)
+    assert (flight_report.balance(flight).safe, flight_report.balance(flight).companions) == (3, 3)
     with LedgerReader.open(flight / "flight.sqlite") as ledger:
         for frame in ledger.frames():
             assert (flight / frame.name).read_bytes() == pattern(frame.index + 1, 200_001)

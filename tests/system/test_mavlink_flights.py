@@ -15,7 +15,7 @@ from dappled.daemon.camera_protocol.camera_settings import code
 from dappled.drivers.mavlink import signing as mavlink_signing
 from dappled.drivers.mavlink.links import mavlink
 from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
-from dappled.flight.ledger import LedgerReader
+from dappled.flight import LedgerReader
 from dappled.mocks.body.body import Body, BodyOptions
 from dappled.mocks.simulation import Simulation, World, free_port
 from tests.daemon.camera_protocol.rig import Peer

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled.flight import summary
+from dappled.flight import flight_report
 from dappled.mocks.autopilot.autopilot import Autopilot
 from dappled.mocks.body.body import Body, BodyOptions
 from tests.system.flying import Flying, eventually, flying, settings_of
@@ -111,7 +111,7 @@ def test_mavsdk_as_autopilot_whose_system_is_adopted_and_whose_triggers_are_shot
         assert (pending.shot.cause.source, pending.shot.cause.kind) == ("mavlink:7/1", "CAMERA_TRIGGER")
         assert pending.tag is not None
         assert pending.tag.pose.source != "none"
-    assert summary.report(camera.flying.service.folder).by_source == {"mavlink:7/1": 3}
+    assert flight_report.balance(camera.flying.service.folder).by_source == {"mavlink:7/1": 3}
 
 
 def test_mavproxys_camera_module(camera: Camera, tmp_path: Path) -> None:

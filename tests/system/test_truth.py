@@ -13,7 +13,7 @@ from dappled.clock import SystemClock
 from dappled.config.settings import Settings, resolve
 from dappled.daemon.service import Service
 from dappled.decode.geometry.interpolation import metres_per_radian
-from dappled.flight import summary
+from dappled.flight import flight_report
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.simulation import Simulation, World
 
@@ -45,7 +45,7 @@ def test_tags_hold_the_true_time_place_and_attitude(tmp_path: Path, sockets: Pat
         code, _ = station.wait(10)
     assert code == 0
     path = FlightPath(SEED)
-    lines = summary.show(service.folder).lines
+    lines = flight_report.show(service.folder).lines
     assert len(lines) == FRAMES
     for line, shot in zip(lines, sorted(truth.glob("*.json")), strict=True):
         tag = line.tag

@@ -9,8 +9,7 @@ from pathlib import Path
 from dappled.clock import SystemClock
 from dappled.config.settings import Settings, resolve
 from dappled.daemon.service import Service
-from dappled.flight import check, summary
-from dappled.flight.index import ImageIndex
+from dappled.flight import ImageIndex, check, flight_report
 from dappled.mocks.simulation import Simulation, World
 from dappled.products.geotags import geotags
 from tests.system.conftest import dappled
@@ -44,7 +43,7 @@ def test_a_flight_learns_utc_and_replays(tmp_path: Path, sockets: Path) -> None:
     assert code == 0
     assert service.folder.name.startswith("boot")
     assert check.check(service.folder).problems == ()
-    began_utc_ns = summary.report(service.folder).began_utc_ns
+    began_utc_ns = flight_report.balance(service.folder).began_utc_ns
     assert began_utc_ns is not None
     assert 0 < time.time_ns() - began_utc_ns < 300 * SECOND_NS
     with ImageIndex(tmp_path / "flights") as index:

@@ -29,8 +29,7 @@ from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import Identity
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.replay import ReplayCamera
-from dappled.flight import check, layout
-from dappled.flight.ledger import LIVE
+from dappled.flight import LIVE, check, layout
 
 _OF_FOLDERS = ("telemetry", "match", "start", "interval")
 _GIVEN = ("camera", "mask", "white", "dark", "calibration")

@@ -29,8 +29,7 @@ from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import Camera, CameraError
 from dappled.drivers.mavlink.links import MavlinkLinks, Packet
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.flight.recording import Recording
-from dappled.flight.records import Shot
+from dappled.flight import Recording, Shot
 
 
 class Part(Protocol):

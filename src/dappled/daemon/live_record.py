@@ -15,9 +15,8 @@ from dappled.config.settings import Settings
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.pending_shot import Names
 from dappled.drivers.raw.darkroom import Recipe
+from dappled.flight import FlightFolder, Recording
 from dappled.flight import recording as flights
-from dappled.flight.layout import FlightFolder
-from dappled.flight.recording import Recording
 
 log = logging.getLogger(__name__)
 

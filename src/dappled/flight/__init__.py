@@ -1,1 +1,14 @@
-"""The flight folder: layout, wishes, ledger, recorder, checks. Written by the daemon, read by everybody."""
+"""The flight folder: journal, ledger, recorded frames, recovery, checks, index, offload."""
+
+from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.index import ImageIndex
+from dappled.flight.layout import FlightFolder, FlightsLock
+from dappled.flight.ledger import LIVE, Ledger, LedgerReader
+from dappled.flight.recording import Recorder, Recording
+from dappled.flight.records import Cause, Frame, Result, Shot, ShotRow, ShotState, Stray, Tag, canonical, digest
+
+__all__ = [
+    "LIVE", "Cause", "FlightError", "FlightFolder", "FlightsLock", "Frame", "ImageIndex", "Ledger", "LedgerReader",
+    "Recorder", "Recording", "Result", "Shot", "ShotRow", "ShotState", "Stray", "Tag", "canonical", "digest",
+    "disk_error",
+]  # fmt: skip

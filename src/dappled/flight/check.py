@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.flight import durable, layout, lock, provenance, telemetry_log
+from dappled.flight import durable, layout, provenance, telemetry_log
 from dappled.flight import journal as wishes
 from dappled.flight.errors import FlightError
 from dappled.flight.layout import FlightFolder
@@ -17,7 +17,7 @@ from dappled.flight.recovery import SIDECAR
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class CheckReport:
     """What was looked at and what is wrong, in sentences. `notes` are no faults."""
 
     flight: str
@@ -32,7 +32,7 @@ class Report:
         return not self.problems
 
 
-def check(path: Path) -> Report:
+def check(path: Path) -> CheckReport:
     """Read a whole flight and compare everything with everything. Raises FlightError when it is no flight."""
     folder = layout.open_folder(path)
     problems: list[str] = []
@@ -47,7 +47,7 @@ def check(path: Path) -> Report:
             problems += [f"the ledger is damaged: {text}" for text in ledger.damage()]
             closed = "closed_utc_ns" in ledger.facts()
             if not closed:
-                (notes if lock.is_held(path.parent) else problems).append(
+                (notes if layout.is_locked(path.parent) else problems).append(
                     "the flight is still recorded, or was never closed: the next `dappled run` puts it in order"
                 )
             gone = ledger.facts().get("offloaded")
@@ -63,7 +63,7 @@ def check(path: Path) -> Report:
             packets = _telemetry(folder, ledger, problems, notes)
     except FlightError as error:
         problems.append(str(error))
-    return Report(folder.name, files, size, packets, tuple(problems), tuple(notes))
+    return CheckReport(folder.name, files, size, packets, tuple(problems), tuple(notes))
 
 
 def _files(folder: FlightFolder, ledger: LedgerReader, *, pruned: bool) -> Iterator[tuple[int, str | None]]:

@@ -1,6 +1,8 @@
-"""Files that survive a power cut: temporary name, fsync, rename, fsync of the folder.
+"""Files that survive a power cut: whole files that replace what was there, and files that are only appended to.
 
-In trials that cut the power, every shorter order lost acknowledged files or left torn ones under their final name.
+A whole file: temporary name, fsync, rename, fsync of the folder. In tests that cut the power, every shorter order lost
+acknowledged files or left torn ones under their final name. An appended file: one write(2) each time, which survives
+the death of the process at once, and an fdatasync by a thread within a set time; the writer never waits for it.
 """
 
 from __future__ import annotations
@@ -8,9 +10,12 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+
+from dappled.flight.errors import FlightError, disk_error
 
 _PART = ".part"
 
@@ -115,3 +120,107 @@ def _put(path: Path, fill: Callable[[int], None]) -> None:
         with contextlib.suppress(OSError):
             os.unlink(part)
         raise
+
+
+class AppendedFile:
+    """Owns its descriptor and its flusher. Its owner lets one thread at a time in. What comes after `shut` is refused:
+    it must not get into another file, opened since, that was given the same descriptor."""
+
+    def __init__(self, path: Path, what: str, flush_interval_s: float, *, new: bool) -> None:
+        """Open or make the file; `new`: there must be none. `what` it is called in sentences. Raises FlightError."""
+        self.path, self._what = path, what
+        doing = f"{'make' if new else 'open'} {what}"
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | (os.O_EXCL if new else 0)
+        try:
+            self._fd = os.open(path, flags, 0o644)
+        except OSError as error:
+            raise disk_error(doing, path, error) from error
+        try:
+            size = os.fstat(self._fd).st_size
+            self.last = os.pread(self._fd, 1, size - 1) if size else b""  # byte, when it was opened
+        except OSError as error:
+            os.close(self._fd)
+            raise disk_error(doing, path, error) from error
+        self._flusher = Flusher(self._fd, flush_interval_s)
+        self._closed = False
+
+    def append(self, data: bytes, doing: str) -> int:
+        """One write; how many bytes the disk took. Raises FlightError, "cannot `doing` …", when it took none."""
+        self._open_for(doing)
+        try:
+            written = os.write(self._fd, data)
+        except OSError as error:
+            raise disk_error(doing, self.path, error) from error
+        self._flusher.poke()
+        return written
+
+    def cut(self, size: int, doing: str) -> None:
+        """Take away what stands beyond `size`. Raises FlightError as `append` does."""
+        self._open_for(doing)
+        try:
+            os.ftruncate(self._fd, size)
+        except OSError as error:
+            raise disk_error(doing, self.path, error) from error
+
+    @property
+    def problem(self) -> str | None:
+        """Why what was written may not survive a power cut, if so."""
+        error = self._flusher.error
+        return None if error is None else str(disk_error(f"flush {self._what}", self.path, error))
+
+    def shut(self) -> bool:
+        """From now on nothing is written. False where that had been said before."""
+        was, self._closed = self._closed, True
+        return not was
+
+    def close(self) -> None:
+        """Flush and close, once, after `shut`; the owner need not keep others out meanwhile."""
+        self._flusher.close()
+        os.close(self._fd)
+
+    def _open_for(self, doing: str) -> None:
+        if self._closed:
+            raise FlightError(f"cannot {doing} {self.path}: the flight is closed")
+
+
+class Flusher:
+    """fdatasync of one descriptor, at most `interval_s` after the first write that it was told of.
+
+    Owns a thread, not the descriptor. A failed fdatasync stays readable in `error`: what was written before it may
+    not survive a power cut.
+    """
+
+    def __init__(self, fd: int, interval_s: float = 0.5) -> None:
+        self._fd = fd
+        self._interval_s = interval_s
+        self._dirty = threading.Event()
+        self._closing = threading.Event()
+        self.error: OSError | None = None
+        self._thread = threading.Thread(target=self._run, name="dappled-flusher", daemon=True)
+        self._thread.start()
+
+    def poke(self) -> None:
+        """Something was written."""
+        if not self._dirty.is_set():
+            self._dirty.set()
+
+    def close(self) -> None:
+        """Flush what is left and end the thread; the descriptor may be closed afterwards."""
+        self._closing.set()
+        self._dirty.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            self._dirty.wait()
+            self._closing.wait(self._interval_s)
+            self._sync()
+        if self._dirty.is_set():
+            self._sync()  # written, then closed, while the last one ran
+
+    def _sync(self) -> None:
+        self._dirty.clear()  # before the sync: a write during it is told of again
+        try:
+            os.fdatasync(self._fd)
+        except OSError as error:
+            self.error = error

@@ -1,22 +1,155 @@
-"""What became of everybody's wishes: a flight's books by source, for `dappled flight report`."""
+"""Report what is in a flight, which shots became frames, and how each source's capture requests ended."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from dappled.flight import layout
-from dappled.flight.entries import Event
+from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
+from dappled.flight.records import Frame, LedgerEvent, Result, ShotRow, Stray, Tag
+
+
+@dataclass(frozen=True, slots=True)
+class Balance:
+    """The books of a flight: every wish that became a shot is safe, failed or still open; `refused` ones became none.
+    `by_source` counts shots, `following` those of the failed whose files are still at the camera, `companions` files
+    beside frames. `began_utc_ns` is None where nobody ever knew UTC."""
+
+    flight: str
+    wishes: int
+    safe: int
+    failed: int
+    open: int
+    frames: int
+    tagged: int
+    decoded: int
+    strays: int
+    size: int
+    by_source: Mapping[str, int]
+    closed: bool
+    refused: int = 0
+    following: int = 0
+    companions: int = 0
+    began_utc_ns: int | None = None
+
+    @property
+    def balanced(self) -> bool:
+        """Whether the numbers add up; in a closed flight nothing is open."""
+        settled = self.wishes == self.safe + self.failed + self.open and self.frames == self.safe
+        within = self.tagged <= self.frames and self.decoded <= self.frames
+        return settled and within and (not self.closed or self.open == 0)
+
+
+@dataclass(frozen=True, slots=True)
+class ShotLine:
+    """All that is known of one shot."""
+
+    row: ShotRow
+    frame: Frame | None
+    tag: Tag | None
+    result: Result | None
+
+
+@dataclass(frozen=True, slots=True)
+class FlightContents:
+    """A flight, whole: settings, facts, a line for every shot, strays and events. `utc_correction_ns` is to be added to
+    every `utc_ns`; None where nobody ever knew UTC. `runs` counts the results of each."""
+
+    name: str
+    settings: Mapping[str, Any]
+    facts: Mapping[str, Any]
+    lines: tuple[ShotLine, ...]
+    strays: tuple[Stray, ...]
+    events: tuple[LedgerEvent, ...]
+    utc_correction_ns: int | None
+    runs: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class ListedFlight:
+    """One flight of a list: its balance, or the sentence why there is none."""
+
+    name: str
+    path: Path
+    balance: Balance | None
+    problem: str | None
+
+
+def balance(path: Path) -> Balance:
+    """The balance of a flight, also while it is recorded. Raises FlightError."""
+    folder = layout.open_folder(path)
+    with LedgerReader.open(folder.ledger) as ledger:
+        shots, frames, facts = ledger.shots(), ledger.frames(), ledger.facts()
+        correction_ns = ledger.utc_correction_ns()
+        states = Counter(row.state for row in shots)
+        return Balance(
+            flight=folder.name,
+            wishes=len(shots),
+            safe=states["safe"],
+            failed=states["failed"],
+            open=states["wished"] + states["fired"],
+            frames=len(frames),
+            tagged=len(ledger.tags()),
+            decoded=len(ledger.results()),
+            strays=len(ledger.strays()),
+            size=sum(frame.size for frame in frames),
+            by_source=dict(sorted(Counter(row.shot.cause.source for row in shots).items())),
+            closed="closed_utc_ns" in facts,
+            following=len(ledger.following()),
+            companions=len(ledger.companions()),
+            refused=sum(event.kind == "refused" for event in ledger.events()),
+            began_utc_ns=None
+            if correction_ns is None or "began_utc_ns" not in facts
+            else facts["began_utc_ns"] + correction_ns,
+        )
+
+
+def show(path: Path) -> FlightContents:
+    """Everything that a flight's ledger says. Raises FlightError."""
+    folder = layout.open_folder(path)
+    with LedgerReader.open(folder.ledger) as ledger:
+        frames = {frame.index: frame for frame in ledger.frames()}
+        tags, results = ledger.tags(), ledger.results()
+        lines = tuple(
+            ShotLine(row, frames.get(row.shot.index), tags.get(row.shot.index), results.get(row.shot.index))
+            for row in ledger.shots()
+        )
+        return FlightContents(
+            name=folder.name,
+            settings=layout.read_facts(folder),
+            facts=ledger.facts(),
+            lines=lines,
+            strays=tuple(ledger.strays()),
+            events=tuple(ledger.events()),
+            utc_correction_ns=ledger.utc_correction_ns(),
+            runs=ledger.runs(),
+        )
+
+
+def list_flights(root: Path) -> list[ListedFlight]:
+    """All flights under `root`; one that can't be read is listed with the reason. Raises FlightError for no folder."""
+    if not root.is_dir():
+        raise FlightError(f"there is no flights folder {root}; check record.directory")
+    listed = []
+    for folder in layout.flights(root):
+        try:
+            listed.append(ListedFlight(folder.name, folder.path, balance(folder.path), None))
+        except FlightError as error:
+            listed.append(ListedFlight(folder.name, folder.path, None, str(error)))
+    return listed
+
 
 _REFUSED = re.compile(r"\S+ from (?P<source>\S+): ")  # as the daemon notes it: kind, source, reason
 
 
 @dataclass(frozen=True, slots=True)
-class Account:
+class SourceReport:
     """One source's wishes ("mavlink:1/1", "console" …). wishes = refused + shots; shots = safe + failed + open."""
 
     source: str
@@ -30,7 +163,7 @@ class Account:
     decoded: int
 
 
-def accounts(path: Path) -> tuple[Account, ...]:
+def by_source(path: Path) -> tuple[SourceReport, ...]:
     """The books of a flight, a line for each source in the order of their names. Raises FlightError."""
     with LedgerReader.open(layout.open_folder(path).ledger) as ledger:
         rows, tags, results = ledger.shots(), ledger.tags(), ledger.results()
@@ -44,12 +177,12 @@ def accounts(path: Path) -> tuple[Account, ...]:
         mine["decoded"] += row.shot.index in results
     names = ("refused", "shots", "safe", "failed", "open", "tagged", "decoded")
     return tuple(
-        Account(source, mine["refused"] + mine["shots"], *(mine[name] for name in names))
+        SourceReport(source, mine["refused"] + mine["shots"], *(mine[name] for name in names))
         for source, mine in sorted(counts.items())
     )
 
 
-def _refused(events: Iterable[Event]) -> Counter[str]:
+def _refused(events: Iterable[LedgerEvent]) -> Counter[str]:
     """Refused wishes by source; one whose note says no source stands under "unknown"."""
     found: Counter[str] = Counter()
     for event in events:

@@ -40,7 +40,7 @@ COMMIT;
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class IndexEntry:
     """Where an image index leads: the flight's name, the frame's name in it (None without one), the shot's state."""
 
     index: int
@@ -84,7 +84,7 @@ class ImageIndex(Database):
             None if start_utc_ns is None else utc_correction_ns,
         )
 
-    def put(self, entry: Entry) -> None:
+    def put(self, entry: IndexEntry) -> None:
         """What an image index leads to now. Raises FlightError when it belongs to another flight."""
         held = self.lookup(entry.index)
         if held is not None and held.flight != entry.flight:
@@ -94,10 +94,10 @@ class ImageIndex(Database):
         values = (entry.index, entry.flight, entry.frame, entry.state)
         self._rows("INSERT OR REPLACE INTO images VALUES (?, ?, ?, ?)", *values)
 
-    def lookup(self, index: int) -> Entry | None:
+    def lookup(self, index: int) -> IndexEntry | None:
         """Where an image index leads; None when no flight has it."""
         rows = self._rows("SELECT idx, flight, frame, state FROM images WHERE idx = ?", index)
-        return None if not rows else Entry(rows[0][0], rows[0][1], rows[0][2], cast(ShotState, rows[0][3]))
+        return None if not rows else IndexEntry(rows[0][0], rows[0][1], rows[0][2], cast(ShotState, rows[0][3]))
 
     def highest(self) -> int | None:
         """The highest image index that is indexed, or that a sealed flight mentions."""
@@ -128,7 +128,7 @@ class ImageIndex(Database):
             for row in ledger.shots():
                 index = row.shot.index
                 try:
-                    self.put(Entry(index, folder.name, frames.get(index), row.state))
+                    self.put(IndexEntry(index, folder.name, frames.get(index), row.state))
                 except FlightError as error:
                     problems.append(str(error))
         if seal:

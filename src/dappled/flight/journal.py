@@ -12,12 +12,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from dappled.flight.appended import AppendedFile
+from dappled.flight.durable import AppendedFile
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.records import Cause, Shot, canonical
 
 
-class WishJournal:
+class ShotJournal:
     """The open journal of one flight; owns its descriptor and its flusher. `note` may be called by any thread."""
 
     def __init__(self, path: Path, flush_interval_s: float = 0.5) -> None:
@@ -56,14 +56,14 @@ class WishJournal:
 
 
 @dataclass(frozen=True, slots=True)
-class Wishes:
+class JournalContents:
     """What a journal says: shots in the order of their notes, and a sentence for each line that is no wish."""
 
     shots: tuple[Shot, ...]
     problems: tuple[str, ...]
 
 
-def read(path: Path) -> Wishes:
+def read(path: Path) -> JournalContents:
     """Read a journal; none at all is an empty one. A torn or damaged line is reported, the others are kept.
 
     Raises FlightError when the file can't be read.
@@ -71,7 +71,7 @@ def read(path: Path) -> Wishes:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        return Wishes((), ())
+        return JournalContents((), ())
     except OSError as error:
         raise disk_error("read the wish journal", path, error) from error
     lines = data.split(b"\n")
@@ -88,7 +88,7 @@ def read(path: Path) -> Wishes:
             shots[shot.index] = shot
     if tail:
         problems.append(f"the last line of {path} is torn ({len(tail)} bytes)")
-    return Wishes(tuple(shots.values()), tuple(problems))
+    return JournalContents(tuple(shots.values()), tuple(problems))
 
 
 def _parse(line: bytes) -> Shot | None:

@@ -1,4 +1,4 @@
-"""The flight folder: what stands where, and how a new one is made.
+"""The flight folder: what stands where, how a new one is made, and who records into it.
 
 `<flights>/<UTC start as 20261121T101503Z>-<8 hex>/` holds flight.toml, flight.sqlite, shots.jsonl, telemetry.tlog,
 frames/ and, where asked for, lightfields/. A machine that does not know UTC yet names its flight by boot.
@@ -6,6 +6,7 @@ frames/ and, where asked for, lightfields/. A machine that does not know UTC yet
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import secrets
@@ -15,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import tomli_w
 
@@ -24,6 +25,7 @@ from dappled.flight.errors import FlightError, disk_error
 
 _FLIGHT_NAME = re.compile(r"(\d{8}T\d{6}Z|boot[0-9a-f]{8})-[0-9a-f]{8}")
 _FRAME_NAME = re.compile(r"(\d{6,})\.([a-z0-9]{1,8})")
+_LOCK = ".lock"
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
@@ -191,3 +193,57 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value if item is not None]
     return str(value) if isinstance(value, os.PathLike) else value
+
+
+class FlightsLock:
+    """Held from creation to `close`, or to the end of the process however it ends."""
+
+    def __init__(self, root: Path) -> None:
+        """Take the lock of `root`, which is made if missing. Raises FlightError when another process has it."""
+        path = root / _LOCK
+        try:
+            durable.make_folder(root)
+            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise disk_error("make the lock", path, error) from error
+        try:
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.ftruncate(self._fd, 0)
+            os.pwrite(self._fd, f"{os.getpid()}\n".encode(), 0)
+        except BlockingIOError as error:
+            holder = os.pread(self._fd, 20, 0).decode("ascii", "replace").strip() or "unknown"
+            os.close(self._fd)
+            raise FlightError(
+                f"another dappled (process {holder}) records into {root}; "
+                "stop it, or set record.directory to another folder"
+            ) from error
+        except OSError as error:
+            os.close(self._fd)
+            raise disk_error("take the lock", path, error) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+def is_locked(root: Path) -> bool:
+    """Whether some process records into `root` now. Raises FlightError when that can't be told."""
+    path = root / _LOCK
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise disk_error("look at the lock", path, error) from error
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return False
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(fd)

@@ -1,4 +1,8 @@
-"""The recording of one flight, from its first to its last line: what the daemon opens and closes."""
+"""Record one flight: begin it, make the camera's files safe, end it.
+
+A frame is written under a temporary name, fsynced, renamed, and the folder fsynced; then the ledger gets its row. Only
+then does `Recorder.record` return; only then may the frame be announced and the camera's own copy be deleted.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +11,117 @@ import threading
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePosixPath
+from typing import Any, Protocol
 
 from dappled.flight import durable, layout, provenance, recovery
-from dappled.flight.errors import disk_error
-from dappled.flight.index import Entry, ImageIndex, open_or_rebuild
-from dappled.flight.journal import WishJournal
-from dappled.flight.layout import FlightFolder
+from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.index import ImageIndex, IndexEntry, open_or_rebuild
+from dappled.flight.journal import ShotJournal
+from dappled.flight.layout import FlightFolder, FlightsLock
 from dappled.flight.ledger import Ledger
-from dappled.flight.lock import FlightsLock
-from dappled.flight.recorder import Recorder
+from dappled.flight.records import Frame, Stray
 from dappled.flight.telemetry_log import TelemetryLog
+
+
+class FileBytes(Protocol):
+    """A file's bytes behind a descriptor; read by position, never closed here."""
+
+    @property
+    def fd(self) -> int: ...
+
+    @property
+    def size(self) -> int: ...
+
+
+class StrayFileError(FlightError):
+    """The file was made safe, but it is not the frame of a shot: it stands beside the frames as `stray`."""
+
+    def __init__(self, stray: Stray) -> None:
+        super().__init__(stray.reason)
+        self.stray = stray
+
+
+class Recorder:
+    """Writes the frames of one flight. One thread calls it."""
+
+    def __init__(self, folder: FlightFolder, ledger: Ledger) -> None:
+        self._folder = folder
+        self._ledger = ledger
+
+    def record(self, index: int, camera_name: str, blob: FileBytes, *, arrived_utc_ns: int) -> Frame:
+        """Make the file of shot `index` safe: when this returns, bytes, name and ledger row are durable.
+
+        The same bytes a second time give the same Frame. Raises StrayFileError (bytes kept, under another name) for a
+        second file of a shot or an unknown shot, and FlightError when the disk or the blob fails: no torn file is left
+        under a final name, and the shot is noted as failed where that can still be noted.
+        """
+        row = self._ledger.shot(index)
+        if row is None:
+            reason = f"{camera_name} came for shot {index}, which was never wished for: kept as a stray"
+            raise StrayFileError(self.record_stray(camera_name, blob, reason, arrived_utc_ns=arrived_utc_ns))
+        first = self._ledger.frame(index)
+        if first is not None:
+            return self._again(first, camera_name, blob, arrived_utc_ns)
+        name = layout.frame_name(index, camera_name)
+        try:
+            frame = Frame(index, name, camera_name, blob.size, self._write(name, camera_name, blob), arrived_utc_ns)
+        except FlightError as error:
+            if row.state != "failed":
+                self._note_failure(index, error)
+            raise
+        self._ledger.safe(frame)
+        return frame
+
+    def record_companion(self, index: int, camera_name: str, blob: FileBytes, *, arrived_utc_ns: int) -> Frame:
+        """Make a file safe that stands beside the frame of a shot, under the same number. Raises FlightError where the
+        shot has no frame, or has such a file."""
+        if self._ledger.frame(index) is None:
+            raise FlightError(f"{camera_name} goes with shot {index}, which has no frame: it was not recorded")
+        name = layout.frame_name(index, camera_name)
+        sha256 = self._write(name, camera_name, blob)
+        companion = Frame(index, name, camera_name, blob.size, sha256, arrived_utc_ns)
+        self._ledger.add_companion(companion)
+        return companion
+
+    def record_stray(self, camera_name: str, blob: FileBytes, reason: str, *, arrived_utc_ns: int) -> Stray:
+        """Make a file safe that belongs to no shot. `reason` is a sentence. Raises FlightError."""
+        taken = {PurePosixPath(stray.name).stem for stray in self._ledger.strays()}
+        taken |= {path.stem for path in self._folder.frames.glob("stray-*")}  # one may have lost its row to a full disk
+        number = next(n for n in range(len(taken) + 1) if f"stray-{n:06d}" not in taken)
+        name = f"frames/stray-{number:06d}.{layout.extension(camera_name)}"
+        sha256 = self._write(name, camera_name, blob)
+        stray = Stray(name, camera_name, blob.size, sha256, arrived_utc_ns, reason)
+        self._ledger.add_stray(stray)
+        return stray
+
+    def _again(self, first: Frame, camera_name: str, blob: FileBytes, arrived_utc_ns: int) -> Frame:
+        if blob.size == first.size and durable.hash_descriptor(blob.fd, blob.size) == first.sha256:
+            self._ledger.add_event("double", f"{camera_name} came again with the same bytes", first.index)
+            return first
+        reason = f"{camera_name} is a second file for shot {first.index}, whose frame is {first.name}: kept as a stray"
+        raise StrayFileError(self.record_stray(camera_name, blob, reason, arrived_utc_ns=arrived_utc_ns))
+
+    def _write(self, name: str, camera_name: str, blob: FileBytes) -> str:
+        path = self._folder.path / name
+        if blob.size <= 0:
+            raise FlightError(f"the camera's file {camera_name} is empty: nothing was recorded")
+        if path.exists():
+            raise FlightError(
+                f"{path} stands there already without a ledger row; start a new flight to have it adopted"
+            )
+        try:
+            return durable.copy_in(blob.fd, blob.size, path)
+        except OSError as error:
+            raise disk_error(f"record {camera_name} as", path, error) from error
+        except EOFError as error:
+            raise FlightError(f"the camera's file {camera_name} ended early ({error}): it was not recorded") from error
+
+    def _note_failure(self, index: int, error: FlightError) -> None:
+        try:
+            self._ledger.failed(index, str(error))
+        except FlightError as second:
+            raise FlightError(f"{error}; nor can that be noted: {second}") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +132,7 @@ class Recording:
     """
 
     folder: FlightFolder
-    journal: WishJournal
+    journal: ShotJournal
     ledger: Ledger
     recorder: Recorder
     telemetry: TelemetryLog
@@ -50,7 +153,7 @@ class Recording:
         row = self.ledger.shot(index)
         if row is not None:
             frame = self.ledger.frame(index)
-            self.index.put(Entry(index, self.folder.name, None if frame is None else frame.name, row.state))
+            self.index.put(IndexEntry(index, self.folder.name, None if frame is None else frame.name, row.state))
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
         """Add to flight.toml what was learnt since the start, such as the camera's identity. Raises FlightError."""
@@ -114,7 +217,7 @@ def begin(
         ledger.set_fact("utc_known", utc_known)
         provenance.note(folder, ledger, folder.settings.name)
         index.add_flight(folder.name, start_utc_ns)
-        journal = WishJournal(folder.journal)
+        journal = ShotJournal(folder.journal)
         stack.callback(journal.close)
         telemetry = TelemetryLog(folder.telemetry)
         stack.callback(telemetry.close)

@@ -1,4 +1,4 @@
-"""The values that a flight is made of. All are facts, written once; what is not known is None.
+"""The values that a flight is made of, as immutable records. What is not known is None.
 
 One number, the image index, names a shot, the frame that it became, its file, and its CAMERA_IMAGE_CAPTURED. It goes
 on over restarts. A shot that failed keeps its index.
@@ -9,10 +9,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from dappled.decode.geometry.pose import Pose
+from dappled.flight.errors import FlightError
 
 ShotState = Literal["wished", "fired", "safe", "failed"]
 
@@ -75,3 +76,77 @@ def digest(record: Pose | Tag | Mapping[str, Any]) -> str:
     """SHA-256 (hex) of a record's canonical form."""
     value = record if isinstance(record, Mapping) else asdict(record)
     return hashlib.sha256(canonical(value)).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class ShotRow:
+    """A shot and how far it came. The fired times bracket the trigger call; None where it was not seen to fire.
+
+    `reason` is a sentence, for a failed shot.
+    """
+
+    shot: Shot
+    state: ShotState
+    reason: str | None
+    fired_called_monotonic_ns: int | None
+    fired_returned_monotonic_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What decoding made of a frame. `run` is "live" for the flight itself; other runs stand beside it.
+
+    `slices_sha256` is that of the published body. `decode_ms` is None where nobody measured it.
+    """
+
+    index: int
+    slices_sha256: str
+    carriers_found: int
+    carriers_predicted: int
+    law: str
+    carriers_from: str
+    decode_ms: float | None = None
+    run: str = "live"
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Stray:
+    """A file that belongs to no shot or is one too many: kept, with the reason."""
+
+    name: str
+    camera_name: str
+    size: int
+    sha256: str
+    arrived_utc_ns: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class LedgerEvent:
+    """Something that happened, in words. `index` is the shot's, where there is one."""
+
+    number: int
+    utc_ns: int
+    kind: str
+    index: int | None
+    text: str
+
+
+TRANSITIONS: dict[ShotState, frozenset[ShotState]] = {
+    "wished": frozenset({"fired", "safe", "failed"}),
+    "fired": frozenset({"safe", "failed"}),
+    "failed": frozenset({"safe"}),
+    "safe": frozenset(),
+}
+
+
+class IllegalTransitionError(FlightError):
+    """A shot was asked to go where it can't."""
+
+
+def advance(index: int, old: ShotState, new: ShotState) -> ShotState:
+    """`new`, when a shot may go there from `old`. Raises IllegalTransitionError."""
+    if new not in TRANSITIONS[old]:
+        raise IllegalTransitionError(f"shot {index} is {old}: it can't become {new}")
+    return new

@@ -13,13 +13,12 @@ from pathlib import Path
 
 from dappled.flight import durable, layout, telemetry_log
 from dappled.flight import journal as wishes
-from dappled.flight.entries import Stray
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.index import ImageIndex
-from dappled.flight.journal import WishJournal
+from dappled.flight.journal import ShotJournal
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, ledger_damage
-from dappled.flight.records import Frame
+from dappled.flight.records import Frame, Stray
 
 SIDECAR = ".xmp"
 _JPEG = (".jpg", ".jpeg")
@@ -73,7 +72,7 @@ def close_ledger(
     folder: FlightFolder,
     ledger: Ledger,
     utc_ns: int,
-    telemetry: telemetry_log.Summary | None,
+    telemetry: telemetry_log.TelemetrySummary | None,
     report: list[str],
 ) -> None:
     """Note in the ledger what the telemetry is (read from the file when not given) and that the flight is over."""
@@ -122,7 +121,7 @@ def _enter_wishes(folder: FlightFolder, ledger: Ledger) -> list[str]:
     noted = {shot.index for shot in journal.shots}
     missing = [row.shot for row in ledger.shots() if row.shot.index not in noted]
     if missing:
-        writer = WishJournal(folder.journal)
+        writer = ShotJournal(folder.journal)
         try:
             for shot in missing:
                 writer.note(shot)

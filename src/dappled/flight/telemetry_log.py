@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.flight.appended import AppendedFile
+from dappled.flight.durable import AppendedFile
 from dappled.flight.errors import FlightError, disk_error
 
 _MAVLINK_1, _MAVLINK_2 = 0xFE, 0xFD
@@ -25,7 +25,7 @@ _Bytes = bytes | mmap.mmap | memoryview
 
 
 @dataclass(frozen=True, slots=True)
-class Summary:
+class TelemetrySummary:
     """What a closed telemetry log is."""
 
     packets: int
@@ -85,13 +85,13 @@ class TelemetryLog:
         """Why logged packets may not survive a power cut, if so."""
         return self._file.problem
 
-    def close(self) -> Summary:
+    def close(self) -> TelemetrySummary:
         """Flush and close; says what the file now is."""
         with self._lock:
             first = self._file.shut()
         if first:
             self._file.close()
-        return Summary(self._packets, self._size, self._sha.hexdigest())
+        return TelemetrySummary(self._packets, self._size, self._sha.hexdigest())
 
     def _cut(self) -> None:
         """Take away what there is of a record that was not taken whole; tried again before the next one."""
@@ -135,12 +135,14 @@ def split(data: bytes | mmap.mmap, report: Callable[[str], object] = lambda _: N
         at = end
 
 
-def summarise(path: Path, report: Callable[[str], object] = lambda _: None) -> Summary:
+def summarise(path: Path, report: Callable[[str], object] = lambda _: None) -> TelemetrySummary:
     """Read a whole log and say what it is. Raises FlightError."""
     packets = sum(1 for _ in read(path, report))
     try:
         with path.open("rb") as file:
-            return Summary(packets, os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest())
+            return TelemetrySummary(
+                packets, os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest()
+            )
     except OSError as error:
         raise disk_error("read the telemetry", path, error) from error
 

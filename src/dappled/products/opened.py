@@ -36,8 +36,7 @@ from dappled.decode.lightfield.view_stack import ViewStack
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.drivers.raw.recipe import of_flight
 from dappled.errors import DappledError
-from dappled.flight import layout, summary
-from dappled.flight.records import Tag
+from dappled.flight import Tag, flight_report, layout
 from dappled.products.exports import light_files, view_folders
 
 _LIGHT_FIELDS = (".zarr", ".npz", ".h5")
@@ -199,7 +198,7 @@ class OpenedFlight:
     """A recorded flight: a sequence of its safe frames, decoded by its own recipe when they are looked at."""
 
     path: Path
-    record: summary.Flight
+    record: flight_report.FlightContents
     darkroom: Darkroom | None
     focus_m: float | None = None
 
@@ -216,7 +215,7 @@ class OpenedFlight:
                 return self._frame(line)
         raise KeyError(index)
 
-    def _frame(self, line: summary.Line) -> OpenedFrame:
+    def _frame(self, line: flight_report.ShotLine) -> OpenedFrame:
         if self.darkroom is None:
             raise OpenError(f"{self.path} was recorded without a mask: name one, as in dappled.open(path, mask=…)")
         assert line.frame is not None
@@ -243,7 +242,7 @@ def open(path: str | Path, *, focus_m: float | None = None, **recipe: Any) -> Op
         darkroom = Darkroom(_recipe(Recipe("auto", "", workers=2), recipe, found))
         return OpenedFrame(found, darkroom, focus_m=focus_m)
     if layout.FlightFolder(found).ledger.exists():
-        record = summary.show(found)
+        record = flight_report.show(found)
         own = of_flight(found, record.settings, recipe)
         return OpenedFlight(found, record, None if own is None else Darkroom(own), focus_m)
     _refuse(recipe, found)

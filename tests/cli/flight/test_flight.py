@@ -10,9 +10,7 @@ from pathlib import Path
 import pytest
 
 from dappled.cli import main
-from dappled.flight import recording
-from dappled.flight.entries import Result
-from dappled.flight.recording import Recording
+from dappled.flight import Recording, Result, recording
 from tests.flight.makers import deliver, flip, tag, wish
 
 START_UTC_NS = 1_795_256_103_000_000_000  # 2026-11-21T10:15:03Z

@@ -18,7 +18,7 @@ from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink.framing import pack
 from dappled.drivers.mavlink.links import MavlinkLinks, Message, Packet, mavlink
 from dappled.drivers.mavlink.signing import Signing
-from dappled.flight.records import Cause
+from dappled.flight import Cause
 from tests.daemon.fakes import eventually
 
 

@@ -9,8 +9,7 @@ from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol import ground_facts
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.drivers.camera import Identity
-from dappled.flight.index import ImageIndex
-from dappled.flight.records import Cause, Shot
+from dappled.flight import Cause, ImageIndex, Shot
 
 SHOT = Shot(7, Cause("test", "console", 1), 1_000, 1_000)
 

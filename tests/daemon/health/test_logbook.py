@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from dappled.daemon.health.logbook import Logbook, of_story
 from dappled.daemon.pipeline.pending_shot import PendingShot
-from dappled.flight.records import Cause, Frame, Shot
+from dappled.flight import Cause, Frame, Shot
 
 SHOT = Shot(7, Cause("console", "console", 1), 0, 0)
 FRAME = Frame(7, "frames/000007.dng", "IMG.DNG", 5_100_000, "0" * 64, 0)

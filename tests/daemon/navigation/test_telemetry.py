@@ -20,7 +20,7 @@ from dappled.daemon.navigation.telemetry import HISTORY_NS, Telemetry, first_pos
 from dappled.decode.geometry.interpolation import from_euler, hermite, metres_per_radian, normalised, slerp, turn_rad
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Decoder, Message, mavlink
-from dappled.flight.records import digest
+from dappled.flight import digest
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 

@@ -26,7 +26,7 @@ from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.daemon.service import Service
 from dappled.drivers.mavlink.links import Message, mavlink
 from dappled.errors import DappledError
-from dappled.flight.records import digest
+from dappled.flight import digest
 from tests.daemon.camera_protocol.rig import Peer
 from tests.daemon.fakes import FakeCamera, eventually
 

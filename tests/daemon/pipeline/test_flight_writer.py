@@ -11,10 +11,7 @@ from dappled.clock import SystemClock
 from dappled.daemon.pipeline.flight_writer import Expected, LedgerWriter, ReplayVerifier
 from dappled.drivers.camera import Blob, Fired
 from dappled.errors import DappledError
-from dappled.flight import recording
-from dappled.flight.entries import Result, ShotRow
-from dappled.flight.errors import FlightError
-from dappled.flight.records import Cause, Frame, Shot, Tag, digest
+from dappled.flight import Cause, FlightError, Frame, Result, Shot, ShotRow, Tag, digest, recording
 from tests.daemon.fakes import no_pose
 
 SHOT = Shot(0, Cause("test", "console", 1), 10, 20)

@@ -16,7 +16,7 @@ from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.daemon.pipeline.tagger import ExposureTime, tag
 from dappled.daemon.pipeline.tagger import FrameSettings as Shown
 from dappled.daemon.stream import wire
-from dappled.flight.records import Cause, Frame, Shot
+from dappled.flight import Cause, Frame, Shot
 from tests.daemon.fakes import eventually, no_pose
 
 

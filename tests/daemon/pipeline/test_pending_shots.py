@@ -10,7 +10,7 @@ import pytest
 from dappled.daemon.pipeline import pending_shots as module
 from dappled.daemon.pipeline.pending_shot import FlightWriter, Observer, PendingShot
 from dappled.daemon.pipeline.pending_shots import GIVEN_UP, PendingShots
-from dappled.flight.records import Cause, Frame, Shot
+from dappled.flight import Cause, Frame, Shot
 
 
 class Events:

@@ -17,13 +17,12 @@ from PIL import Image
 from dappled.daemon.navigation import camera_clock
 from dappled.daemon.pipeline import capture, tagger
 from dappled.drivers.camera import Blob, CameraError, CameraEvent, Companion, Deferred
-from dappled.flight import check, summary
-from dappled.flight.records import ShotState
+from dappled.flight import ShotState, check, flight_report
 from tests.daemon.fakes import FakeCamera, arrival, eventually, failed, fired, good, rig
 
 
 def states(flight: Path) -> dict[int, ShotState]:
-    return {line.row.shot.index: line.row.state for line in summary.show(flight).lines}
+    return {line.row.shot.index: line.row.state for line in flight_report.show(flight).lines}
 
 
 def test_a_shot_goes_all_the_way(tmp_path: Path) -> None:
@@ -276,7 +275,7 @@ def test_every_wish_is_one_shot_and_every_shot_ends_once(plan: list[tuple[list[t
                     assert (one.wish(number).outcome, one.wish(number).index) == ("duplicate", number)
         flight = one.flight.folder.path
         assert check.check(flight).problems == ()
-        balance = summary.report(flight)
+        balance = flight_report.balance(flight)
         assert balance.balanced
         assert (balance.wishes, balance.open) == (len(plan), 0)
         assert one.camera.fired == list(range(len(plan)))

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from dappled.clock import RecordedClock, SystemClock
 from dappled.daemon.pipeline import shutter as module
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
-from dappled.flight.records import Shot
+from dappled.flight import Shot
 
 PILOT = "mavlink:255/190"
 VEHICLE = "mavlink:1/1"

@@ -6,7 +6,7 @@ import pytest
 
 from dappled.daemon.pipeline import tagger
 from dappled.daemon.pipeline.tagger import BodyLatency, FrameSettings
-from dappled.flight.records import Frame
+from dappled.flight import Frame
 from tests.daemon.fakes import no_pose
 
 LATENCY = BodyLatency(60.0, 15.0, "measured")

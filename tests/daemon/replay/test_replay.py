@@ -15,8 +15,7 @@ from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayProgress
 from dappled.drivers.camera import Arrival, CameraEvent, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.replay import ReplayCamera
-from dappled.flight.errors import FlightError
-from dappled.flight.records import Cause, Shot
+from dappled.flight import Cause, FlightError, Shot
 from tests.daemon.fakes import FakeDeveloper, failed, fired, good, rig
 
 

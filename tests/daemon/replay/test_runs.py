@@ -14,11 +14,8 @@ from dappled.daemon.replay import runs
 from dappled.daemon.replay.runs import Run, RunWriter
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
-from dappled.flight import recording
+from dappled.flight import LedgerReader, Recording, Result, recording
 from dappled.flight.check import check
-from dappled.flight.entries import Result
-from dappled.flight.ledger import LedgerReader
-from dappled.flight.recording import Recording
 from tests.flight.makers import deliver, tag, wish
 
 RESULT = Result(0, "a" * 64, 12, 13, "geometric", "calibrated")

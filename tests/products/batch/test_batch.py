@@ -18,8 +18,7 @@ import pytest
 from dappled.cli import main
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
-from dappled.flight import durable
-from dappled.flight.records import Frame
+from dappled.flight import Frame, durable
 from dappled.products.batch import batch, workers
 from dappled.products.batch.batch import Done, Job
 from dappled.products.batch.manifest import Manifest, ManifestError

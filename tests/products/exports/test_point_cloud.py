@@ -7,7 +7,7 @@ import pytest
 
 from dappled.decode.depth.ranging import DistanceMap
 from dappled.decode.geometry.pose import Pose
-from dappled.flight.records import Frame, Tag
+from dappled.flight import Frame, Tag
 from dappled.products.exports import point_cloud
 from dappled.products.exports.point_cloud import PointCloudError
 from dappled.products.maps import photographs

@@ -22,8 +22,7 @@ from dappled.decode.geometry.interpolation import from_euler
 from dappled.decode.lightfield.light_field import LightField
 from dappled.drivers.raw.darkroom import Darkroom
 from dappled.errors import DappledError
-from dappled.flight import recording
-from dappled.flight.records import Tag
+from dappled.flight import Tag, recording
 from dappled.mocks.autopilot.path import TruePose
 from dappled.mocks.scene.masked_camera import Truth
 from dappled.mocks.simulation import CAMERA, MASK

@@ -16,8 +16,7 @@ from dappled.cli.actions import Actions
 from dappled.cli.flight import lines as flight_lines
 from dappled.cli.flight import pickup
 from dappled.config import settings
-from dappled.flight import check, flight_report, index, offload, summary
-from dappled.flight.errors import FlightError
+from dappled.flight import FlightError, check, flight_report, index, offload
 
 _FLIGHT = "~/flights/20261121T101503Z-0a1b2c3d"
 
@@ -77,14 +76,14 @@ def _flights(config: Path | None) -> Path:
 
 
 def _list(folder: Path, as_json: bool) -> int:
-    found = summary.list_flights(folder)
+    found = flight_report.list_flights(folder)
     if not found and not as_json:
         print(f"no flights in {folder}", file=sys.stderr)
     return _said([_plain(one) for one in found], map(flight_lines.of_list, found), as_json)
 
 
 def _show(flight: Path, as_json: bool) -> int:
-    found = summary.show(flight)
+    found = flight_report.show(flight)
     return _said(_plain(found), flight_lines.of_flight(found), as_json)
 
 
@@ -95,7 +94,7 @@ def _check(flight: Path, as_json: bool) -> int:
 
 
 def _report(flight: Path, as_json: bool) -> int:
-    found, books = summary.report(flight), flight_report.accounts(flight)
+    found, books = flight_report.balance(flight), flight_report.by_source(flight)
     sources = [asdict(one) for one in books]
     values = {**_plain(found), "sources": sources, "balanced": found.balanced}
     _said(values, flight_lines.of_report(found, books), as_json)

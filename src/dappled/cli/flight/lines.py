@@ -6,14 +6,13 @@ import math
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 
-from dappled.flight.check import Report
-from dappled.flight.flight_report import Account
-from dappled.flight.ledger import LIVE
+from dappled.flight import LIVE
+from dappled.flight.check import CheckReport
+from dappled.flight.flight_report import Balance, FlightContents, ListedFlight, ShotLine, SourceReport
 from dappled.flight.offload import Offloaded
-from dappled.flight.summary import Balance, Flight, Line, Listed
 
 
-def of_list(one: Listed) -> str:
+def of_list(one: ListedFlight) -> str:
     """A flight of a list: when it began, what is in it, or why that can't be said."""
     b = one.balance
     if b is None:
@@ -23,7 +22,7 @@ def of_list(one: Listed) -> str:
     return f"{one.name}  {began}  {b.frames} frames, {b.failed} failed, {b.size / 1e6:.1f} MB{state}"
 
 
-def of_flight(found: Flight) -> Iterator[str]:
+def of_flight(found: FlightContents) -> Iterator[str]:
     """A line for each shot, run and stray."""
     yield found.name
     if found.utc_correction_ns is None:
@@ -37,7 +36,7 @@ def of_flight(found: Flight) -> Iterator[str]:
         yield f" stray  {stray.name}  {stray.reason}"
 
 
-def _of_shot(line: Line, utc_correction_ns: int) -> str:
+def _of_shot(line: ShotLine, utc_correction_ns: int) -> str:
     shot = line.row.shot
     words = [
         f"{shot.index:6d}",
@@ -58,7 +57,7 @@ def _of_shot(line: Line, utc_correction_ns: int) -> str:
     return "  ".join(words)
 
 
-def of_check(found: Report) -> Iterator[str]:
+def of_check(found: CheckReport) -> Iterator[str]:
     """What is wrong, what is worth knowing, and the verdict."""
     yield from (f"wrong: {text}" for text in found.problems)
     yield from (f"note:  {text}" for text in found.notes)
@@ -67,7 +66,7 @@ def of_check(found: Report) -> Iterator[str]:
     yield f"{found.flight}: {word}: {found.files} files, {size}, {found.telemetry_packets} telemetry packets"
 
 
-def of_report(found: Balance, books: Sequence[Account]) -> Iterator[str]:
+def of_report(found: Balance, books: Sequence[SourceReport]) -> Iterator[str]:
     """The books by source, the sums, and whether they balance."""
     yield f"{found.flight}{'' if found.closed else ' (still open)'}"
     yield from (f"  {line}" for line in _table(books))
@@ -84,7 +83,7 @@ def of_report(found: Balance, books: Sequence[Account]) -> Iterator[str]:
     yield "the books balance" if found.balanced else "THE BOOKS DO NOT BALANCE: run `dappled flight check`"
 
 
-def _table(books: Sequence[Account]) -> Iterator[str]:
+def _table(books: Sequence[SourceReport]) -> Iterator[str]:
     """A line for each source, below one of headings; nothing for a flight without a wish."""
     names = ("wishes", "refused", "shots", "safe", "failed", "open", "tagged", "decoded")
     if books:

@@ -15,9 +15,7 @@ from dappled.daemon.camera_protocol.component import CameraFacts, Captured, Stor
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.drivers.camera import Identity
 from dappled.errors import DappledError, report
-from dappled.flight import layout
-from dappled.flight.index import ImageIndex
-from dappled.flight.ledger import LedgerReader
+from dappled.flight import ImageIndex, LedgerReader, layout
 
 log = logging.getLogger(__name__)
 Chip = dict[str, Any]

@@ -15,7 +15,7 @@ from dappled.daemon.navigation.vehicles import Vehicles
 from dappled.daemon.pipeline.tagger import ExposureTime
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Packet
-from dappled.flight.recording import Recording
+from dappled.flight import Recording
 
 log = logging.getLogger(__name__)
 AHEAD_NS = 10**9  # a body's latency and half an exposure; what is said to lie further ahead is not waited for

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from dappled.daemon.navigation.telemetry import Telemetry
-from dappled.flight.ledger import LedgerReader
+from dappled.flight import LedgerReader
 
 FACT = "vehicles"
 

@@ -23,7 +23,7 @@ from dappled.drivers.child_process import RestartBudget
 from dappled.drivers.process_channel import ChannelError, ChannelMessage, ProcessChannel
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
-from dappled.flight.entries import Result
+from dappled.flight import Result
 
 log = logging.getLogger(__name__)
 NICENESS = 10

@@ -10,7 +10,7 @@ from dappled.daemon.pipeline.pending_shots import PendingShots
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher
 from dappled.daemon.stream.wire import slices_header
-from dappled.flight.records import Tag
+from dappled.flight import Tag
 
 
 class Decoding:

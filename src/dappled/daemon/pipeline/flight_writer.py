@@ -12,10 +12,7 @@ from pathlib import Path
 from dappled.clock import Clock
 from dappled.drivers.camera import Blob, Fired
 from dappled.errors import DappledError, report
-from dappled.flight import durable
-from dappled.flight.entries import Result, ShotRow
-from dappled.flight.recording import Recording
-from dappled.flight.records import Frame, Shot, Tag, digest
+from dappled.flight import Frame, Recording, Result, Shot, ShotRow, Tag, digest, durable
 
 log = logging.getLogger(__name__)
 _LATER = 1000

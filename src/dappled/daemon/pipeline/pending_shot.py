@@ -10,8 +10,7 @@ from dappled.daemon.pipeline.decode_process import DecodedFrame
 from dappled.daemon.pipeline.tagger import ExposureTime
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.camera import Blob, Fired, SettingsChanged, StateChanged
-from dappled.flight.entries import Result
-from dappled.flight.records import Frame, Shot, Tag
+from dappled.flight import Frame, Result, Shot, Tag
 
 
 class FlightWriter(Protocol):

@@ -9,7 +9,7 @@ from typing import Any
 
 from dappled.daemon.pipeline.pending_shot import FlightWriter, Observer, PendingShot
 from dappled.errors import report
-from dappled.flight.records import Frame, Shot
+from dappled.flight import Frame, Shot
 
 log = logging.getLogger(__name__)
 GIVEN_UP = 16  # failed shots whose file is still known for theirs when it comes after all

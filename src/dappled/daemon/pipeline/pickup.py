@@ -25,13 +25,8 @@ from dappled.drivers.raw.darkroom import camera_name
 from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching, in_order, match
 from dappled.drivers.wired.sources import Found, Group, Source, groups
 from dappled.errors import DappledError
-from dappled.flight import layout
-from dappled.flight.entries import ShotRow
-from dappled.flight.index import Entry, ImageIndex
-from dappled.flight.ledger import Ledger, LedgerReader
-from dappled.flight.lock import FlightsLock
-from dappled.flight.recorder import Recorder
-from dappled.flight.records import Frame
+from dappled.flight import FlightsLock, Frame, ImageIndex, Ledger, LedgerReader, Recorder, ShotRow, layout
+from dappled.flight.index import IndexEntry
 
 
 class PickupError(DappledError):
@@ -155,7 +150,7 @@ def bring(
             exposure, pose = telemetry.pose(number, exposure)
             camera = camera_name(names.get("camera", "auto"), facts_of.model)
             ledger.add_tag(tagger.tag(frame, exposure, facts_of, camera=camera, mask=names.get("mask", ""), pose=pose))
-            index.put(Entry(number, folder.name, frame.name, "safe"))
+            index.put(IndexEntry(number, folder.name, frame.name, "safe"))
             if zoomed := zoom.look(number, facts_of.focal_length_mm):
                 zooms.append(f"frame {number}: {zoomed}")
                 ledger.add_event("zoom", zoomed, number)

@@ -19,7 +19,7 @@ from dappled.daemon.pipeline.tagging import Tagging
 from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import BodyState, Camera
 from dappled.errors import sentence
-from dappled.flight.records import Shot
+from dappled.flight import Shot
 from dappled.workers import Worker
 
 _TAG_QUEUE = 1000

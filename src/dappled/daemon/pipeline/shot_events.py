@@ -16,7 +16,7 @@ from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Identity, SettingsChanged, StateChanged
 from dappled.drivers.mavlink.links import mavlink
 from dappled.errors import DappledError, report
-from dappled.flight.recording import Recording
+from dappled.flight import Recording
 
 log = logging.getLogger(__name__)
 

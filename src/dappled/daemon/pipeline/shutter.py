@@ -12,8 +12,7 @@ from typing import Literal
 from dappled.clock import Clock
 from dappled.daemon.pipeline.capture_requests import CaptureRequest, Recent
 from dappled.errors import report
-from dappled.flight.errors import FlightError
-from dappled.flight.records import Cause, Shot
+from dappled.flight import Cause, FlightError, Shot
 
 __all__ = ["CaptureRequest", "ShotDecision", "Shutter", "ShutterStatistics"]
 

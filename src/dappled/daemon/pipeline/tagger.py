@@ -9,7 +9,7 @@ from typing import Self
 from dappled.config.settings import CameraSettings
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.raw.raw_file import ExposureSettings
-from dappled.flight.records import Frame, Shot, Tag
+from dappled.flight import Frame, Shot, Tag
 
 LATENCY_SOURCE = "trigger call + body latency"
 WISH_SOURCE = "wish + body latency"

@@ -18,7 +18,7 @@ from dappled.daemon.stream.wire import frame_header
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
 from dappled.errors import DappledError
-from dappled.flight.records import Frame
+from dappled.flight import Frame
 
 log = logging.getLogger(__name__)
 

@@ -20,10 +20,7 @@ from dappled.daemon.replay.replay import RecordedFlight, RecordedTelemetry, Repl
 from dappled.drivers.camera import Blob, Identity
 from dappled.drivers.replay import ReplayCamera
 from dappled.errors import DappledError
-from dappled.flight import layout
-from dappled.flight.ledger import Ledger, LedgerReader
-from dappled.flight.lock import FlightsLock
-from dappled.flight.records import Frame, Tag
+from dappled.flight import FlightsLock, Frame, Ledger, LedgerReader, Tag, layout
 
 
 class MissingTagWriter(ReplayVerifier):

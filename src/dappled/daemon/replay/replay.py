@@ -23,10 +23,7 @@ from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.framing import Decoder, Message
 from dappled.drivers.replay import Recorded
 from dappled.errors import DappledError
-from dappled.flight import durable, layout, telemetry_log
-from dappled.flight.entries import Result, ShotRow
-from dappled.flight.ledger import LIVE, LedgerReader
-from dappled.flight.records import Cause, Frame, Shot
+from dappled.flight import LIVE, Cause, Frame, LedgerReader, Result, Shot, ShotRow, durable, layout, telemetry_log
 
 FRAME_SUFFIXES = (".raf", ".cr2", ".dng", ".tif", ".tiff", ".png", ".npy", ".nef", ".arw", ".jpg", ".jpeg")
 

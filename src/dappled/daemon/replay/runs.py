@@ -16,9 +16,7 @@ from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.pending_shot import Names
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
-from dappled.flight import layout, lock, provenance
-from dappled.flight.entries import Result
-from dappled.flight.ledger import LIVE, Ledger, LedgerReader
+from dappled.flight import LIVE, Ledger, LedgerReader, Result, layout, provenance
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -44,7 +42,7 @@ class RunWriter:
         with LedgerReader.open(folder.ledger) as ledger:
             facts, runs = ledger.facts(), ledger.runs()
         if "closed_utc_ns" not in facts:
-            held = lock.is_held(flight.absolute().parent)
+            held = layout.is_locked(flight.absolute().parent)
             what = "is still recorded: wait for its end" if held else "was never closed: the next `dappled run` does it"
             raise DappledError(f"{flight} {what}, or replay it without another recipe")
         if run.name in runs or _fact(run.name) in facts:

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 from dappled.daemon.stream.publisher import Reply
 from dappled.daemon.stream.wire import DecodedSlices, Message, WireError, frame_header, slices_header
 from dappled.errors import sentence
-from dappled.flight.records import Frame, Tag
+from dappled.flight import Frame, Tag
 from dappled.workers import Worker
 
 WAITING = 32

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dappled import __version__
 from dappled.config.settings import PublishSettings
 from dappled.errors import DappledError
-from dappled.flight.records import Frame, Tag
+from dappled.flight import Frame, Tag
 
 VERSION = 1
 TOPICS = ("start", "frame", "slices", "depth", "preview", "health", "end")

@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from dappled.flight.errors import FlightError
+from dappled.flight import FlightError
 from dappled.mocks.soak.soak import SoakPlan, SoakReport, soak
 
 

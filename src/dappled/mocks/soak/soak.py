@@ -23,7 +23,7 @@ import tomli_w
 from dappled.config import settings as configuration
 from dappled.daemon.camera_protocol.ground_client import GroundClient
 from dappled.drivers.mavlink.links import mavlink
-from dappled.flight import check, summary
+from dappled.flight import check, flight_report
 from dappled.mocks.simulation import Simulation, World, free_port
 from dappled.mocks.soak.supervised import Resources, Supervised
 from dappled.mocks.soak.troubles import Troubles
@@ -128,7 +128,7 @@ def _settle(
     """Compare what the ground was told with what stands in the flights."""
     shots: Counter[int] = Counter()
     safe = failed = flights = 0
-    for listed in summary.list_flights(root):
+    for listed in flight_report.list_flights(root):
         flights += 1
         problems += [f"{listed.name}: {text}" for text in check.check(listed.path).problems]
         if listed.balance is None:
@@ -137,7 +137,7 @@ def _settle(
         safe, failed = safe + listed.balance.safe, failed + listed.balance.failed
         if not listed.balance.balanced or listed.balance.open:
             problems.append(f"{listed.name}: the books do not balance: {listed.balance}")
-        for line in summary.show(listed.path).lines:
+        for line in flight_report.show(listed.path).lines:
             shots[line.row.shot.cause.sequence or 0] += 1
             if line.row.state == "failed" and not line.row.reason:
                 problems.append(f"{listed.name}: shot {line.row.shot.index} failed without a reason")

@@ -18,8 +18,7 @@ from pathlib import Path
 from dappled import __version__
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError, sentence
-from dappled.flight import durable
-from dappled.flight.records import Frame, Tag, canonical
+from dappled.flight import Frame, Tag, canonical, durable
 from dappled.products.exports import light_files
 from dappled.products.maps import cog, drawings, georeference, photographs
 from dappled.products.maps.earth import Projection, utm

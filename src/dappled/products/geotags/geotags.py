@@ -14,10 +14,7 @@ from typing import Any
 from dappled.decode.geometry import camera_pose
 from dappled.decode.geometry.camera_pose import NADIR, CameraPose, Matrix
 from dappled.decode.geometry.pose import Pose, Vector3
-from dappled.flight import durable, layout
-from dappled.flight.errors import FlightError, disk_error
-from dappled.flight.ledger import LedgerReader
-from dappled.flight.records import Frame, Tag
+from dappled.flight import FlightError, Frame, LedgerReader, Tag, disk_error, durable, layout
 from dappled.products.geotags import exif_gps, sidecars
 from dappled.products.geotags.exif_gps import ExifError
 from dappled.products.maps.earth import Geoid

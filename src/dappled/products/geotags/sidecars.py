@@ -8,9 +8,7 @@ from xml.sax.saxutils import quoteattr
 
 from dappled.decode.geometry.camera_pose import CameraPose
 from dappled.errors import DappledError
-from dappled.flight import durable
-from dappled.flight.errors import disk_error
-from dappled.flight.records import Tag
+from dappled.flight import Tag, disk_error, durable
 
 _MARK = "dappled"
 _SPACES = {

@@ -14,8 +14,7 @@ import numpy as np
 
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import DappledError
-from dappled.flight import durable
-from dappled.flight.records import Frame, Tag
+from dappled.flight import Frame, Tag, durable
 from dappled.products.maps import control as control_points
 from dappled.products.maps import footprints, map_grid, photographs, refine
 from dappled.products.maps.basemap import BaseMap

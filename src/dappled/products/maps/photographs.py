@@ -18,9 +18,7 @@ from dappled.decode.geometry.pose import Pose, Vector3
 from dappled.decode.lightfield.light_field import LightField
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
-from dappled.flight import layout
-from dappled.flight.ledger import LedgerReader
-from dappled.flight.records import Frame, Tag
+from dappled.flight import Frame, LedgerReader, Tag, layout
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.eye import Eye, intrinsics, look, through
 from dappled.products.maps.map_grid import Image
