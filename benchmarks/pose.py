@@ -24,8 +24,8 @@ from typing import TypeVar
 
 from dappled.daemon.navigation import pose as telemetry_pose
 from dappled.daemon.navigation.camera_clock import CameraClock, exposure_from_camera
+from dappled.daemon.navigation.navigation import Telemetry
 from dappled.daemon.navigation.samples import AttitudeSample, PositionSample, attitude, position
-from dappled.daemon.navigation.telemetry import Telemetry
 from dappled.daemon.navigation.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
 from dappled.daemon.pipeline.tagger import BodyLatency, ExposureTime, mid_exposure
 from dappled.decode.geometry.interpolation import metres_per_radian, turn_rad

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled.daemon.navigation.telemetry import Telemetry
+from dappled.daemon.navigation.navigation import Telemetry
 from dappled.daemon.pipeline import tagger
 from dappled.daemon.pipeline.tagger import BodyLatency, FrameSettings
 from dappled.decode.geometry.pose import Pose

@@ -12,7 +12,7 @@ from types import TracebackType
 from dappled.clock import Clock, RecordedClock, SystemClock
 from dappled.daemon.camera_protocol.camera_settings import Knobs
 from dappled.daemon.camera_protocol.component import CameraFacts, Captured, Component, Storage
-from dappled.daemon.navigation.telemetry import Telemetry
+from dappled.daemon.navigation.navigation import Telemetry
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink.framing import pack

@@ -14,7 +14,7 @@ from dappled.daemon.navigation import hot_shoe
 from dappled.daemon.navigation.boot_clock import BootClock
 from dappled.daemon.navigation.camera_clock import CameraClock, exposure_from_camera, shown
 from dappled.daemon.navigation.hot_shoe import Feedback
-from dappled.daemon.navigation.telemetry import Telemetry
+from dappled.daemon.navigation.navigation import Telemetry
 from dappled.daemon.pipeline.tagger import BodyLatency, ExposureTime, mid_exposure
 from dappled.drivers.mavlink.links import Message, mavlink
 from dappled.mocks.autopilot.autopilot import BootTime, flight

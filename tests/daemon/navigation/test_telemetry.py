@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dappled.daemon.navigation.boot_clock import Answer, from_arrivals, from_timesync
-from dappled.daemon.navigation.history import MOST
-from dappled.daemon.navigation.telemetry import HISTORY_NS, Telemetry, first_position_utc_ns
+from dappled.daemon.navigation.boot_clock import TimesyncAnswer, from_arrivals, from_timesync
+from dappled.daemon.navigation.navigation import HISTORY_NS, Telemetry, first_position_utc_ns
+from dappled.daemon.navigation.vehicle_history import MOST_SAMPLES
 from dappled.decode.geometry.interpolation import from_euler, hermite, metres_per_radian, normalised, slerp, turn_rad
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Decoder, Message, mavlink
@@ -201,7 +201,7 @@ def test_the_timesync_filter_finds_offset_and_drift(ppm: float, seconds: float, 
         sent = START_NS + n * 200_000_000
         there = sent + 10**6 + round(rng.expovariate(1) * jitter_s * 1e9)
         back = there + 10**6 + round(rng.expovariate(1) * jitter_s * 1e9)
-        answers.append(Answer(n, sent, back, round((there - START_NS) * (1 + ppm * 1e-6)) + 7 * 10**9))
+        answers.append(TimesyncAnswer(n, sent, back, round((there - START_NS) * (1 + ppm * 1e-6)) + 7 * 10**9))
     clock = from_timesync(answers)
     assert clock is not None
     last = answers[-1].boot_ns
@@ -313,9 +313,9 @@ def test_a_flood_of_one_kind_keeps_the_newest_and_the_rest_of_the_history() -> N
     telemetry = fed(packets)
     number, stamp_us = packets[-1][0], packets[-1][1]
     flood = made(mavlink.MAVLink_gps_raw_int_message(0, 3, 10**7, 10**7, 0, 100, 100, 0, 0, 9))
-    for _ in range(MOST + 1000):
+    for _ in range(MOST_SAMPLES + 1000):
         number += 1
         telemetry.feed(number, stamp_us, flood)
-    assert len(telemetry._history._receiver) <= MOST
+    assert len(telemetry._history._receiver) <= MOST_SAMPLES
     assert telemetry._history._receiver[-1].number == number
     assert telemetry.pose_at(START_NS + 4 * 10**9, 0).source == "interpolated"

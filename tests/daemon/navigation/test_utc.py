@@ -7,14 +7,28 @@ from pathlib import Path
 import pytest
 
 from dappled.daemon.navigation import utc
-from dappled.daemon.navigation.telemetry import Telemetry, UtcCorrection
-from dappled.daemon.navigation.utc import FLOOR_NS, UtcLearner
+from dappled.daemon.navigation.navigation import Telemetry
+from dappled.daemon.navigation.utc import FLOOR_NS, UtcCorrection, UtcLearner
 from dappled.drivers.mavlink.links import mavlink
 from dappled.errors import DappledError
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath
 
 NOW_NS = FLOOR_NS + 10**18
+
+
+class Notes:
+    """What a learner records. The first `refusals` calls fail."""
+
+    def __init__(self, refusals: int = 0) -> None:
+        self.refusals = refusals
+        self.noted: list[UtcCorrection] = []
+
+    def learn_utc(self, correction_ns: int, sigma_ns: int, source: str) -> None:
+        if self.refusals:
+            self.refusals -= 1
+            raise DappledError("the disk is full")
+        self.noted.append(UtcCorrection(correction_ns, sigma_ns, source))
 
 
 def machine(root: Path, *, board: bool, clock: bool) -> Path:
@@ -61,37 +75,35 @@ def test_the_kernel_can_be_asked() -> None:
 
 
 def test_the_first_word_is_noted_and_then_only_much_better_ones() -> None:
-    noted: list[UtcCorrection] = []
-    learner = UtcLearner(known=False, note=noted.append)
+    notes = Notes()
+    learner = UtcLearner(notes, known=False)
     assert learner.utc_ns(5) is None
     learner.look(None)
     assert not learner.known
     for correction_ns, sigma_ns in ((100, 50), (101, 40), (102, 25), (103, 24)):
         learner.look(UtcCorrection(correction_ns, sigma_ns, "test"))
-    assert [one.correction_ns for one in noted] == [100, 102]
+    assert [one.correction_ns for one in notes.noted] == [100, 102]
     assert learner.utc_ns(5) == 107
     assert learner.known
 
 
 def test_what_could_not_be_noted_is_tried_again() -> None:
-    refusals = iter([DappledError("the disk is full")])
-
-    def note(_: UtcCorrection) -> None:
-        for error in refusals:
-            raise error
-
-    learner = UtcLearner(known=False, note=note)
+    notes = Notes(refusals=1)
+    learner = UtcLearner(notes, known=False)
     with pytest.raises(DappledError):
         learner.look(UtcCorrection(1, 1, "test"))
-    assert learner.learnt is None
+    assert learner.utc_ns(5) is None
     learner.look(UtcCorrection(1, 1, "test"))
-    assert learner.learnt is not None
+    assert learner.utc_ns(5) == 6
+    assert notes.noted == [UtcCorrection(1, 1, "test")]
 
 
 def test_a_machine_that_knows_learns_nothing() -> None:
-    learner = UtcLearner(known=True, note=lambda _: pytest.fail("nothing to note"))
+    notes = Notes()
+    learner = UtcLearner(notes, known=True)
     learner.look(UtcCorrection(1, 1, "test"))
     assert learner.utc_ns(5) == 5
+    assert notes.noted == []
 
 
 S = 10**9
@@ -108,14 +120,16 @@ S = 10**9
     ],
 )
 def test_a_clock_that_is_believed_and_wrong_is_told(correction_ns: int, sigma_ns: int, said: str | None) -> None:
-    learner = UtcLearner(known=True, note=lambda _: pytest.fail("nothing to note"))
+    notes = Notes()
+    learner = UtcLearner(notes, known=True)
     assert learner.doubt() is None
     learner.look(UtcCorrection(correction_ns, sigma_ns, "test"))
     learner.look(None)  # the autopilot was silent for a moment
     told = learner.doubt()
     assert (told is None) if said is None else (told is not None and said in told)
     assert learner.utc_ns(5) == 5
-    unsure = UtcLearner(known=False, note=lambda _: None)
+    assert notes.noted == []
+    unsure = UtcLearner(notes, known=False)
     unsure.look(UtcCorrection(correction_ns, sigma_ns, "test"))
     assert unsure.doubt() is None
 

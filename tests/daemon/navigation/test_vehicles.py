@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from dappled.clock import SystemClock
 from dappled.config import settings as configuration
 from dappled.config.settings import MavlinkSettings, PoseSettings, PublishSettings, RecordSettings, Settings
 from dappled.daemon import service as module
 from dappled.daemon.camera_protocol import identity
 from dappled.daemon.camera_protocol.identity import Identity
-from dappled.daemon.navigation.telemetry import Telemetry
-from dappled.daemon.navigation.vehicles import Vehicles
+from dappled.daemon.navigation.navigation import Navigation, Telemetry, recorded_vehicles
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.pipeline.tagger import ExposureTime
@@ -26,7 +26,7 @@ from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.daemon.service import Service
 from dappled.drivers.mavlink.links import Message, mavlink
 from dappled.errors import DappledError
-from dappled.flight import digest
+from dappled.flight import digest, recording
 from tests.daemon.camera_protocol.rig import Peer
 from tests.daemon.fakes import FakeCamera, eventually
 
@@ -81,23 +81,27 @@ def test_following_the_vehicle_that_is_followed_already_forgets_nothing() -> Non
     assert told.pose_at(utc_ns, 0).source == "interpolated"
 
 
-def test_a_turn_that_could_not_be_noted_is_noted_later() -> None:
-    notes: list[object] = []
-    full = True
+def test_a_change_of_vehicle_that_could_not_be_recorded_is_recorded_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight = recording.begin(tmp_path, SystemClock().utc_ns)
+    navigation = Navigation(Settings, SystemClock(), flight, utc_known=True)
 
-    def note(_: str, turns: object) -> None:
-        if full:
-            raise DappledError("the disk is full")
-        notes.append(turns)
+    def full(key: str, value: object) -> None:
+        raise DappledError("the disk is full")
 
-    vehicles = Vehicles(Telemetry(), note)
-    vehicles.look(None)
-    with pytest.raises(DappledError):
-        vehicles.look(OURS)
-    full = False
-    for _ in range(3):
-        vehicles.look(OURS)
-    assert notes == [[[0, OURS]]]
+    try:
+        navigation.belongs_to(None)
+        with monkeypatch.context() as patched:
+            patched.setattr(flight.ledger, "set_fact", full)
+            with pytest.raises(DappledError):
+                navigation.belongs_to(OURS)
+        assert recorded_vehicles(flight.ledger) == []
+        for _ in range(3):
+            navigation.belongs_to(OURS)
+        assert recorded_vehicles(flight.ledger) == [(0, OURS)]
+    finally:
+        flight.close()
 
 
 @pytest.mark.parametrize(
@@ -164,10 +168,10 @@ def test_the_daemon_tags_with_the_place_of_its_own_vehicle(settings: Settings) -
     tag = shots[0].tag
     assert tag is not None
     assert math.degrees(tag.pose.latitude_rad or 0) == pytest.approx(47)
-    recording = replay.of_flight(service.folder)
-    assert [system for _, system in recording.vehicles] == [OURS]
+    recorded = replay.of_flight(service.folder)
+    assert [system for _, system in recorded.vehicles] == [OURS]
     exposure = ExposureTime(tag.utc_ns, tag.utc_sigma_ns, tag.time_source)
-    for vehicles, same in ((recording.vehicles, True), ((), False)):
-        again = RecordedTelemetry(recording.telemetry, recording.horizons, wait_s=1.0, vehicles=vehicles)
+    for vehicles, same in ((recorded.vehicles, True), ((), False)):
+        again = RecordedTelemetry(recorded.telemetry, recorded.horizons, wait_s=1.0, vehicles=vehicles)
         _, pose = again.pose(0, replace(exposure))
-        assert (digest(pose) == recording.expected[0].pose_sha256) is same
+        assert (digest(pose) == recorded.expected[0].pose_sha256) is same

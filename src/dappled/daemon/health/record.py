@@ -10,7 +10,7 @@ from typing import Any
 
 from dappled.config.settings import Settings
 from dappled.daemon.navigation.boot_clock import BootClock
-from dappled.daemon.navigation.telemetry import TelemetryStatistics
+from dappled.daemon.navigation.navigation import TelemetryStatistics
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.stream import wire

@@ -23,7 +23,7 @@ _ARRIVAL_FLOOR_NS = 5e6  # the shortest way through radio, UART and scheduler; n
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class TimesyncAnswer:
     """One answer to our TIMESYNC request: the autopilot's clock between our sending and our receiving."""
 
     number: int
@@ -67,7 +67,7 @@ class BootClock:
         return near - round(self.drift / (1 + self.drift) * (near - self.reference_boot_ns))
 
 
-def from_timesync(answers: Sequence[Answer]) -> BootClock | None:
+def from_timesync(answers: Sequence[TimesyncAnswer]) -> BootClock | None:
     """A line through the answers, quick ones weighing most; None from fewer than three.
 
     An answer that took `e` longer than the quickest one is wrong by at most e/2, all of it on one way: its weight is

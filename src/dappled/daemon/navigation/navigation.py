@@ -1,31 +1,186 @@
-"""Where the vehicle is and what time it is, live: packets come in, poses go out, what is learnt is noted."""
+"""Say where the vehicle was and how it pointed: fold the packets of the telemetry log, and interpolate poses.
+
+The state depends only on the packets fed (number, stamp, message), and a pose only on the packets whose number is below
+the limit that it was asked with. So a replay that passes a recorded `telemetry_packets` as `upto_packet` gets the same
+floats, also when it has read on already (by less than a minute of flight).
+"""
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 from dappled.clock import Clock
 from dappled.config.settings import Settings
-from dappled.daemon.navigation.telemetry import Telemetry, UtcCorrection
-from dappled.daemon.navigation.utc import UtcLearner
-from dappled.daemon.navigation.vehicles import Vehicles
+from dappled.daemon.navigation import hot_shoe, pose
+from dappled.daemon.navigation.boot_clock import BootClock
+from dappled.daemon.navigation.utc import UtcCorrection, UtcLearner
+from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, Counts, VehicleHistory
 from dappled.daemon.pipeline.tagger import ExposureTime
 from dappled.decode.geometry.pose import Pose
-from dappled.drivers.mavlink.links import Packet
-from dappled.flight import Recording
+from dappled.drivers.mavlink.links import Message, Packet
+from dappled.flight import LedgerReader, Recording
 
-log = logging.getLogger(__name__)
-AHEAD_NS = 10**9  # a body's latency and half an exposure; what is said to lie further ahead is not waited for
+HISTORY_NS = TIMESYNC_WINDOW_NS + 60 * 10**9
+AHEAD_NS = 10**9  # a body's latency and half an exposure; an exposure further ahead is not waited for
+_VEHICLES = "vehicles"  # the ledger's fact: [number of the first packet, system id] of each vehicle followed
+_HINT_NS = 50_000_000  # a new fit while one frame waits changes the clock by less
+_PRUNE_EVERY = 256
 _LOOK_S = 0.005
 
 
-class Navigation:
-    """Owner of one flight's telemetry, of whose it is, and of what the autopilot told of UTC.
+@dataclass(frozen=True, slots=True)
+class TelemetryStatistics:
+    """What was fed so far."""
 
-    `settings()` are those of now: `pose.wait_ms` may change in flight.
+    packets: int
+    positions: int
+    attitudes: int
+    timesync_answers: int
+    reboots: int
+    out_of_order: int
+    feedbacks: int = 0
+    gimbals: int = 0
+
+
+class Telemetry:
+    """Telemetry of one vehicle: the one given to `follow`; until then the first autopilot (component 1) heard.
+
+    `vehicles` are (packet number, system id) in order, as a recorded flight followed them. `component_id` is our own
+    (see AutopilotTime). `attitude_sigma_rad` is how well the autopilot knows its attitude, where it doesn't say; 0 is
+    not known. All methods may be called from any thread.
+    """
+
+    def __init__(
+        self, *, vehicles: Sequence[tuple[int, int]] = (), component_id: int = 100, attitude_sigma_rad: float = 0.0
+    ) -> None:
+        self._turns = deque(vehicles)
+        self._component_id, self._attitude_sigma_rad = component_id, attitude_sigma_rad
+        self._lock = threading.Lock()
+        self._packets = self._prune_at = 0
+        self._counts = Counts()
+        self._history = VehicleHistory(None, component_id, self._counts)
+
+    def feed(self, number: int, stamp_us: int, message: Message) -> None:
+        """Take one packet. Numbers must rise. Messages that are not used only count."""
+        with self._lock:
+            while self._turns and self._turns[0][0] <= number:
+                _, system_id = self._turns.popleft()
+                if system_id != self._history.system_id:
+                    self._history = VehicleHistory(system_id, self._component_id, self._counts)
+            self._packets = number + 1
+            used = self._history.feed(number, stamp_us * 1000, message)
+            if used and number >= self._prune_at:  # by packets that a replay decodes as well
+                self._prune_at = number + _PRUNE_EVERY
+                self._history.prune(stamp_us * 1000 - HISTORY_NS)
+
+    def follow(self, system_id: int) -> int:
+        """Follow this vehicle from the next packet on, and forget then what was known of another vehicle.
+
+        Returns the number of that packet: a replay changes vehicles at the same packet.
+        """
+        with self._lock:
+            self._turns.append((self._packets, system_id))
+            return self._packets
+
+    def boot_clock(self, upto_packet: int | None = None) -> BootClock | None:
+        """The autopilot's clock against ours, as known from the packets below the limit; None while unknown."""
+        with self._lock:
+            return self._history.clock(self._packets if upto_packet is None else upto_packet)
+
+    def bracketed(self, utc_ns: int) -> bool:
+        """Whether samples from after this instant have arrived: waiting longer would not improve its pose.
+
+        Attitude counts only if some arrived in the last five seconds.
+        """
+        with self._lock:
+            hint = self._history.time.last_fit(self._packets)
+            if hint is not None and not self._history.reached(hint.boot_ns(utc_ns) - _HINT_NS):
+                return False  # far from it: no new fit for every packet that arrives while a frame waits
+            clock = self._history.clock(self._packets)
+            return clock is not None and self._history.reached(clock.boot_ns(utc_ns))
+
+    def settled(self, exposure: ExposureTime) -> bool:
+        """Whether waiting longer would not improve this exposure's pose.
+
+        Samples from after it have arrived, and, from an autopilot that reports the hot shoe, everything that it could
+        report about this exposure.
+        """
+        later_ns = hot_shoe.reach_ns(exposure) if self._counts.feedbacks else 0
+        return self.bracketed(exposure.utc_ns + later_ns)
+
+    def locate(self, exposure: ExposureTime, *, upto_packet: int | None = None) -> tuple[ExposureTime, Pose]:
+        """When and where a frame was exposed, from the packets below `upto_packet` (all so far).
+
+        Where the autopilot saw the hot shoe close, its time replaces the expected one (see `hot_shoe`). That time is on
+        the autopilot's own clock, as the poses are, so the error between the two machines' clocks doesn't count.
+        """
+        with self._lock:
+            limit = self._packets if upto_packet is None else upto_packet
+            clock = self._history.clock(limit)
+            events = self._history.feedbacks(limit)
+        event = None if clock is None else hot_shoe.choose(events, exposure, clock)
+        if clock is None or event is None:
+            return exposure, self.pose_at(exposure.utc_ns, exposure.sigma_ns, upto_packet=limit)
+        better, boot_ns = hot_shoe.refined(exposure, event, clock)
+        return better, self.pose_at(better.utc_ns, hot_shoe.CONTACT_SIGMA_NS, upto_packet=limit, boot_ns=boot_ns)
+
+    def pose_at(
+        self, utc_ns: int, utc_sigma_ns: float, *, upto_packet: int | None = None, boot_ns: int | None = None
+    ) -> Pose:
+        """The pose at mid-exposure, UTC ± one sigma (nanoseconds), from the packets below `upto_packet` (all so far).
+
+        Positions are interpolated over gaps up to 2.5 s, attitudes over gaps up to 1.5 s. Outside of that the nearest
+        sample up to 10 s away is used, marked "nearest", with its age in the sigma; else what is missing is None, and
+        without a position the source is "none". See `navigation.pose`.
+
+        `boot_ns`, where given, is the same instant on the autopilot's own clock; sigma is then of that.
+        """
+        with self._lock:
+            limit = self._packets if upto_packet is None else upto_packet
+            clock = self._history.clock(limit)
+            if clock is None:
+                return pose.nothing(utc_ns, limit)
+            if boot_ns is None:
+                boot_ns, sigma_ns = clock.boot_ns(utc_ns), (utc_sigma_ns**2 + clock.sigma_ns**2) ** 0.5
+            else:
+                sigma_ns = utc_sigma_ns
+            at = self._history.around(utc_ns, boot_ns, sigma_ns, limit)
+        return pose.pose(at, packets=limit, attitude_sigma_rad=self._attitude_sigma_rad)
+
+    def utc_correction(self) -> UtcCorrection | None:
+        """This machine's UTC against that of the autopilot's satellites; None while either is unknown."""
+        with self._lock:
+            clock = self._history.clock(self._packets)
+            unix_minus_boot_ns, now_boot_ns = self._history.time.unix_minus_boot_ns, self._history.time.now_boot_ns
+        if clock is None or unix_minus_boot_ns is None or now_boot_ns is None:
+            return None
+        correction_ns = unix_minus_boot_ns + now_boot_ns - clock.utc_ns(now_boot_ns)
+        return UtcCorrection(correction_ns, round(clock.sigma_ns), f"SYSTEM_TIME, clocks by {clock.source}")
+
+    def statistics(self) -> TelemetryStatistics:
+        """Counters."""
+        with self._lock:
+            counts, history = self._counts, self._history
+            return TelemetryStatistics(
+                self._packets,
+                counts.positions,
+                counts.attitudes,
+                history.time.answers_seen,
+                history.time.reboots,
+                counts.out_of_order,
+                counts.feedbacks,
+                history.gimbals.seen,
+            )
+
+
+class Navigation:
+    """Live navigation of one flight: takes packets, gives poses, and records whose telemetry counts and UTC.
+
+    `settings()` returns the current ones: `pose.wait_ms` may change in flight.
     """
 
     def __init__(
@@ -37,26 +192,33 @@ class Navigation:
         self.telemetry = Telemetry(
             component_id=now.mavlink.component_id, attitude_sigma_rad=math.radians(now.pose.attitude_sigma_deg)
         )
-        self.utc = UtcLearner(known=utc_known, note=self._learn)
-        self._vehicles = Vehicles(self.telemetry, recording.ledger.set_fact)
+        self.utc = UtcLearner(recording, known=utc_known)
+        self._vehicles: list[tuple[int, int]] = []
+        self._vehicles_noted = 0
 
     def on_packet(self, packet: Packet) -> None:
-        """A packet was received or sent. What the telemetry log doesn't hold would not be there in a replay."""
+        """Take a packet, received or sent. One outside the telemetry log is ignored: a replay wouldn't have it."""
         if packet.number is not None:
             self.telemetry.feed(packet.number, packet.stamp_us, packet.message)
 
     def belongs_to(self, system_id: int | None) -> None:
-        """Which system the camera belongs to now, None while that is open. Raises DappledError where a change can't be
-        noted; the next call tries again."""
-        self._vehicles.look(system_id)
+        """Follow the system that the camera belongs to now; None while that is undecided.
+
+        Each change is recorded for a replay. Raises DappledError when it can't be; the next call tries again.
+        """
+        if system_id is not None and (not self._vehicles or self._vehicles[-1][1] != system_id):
+            self._vehicles.append((self.telemetry.follow(system_id), system_id))
+        if self._vehicles_noted != len(self._vehicles):
+            self._recording.ledger.set_fact(_VEHICLES, self._vehicles)
+            self._vehicles_noted = len(self._vehicles)
 
     def look_for_utc(self) -> None:
-        """Whether the autopilot can tell UTC by now. Raises DappledError where it can't be noted; the next call tries
-        again."""
+        """Learn UTC from the autopilot if it is known by now. Raises DappledError when it can't be recorded; the next
+        call tries again."""
         self.utc.look(self.telemetry.utc_correction())
 
     def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
-        """The pose once telemetry from after the exposure is there, or `pose.wait_ms` after it as it is then."""
+        """The pose, once telemetry from after the exposure has arrived, or at the latest `pose.wait_ms` after it."""
         give_up_ns = min(exposure.utc_ns, self._clock.utc_ns() + AHEAD_NS) + round(self._settings().pose.wait_ms * 1e6)
         while not self.telemetry.settled(exposure) and self._clock.utc_ns() < give_up_ns:
             self._clock.wait(self._never, _LOOK_S)
@@ -66,6 +228,15 @@ class Navigation:
         """The vehicle's pose at this moment."""
         return self.telemetry.pose_at(self._clock.utc_ns(), 0.0)
 
-    def _learn(self, found: UtcCorrection) -> None:
-        log.info("UTC is %+.3f s from this machine's, by %s", found.correction_ns / 1e9, found.source)
-        self._recording.learn_utc(found.correction_ns, found.sigma_ns, found.source)
+
+def recorded_vehicles(ledger: LedgerReader) -> list[tuple[int, int]]:
+    """The vehicles that a flight followed, (number of the first telemetry packet, system id), for `Telemetry`."""
+    return [(packet, system_id) for packet, system_id in ledger.facts().get(_VEHICLES, [])]
+
+
+def first_position_utc_ns(packets: Iterable[tuple[int, int, Message]]) -> int | None:
+    """When the first known position of a log arrived (its stamp), from (number, stamp_us, message), or None."""
+    for _, stamp_us, message in packets:
+        if message.get_type() == "GLOBAL_POSITION_INT" and (message.lat or message.lon):
+            return stamp_us * 1000
+    return None

@@ -20,6 +20,8 @@ from dappled.decode.geometry.interpolation import (
 from dappled.decode.geometry.pose import Gnss, Pose, Quaternion, Symmetric, Vector3
 
 NEAREST_NS = 10 * 10**9
+# A single-frequency receiver under open sky, where it reports a dilution only; GPS_FIX_TYPE → metres for each unit.
+METRES_PER_DOP = {2: 2.5, 3: 2.5, 4: 1.0, 5: 0.3, 6: 0.02, 7: 0.02, 8: 0.05}
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +69,8 @@ def pose(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) -> Pose:
     age_s = min(abs(sample.boot_ns - at.boot_ns) for sample in at.positions) / 1e9
     blur_s = sigma_s if len(at.positions) == 2 else math.hypot(sigma_s, age_s)
     north, east, down = found.velocity_ned_m_s
-    across_m = at.gnss.horizontal_sigma_m if at.gnss else None
-    upright_m = at.gnss.vertical_sigma_m if at.gnss else None
+    across_m = _receiver_sigma_m(at.gnss, at.gnss.horizontal_accuracy_m, at.gnss.hdop) if at.gnss else None
+    upright_m = _receiver_sigma_m(at.gnss, at.gnss.vertical_accuracy_m, at.gnss.vdop) if at.gnss else None
     covariance = None
     if across_m is not None and upright_m is not None:
         across = (across_m**2 + across_doubt_m**2) / 2  # of each axis
@@ -188,3 +190,9 @@ def _gnss(at: Around) -> Gnss | None:
         return None
     told = {name: value for name, value in asdict(at.gnss).items() if name not in ("number", "stamp_ns")}
     return Gnss(**told, age_ms=abs(at.utc_ns - at.gnss.stamp_ns) / 1e6)
+
+
+def _receiver_sigma_m(receiver: GnssSample, accuracy_m: float | None, dilution: float | None) -> float | None:
+    """The receiver's own accuracy, else what its dilution of precision suggests."""
+    each_m = METRES_PER_DOP.get(receiver.fix_type)
+    return accuracy_m or (None if dilution is None or each_m is None else dilution * each_m)

@@ -10,8 +10,6 @@ from dappled.decode.geometry.pose import Quaternion, Vector3
 from dappled.drivers.mavlink.links import Message, mavlink
 
 HALF_MS_NS = 500_000  # time_boot_ms is cut to whole milliseconds: its middle is meant
-# A single-frequency receiver under open sky, where it reports a dilution only; GPS_FIX_TYPE → metres for each unit.
-METRES_PER_DOP = {2: 2.5, 3: 2.5, 4: 1.0, 5: 0.3, 6: 0.02, 7: 0.02, 8: 0.05}
 GIMBAL_COMPONENTS = frozenset({1, 154, 171, 172, 173, 174, 175})  # an autopilot speaks for a gimbal without MAVLink
 _EARTH = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
 _VEHICLE = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
@@ -58,20 +56,6 @@ class GnssSample:
     horizontal_accuracy_m: float | None
     vertical_accuracy_m: float | None
     velocity_accuracy_m_s: float | None
-
-    @property
-    def horizontal_sigma_m(self) -> float | None:
-        """The receiver's own accuracy, else what its dilution of precision lets expect."""
-        return self.horizontal_accuracy_m or self._expected_m(self.hdop)
-
-    @property
-    def vertical_sigma_m(self) -> float | None:
-        """As `horizontal_sigma_m`."""
-        return self.vertical_accuracy_m or self._expected_m(self.vdop)
-
-    def _expected_m(self, dilution: float | None) -> float | None:
-        each_m = METRES_PER_DOP.get(self.fix_type)
-        return None if dilution is None or each_m is None else dilution * each_m
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,23 +1,45 @@
-"""Does this machine know UTC? Where it doesn't, the autopilot's satellites tell it later; nothing is stamped anew."""
+"""Decide whether this machine's UTC can be believed, and learn it from the autopilot's satellites where it can't.
+
+Stamps already written stay as they are; the correction is recorded beside them.
+"""
 
 from __future__ import annotations
 
 import ctypes
+import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
-from dappled.daemon.navigation.telemetry import UtcCorrection
-
+log = logging.getLogger(__name__)
 FLOOR_NS = 1_735_689_600 * 10**9  # 2025: a clock that shows less has never been set
 _BETTER = 2
-_AGREES_NS = 10**9  # what clocks may differ by before it is told
+_AGREES_NS = 10**9  # clocks that differ by less are not reported
 _TIMEX_BYTES = 512  # more than any kernel's struct timex
 
 
+@dataclass(frozen=True, slots=True)
+class UtcCorrection:
+    """What to add to this machine's UTC to get the autopilot's (from its satellites), ± 1 σ."""
+
+    correction_ns: int
+    sigma_ns: int
+    source: str
+
+
+class UtcNotes(Protocol):
+    """Where a correction is recorded; see `flight.recording.Recording`."""
+
+    def learn_utc(self, correction_ns: int, sigma_ns: int, source: str) -> None: ...
+
+
 def system_knows(utc_ns: int, *, synchronised: Callable[[], bool] | None = None, root: Path = Path("/")) -> bool:
-    """Whether the machine's time of day is to be believed: set at all; and kept by the network, by a clock of its own
-    that runs while it is off, or by a host. A single-board computer without either shows when it was last switched off.
-    A service may not ask the kernel (`ProtectClock=`): systemd-timesyncd's mark is looked for as well.
+    """Whether the machine's time of day can be believed: it was set, and is kept by the network, by a hardware clock
+    that runs while the machine is off, or by a host.
+
+    A single-board computer without these shows the time of its last shutdown. A systemd service with `ProtectClock=`
+    may not ask the kernel, so systemd-timesyncd's mark counts as well.
     """
     if utc_ns < FLOOR_NS:
         return False
@@ -28,7 +50,7 @@ def system_knows(utc_ns: int, *, synchronised: Callable[[], bool] | None = None,
 
 
 def kernel_synchronised() -> bool:
-    """Whether the kernel's clock is disciplined (adjtimex(2)): False where that can't be asked."""
+    """Whether the kernel's clock is synchronised (adjtimex(2)); False where the kernel can't be asked."""
     try:
         adjtimex = ctypes.CDLL(None, use_errno=True).adjtimex
     except (OSError, AttributeError):
@@ -38,33 +60,34 @@ def kernel_synchronised() -> bool:
 
 
 def known(setting: str, utc_ns: int) -> bool:
-    """As `record.utc` has it: system, autopilot (not known until it tells), or auto."""
+    """Whether UTC is known by the setting `record.utc`: system, autopilot (only once it reports UTC), or auto."""
     return setting == "system" or (setting == "auto" and system_knows(utc_ns))
 
 
 class UtcLearner:
-    """Notes the autopilot's word once there is one, and again when it is twice as sure.
+    """Records the autopilot's UTC once it is known, and again when it is twice as precise.
 
-    Where the machine's own clock is believed nothing is noted; that they differ is told.
+    Where the machine's own clock is believed nothing is recorded; `doubt` reports a difference.
     """
 
-    def __init__(self, *, known: bool, note: Callable[[UtcCorrection], object]) -> None:
-        self._known, self._note = known, note
+    def __init__(self, notes: UtcNotes, *, known: bool) -> None:
+        self._known, self._notes = known, notes
         self.learnt: UtcCorrection | None = None
         self._last: UtcCorrection | None = None
 
     @property
     def known(self) -> bool:
-        """Whether the stamps of this flight can be told as UTC."""
+        """Whether the stamps of this flight can be converted to UTC."""
         return self._known or self.learnt is not None
 
     def look(self, found: UtcCorrection | None) -> None:
-        """What telemetry says now. Raises DappledError when it can't be noted; the next look tries again."""
+        """Take what telemetry says now. Raises DappledError when it can't be recorded; the next call tries again."""
         self._last = found or self._last
         if self._known or found is None:
             return
         if self.learnt is None or found.sigma_ns * _BETTER <= self.learnt.sigma_ns:
-            self._note(found)
+            log.info("UTC is %+.3f s from this machine's, by %s", found.correction_ns / 1e9, found.source)
+            self._notes.learn_utc(found.correction_ns, found.sigma_ns, found.source)
             self.learnt = found
 
     def doubt(self) -> str | None:

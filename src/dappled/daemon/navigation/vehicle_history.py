@@ -1,29 +1,69 @@
-"""What the packets of one vehicle told, in order: samples of position, attitude, receiver, gimbal and hot shoe."""
+"""Collect the telemetry of one vehicle, packet by packet: samples, the autopilot's time, the gimbal.
+
+The state is a fold over packets (number, stamp, message), so a replay that feeds the same packets has the same state.
+"""
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 from dappled.daemon.navigation import hot_shoe
 from dappled.daemon.navigation import samples as telemetry_samples
-from dappled.daemon.navigation.autopilot_time import AutopilotTime
-from dappled.daemon.navigation.boot_clock import BootClock
-from dappled.daemon.navigation.gimbals import Gimbals
-from dappled.daemon.navigation.history import around, between, keep, prune
-from dappled.daemon.navigation.hot_shoe import Feedback
+from dappled.daemon.navigation.boot_clock import BootClock, TimesyncAnswer, from_arrivals, from_timesync
+from dappled.daemon.navigation.hot_shoe import EPOCH_US, Feedback
 from dappled.daemon.navigation.pose import NEAREST_NS, Around
-from dappled.daemon.navigation.samples import AttitudeSample, GnssSample, PositionSample
+from dappled.daemon.navigation.samples import (
+    GIMBAL_COMPONENTS,
+    HALF_MS_NS,
+    AttitudeSample,
+    GimbalSample,
+    GnssSample,
+    PositionSample,
+)
 from dappled.drivers.mavlink.links import Message
 
 POSITION_GAP_NS = 2_500_000_000
 ATTITUDE_GAP_NS = 1_500_000_000
+GIMBAL_GAP_NS = 1_500_000_000
+TIMESYNC_WINDOW_NS = 120 * 10**9
+ARRIVAL_WINDOW_NS = 60 * 10**9
+REBOOT_BACK_NS = 2 * 10**9
+REBOOT_CONFIRM_NS = 500_000_000
+MOST_SAMPLES = 2**16  # of one kind: three minutes at 360 Hz, more than any autopilot sends
 _ALIVE_NS = 5 * 10**9
+_REQUESTS_KEPT = 64
+_BOOTS_KEPT = 8
+_AUTOPILOT = 1
+_FitKey = tuple[str | int, ...]  # what a fit was made from: its kind, the boot's first packet, the last packets
+
+
+class Numbered(Protocol):
+    """Something from one packet of the telemetry log: its running number, and when it arrived."""
+
+    @property
+    def number(self) -> int: ...
+
+    @property
+    def stamp_ns(self) -> int: ...
+
+
+class Sample(Numbered, Protocol):
+    """Something that also has the vehicle's own time."""
+
+    @property
+    def boot_ns(self) -> int: ...
+
+
+N = TypeVar("N", bound=Numbered)
+S = TypeVar("S", bound=Sample)
 
 
 @dataclass(slots=True)
 class Counts:
-    """What was taken of all vehicles so far, and what came out of order."""
+    """How much of all vehicles was used so far, and how much came out of order."""
 
     positions: int = 0
     attitudes: int = 0
@@ -31,9 +71,163 @@ class Counts:
     out_of_order: int = 0
 
 
+class AutopilotTime:
+    """The autopilot's reboots, its answers to TIMESYNC, and what it says of UTC.
+
+    `component_id` is our own: a TIMESYNC request from it whose `ts1` is our UTC is ours, and an answer with the same
+    `ts1` answers it; all others belong to other programs.
+
+    The clock depends only on the packets below a limit. The last fit is kept, so asking again costs nothing while no
+    better observation has arrived.
+    """
+
+    def __init__(self, component_id: int) -> None:
+        self._component_id = component_id
+        self._answers: list[TimesyncAnswer] = []
+        self._requests: dict[int, int] = {}
+        self._boots: list[int] = [0]  # packet numbers at which the autopilot's time began anew
+        self._back_since_ns: int | None = None
+        self._fitted: tuple[_FitKey | None, BootClock | None] = (None, None)
+        self.now_boot_ns: int | None = None
+        self.unix_minus_boot_ns: int | None = None
+        self.answers_seen = self.reboots = 0
+
+    def believe(self, number: int, stamp_ns: int, boot_ns: int) -> bool:
+        """Whether a packet's time since boot is plausible.
+
+        A reboot is a time more than 2 s behind for half a second without a packet to the contrary; a late packet on a
+        slow second link is not a reboot.
+        """
+        if self.now_boot_ns is not None and boot_ns < self.now_boot_ns - REBOOT_BACK_NS:
+            if self._back_since_ns is None:
+                self._back_since_ns = stamp_ns
+            if stamp_ns - self._back_since_ns < REBOOT_CONFIRM_NS:
+                return False
+            self._boots.append(number)
+            self.reboots += 1
+            self._requests.clear()
+            self.unix_minus_boot_ns = None
+            self.now_boot_ns = boot_ns
+        self._back_since_ns = None
+        self.now_boot_ns = boot_ns if self.now_boot_ns is None else max(self.now_boot_ns, boot_ns)
+        return True
+
+    def first(self, limit: int) -> int:
+        """The packet number at which the boot began that was current below `limit`."""
+        return self._boots[max(0, bisect_left(self._boots, limit) - 1)]
+
+    def system_time(self, message: Message) -> None:
+        """Take a SYSTEM_TIME of the autopilot."""
+        if message.time_unix_usec > EPOCH_US and message.time_boot_ms > 0:
+            self.unix_minus_boot_ns = message.time_unix_usec * 1000 - (message.time_boot_ms * 10**6 + HALF_MS_NS)
+
+    def timesync(self, number: int, stamp_ns: int, message: Message, *, from_autopilot: bool) -> None:
+        """Take a TIMESYNC, request or answer."""
+        if message.tc1 == 0:
+            if message.get_srcComponent() == self._component_id and 0 <= stamp_ns - message.ts1 < 10**9:
+                self._requests[message.ts1] = stamp_ns
+                if len(self._requests) > _REQUESTS_KEPT:
+                    self._requests.pop(next(iter(self._requests)))
+            return
+        if message.ts1 not in self._requests or not from_autopilot:
+            return
+        answer = TimesyncAnswer(number, message.ts1, stamp_ns, message.tc1)
+        if answer.delay_ns < 0:
+            return
+        if self.now_boot_ns is not None and message.tc1 < self.now_boot_ns - REBOOT_BACK_NS:
+            return  # from before or after a reboot that the telemetry has yet to show
+        del self._requests[message.ts1]  # the same answer on a second link is no second observation
+        self.answers_seen += 1
+        self._answers.append(answer)
+
+    def clock(self, limit: int, histories: Sequence[Sequence[Sample]]) -> BootClock | None:
+        """The autopilot's clock against ours, from the packets below `limit`; None while unknown.
+
+        By TIMESYNC where there are answers, else by when the samples of `histories` arrived.
+        """
+        first = self.first(limit)
+        answers = _between(self._answers, first, limit)
+        if answers:
+            by_timesync: _FitKey = ("timesync", first, answers[-1].number)
+            clock = self._fit(by_timesync, lambda: from_timesync(_last(answers, TIMESYNC_WINDOW_NS)))
+            if clock is not None:
+                return clock
+        tails = [_last(_between(one, first, limit), ARRIVAL_WINDOW_NS) for one in histories]
+        key: _FitKey = ("arrival", first, *(tail[-1].number for tail in tails if tail))
+        return self._fit(key, lambda: from_arrivals([(one.boot_ns, one.stamp_ns) for tail in tails for one in tail]))
+
+    def _fit(self, key: _FitKey, make: Callable[[], BootClock | None]) -> BootClock | None:
+        if self._fitted[0] != key:
+            self._fitted = (key, make())
+        return self._fitted[1]
+
+    def last_fit(self, limit: int) -> BootClock | None:
+        """The clock as it was last fitted, perhaps from older packets of this boot: a hint that costs nothing."""
+        key, fitted = self._fitted
+        return fitted if key is not None and key[1] == self.first(limit) else None
+
+    def prune(self, before_ns: int) -> None:
+        """Forget what came before."""
+        _prune(self._answers, before_ns)
+        del self._boots[:-_BOOTS_KEPT]
+
+
+class Gimbals:
+    """Attitudes of the first gimbal heard. MOUNT_ORIENTATION counts until it sends the modern message."""
+
+    def __init__(self) -> None:
+        self._samples: list[GimbalSample] = []
+        self.seen = 0
+
+    def feed(self, number: int, stamp_ns: int, message: Message) -> None:
+        """Take a packet of the vehicle's system. A sample with an older time is a late copy, or a gimbal that
+        restarted."""
+        if message.get_srcComponent() not in GIMBAL_COMPONENTS:
+            return
+        before = self._samples[-1] if self._samples else None
+        sample = telemetry_samples.gimbal(number, stamp_ns, message, before.epoch if before else 0)
+        if sample is None:
+            return
+        if before is not None:
+            modern = sample.kind != "MOUNT_ORIENTATION" and before.kind == "MOUNT_ORIENTATION"
+            same = (before.component, before.kind) == (sample.component, sample.kind)
+            restarted = sample.boot_ns < before.boot_ns - NEAREST_NS
+            if not (modern or (same and (restarted or sample.boot_ns > before.boot_ns))):
+                return
+            if modern or restarted:
+                sample = telemetry_samples.gimbal(number, stamp_ns, message, before.epoch + 1)
+                assert sample is not None
+        self.seen += 1
+        _keep(self._samples, sample)
+
+    def around(self, utc_ns: int, boot_ns: int, first: int, limit: int) -> tuple[tuple[GimbalSample, ...], int]:
+        """The samples around an instant from the packets below `limit`, and the instant on the gimbal's clock.
+
+        `boot_ns` is the instant on the autopilot's clock, which began at packet `first`. A gimbal's clock need not be
+        the autopilot's.
+        """
+        known = _between(self._samples, 0, limit)
+        if not known:
+            return (), boot_ns
+        if known[-1].component == _AUTOPILOT:
+            known = _between(known, first, limit)
+        samples = [sample for sample in known if sample.epoch == known[-1].epoch]
+        if samples and samples[0].component != _AUTOPILOT:
+            clock = from_arrivals([(one.boot_ns, one.stamp_ns) for one in _last(samples, ARRIVAL_WINDOW_NS)])
+            assert clock is not None
+            boot_ns = clock.boot_ns(utc_ns)
+        return _around(samples, boot_ns, gap_ns=GIMBAL_GAP_NS), boot_ns
+
+    def prune(self, before_ns: int) -> None:
+        """Forget what came before."""
+        _prune(self._samples, before_ns)
+
+
 class VehicleHistory:
-    """A fold over packets (number, stamp, message). `system_id` is whose: None for the first autopilot (component 1)
-    that is heard. `component_id` is our own (see AutopilotTime). One thread at a time.
+    """Samples of position, attitude, receiver, gimbal and hot shoe of one vehicle.
+
+    `system_id` is the vehicle's: None for the first autopilot (component 1) that is heard. `component_id` is our own
+    (see AutopilotTime). Not thread-safe.
     """
 
     def __init__(self, system_id: int | None, component_id: int, counts: Counts) -> None:
@@ -46,7 +240,7 @@ class VehicleHistory:
         self._feedbacks: list[Feedback] = []
 
     def feed(self, number: int, stamp_ns: int, message: Message) -> bool:
-        """One packet; False for a kind of no interest. One of another vehicle changes nothing."""
+        """Take a packet; False for a message type that isn't used. A packet of another vehicle changes nothing."""
         handler = _HANDLERS.get(message.get_type())
         if handler is not None:
             handler(self, number, stamp_ns, message)
@@ -54,10 +248,10 @@ class VehicleHistory:
 
     def prune(self, before_ns: int) -> None:
         """Forget what came before."""
-        prune(self._positions, before_ns)
-        prune(self._attitudes, before_ns)
-        prune(self._receiver, before_ns)
-        prune(self._feedbacks, before_ns)
+        _prune(self._positions, before_ns)
+        _prune(self._attitudes, before_ns)
+        _prune(self._receiver, before_ns)
+        _prune(self._feedbacks, before_ns)
         self.gimbals.prune(before_ns)
         self.time.prune(before_ns)
 
@@ -66,11 +260,11 @@ class VehicleHistory:
         return self.time.clock(limit, (self._positions, self._attitudes))
 
     def feedbacks(self, limit: int) -> Sequence[Feedback]:
-        """What was told of the hot shoe, from the packets below `limit` since the autopilot's last boot."""
-        return between(self._feedbacks, self.time.first(limit), limit)
+        """Messages about the hot shoe, from the packets below `limit` since the autopilot's last boot."""
+        return _between(self._feedbacks, self.time.first(limit), limit)
 
     def reached(self, boot_ns: int) -> bool:
-        """Whether samples from after this instant have arrived. Attitude counts only if there was any in the last five
+        """Whether samples from after this instant have arrived. Attitude counts only if some arrived in the last five
         seconds."""
         positions, attitudes = self._positions[-1:], self._attitudes[-1:]
         if not positions or positions[0].boot_ns < boot_ns:
@@ -79,9 +273,9 @@ class VehicleHistory:
         return not alive or attitudes[0].boot_ns >= boot_ns
 
     def around(self, utc_ns: int, boot_ns: int, sigma_ns: float, limit: int) -> Around:
-        """What the packets below `limit` tell of an instant, which is `boot_ns` ± sigma on the autopilot's clock."""
+        """The samples around an instant (`boot_ns` ± σ on the autopilot's clock), from the packets below `limit`."""
         first = self.time.first(limit)
-        receiver = between(self._receiver, first, limit)
+        receiver = _between(self._receiver, first, limit)
         nearest = min(receiver, key=lambda sample: abs(sample.stamp_ns - utc_ns), default=None)
         if nearest is not None and abs(nearest.stamp_ns - utc_ns) > NEAREST_NS:
             nearest = None
@@ -90,8 +284,8 @@ class VehicleHistory:
             utc_ns,
             boot_ns,
             sigma_ns,
-            around(between(self._positions, first, limit), boot_ns, gap_ns=POSITION_GAP_NS, nearest_ns=NEAREST_NS),
-            around(between(self._attitudes, first, limit), boot_ns, gap_ns=ATTITUDE_GAP_NS, nearest_ns=NEAREST_NS),
+            _around(_between(self._positions, first, limit), boot_ns, gap_ns=POSITION_GAP_NS),
+            _around(_between(self._attitudes, first, limit), boot_ns, gap_ns=ATTITUDE_GAP_NS),
             nearest,
             gimbals,
             gimbal_boot_ns,
@@ -101,17 +295,17 @@ class VehicleHistory:
         sample = telemetry_samples.position(number, stamp_ns, message)
         if sample is not None and self._believed(sample, message, self._positions):
             self.counts.positions += 1
-            keep(self._positions, sample)
+            _keep(self._positions, sample)
 
     def _attitude(self, number: int, stamp_ns: int, message: Message) -> None:
         sample = telemetry_samples.attitude(number, stamp_ns, message)
         if sample is not None and self._believed(sample, message, self._attitudes):
             self.counts.attitudes += 1
-            keep(self._attitudes, sample)
+            _keep(self._attitudes, sample)
 
     def _gnss(self, number: int, stamp_ns: int, message: Message) -> None:
         if self._ours(message):
-            keep(self._receiver, telemetry_samples.gnss(number, stamp_ns, message))
+            _keep(self._receiver, telemetry_samples.gnss(number, stamp_ns, message))
 
     def _gimbal(self, number: int, stamp_ns: int, message: Message) -> None:
         if message.get_srcSystem() == self.system_id:
@@ -131,7 +325,7 @@ class VehicleHistory:
         if boot_ns is None or now_ns is None or abs(boot_ns - now_ns) > NEAREST_NS:
             return
         self.counts.feedbacks += 1
-        keep(self._feedbacks, Feedback(number, stamp_ns, boot_ns, message.get_type()))
+        _keep(self._feedbacks, Feedback(number, stamp_ns, boot_ns, message.get_type()))
 
     def _ours(self, message: Message) -> bool:
         if message.get_srcComponent() != 1:
@@ -146,7 +340,7 @@ class VehicleHistory:
         message: Message,
         samples: list[PositionSample] | list[AttitudeSample],
     ) -> bool:
-        """Not another vehicle's, not from before a reboot, not a copy, not out of order."""
+        """Whether a sample counts: our vehicle's, from after the last reboot, no copy, not out of order."""
         if not self._ours(message) or not self.time.believe(sample.number, sample.stamp_ns, sample.boot_ns):
             return False
         if samples and samples[-1].number >= self.time.first(sample.number + 1):
@@ -169,3 +363,46 @@ _HANDLERS: dict[str, Callable[[VehicleHistory, int, int, Message], None]] = {
     "CAMERA_FEEDBACK": VehicleHistory._feedback,
     "CAMERA_TRIGGER": VehicleHistory._feedback,
 }
+
+
+def _between(history: Sequence[N], first: int, limit: int) -> Sequence[N]:
+    """Those of the packets first <= number < limit."""
+    return history[_place(history, first) : _place(history, limit)]
+
+
+def _place(history: Sequence[Numbered], number: int) -> int:
+    """Where packet `number` would stand."""
+    return bisect_left(history, number, key=lambda sample: sample.number)
+
+
+def _last(history: Sequence[N], window_ns: int) -> Sequence[N]:
+    """Those that arrived in the last `window_ns` before the last one."""
+    if not history:
+        return history
+    since = history[-1].stamp_ns - window_ns
+    return history[bisect_left(history, since, key=lambda sample: sample.stamp_ns) :]
+
+
+def _around(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[S, ...]:
+    """The two samples around an instant, not more than `gap_ns` apart; or the nearest one, if it is near enough; or
+    none. `boot_ns` of the history must rise."""
+    at = bisect_left(history, boot_ns, key=lambda sample: sample.boot_ns)
+    sides = tuple(history[max(0, at - 1) : at + 1])
+    if len(sides) == 2 and sides[1].boot_ns - sides[0].boot_ns <= gap_ns:
+        return sides
+    nearest = min(sides, key=lambda sample: abs(sample.boot_ns - boot_ns), default=None)
+    if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS:
+        return ()
+    return (nearest,)
+
+
+def _keep(history: list[N], sample: N) -> None:
+    """Append. `_prune` bounds a history by time; this bounds it by number, in a flood of messages."""
+    history.append(sample)
+    if len(history) > MOST_SAMPLES:
+        del history[: MOST_SAMPLES // 4]
+
+
+def _prune(history: list[N], before_ns: int) -> None:
+    """Forget what came before."""
+    del history[: bisect_left(history, before_ns, key=lambda sample: sample.stamp_ns)]

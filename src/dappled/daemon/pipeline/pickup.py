@@ -16,7 +16,7 @@ from statistics import median
 from typing import Any
 
 from dappled.config import settings as configuration
-from dappled.daemon.navigation import vehicles
+from dappled.daemon.navigation.navigation import recorded_vehicles
 from dappled.daemon.pipeline import tagger
 from dappled.daemon.pipeline.tagger import BodyLatency, Zoom
 from dappled.daemon.replay.replay import RecordedTelemetry
@@ -125,7 +125,7 @@ def bring(
     names = facts.get("names", {})
     latency = BodyLatency.of(settings.camera)
     with LedgerReader.open(folder.ledger) as reader:
-        turns = vehicles.of_flight(reader)
+        turns = recorded_vehicles(reader)
     log = folder.telemetry if folder.telemetry.is_file() else None
     telemetry = RecordedTelemetry.flown(settings, log, {}, turns)
     frames: list[Frame] = []

@@ -13,8 +13,7 @@ from typing import Self
 
 from dappled.clock import RecordedClock
 from dappled.config.settings import Settings
-from dappled.daemon.navigation import vehicles
-from dappled.daemon.navigation.telemetry import Telemetry, first_position_utc_ns
+from dappled.daemon.navigation.navigation import Telemetry, first_position_utc_ns, recorded_vehicles
 from dappled.daemon.pipeline.flight_writer import Expected, ReplayVerifier
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
@@ -57,7 +56,7 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
         digests = {table: ledger.digests(table) for table in ("poses", "tags")}
         results = ledger.results(run)
         events = [event for event in ledger.events() if event.index is not None]
-        turns = vehicles.of_flight(ledger)
+        turns = recorded_vehicles(ledger)
     told: dict[int | None, dict[str, str]] = defaultdict(dict)
     for event in events:
         told[event.index][event.kind] = event.text
