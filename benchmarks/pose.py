@@ -30,7 +30,7 @@ from dappled.daemon.navigation.vehicle_history import ATTITUDE_GAP_NS, POSITION_
 from dappled.daemon.pipeline.tagger import BodyLatency, ExposureTime, mid_exposure
 from dappled.decode.geometry.interpolation import metres_per_radian, turn_rad
 from dappled.decode.geometry.pose import Pose
-from dappled.drivers.mavlink.links import Decoder, Message, mavlink
+from dappled.drivers.mavlink.links import Message, PacketParser, mavlink
 from dappled.flight import telemetry_log
 from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
 from dappled.mocks.autopilot.path import FlightPath
@@ -144,7 +144,7 @@ def _left_out(
 
 def _samples(log: File) -> tuple[list[PositionSample], list[AttitudeSample]]:
     """All positions and attitudes of the autopilot, once each."""
-    decode = Decoder()
+    decode = PacketParser()
     positions: list[PositionSample] = []
     attitudes: list[AttitudeSample] = []
     for number, stamp_us, raw in telemetry_log.read(log):

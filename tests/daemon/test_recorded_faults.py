@@ -14,7 +14,7 @@ from dappled.daemon.navigation.navigation import Telemetry
 from dappled.daemon.pipeline import tagger
 from dappled.daemon.pipeline.tagger import BodyLatency, FrameSettings
 from dappled.decode.geometry.pose import Pose
-from dappled.drivers.mavlink.links import Decoder, Message, mavlink
+from dappled.drivers.mavlink.links import Message, PacketParser, mavlink
 from dappled.flight import Cause, LedgerReader, Result, Shot, recording
 from dappled.flight.check import check
 from dappled.mocks.autopilot.autopilot import BootTime, flight
@@ -48,7 +48,7 @@ def with_a_reboot() -> Packets:
 def fly(flights: Path, packets: Packets, exposures_s: list[float]) -> Path:
     """Record what the daemon would: every packet, and a frame for each trigger call, tagged 0.4 s afterwards."""
     begun = recording.begin(flights, lambda: START_NS)
-    decode = Decoder()
+    decode = PacketParser()
     telemetry, waiting = Telemetry(), list(enumerate(exposures_s))
 
     def shoot(index: int, called_s: float) -> None:

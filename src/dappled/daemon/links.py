@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
 from dappled.clock import Clock
 from dappled.config.schema import ConfigError
 from dappled.config.settings import Settings
-from dappled.drivers.mavlink.links import MavlinkLinks, Packet
-from dappled.drivers.mavlink.signing import Signing, Unsigned, signing
+from dappled.drivers.mavlink.links import MavlinkLinks
+from dappled.drivers.mavlink.signing import Signing, Unsigned, open_signing
 
 TIME_FILE = ".mavlink-signing"
 
 
-def configured(
-    settings: Settings, clock: Clock, *, tap: Callable[[int, bytes], int], on_packet: Callable[[Packet], None]
-) -> MavlinkLinks:
+def configured(settings: Settings, clock: Clock) -> MavlinkLinks:
     """All links of the settings, not yet open. Raises ConfigError, LinkError, SigningError."""
     wanted = settings.mavlink
     return MavlinkLinks(
         wanted.url,
         system_id=wanted.system_id,
         component_id=wanted.component_id,
-        tap=tap,
-        on_packet=on_packet,
         clock=clock,
         signing=_signing(settings, clock),
     )
@@ -40,4 +35,4 @@ def _signing(settings: Settings, clock: Clock) -> Signing | None:
     each = keys * links if len(keys) == 1 else keys or ("",) * links
     files = [Path(key) if key else None for key in each]
     time_file = Path(settings.record.directory) / TIME_FILE
-    return signing(files, time_file, clock, cast(Unsigned, settings.mavlink.unsigned))
+    return open_signing(files, time_file, clock, cast(Unsigned, settings.mavlink.unsigned))

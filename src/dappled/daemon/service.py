@@ -79,7 +79,7 @@ class Service:
             self._open_sockets(door.private if door else "", stack)
             kept = self._begin_recording(camera, names, recipe, stack)
             self._begin_parts(names, stack)
-            self._links.start()
+            self._links.start(self)
             if door:
                 self.console_url = door.url
                 console_process.begin(door, self.settings, stack, recipe=kept, act=self._act, logbook=self._logbook)
@@ -100,7 +100,7 @@ class Service:
             private=private,
         )
         stack.callback(self._publisher.stop)
-        self._links = links.configured(self.settings, self._clock, tap=self._log_packet, on_packet=self._packet)
+        self._links = links.configured(self.settings, self._clock)
         self._links.open()
         stack.callback(self._links.stop)
 
@@ -273,10 +273,12 @@ class Service:
     def _answer(self, request: Mapping[str, Any], reply: Reply) -> None:
         self._parts.answers.answer(request, reply)
 
-    def _log_packet(self, stamp_us: int, raw: bytes) -> int:
+    def log_packet(self, stamp_us: int, raw: bytes) -> int:
+        """See `PacketSink`."""
         return self._recording.telemetry.append(stamp_us, raw)
 
-    def _packet(self, packet: Packet) -> None:
+    def on_packet(self, packet: Packet) -> None:
+        """See `PacketSink`."""
         self._parts.on_packet(packet)
 
     def _order(self, number: int, parameters: Sequence[float]) -> str | None:

@@ -15,8 +15,7 @@ from dappled.daemon.camera_protocol.component import CameraFacts, Captured, Comp
 from dappled.daemon.navigation.navigation import Telemetry
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Setting, SettingName
-from dappled.drivers.mavlink.framing import pack
-from dappled.drivers.mavlink.links import MavlinkLinks, Message, Packet, mavlink
+from dappled.drivers.mavlink.links import MavlinkLinks, Message, Packet, mavlink, pack
 from dappled.drivers.mavlink.signing import Signing
 from dappled.flight import Cause
 from tests.daemon.fakes import eventually
@@ -53,8 +52,6 @@ class Camera:
             urls,
             system_id=1,
             component_id=100,
-            tap=self._tap,
-            on_packet=self._on_packet,
             clock=self.clock,
             signing=signing,
         )
@@ -79,7 +76,7 @@ class Camera:
         self._worker = threading.Thread(target=self._work)
 
     def __enter__(self) -> Camera:
-        self.links.start()
+        self.links.start(self)
         self.shutter.start()
         self._worker.start()
         return self
@@ -120,11 +117,11 @@ class Camera:
     def change(self, name: SettingName, value: str) -> None:
         """Never done: the body is deaf."""
 
-    def _tap(self, stamp_us: int, raw: bytes) -> int:
+    def log_packet(self, stamp_us: int, raw: bytes) -> int:
         self.logged += 1
         return self.logged - 1
 
-    def _on_packet(self, packet: Packet) -> None:
+    def on_packet(self, packet: Packet) -> None:
         assert packet.number is not None
         self.telemetry.feed(packet.number, packet.stamp_us, packet.message)
         self.component.on_packet(packet)

@@ -14,8 +14,7 @@ from dappled.daemon.camera_protocol.camera_settings import Knobs, OwnKnob, code
 from dappled.daemon.camera_protocol.component import CameraFacts, Captured, Component, Storage
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Setting, SettingName, check_change
-from dappled.drivers.mavlink.framing import pack
-from dappled.drivers.mavlink.links import Message, Packet, mavlink
+from dappled.drivers.mavlink.links import Message, Packet, mavlink, pack
 
 NAN = math.nan
 GCS = (255, 190)

@@ -22,8 +22,7 @@ from hypothesis import strategies as st
 
 from dappled.clock import SystemClock
 from dappled.drivers.mavlink import signing as mavlink_signing
-from dappled.drivers.mavlink.framing import Framer
-from dappled.drivers.mavlink.links import Packet, mavlink
+from dappled.drivers.mavlink.links import Framer, Packet, mavlink
 from dappled.drivers.mavlink.signing import Unsigned
 from tests.daemon.camera_protocol.rig import Camera, Peer
 from tests.daemon.camera_protocol.test_component import Rig
@@ -228,7 +227,7 @@ def test_an_autopilot_that_boots_again_is_followed_and_fires_nothing_by_that() -
 @pytest.mark.parametrize("unsigned", ["refuse", "listen"])
 def test_forged_replayed_and_unsigned_packets_fire_nothing_on_a_signed_link(tmp_path: Path, unsigned: Unsigned) -> None:
     mavlink_signing.make_key(tmp_path / "key")
-    signing = mavlink_signing.signing([tmp_path / "key"], tmp_path / "time", SystemClock(), unsigned)
+    signing = mavlink_signing.open_signing([tmp_path / "key"], tmp_path / "time", SystemClock(), unsigned)
     key = mavlink_signing.read_key(tmp_path / "key")
     with Camera(signing=signing) as camera, Peer(camera.links.port(0)) as gcs:
         port = camera.links.port(0)
@@ -266,7 +265,7 @@ def test_forged_replayed_and_unsigned_packets_fire_nothing_on_a_signed_link(tmp_
 def test_a_station_with_a_wrong_clock_is_taken_once_it_has_heard_the_camera(tmp_path: Path, clock_off_s: int) -> None:
     mavlink_signing.make_key(tmp_path / "key")
     key = mavlink_signing.read_key(tmp_path / "key")
-    signing = mavlink_signing.signing([tmp_path / "key"], tmp_path / "time", SystemClock())
+    signing = mavlink_signing.open_signing([tmp_path / "key"], tmp_path / "time", SystemClock())
     with Camera(signing=signing) as camera:
         for system, off_s in ((255, clock_off_s), (254, 0)):  # the second with the right clock, whatever the first had
             with Peer(camera.links.port(0), system) as station:

@@ -19,7 +19,7 @@ from dappled.daemon.navigation.navigation import HISTORY_NS, Telemetry, first_po
 from dappled.daemon.navigation.vehicle_history import MOST_SAMPLES
 from dappled.decode.geometry.interpolation import from_euler, hermite, metres_per_radian, normalised, slerp, turn_rad
 from dappled.decode.geometry.pose import Pose
-from dappled.drivers.mavlink.links import Decoder, Message, mavlink
+from dappled.drivers.mavlink.links import Message, PacketParser, mavlink
 from dappled.flight import digest
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath, TruePose
@@ -243,7 +243,7 @@ def test_hermite_reproduces_every_cubic(c: tuple[float, ...], span: float, share
 
 def real_flight(shared_data: File) -> Iterator[Stamped]:
     data = (shared_data / "telemetry" / "dronekit-flight.tlog").read_bytes()
-    decode, place, number = Decoder(), 0, 0
+    decode, place, number = PacketParser(), 0, 0
     while place + 10 <= len(data):
         length = data[place + 9] + 8
         message = decode(data[place + 8 : place + 8 + length])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import pty
 import socket
@@ -11,19 +10,13 @@ import time
 from collections.abc import Callable
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from dappled.clock import SystemClock
 from dappled.drivers.mavlink import links as mavlink_links
-from dappled.drivers.mavlink.address import Address
-from dappled.drivers.mavlink.links import LinkError, MavlinkLinks, Packet, mavlink
-from dappled.drivers.mavlink.stream import Listener, Stream, over_tcp
-
-
-class Clock:
-    def utc_ns(self) -> int:
-        return time.time_ns()
-
-    def monotonic_ns(self) -> int:
-        return time.monotonic_ns()
+from dappled.drivers.mavlink.channels import Address, ByteStream
+from dappled.drivers.mavlink.links import Framer, LinkError, MavlinkLinks, Packet, PacketParser, mavlink, pack
 
 
 class Side:
@@ -33,17 +26,21 @@ class Side:
         self.packets: list[Packet] = []
         self.logged: list[bytes] = []
         self.changed = threading.Condition()
+        self.log_fails = False
         self._act = on_packet
-        self.links = MavlinkLinks(
-            [url], system_id=system_id, component_id=1, tap=self._tap, on_packet=self._seen, clock=Clock()
-        )
+        self.links = MavlinkLinks([url], system_id=system_id, component_id=1, clock=SystemClock())
 
-    def _tap(self, stamp_us: int, raw: bytes) -> int:
+    def start(self) -> None:
+        self.links.start(self)
+
+    def log_packet(self, stamp_us: int, raw: bytes) -> int:
+        if self.log_fails:
+            raise OSError("disk full")
         assert abs(stamp_us - time.time_ns() // 1000) < 10**8
         self.logged.append(raw)
         return len(self.logged) - 1
 
-    def _seen(self, packet: Packet) -> None:
+    def on_packet(self, packet: Packet) -> None:
         with self.changed:
             self.packets.append(packet)
             self.changed.notify_all()
@@ -56,7 +53,7 @@ class Side:
             return [p for p in self.packets if not p.sent]
 
     def __enter__(self) -> Side:
-        self.links.start()
+        self.start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -104,7 +101,7 @@ def test_mavlink_1_is_understood_and_answered_in_kind() -> None:
 
 def test_a_tcp_link_comes_back_after_its_server_was_gone() -> None:
     server = Side("tcpin:127.0.0.1:0")
-    server.links.start()
+    server.start()
     port = server.links.port(0)
     with Side(f"tcp:127.0.0.1:{port}") as client:
         send_until_received(client, server)
@@ -126,84 +123,6 @@ def test_a_client_that_fell_silent_does_not_keep_the_next_one_waiting() -> None:
             assert second.recv(300)[0] == 0xFD
             vanished.settimeout(10)
             assert vanished.recv(300) == b""  # let go: a machine that is still there comes again
-
-
-def test_a_client_is_not_let_go_while_somebody_writes_to_it() -> None:
-    """Its descriptor could be another file's by then."""
-    told: list[str] = []
-    began, go_on = threading.Event(), threading.Event()
-
-    class Slow:
-        def write(self, _data: bytes) -> bool:
-            told.append("begun")
-            began.set()
-            assert go_on.wait(20)
-            told.append("written")
-            return True
-
-        def close(self) -> None:
-            told.append("closed")
-
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        server.setblocking(False)
-        listener = Listener(server)
-        listener._client = Slow()  # type: ignore[assignment]  # all that is asked of one
-        writer = threading.Thread(target=listener.write, args=[b"x"])
-        writer.start()
-        assert began.wait(20)
-        with socket.create_connection(server.getsockname()):
-            reader = threading.Thread(target=listener.read)
-            reader.start()
-            reader.join(0.1)
-            assert told == ["begun"]
-            go_on.set()
-            for thread in (writer, reader):
-                thread.join(20)
-            assert told == ["begun", "written", "closed"]
-        listener.close()
-
-
-@pytest.mark.parametrize("number", [errno.ECONNABORTED, errno.EHOSTUNREACH])
-def test_one_who_left_before_it_was_let_in_costs_nobody_the_link(number: int) -> None:
-    class Knocked:
-        """A listening socket at which somebody knocks and runs away."""
-
-        def __init__(self, sock: socket.socket) -> None:
-            self.sock, self.away = sock, True
-
-        def accept(self) -> tuple[socket.socket, object]:
-            if self.away:
-                self.away = False
-                raise OSError(number, os.strerror(number))
-            return self.sock.accept()
-
-        def close(self) -> None:
-            self.sock.close()
-
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        door = Knocked(server)
-        server.setblocking(False)
-        listener = Listener(door)  # type: ignore[arg-type]  # all that it asks of one
-        with socket.create_connection(server.getsockname()) as client:
-            assert listener.read() == b""  # who ran away
-            client.sendall(b"here")
-            deadline, heard = time.monotonic() + 20, listener.read()
-            while not heard:
-                assert time.monotonic() < deadline
-                door.away = not door.away  # again and again
-                heard = listener.read()
-            assert heard == b"here"
-        listener.close()
-
-
-def test_a_connection_whose_other_side_vanished_is_given_up_within_seconds() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as client:
-        over_tcp(client)
-        # The kernel's own limits are a quarter of an hour where something was sent, and two hours where nothing was.
-        assert client.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 5000
-        assert client.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
-        assert client.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) == 2
-        assert client.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL) == 1
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # what it provokes
@@ -234,17 +153,17 @@ def test_a_channel_that_is_opened_after_the_end_is_closed(monkeypatch: pytest.Mo
     near, far = socket.socketpair()
     asked, answered = threading.Event(), threading.Event()
 
-    def late(_: Address) -> Stream:
+    def late(_: Address) -> ByteStream:
         asked.set()
         assert answered.wait(20)
-        return Stream(near.fileno(), near.close)
+        return ByteStream(near.fileno(), near.close)
 
     with socket.create_server(("127.0.0.1", 0)) as gone:
         port = gone.getsockname()[1]
     side = Side(f"tcp:127.0.0.1:{port}")
     side.links.open()  # nobody is there yet
     monkeypatch.setattr(mavlink_links, "open_channel", late)
-    side.links.start()
+    side.start()
     assert asked.wait(20)
     side.links.stop()
     answered.set()
@@ -271,7 +190,7 @@ def test_a_serial_device() -> None:
 
 def test_a_port_in_use_is_said_in_one_sentence() -> None:
     with Side("udpin:127.0.0.1:0") as server, pytest.raises(LinkError, match="in use"):
-        Side(f"udpin:127.0.0.1:{server.links.port(0)}").links.start()
+        Side(f"udpin:127.0.0.1:{server.links.port(0)}").start()
 
 
 @pytest.mark.parametrize(
@@ -285,7 +204,7 @@ def test_a_port_in_use_is_said_in_one_sentence() -> None:
 )
 def test_what_can_not_be_opened_is_said_in_one_sentence(url: str, words: str) -> None:
     with pytest.raises(LinkError, match=words):
-        Side(url).links.start()
+        Side(url).start()
 
 
 def test_a_log_that_fails_and_a_handler_that_raises_end_nothing() -> None:
@@ -293,10 +212,66 @@ def test_a_log_that_fails_and_a_handler_that_raises_end_nothing() -> None:
         raise RuntimeError("unforeseen")
 
     with Side("udpin:127.0.0.1:0", on_packet=fail) as server:
-        server.links._tap = lambda _stamp, _raw: (_ for _ in ()).throw(OSError("disk full"))
+        server.log_fails = True
         with Side(f"udpout:127.0.0.1:{server.links.port(0)}") as client:
             packets = send_until_received(client, server, 2)
             assert {p.number for p in packets} == {None}
             statistics = server.links.statistics()[0]
             assert statistics.packets_unlogged >= 2
             assert statistics.failures >= 1
+
+
+# --- bytes to packets
+
+
+def sound_packets(count: int, *, version_1: bool = False) -> list[bytes]:
+    packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    return [
+        pack(mavlink.MAVLink_attitude_message(i + 1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6), packer, version_1=version_1)
+        for i in range(count)
+    ]
+
+
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=40), st.booleans())
+def test_a_stream_cut_anywhere_gives_the_same_sound_packets(cuts: list[int], version_1: bool) -> None:
+    wanted = sound_packets(8, version_1=version_1)
+    data, framer, got = b"".join(wanted), Framer(), []
+    for cut in cuts:
+        got += [framed.raw for framed in framer.feed(data[:cut])]
+        data = data[cut:]
+    got += [framed.raw for framed in framer.feed(data)]
+    assert got == wanted
+    assert framer.bad == 0
+
+
+@given(st.lists(st.binary(max_size=30), min_size=4, max_size=4))
+def test_garbage_between_datagrams_packets_costs_no_sound_packet_that_stands_alone(noise: list[bytes]) -> None:
+    framer = Framer()
+    for raw, garbage in zip(sound_packets(4), noise, strict=True):
+        list(framer.datagram(garbage))
+        assert [framed.raw for framed in framer.datagram(raw)] == [raw]
+
+
+@given(st.integers(0, 39), st.integers(1, 255))
+def test_one_changed_byte_never_gives_a_different_known_message(place: int, change: int) -> None:
+    raw = bytearray(sound_packets(1)[0])
+    raw[place % len(raw)] ^= change
+    for framed in Framer().datagram(bytes(raw)):
+        assert isinstance(framed.message, mavlink.MAVLink_unknown)
+
+
+def test_a_stream_finds_its_way_after_garbage_and_counts_it() -> None:
+    first, second, third = sound_packets(3)
+    framer = Framer()
+    got = [f.raw for f in framer.feed(first + b"\xfe\x05garbage" + second + third + bytes(300))]
+    assert got == [first, second, third]
+    assert framer.bad >= 1
+
+
+def test_the_decoder_refuses_what_is_no_packet() -> None:
+    decode = PacketParser()
+    assert decode(b"") is None
+    assert decode(sound_packets(1)[0][:-1]) is None
+    message = decode(sound_packets(1)[0])
+    assert message is not None
+    assert message.get_type() == "ATTITUDE"

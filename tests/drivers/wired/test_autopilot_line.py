@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from dappled.clock import SystemClock
 from dappled.drivers.camera import Identity
 from dappled.drivers.mavlink.links import MavlinkLinks, Packet, mavlink
 from dappled.drivers.wired.composed import ComposedCamera, Plan
@@ -22,22 +22,17 @@ OPEN_US = 1500
 """A servo's pulse above this closes the contact."""
 
 
-class Clock:
-    def utc_ns(self) -> int:
-        return time.time_ns()
-
-    def monotonic_ns(self) -> int:
-        return time.monotonic_ns()
-
-
 class Pixhawk:
     """An autopilot whose outputs are wired to a body's contact: camera trigger, relay 0, servo 9."""
 
     def __init__(self, body: FinePix) -> None:
         self._body = body
-        self.links = links("udpin:127.0.0.1:0", self._hear)
+        self.links = links("udpin:127.0.0.1:0")
 
-    def _hear(self, packet: Packet) -> None:
+    def log_packet(self, stamp_us: int, raw: bytes) -> None:
+        return
+
+    def on_packet(self, packet: Packet) -> None:
         message = packet.message
         if packet.sent or message.get_type() != "COMMAND_LONG":
             return
@@ -53,7 +48,13 @@ class Companion:
     """The camera's side of the link: gives the autopilot orders."""
 
     def __init__(self, port: int) -> None:
-        self.links = links(f"udpout:127.0.0.1:{port}", lambda _: None, component=100)
+        self.links = links(f"udpout:127.0.0.1:{port}", component=100)
+
+    def log_packet(self, stamp_us: int, raw: bytes) -> None:
+        return
+
+    def on_packet(self, packet: Packet) -> None:
+        return
 
     def order(self, command: int, parameters: Sequence[float]) -> str | None:
         """See `shutter_line.Order`."""
@@ -62,15 +63,8 @@ class Companion:
         return None if sent else "the link is down"
 
 
-def links(url: str, on_packet: Callable[[Packet], None], component: int = 1) -> MavlinkLinks:
-    return MavlinkLinks(
-        [url],
-        system_id=1,
-        component_id=component,
-        tap=lambda _stamp_us, _raw: 0,
-        on_packet=on_packet,
-        clock=Clock(),
-    )
+def links(url: str, component: int = 1) -> MavlinkLinks:
+    return MavlinkLinks([url], system_id=1, component_id=component, clock=SystemClock())
 
 
 class TestContractOfTheAutopilotAndAFolder(CameraContract):
@@ -79,10 +73,10 @@ class TestContractOfTheAutopilotAndAFolder(CameraContract):
         body = FinePix(tmp_path, write_s=0.0, wall_s=lambda: T0)
         with ExitStack() as stack:
             pixhawk = Pixhawk(body)
-            pixhawk.links.start()
+            pixhawk.links.start(pixhawk)
             stack.callback(pixhawk.links.stop)
             companion = Companion(pixhawk.links.port(0))
-            companion.links.start()
+            companion.links.start(companion)
             stack.callback(companion.links.stop)
             plan = Plan(hold_s=0.01, poll_s=0.02)
             identity = Identity("FUJIFILM", "FinePix S5200", "", request.param)

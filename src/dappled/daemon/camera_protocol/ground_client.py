@@ -11,7 +11,7 @@ from pathlib import Path
 
 from dappled.clock import SystemClock
 from dappled.drivers.mavlink.links import MavlinkLinks, Message, Packet, mavlink
-from dappled.drivers.mavlink.signing import signing
+from dappled.drivers.mavlink.signing import open_signing
 from dappled.errors import DappledError
 
 ACK_S = 0.5
@@ -52,10 +52,8 @@ class GroundClient:
             [url],
             system_id=system_id,
             component_id=component_id,
-            tap=lambda _stamp, _raw: 0,
-            on_packet=self._on_packet,
             clock=clock,
-            signing=signing([key_file], key_file.with_name(f"{key_file.name}.time"), clock) if key_file else None,
+            signing=open_signing([key_file], key_file.with_name(f"{key_file.name}.time"), clock) if key_file else None,
         )
         self._changed = threading.Condition()
         self._heard: deque[Message] = deque(maxlen=_KEPT)
@@ -65,7 +63,7 @@ class GroundClient:
         self._sequence = time.time_ns() // 10**8 % 2**23  # another than that of a run just before; exact as a float
 
     def __enter__(self) -> GroundClient:
-        self._links.start()
+        self._links.start(self)
         self._heart.start()
         return self
 
@@ -171,7 +169,11 @@ class GroundClient:
     def _listening(self) -> _Listening:
         return _Listening(self._changed, self._heard)
 
-    def _on_packet(self, packet: Packet) -> None:
+    def log_packet(self, _stamp_us: int, _raw: bytes) -> None:
+        """See `PacketSink`: a ground client keeps no log."""
+
+    def on_packet(self, packet: Packet) -> None:
+        """See `PacketSink`."""
         message = packet.message
         if packet.sent:
             return

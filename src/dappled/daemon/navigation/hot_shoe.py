@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from dappled.daemon.navigation.boot_clock import BootClock
 from dappled.daemon.pipeline.tagger import ExposureTime
-from dappled.drivers.mavlink.framing import Message
+from dappled.drivers.mavlink.links import Message
 
 CONTACT_SIGMA_NS = 1_000_000  # interrupt and contact bounce; the best bodies were measured at 0.56 ms
 EPOCH_US = 10**15  # 2001; no autopilot has been running for that long

@@ -19,7 +19,7 @@ from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.tagger import ExposureTime
 from dappled.decode.geometry.pose import Pose
-from dappled.drivers.mavlink.framing import Decoder, Message
+from dappled.drivers.mavlink.links import Message, PacketParser
 from dappled.drivers.replay import Recorded
 from dappled.errors import DappledError
 from dappled.flight import LIVE, Cause, Frame, LedgerReader, Result, Shot, ShotRow, durable, layout, telemetry_log
@@ -254,7 +254,7 @@ def _recorded(digests: dict[int, tuple[str, str]], index: int) -> str | None:
 
 
 def _packets(path: Path) -> Iterator[tuple[int, int, Message]]:
-    decoder = Decoder()
+    decoder = PacketParser()
     for number, stamp_us, raw in telemetry_log.read(path):
         message = decoder(raw)
         if message is not None:  # a packet with a wrong checksum was never acted on either

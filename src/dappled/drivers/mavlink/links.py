@@ -1,63 +1,286 @@
-"""MAVLink links: several at once, one receiving thread each, every packet logged before it is acted on."""
+"""Receive and send MAVLink packets on several links at once, and log each one before it is acted on."""
 
 from __future__ import annotations
 
 import logging
 import select
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import reduce
 from operator import or_
-from typing import Protocol
+from typing import Any, Protocol
 
-from dappled.drivers.mavlink.address import LinkError, parse
-from dappled.drivers.mavlink.channel import Channel, open_channel
-from dappled.drivers.mavlink.framing import Decoder, Framed, Framer, Message, mavlink
-from dappled.drivers.mavlink.link import Link, LinkStatistics, Packet
-from dappled.drivers.mavlink.signing import Signing, SigningError
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-__all__ = ["Decoder", "LinkError", "LinkStatistics", "MavlinkLinks", "Message", "Packet", "mavlink"]
+from dappled.clock import Clock
+from dappled.drivers.mavlink.channels import Address, ByteChannel, LinkError, open_channel, parse
+from dappled.drivers.mavlink.signing import SignatureGuard, Signing, SigningError, SigningStatistics
+
+# `mavlink` holds the message classes, for the whole project: version 2 on the wire, and ArduPilot's dialect, which
+# contains `common`.
+__all__ = [
+    "Framed",
+    "Framer",
+    "LinkError",
+    "LinkStatistics",
+    "MavlinkLinks",
+    "Message",
+    "Packet",
+    "PacketParser",
+    "PacketSink",
+    "mavlink",
+    "pack",
+]
+
+Message = Any  # pymavlink's message classes have no common typed base
 
 log = logging.getLogger(__name__)
+_MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
+_SIGNED = 0x01
+_MAX_ID_1 = 255
 _REOPEN_S = 1.0
-_LOOK_S = 0.2
+_POLL_S = 0.2
 _KEEP_S = 1.0
 
 
-class Clock(Protocol):
-    """The two times that a link stamps with."""
+# --- one packet
 
-    def utc_ns(self) -> int: ...
 
-    def monotonic_ns(self) -> int: ...
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One packet, received or (`sent`) sent. `number` is its place in the telemetry log, None if it was not logged.
+
+    `trusted`: False for an unsigned packet on a signed link, which may be heard but not obeyed.
+    """
+
+    number: int | None
+    stamp_us: int
+    link: int
+    message: Message
+    raw: bytes
+    sent: bool = False
+    trusted: bool = True
+
+
+class PacketSink(Protocol):
+    """What takes the packets of `MavlinkLinks`, in the thread that received or sent each. Both calls must be quick."""
+
+    def log_packet(self, stamp_us: int, raw: bytes) -> int | None:
+        """Write a packet to the telemetry log. Returns its number there, None where there is no log."""
+
+    def on_packet(self, packet: Packet) -> None:
+        """Act on a packet; may call `MavlinkLinks.send`."""
+
+
+class PacketParser:
+    """Parse whole packets and verify their checksums, not their signatures. One for each stream: it keeps state."""
+
+    def __init__(self) -> None:
+        self._parser = mavlink.MAVLink(None)
+
+    def __call__(self, raw: bytes) -> Message | None:
+        """Return the message, or None where the bytes are not one sound packet. An unknown id is `MAVLink_unknown`."""
+        try:
+            return self._parser.decode(bytearray(raw))
+        except (mavlink.MAVError, IndexError):  # IndexError: no bytes at all
+            return None
+
+
+@dataclass(frozen=True, slots=True)
+class Framed:
+    """The bytes of one packet as they came, and its message."""
+
+    raw: bytes
+    message: Message
+
+    @property
+    def version(self) -> int:
+        """MAVLink 1 or 2."""
+        return 1 if self.raw[0] == _MAGIC_1 else 2
+
+
+class Framer:
+    """Cut bytes into packets. Keeps less than one packet (280 bytes) between calls.
+
+    `bad` counts the places where bytes did not make a packet: garbage, wrong checksum, unknown flags. The checksum of a
+    packet with an unknown message can't be verified; in a stream it counts only if another packet, or nothing, follows.
+    """
+
+    def __init__(self) -> None:
+        self.bad = 0
+        self._rest = b""
+        self._lost = False
+        self._parse = PacketParser()
+
+    def feed(self, data: bytes) -> Iterator[Framed]:
+        """Yield the packets that more bytes of a stream complete."""
+        buffer = self._rest + data
+        position, packets = self._cut(buffer, whole=False)
+        self._rest = buffer[position:]
+        yield from packets
+
+    def datagram(self, data: bytes) -> Iterator[Framed]:
+        """Yield the packets of one datagram, which holds whole packets only."""
+        _, packets = self._cut(data, whole=True)
+        self._lost = False
+        yield from packets
+
+    def _cut(self, buffer: bytes, *, whole: bool) -> tuple[int, list[Framed]]:
+        packets: list[Framed] = []
+        position = 0
+        while position < len(buffer):
+            length = _length(buffer, position)
+            if length is None and not whole:
+                break
+            if length is not None and length > 0 and position + length > len(buffer) and not whole:
+                break
+            framed = None
+            if length is not None and 0 < length <= len(buffer) - position:
+                framed = self._packet(buffer, position, length, whole=whole)
+            if framed is None:
+                if not self._lost:
+                    self.bad += 1
+                self._lost = True
+                position = _next_magic(buffer, position + 1)
+                continue
+            self._lost = False
+            packets.append(framed)
+            position += len(framed.raw)
+        return position, packets
+
+    def _packet(self, buffer: bytes, position: int, length: int, *, whole: bool) -> Framed | None:
+        end = position + length
+        raw = buffer[position:end]
+        message = self._parse(raw)
+        if message is None:
+            return None
+        if isinstance(message, mavlink.MAVLink_unknown) and not whole:
+            follows = end == len(buffer) or buffer[end] in (_MAGIC_1, _MAGIC_2)
+            if not follows:
+                return None
+        return Framed(raw, message)
+
+
+def _length(buffer: bytes, position: int) -> int | None:
+    """The length of the packet that begins here; None when its header is incomplete, 0 when no packet begins here."""
+    magic = buffer[position]
+    have = len(buffer) - position
+    if magic == _MAGIC_1:
+        return None if have < 2 else buffer[position + 1] + 8
+    if magic == _MAGIC_2:
+        if have < 3:
+            return None
+        flags = buffer[position + 2]
+        if flags & ~_SIGNED:
+            return 0
+        return buffer[position + 1] + 12 + (13 if flags & _SIGNED else 0)
+    return 0
+
+
+def _next_magic(buffer: bytes, start: int) -> int:
+    places = [p for p in (buffer.find(_MAGIC_1, start), buffer.find(_MAGIC_2, start)) if p >= 0]
+    return min(places, default=len(buffer))
+
+
+def pack(message: Message, packer: Any, *, version_1: bool) -> bytes:
+    """Pack a message with the packer's ids and next sequence number; in version 1 only where its id fits."""
+    version_1 = version_1 and message.get_msgId() <= _MAX_ID_1
+    raw: bytes = message.pack(packer, force_mavlink1=version_1)
+    packer.seq = (packer.seq + 1) % 256
+    return raw
+
+
+# --- one link
+
+
+@dataclass(frozen=True, slots=True)
+class LinkStatistics:
+    """Counters of a link. `error` says why it is down, None when it is up; `signing` is None without a key.
+
+    `packets_in` counts what was accepted; packets that signing refused are in `signing` alone, and in no log.
+    """
+
+    url: str
+    packets_in: int
+    packets_out: int
+    packets_bad: int
+    packets_unsent: int
+    packets_unlogged: int
+    failures: int
+    last_heard_monotonic_ns: int | None
+    error: str | None
+    signing: SigningStatistics | None = None
+
+
+class Link:
+    """One link's state. Its receiving thread writes it and, under the order lock, so do the senders."""
+
+    def __init__(self, number: int, address: Address, guard: SignatureGuard | None) -> None:
+        self.number = number
+        self.address = address
+        self.guard = guard
+        self.channel: ByteChannel | None = None
+        self.error: str | None = None
+        self.packer = mavlink.MAVLink(None)
+        self.heard_1 = self.heard_2 = False
+        self.packets_in = self.packets_out = self.packets_bad = 0
+        self.packets_unsent = self.packets_unlogged = self.failures = 0
+        self.last_heard_monotonic_ns: int | None = None
+
+    def packed(self, message: Message, system_id: int, component_id: int) -> bytes:
+        """Pack a message from this component: signed where there is a key, else in the version that was heard."""
+        self.packer.srcSystem, self.packer.srcComponent = system_id, component_id
+        if self.guard is None:
+            return pack(message, self.packer, version_1=self.heard_1 and not self.heard_2)
+        self.guard.prepare(self.packer)
+        return pack(message, self.packer, version_1=False)
+
+    def fail(self, problem: object) -> None:
+        """Mark the channel as broken: the receiving thread opens another."""
+        self.error = f"MAVLink link {self.address.url}: {problem}"
+
+    def close(self) -> None:
+        """Close the channel, where there is one. Under the order lock."""
+        channel, self.channel = self.channel, None
+        if channel is not None:
+            channel.close()
+
+    def statistics(self) -> LinkStatistics:
+        """Counters so far."""
+        return LinkStatistics(
+            self.address.url,
+            self.packets_in,
+            self.packets_out,
+            self.packets_bad,
+            self.packets_unsent,
+            self.packets_unlogged,
+            self.failures,
+            self.last_heard_monotonic_ns,
+            self.error,
+            self.guard.statistics() if self.guard else None,
+        )
+
+
+# --- all links
 
 
 class MavlinkLinks:
-    """All links of one MAVLink component.
+    """All links of one MAVLink component, with a receiving thread each.
 
-    `tap(stamp_us, raw)` writes a packet to the telemetry log and returns its number there; then `on_packet` is called,
-    for received packets and for sent ones, in the order of their numbers over all links (one lock sees to that), in
-    the thread that received or sent. It must be quick, and may call `send`. Stamps are UTC microseconds from `clock`.
+    Every packet, received or sent, is logged and then handed to the sink, in the order of its number over all links;
+    one lock sees to that. Stamps are UTC microseconds of `clock`. Between `open` and `start` nothing can be sent.
 
     `system_id` may be set while running: a camera takes its autopilot's.
     """
 
     def __init__(
-        self,
-        urls: Sequence[str],
-        *,
-        system_id: int,
-        component_id: int,
-        tap: Callable[[int, bytes], int],
-        on_packet: Callable[[Packet], None],
-        clock: Clock,
-        signing: Signing | None = None,
+        self, urls: Sequence[str], *, system_id: int, component_id: int, clock: Clock, signing: Signing | None = None
     ) -> None:
         self.component_id = component_id
         self.system_id = system_id
-        self._tap = tap
-        self._on_packet = on_packet
         self._clock = clock
+        self._sink: PacketSink | None = None
         self._order = threading.RLock()
         self._stop = threading.Event()
         self._opened = False
@@ -68,8 +291,11 @@ class MavlinkLinks:
         self._threads: list[threading.Thread] = []
 
     def open(self) -> None:
-        """Open all links, without receiving yet. Raises LinkError for what would not get better by waiting: a port in
-        use, a missing device. A TCP server that isn't there yet is looked for every second."""
+        """Open all links, without receiving yet.
+
+        Raises LinkError for what waiting would not mend: a port in use, a missing device. A TCP server that isn't there
+        yet is tried again every second.
+        """
         if self._opened:
             return
         try:
@@ -85,9 +311,10 @@ class MavlinkLinks:
             raise
         self._opened = True
 
-    def start(self) -> None:
+    def start(self, sink: PacketSink) -> None:
         """Begin to receive; opens the links if `open` did not. Raises LinkError as `open` does."""
         self.open()
+        self._sink = sink
         for link in self._links:
             thread = threading.Thread(target=self._receive, args=(link,), name=f"mavlink {link.number}", daemon=True)
             self._threads.append(thread)
@@ -107,7 +334,7 @@ class MavlinkLinks:
             self._close_channels()
 
     def port(self, link: int) -> int:
-        """The local UDP or TCP port of a link: what the system chose where the url said 0."""
+        """Return the local UDP or TCP port of a link: the one that the system chose where the url said 0."""
         channel = self._links[link].channel
         return channel.port() if channel else 0
 
@@ -124,14 +351,14 @@ class MavlinkLinks:
         return tuple(link.statistics() for link in self._links)
 
     def dead_threads(self) -> list[str]:
-        """Which receiving threads have ended without being asked to: none, unless there is a bug."""
+        """Names of threads that have ended without being asked to: none, unless there is a bug."""
         if self._stop.is_set():
             return []
         return [thread.name for thread in self._threads if not thread.is_alive()]
 
     def _send_on(self, link: Link, message: Message) -> bool:
-        channel = link.channel
-        if channel is None:
+        channel, sink = link.channel, self._sink
+        if channel is None or sink is None:
             link.packets_unsent += 1
             return False
         raw = link.packed(message, self.system_id, self.component_id)
@@ -145,24 +372,34 @@ class MavlinkLinks:
             link.packets_unsent += 1
             return False
         link.packets_out += 1
-        self._deliver(link, stamp_us, raw, message, sent=True)
+        self._deliver(sink, link, stamp_us, raw, message, sent=True)
         return True
 
     def _deliver(
-        self, link: Link, stamp_us: int, raw: bytes, message: Message, *, sent: bool, trusted: bool = True
+        self,
+        sink: PacketSink,
+        link: Link,
+        stamp_us: int,
+        raw: bytes,
+        message: Message,
+        *,
+        sent: bool,
+        trusted: bool = True,
     ) -> None:
         number: int | None = None
         try:
-            number = self._tap(stamp_us, raw)
+            number = sink.log_packet(stamp_us, raw)
         except Exception:  # a full disk must not stop the commands of a flying machine
             if link.packets_unlogged == 0:
                 log.exception("A MAVLink packet could not be written to the telemetry log")
             link.packets_unlogged += 1
         try:
-            self._on_packet(Packet(number, stamp_us, link.number, message, raw, sent, trusted))
-        except Exception:  # one packet that nobody foresaw must not end the link
+            sink.on_packet(Packet(number, stamp_us, link.number, message, raw, sent, trusted))
+        except Exception:  # one unforeseen packet must not end the link
             link.failures += 1
             log.exception("A MAVLink packet (%s) could not be handled", message.get_type())
+
+    # --- the receiving threads
 
     def _receive(self, link: Link) -> None:
         framer = Framer()
@@ -191,18 +428,20 @@ class MavlinkLinks:
                 self._received(link, stamp_us, framed)
             link.packets_bad += framer.bad - bad
 
-    def _wait(self, channel: Channel) -> bool:
-        """Whether there is something to read; sends what waits. poll knows descriptors above 1023, select does not."""
+    def _wait(self, channel: ByteChannel) -> bool:
+        """Wait until there is something to read, and flush meanwhile. poll takes descriptors above 1023, select does
+        not."""
         poll = select.poll()
         for descriptor in channel.descriptors():
             poll.register(descriptor, select.POLLIN | (select.POLLOUT if channel.wants_write() else 0))
-        ready = reduce(or_, (events for _, events in poll.poll(_LOOK_S * 1e3)), 0)
+        ready = reduce(or_, (events for _, events in poll.poll(_POLL_S * 1e3)), 0)
         if ready & select.POLLOUT:
             with self._order:
                 channel.flush()
         return bool(ready & ~select.POLLOUT)
 
     def _received(self, link: Link, stamp_us: int, framed: Framed) -> None:
+        assert self._sink is not None, "the threads begin in `start`"
         with self._order:
             message = framed.message
             trusted = True
@@ -216,7 +455,7 @@ class MavlinkLinks:
             link.last_heard_monotonic_ns = self._clock.monotonic_ns()
             link.heard_1 |= framed.version == 1
             link.heard_2 |= framed.version == 2
-            self._deliver(link, stamp_us, framed.raw, message, sent=False, trusted=trusted)
+            self._deliver(self._sink, link, stamp_us, framed.raw, message, sent=False, trusted=trusted)
 
     def _reopen(self, link: Link) -> None:
         with self._order:
@@ -241,7 +480,7 @@ class MavlinkLinks:
             try:
                 self._signing_time.keep(ending=ending)
                 failed = False
-            except SigningError as error:  # the links go on; said once
+            except SigningError as error:  # the links go on; logged once
                 if not failed:
                     log.warning("%s", error)
                 failed = True

@@ -1,8 +1,9 @@
-"""Signed MAVLink (message signing of MAVLink 2): keys in files, which packets count, and a time that never goes back.
+"""Sign and verify MAVLink 2 packets: key files, replay protection, and a signing time that never goes back.
 
-A signature is the first 6 bytes of SHA-256 over key, packet, link id and a timestamp of 10 µs since 2015. A packet
-counts once: its timestamp must be later than the last one of its stream (system, component, link id), and that of a
-stream heard for the first time at most a minute behind the latest good one. Only good packets move the time.
+A signature is the first 6 bytes of SHA-256 over key, packet, link id and a timestamp in units of 10 µs since 2015. A
+packet is accepted once: its timestamp must be later than the last one of its stream (system, component, link id). In a
+stream that is heard for the first time it may be at most a minute older than the latest accepted one. Only accepted
+packets advance the time.
 """
 
 from __future__ import annotations
@@ -13,12 +14,14 @@ import os
 import secrets
 import stat
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
-from dappled.drivers.mavlink.framing import mavlink
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from dappled.clock import Clock
 from dappled.errors import DappledError
 
 Unsigned = Literal["refuse", "listen", "allow"]
@@ -35,18 +38,12 @@ _LATEST = 2**48 - 1
 
 
 class SigningError(DappledError):
-    """A key or the signing time can't be had: one sentence with the file and what to do."""
-
-
-class Clock(Protocol):
-    """UTC as this machine believes it."""
-
-    def utc_ns(self) -> int: ...
+    """A key or the signing time can't be read or written: one sentence with the file and what to do."""
 
 
 def make_key(path: Path, passphrase: str | None = None) -> None:
-    """A new key file (64 hexadecimal digits, mode 0600): random, or SHA-256 of a passphrase as QGroundControl,
-    Mission Planner and MAVProxy make it. Raises SigningError, also where the file is there already."""
+    """Write a new key file (64 hexadecimal digits, mode 0600): random, or SHA-256 of a passphrase as QGroundControl,
+    Mission Planner and MAVProxy make it. Raises SigningError, also where the file exists already."""
     key = secrets.token_bytes(KEY_BYTES) if passphrase is None else hashlib.sha256(passphrase.encode()).digest()
     try:
         fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
@@ -61,14 +58,14 @@ def make_key(path: Path, passphrase: str | None = None) -> None:
             os.fsync(fd)
         _sync_folder(path.parent)
     except OSError as error:
-        path.unlink(missing_ok=True)  # half a key would be in the way of the next attempt
+        path.unlink(missing_ok=True)  # half a key would stop the next attempt
         raise SigningError(f"cannot write the key {path}: {error.strerror or error}; check its folder") from error
 
 
 def read_key(path: Path) -> bytes:
-    """The key in a file that nobody else can read or change. Raises SigningError."""
+    """Read a key from a file that only this user can read or change. Raises SigningError."""
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe must not hold us
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe must not block
         with os.fdopen(fd, "rb") as file:
             facts = os.fstat(fd)
             text = file.read(1024)
@@ -77,7 +74,7 @@ def read_key(path: Path) -> bytes:
             f"cannot read the signing key {path}: {error.strerror or error}; make one with dappled mavlink key"
         ) from error
     if not stat.S_ISREG(facts.st_mode) or facts.st_uid not in (0, os.geteuid()):
-        raise SigningError(f"the signing key {path} belongs to somebody else; make it a file of this user: chown")
+        raise SigningError(f"the signing key {path} belongs to another user; give it to this one with chown")
     if facts.st_mode & 0o077:
         raise SigningError(f"the signing key {path} can be used by others; run: chmod 600 {path}")
     try:
@@ -94,10 +91,10 @@ def read_key(path: Path) -> bytes:
 class SigningTime:
     """The signing times of all links of this machine, kept over restarts.
 
-    The file holds two times: one later than any that was signed with, one later than any that was accepted. So no
-    packet from before a restart is accepted after it. After a crash they are up to ten seconds ahead, for which long
-    genuine packets are refused; after an orderly end they are exact. `keep` may wait for the disk; all else answers
-    from memory.
+    The file holds two times: one later than every time signed with, and one later than every time accepted. So no
+    packet from before a restart is accepted after it. After a crash they are up to 10 s ahead, and genuine packets are
+    refused for as long; after an orderly end they are exact. `keep` may wait for the disk; all other calls answer from
+    memory.
     """
 
     def __init__(self, path: Path, clock: Clock) -> None:
@@ -110,23 +107,23 @@ class SigningTime:
         self.keep()
 
     def oldest(self) -> int:
-        """What a stream that is heard for the first time must be later than."""
+        """Return the time that a stream heard for the first time must be later than."""
         with self._lock:
             return max(self._floor, max(self._used, self._accepted, self._now()) - NEW_STREAM_UNITS)
 
     def next(self) -> int:
-        """A timestamp to sign with: later than every one before."""
+        """Return a timestamp to sign with, later than every one before."""
         with self._lock:
             self._used = min(_LATEST, max(self._used + 1, self._accepted, self._now()))
             return self._used
 
     def accepted(self, timestamp: int) -> None:
-        """A packet with this time was good."""
+        """Take note of an accepted packet's timestamp."""
         with self._lock:
             self._accepted = max(self._accepted, timestamp)
 
     def keep(self, *, ending: bool = False) -> None:
-        """Write the times down, ahead of what is to come; at the end exactly. Raises SigningError."""
+        """Write the times to the file, 10 s ahead; exactly where `ending`. Raises SigningError."""
         with self._lock:
             times = (self._used, self._accepted)
         margin = 0 if ending else AHEAD_UNITS
@@ -165,7 +162,7 @@ class SigningTime:
 
 
 def _sync_folder(path: Path) -> None:
-    """The names in a folder are on the disk afterwards: else a power cut could bring back older times."""
+    """Make the names in a folder durable: else a power cut could bring back older times."""
     fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(fd)
@@ -175,7 +172,7 @@ def _sync_folder(path: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class SigningStatistics:
-    """Packets of a link with a key: by what became of them."""
+    """How many packets of a link with a key were accepted and refused, by reason."""
 
     good: int
     forged: int
@@ -189,11 +186,11 @@ class SigningStatistics:
         return self.forged + self.replayed + self.unsigned_refused
 
 
-class Guard:
-    """Signing on one link: signs what goes out, judges what comes in. Used under the link's lock.
+class SignatureGuard:
+    """Signing on one link: signs what is sent, verifies what is received. Used under the link's lock.
 
-    `unsigned`: packets without a signature are refused, or heard but not obeyed ("listen"), or taken as good
-    ("allow"). RADIO_STATUS, which radios put in by themselves, is always heard.
+    `unsigned` says whether packets without a signature are refused, heard but not obeyed ("listen"), or accepted
+    ("allow"). RADIO_STATUS, which radios insert themselves, is always heard.
     """
 
     def __init__(self, key: bytes, link_id: int, time: SigningTime, unsigned: Unsigned = "refuse") -> None:
@@ -205,7 +202,7 @@ class Guard:
         self._good = self._forged = self._replayed = self._taken = self._refused = 0
 
     def judge(self, raw: bytes, system: int, component: int, message_id: int) -> Trust:
-        """What to do with a sound packet: obey it, only hear it, or refuse it."""
+        """Return whether to obey a sound packet, only hear it, or refuse it."""
         if raw[0] != mavlink.PROTOCOL_MARKER_V2 or not raw[2] & _SIGNED_FLAG:
             return self._judge_unsigned(message_id)
         if not hmac.compare_digest(self._signature(raw[:-6]), raw[-6:]):
@@ -225,12 +222,11 @@ class Guard:
         self._good += 1
         return "obey"
 
-    def sign(self, pack: Callable[[], bytes], packer: mavlink.MAVLink) -> bytes:
-        """What `pack` packs with this packer, signed."""
+    def prepare(self, packer: mavlink.MAVLink) -> None:
+        """Let the next message that `packer` packs be signed, with a timestamp of its own."""
         signing = packer.signing
         signing.sign_outgoing, signing.secret_key, signing.link_id = True, self._key, self._link_id
         signing.timestamp = self._time.next()
-        return pack()
 
     def statistics(self) -> SigningStatistics:
         """Counters."""
@@ -248,7 +244,7 @@ class Guard:
 
 
 def timestamp_of(raw: bytes) -> int:
-    """The timestamp of a signed packet, in 10 µs since 2015."""
+    """Return the timestamp of a signed packet, in units of 10 µs since 2015."""
     return int.from_bytes(raw[-12:-6], "little")
 
 
@@ -256,14 +252,14 @@ def timestamp_of(raw: bytes) -> int:
 class Signing:
     """Which links of `MavlinkLinks` are signed: a guard or None for each, and the time that they share."""
 
-    guards: Sequence[Guard | None]
+    guards: Sequence[SignatureGuard | None]
     time: SigningTime
 
 
-def signing(
+def open_signing(
     key_files: Sequence[Path | None], time_file: Path, clock: Clock, unsigned: Unsigned = "refuse"
 ) -> Signing | None:
-    """Guards for links with a key file each, or none; None where no link has one. Raises SigningError."""
+    """Read each link's key file, where it has one; None where no link has. Raises SigningError."""
     keys = [None if path is None else read_key(path) for path in key_files]
     if not any(keys):
         return None
@@ -273,6 +269,9 @@ def signing(
         raise SigningError(f"cannot make the folder {time_file.parent}: {error.strerror or error}") from error
     time = SigningTime(time_file, clock)
     return Signing(
-        tuple(None if key is None else Guard(key, number % 256, time, unsigned) for number, key in enumerate(keys)),
+        tuple(
+            None if key is None else SignatureGuard(key, number % 256, time, unsigned)
+            for number, key in enumerate(keys)
+        ),
         time,
     )

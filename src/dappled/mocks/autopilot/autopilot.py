@@ -134,8 +134,14 @@ class Flyer:
             next_ns = min(next_ns, self.delayed[0][0])
         return max(0.0, (next_ns - time.monotonic_ns()) / 1e9)
 
-    def heard(self, message: Message) -> None:
-        """A message came in."""
+    def log_packet(self, _stamp_us: int, _raw: bytes) -> None:
+        """See `PacketSink`: the simulated autopilot keeps no log."""
+
+    def on_packet(self, packet: Packet) -> None:
+        """See `PacketSink`: answer what came in."""
+        message = packet.message
+        if packet.sent:
+            return
         if message.get_type() == "TIMESYNC" and message.tc1 == 0:
             self.send(mavlink.MAVLink_timesync_message(self.boot_ns(time.monotonic_ns()), message.ts1))
         if message.get_type() == "COMMAND_LONG" and message.target_system in (0, self.system_id):
@@ -232,25 +238,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--with-parent", action="store_true", help="end when standard input is closed")
     wanted = parser.parse_args(arguments)
     start_ns = time.monotonic_ns() if wanted.start_monotonic_ns is None else wanted.start_monotonic_ns
-    flyer = Flyer(
-        FlightPath(wanted.seed), start_ns, BootTime(wanted.booted), lambda _: None, wanted.jitter, wanted.system_id
-    )
-
-    def received(packet: Packet) -> None:
-        if not packet.sent:
-            flyer.heard(packet.message)
-
-    links = MavlinkLinks(
-        [wanted.url],
-        system_id=wanted.system_id,
-        component_id=1,
-        tap=lambda _stamp, _raw: 0,
-        on_packet=received,
-        clock=SystemClock(),
-    )
-    flyer.send = links.send
+    links = MavlinkLinks([wanted.url], system_id=wanted.system_id, component_id=1, clock=SystemClock())
+    boot = BootTime(wanted.booted)
+    flyer = Flyer(FlightPath(wanted.seed), start_ns, boot, links.send, wanted.jitter, wanted.system_id)
     try:
-        links.start()
+        links.start(flyer)
     except LinkError as error:
         print(f"autopilot: {error}", file=sys.stderr)  # noqa: T201 (a process that speaks to a person)
         return 1

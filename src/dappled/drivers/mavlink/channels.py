@@ -1,0 +1,407 @@
+"""Open a connection string as bytes in and out: UDP, TCP and serial, never blocking."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import termios
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from dappled.errors import DappledError
+
+Kind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial"]
+FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, udpbcast:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or /dev/ttyX[,BAUD]"
+DEFAULT_BAUD = 115200
+_SCHEMES: dict[str, Kind] = {
+    "udp": "udpin",
+    "udpin": "udpin",
+    "udpout": "udpout",
+    "udpbcast": "udpbcast",
+    "tcp": "tcp",
+    "tcpin": "tcpin",
+}
+_CHUNK = 65536
+_OUTBOX_LIMIT = 65536
+_GONE_S = 5
+_PEERS_LIMIT = 16
+_PEER_SILENT_S = 60.0
+_NO_DATAGRAM = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNREFUSED)  # the last: no program listens there yet
+_NO_CLIENT = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNABORTED, errno.EPROTO, errno.ENETDOWN, errno.ENETUNREACH,
+              errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENONET)  # fmt: skip
+"""Errors of `accept` that are the client's and not the listening socket's: see accept(2)."""
+
+
+class LinkError(DappledError):
+    """A link can't be opened: one sentence with the url and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """One parsed connection string. `port` is the UDP or TCP port, or the baud rate of a serial device."""
+
+    url: str
+    kind: Kind
+    host: str
+    port: int
+
+
+def parse(url: str) -> Address:
+    """Parse `url`. `udp:HOST:PORT` and `HOST:PORT` listen, as in pymavlink. Raises LinkError."""
+    scheme, colon, rest = url.partition(":")
+    if url.startswith("/") or scheme == "serial":
+        return _serial_address(url, url if url.startswith("/") else rest)
+    kind = _SCHEMES.get(scheme)
+    if colon and kind is not None:
+        return _socket_address(url, kind, rest)
+    if url.count(":") == 1 and rest.isdigit():
+        return _socket_address(url, "udpin", url)
+    raise LinkError(f"mavlink.url {url!r} is not a connection string; write {FORMS}")
+
+
+def _socket_address(url: str, kind: Kind, rest: str) -> Address:
+    host, _, port = rest.rpartition(":")
+    if not host or ":" in host:
+        raise LinkError(f"mavlink.url {url!r} needs a host and a port, as in {kind}:127.0.0.1:14550")
+    if not (port.isascii() and port.isdigit() and int(port) <= 65535):
+        raise LinkError(f"mavlink.url {url!r}: {port!r} is not a port; write a number up to 65535")
+    if kind not in ("udpin", "tcpin") and int(port) == 0:
+        raise LinkError(
+            f"mavlink.url {url!r}: port 0 can't be connected to; write the port that the other side listens on"
+        )
+    return Address(url, kind, host, int(port))
+
+
+def _serial_address(url: str, rest: str) -> Address:
+    device, separator, baud = rest.replace(":", ",").partition(",")
+    if not device.startswith("/"):
+        raise LinkError(f"mavlink.url {url!r} needs a device, as in /dev/ttyAMA0,921600")
+    if separator and not (baud.isascii() and baud.isdigit()):
+        raise LinkError(f"mavlink.url {url!r}: {baud!r} is not a baud rate; write a number such as {DEFAULT_BAUD}")
+    return Address(url, "serial", device, int(baud) if separator else DEFAULT_BAUD)
+
+
+class ByteChannel(Protocol):
+    """One open connection. One thread reads; `write` is called under the link's lock."""
+
+    datagrams: bool  # `read` returns whole packets
+
+    def descriptors(self) -> Sequence[int]:
+        """The descriptors to poll: any of them may become readable."""
+
+    def read(self) -> bytes | None:
+        """Return what has come, b"" for nothing yet, None when the other side has closed. Raises OSError when
+        broken."""
+
+    def write(self, data: bytes) -> bool:
+        """Send without blocking. False: not sent (no receiver, or the buffer is full). Raises OSError when broken."""
+
+    def wants_write(self) -> bool:
+        """Return whether bytes wait until the descriptor can take them."""
+
+    def flush(self) -> None:
+        """Send what waits. Raises OSError when broken."""
+
+    def port(self) -> int:
+        """Return the local port, 0 where there is none."""
+
+    def close(self) -> None:
+        """Close every descriptor."""
+
+
+def open_channel(address: Address) -> ByteChannel:
+    """Open the connection that `address` names. Raises LinkError, in words."""
+    try:
+        if address.kind == "serial":
+            return over_serial(address)
+        if address.kind == "tcp":
+            return over_tcp(socket.create_connection((address.host, address.port), timeout=1.0))
+        if address.kind == "tcpin":
+            return TcpServer(_bound(address, socket.SOCK_STREAM))
+        if address.kind == "udpin":
+            return UdpIn(_bound(address, socket.SOCK_DGRAM))
+        return UdpOut(address)
+    except OSError as error:
+        raise LinkError(_sentence(address, error)) from error
+
+
+def _sentence(address: Address, error: OSError) -> str:
+    url = address.url
+    if isinstance(error, socket.gaierror):
+        return f"MAVLink link {url}: no machine is called {address.host!r}; write an address such as 127.0.0.1"
+    if error.errno == errno.EADDRINUSE:
+        return (
+            f"MAVLink link {url}: port {address.port} is in use; end the program that listens there or change the port"
+        )
+    if error.errno == errno.EADDRNOTAVAIL:
+        return (
+            f"MAVLink link {url}: {address.host} is no address of this machine; write 0.0.0.0 to listen on all of them"
+        )
+    if error.errno == errno.ENOENT:
+        return f"MAVLink link {url}: there is no device {address.host}; plug it in or correct mavlink.url"
+    if error.errno == errno.EACCES:
+        return f"MAVLink link {url}: no permission to open {address.host}; add the user to the group of the device"
+    return f"MAVLink link {url}: {error.strerror or error}; correct mavlink.url or mend the connection"
+
+
+def _bound(address: Address, kind: socket.SocketKind) -> socket.socket:
+    found = socket.getaddrinfo(address.host, address.port, socket.AF_INET, kind)
+    sock = socket.socket(socket.AF_INET, kind)
+    try:
+        if kind == socket.SOCK_STREAM:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.setblocking(False)
+        sock.bind(found[0][4])
+        if kind == socket.SOCK_STREAM:
+            sock.listen(1)
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+# --- UDP
+
+
+class _Udp:
+    """A UDP socket: each datagram holds whole packets, and writing never has to wait."""
+
+    datagrams = True
+
+    def __init__(self, sock: socket.socket) -> None:
+        sock.setblocking(False)
+        self._sock = sock
+
+    def descriptors(self) -> Sequence[int]:
+        return (self._sock.fileno(),)
+
+    def read(self) -> bytes | None:
+        try:
+            data, peer = self._sock.recvfrom(_CHUNK)
+        except OSError as error:
+            if error.errno in _NO_DATAGRAM:
+                return b""
+            raise
+        self._heard(peer)
+        return data
+
+    def wants_write(self) -> bool:
+        return False
+
+    def flush(self) -> None:
+        return
+
+    def port(self) -> int:
+        return int(self._sock.getsockname()[1])
+
+    def close(self) -> None:
+        self._sock.close()
+
+    def _heard(self, peer: tuple[str, int]) -> None:
+        return
+
+    def _send(self, data: bytes, peer: tuple[str, int]) -> bool:
+        try:
+            self._sock.sendto(data, peer)
+        except OSError:  # no program listens there, or the network is down: the next packet tries again
+            return False
+        return True
+
+
+class UdpIn(_Udp):
+    """Listen, and answer every peer that was heard in the last minute (at most 16)."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        super().__init__(sock)
+        self._peers: dict[tuple[str, int], float] = {}
+
+    def write(self, data: bytes) -> bool:
+        silent = time.monotonic() - _PEER_SILENT_S
+        for peer, heard in list(self._peers.items()):
+            if heard < silent and len(self._peers) > 1:
+                self._peers.pop(peer, None)
+        sent = [self._send(data, peer) for peer in list(self._peers)]
+        return any(sent)
+
+    def _heard(self, peer: tuple[str, int]) -> None:
+        self._peers.pop(peer, None)
+        self._peers[peer] = time.monotonic()
+        if len(self._peers) > _PEERS_LIMIT:
+            self._peers.pop(next(iter(self._peers)))
+
+
+class UdpOut(_Udp):
+    """Send to one address, and hear what comes back."""
+
+    def __init__(self, address: Address) -> None:
+        """Raises OSError."""
+        found = socket.getaddrinfo(address.host, address.port, socket.AF_INET, socket.SOCK_DGRAM)
+        self._to = (str(found[0][4][0]), int(found[0][4][1]))
+        broadcast = address.kind == "udpbcast"
+        super().__init__(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        if broadcast:
+            self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        near = self._to[0].startswith("127.") and not broadcast
+        self._sock.bind(("127.0.0.1" if near else "0.0.0.0", 0))  # noqa: S104  # a client's own port: answers come back to it
+
+    def write(self, data: bytes) -> bool:
+        return self._send(data, self._to)
+
+
+# --- TCP and serial
+
+
+class ByteStream:
+    """A descriptor that carries bytes both ways. What it can't take at once waits: whole packets, at most 64 KiB."""
+
+    datagrams = False
+
+    def __init__(self, fd: int, close: Callable[[], None], port: int = 0) -> None:
+        self._fd, self._close, self._port = fd, close, port
+        self._waiting = bytearray()
+
+    def descriptors(self) -> Sequence[int]:
+        return (self._fd,)
+
+    def read(self) -> bytes | None:
+        try:
+            return os.read(self._fd, _CHUNK) or None
+        except BlockingIOError:
+            return b""
+
+    def write(self, data: bytes) -> bool:
+        if len(self._waiting) + len(data) > _OUTBOX_LIMIT:
+            return False
+        self._waiting += data
+        self.flush()
+        return True
+
+    def wants_write(self) -> bool:
+        return bool(self._waiting)
+
+    def flush(self) -> None:
+        while self._waiting:
+            try:
+                count = os.write(self._fd, self._waiting)
+            except BlockingIOError:
+                return
+            del self._waiting[:count]
+
+    def port(self) -> int:
+        return self._port
+
+    def close(self) -> None:
+        self._close()
+
+
+class TcpServer:
+    """A TCP server for one client at a time, the newest. A client whose radio went out of range never closes its
+    connection, and must not keep the next one waiting."""
+
+    datagrams = False
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
+        self._client: ByteStream | None = None
+        self._change = threading.Lock()  # the reading thread closes clients; no other may write to one meanwhile
+
+    def descriptors(self) -> Sequence[int]:
+        return (self._sock.fileno(), *(self._client.descriptors() if self._client else ()))
+
+    def read(self) -> bytes | None:
+        newcomer = self._accepted()
+        if newcomer is not None:
+            self._replace_client(newcomer)
+            return b""
+        if self._client is None:
+            return b""
+        try:
+            data = self._client.read()
+        except OSError:
+            data = None
+        if data is None:
+            self._replace_client()
+            return b""
+        return data
+
+    def write(self, data: bytes) -> bool:
+        try:
+            with self._change:
+                return self._client.write(data) if self._client else False
+        except OSError:  # the next `read` finds that it has gone
+            return False
+
+    def wants_write(self) -> bool:
+        return self._client is not None and self._client.wants_write()
+
+    def flush(self) -> None:
+        try:
+            with self._change:
+                if self._client:
+                    self._client.flush()
+        except OSError:  # as above
+            return
+
+    def port(self) -> int:
+        return int(self._sock.getsockname()[1])
+
+    def close(self) -> None:
+        self._replace_client()
+        self._sock.close()
+
+    def _accepted(self) -> ByteStream | None:
+        """Accept a client; None where none is there, or it has left again. Raises OSError when the socket is broken."""
+        try:
+            sock = self._sock.accept()[0]
+        except OSError as error:
+            if error.errno in _NO_CLIENT:
+                return None
+            raise
+        try:
+            return over_tcp(sock)
+        except OSError:  # it has left by now
+            sock.close()
+            return None
+
+    def _replace_client(self, newcomer: ByteStream | None = None) -> None:
+        with self._change:
+            client, self._client = self._client, newcomer
+            if client:
+                client.close()
+
+
+def over_tcp(sock: socket.socket) -> ByteStream:
+    """Make a connected TCP socket a stream that fails 5 s after the other side vanished. Raises OSError."""
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * _GONE_S)  # what was sent and not acknowledged
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # where nothing was sent
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 2)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+    sock.setblocking(False)
+    return ByteStream(sock.fileno(), sock.close, int(sock.getsockname()[1]))
+
+
+def over_serial(address: Address) -> ByteStream:
+    """Open a serial device in raw mode, 8N1, without flow control. Raises OSError, and LinkError for another kind of
+    file or an impossible speed."""
+    speed = getattr(termios, f"B{address.port}", None)
+    if speed is None:
+        raise LinkError(
+            f"MAVLink link {address.url}: no serial port runs at {address.port} baud; write 57600, 115200 or 921600"
+        )
+    fd = os.open(address.host, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        attributes = termios.tcgetattr(fd)
+        attributes[6][termios.VMIN], attributes[6][termios.VTIME] = 1, 0
+        attributes[:6] = [0, 0, termios.CS8 | termios.CREAD | termios.CLOCAL, 0, speed, speed]
+        termios.tcsetattr(fd, termios.TCSANOW, attributes)
+    except termios.error as error:
+        os.close(fd)
+        raise LinkError(
+            f"MAVLink link {address.url}: {address.host} is not a serial device; correct mavlink.url"
+        ) from error
+    return ByteStream(fd, lambda: os.close(fd))
