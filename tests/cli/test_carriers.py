@@ -14,10 +14,10 @@ import tomli_w
 from PIL import Image
 
 from dappled.cli import main
-from dappled.cli.calibrate import from_frames
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.mocks.body import dng
 from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
+from tests.simulated.calibration import from_frame
 
 MASK = "reference-5x5"
 SNR = 50
@@ -62,7 +62,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     folder = tmp_path_factory.mktemp("bench")
     camera = reference_camera(6, scale=0.5, scene="bench")
     (folder / "white.dng").write_bytes(camera.bench_frame().file)
-    found = from_frames(Darkroom(Recipe("reference-36mm", MASK)), [folder / "white.dng"])
+    found = from_frame(Darkroom(Recipe("reference-36mm", MASK)), folder / "white.dng")
     (folder / "calibration.toml").write_text(tomli_w.dumps(found.to_dict()))
     return Bench(camera, folder / "calibration.toml")
 

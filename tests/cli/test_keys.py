@@ -1,7 +1,9 @@
-"""`dappled keys`: files with the right modes, and a sentence where something stands in the way."""
+"""`dappled keys` and `dappled mavlink key`: files with the right modes, and a sentence for what stands in the way."""
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 import stat
 from pathlib import Path
@@ -36,3 +38,17 @@ def test_a_token_is_made_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_watch_wants_both_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["watch", "tcp://127.0.0.1:1", "--keys", str(tmp_path / "a")]) == 1
     assert "go together" in capsys.readouterr().err
+
+
+def test_a_random_key_and_one_from_a_passphrase(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["mavlink", "key", str(tmp_path / "a.key")]) == 0
+    assert "keys = [" in capsys.readouterr().out
+    monkeypatch.setattr("sys.stdin", io.StringIO("swordfish\n"))
+    assert main(["mavlink", "key", str(tmp_path / "b.key"), "--passphrase"]) == 0
+    assert (tmp_path / "b.key").read_text().strip() == hashlib.sha256(b"swordfish").hexdigest()
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
+    assert main(["mavlink", "key", str(tmp_path / "c.key"), "--passphrase"]) == 1
+    assert main(["mavlink", "key", str(tmp_path / "a.key")]) == 1
+    assert "exists already" in capsys.readouterr().err

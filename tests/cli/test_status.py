@@ -1,16 +1,21 @@
-"""`dappled status` in front of a stream."""
+"""`dappled status` in front of a stream, and which stream it finds."""
 
 from __future__ import annotations
 
 import json
+import os
+import socket
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from dappled.cli import main
+from dappled.cli.status import is_listening, stream_endpoint
 from dappled.daemon.stream.publisher import Publisher
+from dappled.errors import DappledError
 from tests.daemon.health.test_metrics import HEALTH
 
 
@@ -54,3 +59,49 @@ def test_the_record_itself_as_json(stream: str, capsys: pytest.CaptureFixture[st
 def test_nobody_there_is_said_in_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["status", f"ipc://{tmp_path}/nobody", "--timeout", "0.2"]) == 1
     assert "no daemon was heard on" in capsys.readouterr().err
+
+
+# --- which daemon is asked when the call names none
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The user's own runtime folder, empty."""
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "dappled").mkdir()
+    return tmp_path / "dappled"
+
+
+@contextmanager
+def listening(path: Path) -> Iterator[None]:
+    with socket.socket(socket.AF_UNIX) as one:
+        one.bind(str(path))
+        one.listen()
+        yield
+
+
+def test_without_a_service_it_is_the_user_s_own(own: Path, tmp_path: Path) -> None:
+    assert stream_endpoint(None, tmp_path / "no service") == f"ipc://{own}/slices"
+
+
+def test_a_service_is_found_where_no_daemon_of_the_user_s_own_answers(own: Path, tmp_path: Path) -> None:
+    service = tmp_path / "service"
+    service.mkdir()
+    with listening(own / "slices"):
+        assert is_listening(f"ipc://{own}/slices")
+        assert stream_endpoint(None, service) == f"ipc://{own}/slices"
+    assert not is_listening(f"ipc://{own}/slices")  # what a killed daemon leaves behind
+    assert stream_endpoint(None, service) == f"ipc://{service}/slices"
+
+
+def test_settings_that_name_an_endpoint_are_obeyed(own: Path, tmp_path: Path) -> None:
+    (tmp_path / "dappled.toml").write_text('[publish]\nslices = "tcp://127.0.0.1:5555"\n', encoding="utf-8")
+    assert stream_endpoint(tmp_path / "dappled.toml", tmp_path) == "tcp://127.0.0.1:5555"
+    assert not is_listening("tcp://127.0.0.1:5555")
+
+
+def test_who_may_not_ask_the_service_is_told_how_to(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may look everywhere
+    with pytest.raises(DappledError, match="usermod -aG dappled"):
+        stream_endpoint(None, tmp_path)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from dappled.cli.terminal import CameraRemarks, Frames, ProblemRemarks
+from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, frame_line
 from dappled.daemon.health import log_format
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.drivers.camera import BodyState, StateChanged
@@ -20,11 +20,11 @@ from tests.flight.makers import shot
 
 
 def test_a_line_for_each_frame(capsys: pytest.CaptureFixture[str]) -> None:
-    frames = Frames(lambda pending: f"shot {pending.shot.index}")
+    frames = FrameLines()
     for index in range(20):
         frames.finished(PendingShot(shot(index)))
     frames.close()
-    assert capsys.readouterr().out.splitlines() == [f"shot {index}" for index in range(20)]
+    assert capsys.readouterr().out.splitlines() == [frame_line(PendingShot(shot(index))) for index in range(20)]
 
 
 def test_a_terminal_that_is_gone_stops_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,7 +36,7 @@ def test_a_terminal_that_is_gone_stops_nobody(monkeypatch: pytest.MonkeyPatch) -
             raise BrokenPipeError
 
     monkeypatch.setattr(sys, "stdout", Gone())
-    frames = Frames(lambda pending: f"shot {pending.shot.index}")
+    frames = FrameLines()
     frames.finished(PendingShot(shot(0)))
     frames.close()
     with sys.stdout as nowhere:
@@ -99,7 +99,7 @@ def test_in_the_journal_a_frame_can_be_asked_for(tmp_path: Path, capsys: pytest.
         root.addHandler(handler)
         root.setLevel(logging.INFO)
         try:
-            frames = Frames(lambda pending: f"shot {pending.shot.index}")
+            frames = FrameLines()
             frames.finished(PendingShot(shot(42), problem="it hangs"))
             CameraRemarks().changed(StateChanged("ready", "", 0))
             frames.close()
@@ -109,7 +109,7 @@ def test_in_the_journal_a_frame_can_be_asked_for(tmp_path: Path, capsys: pytest.
             root.setLevel(before)
             handler.close()
     assert capsys.readouterr() == ("", "")
-    frame = told["shot 42"]
+    frame = told[frame_line(PendingShot(shot(42), problem="it hangs"))]
     asked = {name: frame[f"DAPPLED_{name}"] for name in ("FRAME", "STATE", "PROBLEM")}
     assert asked == {"FRAME": "42", "STATE": "failed", "PROBLEM": "it hangs"}
     assert frame["PRIORITY"] == "4"

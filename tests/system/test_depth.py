@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 import dappled
-from dappled.cli import calibrate_target
-from dappled.cli.calibrate import from_frames
+from dappled.cli.calibrate.target import from_frames as targets_from_frames
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.mocks.scene.bench import Bench, Plane
 from dappled.mocks.scene.masked_camera import LEVEL, MaskedCamera, Truth, reference_camera
 from dappled.mocks.scene.synthesis import PASS, Grid
 from dappled.products.opened import OpenedFrame, OpenedLightField, with_ranging
+from tests.simulated.calibration import from_frame
 
 CAMERA, MASK = "reference-36mm", "reference-5x5"
 SCALE, BORDER = 0.5, 12
@@ -82,7 +82,7 @@ def shown(scene: str, seed: int, snr: float) -> Shown:
     with TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "bench.dng").write_bytes(camera.bench_frame().file)
-        calibration = from_frames(Darkroom(Recipe(CAMERA, MASK)), [folder / "bench.dng"])
+        calibration = from_frame(Darkroom(Recipe(CAMERA, MASK)), folder / "bench.dng")
         (folder / "c.toml").write_text(tomli_w.dumps(calibration.to_dict()))
         exposure = camera.expose(0.0, 0)
         (folder / "frame.dng").write_bytes(exposure.file)
@@ -92,7 +92,7 @@ def shown(scene: str, seed: int, snr: float) -> Shown:
         for metres in targets:
             (folder / f"{metres:g}.dng").write_bytes(target(camera, seed, metres).expose(0.0, 1).file)
         recipe = Recipe(CAMERA, MASK, calibration=str(folder / "c.toml"))
-        ranging, _ = calibrate_target.from_frames(recipe, [folder / f"{m:g}.dng" for m in targets], targets)
+        ranging, _ = targets_from_frames(recipe, [folder / f"{m:g}.dng" for m in targets], targets)
         found = OpenedLightField(with_ranging(frame.light_field.field, ranging))
     return _beside_truth(found, exposure.truth, camera)
 

@@ -14,7 +14,6 @@ import pytest
 import tomli_w
 
 import dappled
-from dappled.cli.calibrate import from_frames
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.scene.bench import Bench, Plane
@@ -22,6 +21,7 @@ from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 from dappled.mocks.scene.synthesis import PASS, Grid
 from dappled.mocks.scene.terrain import noise
 from dappled.products.opened import OpenedFrame
+from tests.simulated.calibration import from_frame
 from tests.system.test_depth import BORDER, CAMERA, MASK, SCALE, sampled, say, with_snr
 
 pytestmark = pytest.mark.slow
@@ -102,7 +102,7 @@ CASES = (
 def test_sigma_on_other_scenes(case: Case, tmp_path: Path) -> None:
     camera = case.camera()
     (tmp_path / "bench.dng").write_bytes(camera.bench_frame().file)
-    calibration = from_frames(Darkroom(Recipe(CAMERA, MASK)), [tmp_path / "bench.dng"])
+    calibration = from_frame(Darkroom(Recipe(CAMERA, MASK)), tmp_path / "bench.dng")
     (tmp_path / "c.toml").write_text(tomli_w.dumps(calibration.to_dict()))
     exposure = camera.expose(1.0, 0, f_number=case.f_number)
     (tmp_path / "frame.dng").write_bytes(exposure.file)

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from dappled.cli.calibrate import from_frames
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
+from tests.simulated.calibration import from_frame
 from tests.system.quality import Score, score
 
 CAMERA, MASK = "reference-36mm", "reference-5x5"
@@ -30,7 +30,7 @@ NOISE_FREE, RAW_SNR_100 = Wanted(48, 18), Wanted(35, 8)
 def _score(camera: MaskedCamera, folder: Path, *, least_disparity_px: float) -> Score:
     """One frame decoded with a calibration on the stopped-down bench frame of the same camera."""
     (folder / "bench.dng").write_bytes(camera.bench_frame().file)
-    calibration = from_frames(Darkroom(Recipe(CAMERA, MASK)), [folder / "bench.dng"])
+    calibration = from_frame(Darkroom(Recipe(CAMERA, MASK)), folder / "bench.dng")
     (folder / "calibration.toml").write_text(tomli_w.dumps(calibration.to_dict()))
     exposure = camera.expose(0.0, 0)
     (folder / "frame.dng").write_bytes(exposure.file)
@@ -75,7 +75,7 @@ def test_the_same_bytes_come_out_for_any_number_of_workers(tmp_path: Path) -> No
     outcomes = set()
     for workers in (1, 2, 3, 1):
         recipe = Recipe(CAMERA, MASK, workers=workers, colour=True)
-        found = from_frames(Darkroom(recipe), [tmp_path / "bench.dng"])
+        found = from_frame(Darkroom(recipe), tmp_path / "bench.dng")
         text = tomli_w.dumps(found.to_dict())
         (tmp_path / "calibration.toml").write_text(text)
         made = Darkroom(replace(recipe, calibration=str(tmp_path / "calibration.toml"))).develop(tmp_path / "frame.dng")
@@ -95,6 +95,6 @@ def test_the_mask_s_installation_is_found(tmp_path: Path) -> None:
     for seed in (11, 12):
         camera = reference_camera(seed, scale=0.5, scene="white")
         (tmp_path / "bench.dng").write_bytes(camera.bench_frame().file)
-        (fit,) = from_frames(Darkroom(Recipe(CAMERA, MASK)), [tmp_path / "bench.dng"]).fits
+        (fit,) = from_frame(Darkroom(Recipe(CAMERA, MASK)), tmp_path / "bench.dng").fits
         assert fit.rotation_rad == pytest.approx(camera.installed.rotation_rad, abs=2e-5)
         assert fit.mask_distance_mm == pytest.approx(camera.installed.distance_mm, rel=2e-3)

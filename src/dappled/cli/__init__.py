@@ -22,7 +22,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "watch": ("watch", "subscribe: show and save what arrives"),
     "keys": ("keys", "keys for who may subscribe over the network, and the console's token"),
     "trigger": ("trigger", "the ground station's part: ask for frames over MAVLink"),
-    "mavlink": ("mavlink", "keys for signed MAVLink links"),
+    "mavlink": ("keys", "keys for signed MAVLink links"),
     "decode": ("decode", "frames to light fields"),
     "carriers": ("carriers", "predicted and measured carriers of a frame"),
     "calibrate": ("calibrate", "fit lattice, law and phases to frames"),

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dappled.cli import common, georeference
+from dappled.cli import georeference
+from dappled.cli.arguments import whole
 from dappled.errors import DappledError
 from dappled.flight import layout
 from dappled.products.batch import batch, workers
@@ -30,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for what is made")
     parser.add_argument("--as", dest="kinds", nargs="+", choices=tuple(KINDS), default=["npz"],
                         help="of each frame: light field (npz, zarr, h5) or map (cog, kmz); default: npz")  # fmt: skip
-    parser.add_argument("--workers", type=common.whole, default=os.cpu_count() or 1, metavar="N",
+    parser.add_argument("--workers", type=whole, default=os.cpu_count() or 1, metavar="N",
                         help="processes (default: one a core)")  # fmt: skip
     parser.add_argument("--scheduler", metavar="URL", help="a Dask scheduler, as tcp://10.0.0.5:8786, instead")
     georeference.add_placing(parser)

@@ -12,7 +12,7 @@ from typing import Any
 
 from PIL import Image
 
-from dappled.cli import common
+from dappled.cli import decode_arguments
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
 from dappled.decode.optics.carrier_tables import crossed_orders, lattice_rotation
@@ -34,8 +34,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  dappled carriers --shape 2776 3688 --camera fujifilm-s5200 --mask mask-2 --focal-length 13\n"
         "  dappled carriers lytro.png --mask lenslet"
     )
-    common.frames(parser, "?")
-    common.add_recipe(parser)
+    decode_arguments.add_frames(parser, "?")
+    decode_arguments.add_recipe(parser)
     parser.add_argument(
         "--crossed", action="store_true", help="also the orders between harmonics that the pattern doesn't ask for"
     )
@@ -118,7 +118,7 @@ def _predicted(arguments: argparse.Namespace) -> Table:
     if not arguments.focal_length or arguments.focal_length <= 0:
         raise ConfigError("without a frame nothing tells the focal length: give --focal-length, in mm")
     camera = profiles.camera(arguments.camera)
-    darkroom = Darkroom(common.recipe(arguments))
+    darkroom = Darkroom(decode_arguments.recipe(arguments))
     decoder = darkroom.mask_decoder((arguments.shape[0], arguments.shape[1]), next(iter(camera.models), ""))
     mask = decoder.mask
     lattice = decoder.lattice_at(arguments.focal_length)
@@ -128,7 +128,7 @@ def _predicted(arguments: argparse.Namespace) -> Table:
 
 
 def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
-    darkroom = Darkroom(common.recipe(arguments))
+    darkroom = Darkroom(decode_arguments.recipe(arguments))
     raw = darkroom.read(arguments.frames)
     with darkroom.naming(arguments.frames):
         plane = darkroom.plane(raw)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tomli_w
 
-from dappled.cli.actions import Actions
+from dappled.cli.arguments import Actions
 from dappled.config import profiles, settings
 
 

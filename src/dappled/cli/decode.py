@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dappled.cli import common
+from dappled.cli import decode_arguments
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.errors import DappledError
 from dappled.products.exports import light_files
@@ -20,8 +20,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "examples:\n  dappled decode frame.dng --mask reference-5x5 --calibration c.toml -o frame.zarr\n"
         "  dappled decode *.png --mask lenslet --white white.png -o decoded/"
     )
-    common.frames(parser, "+")
-    common.add_recipe(parser)
+    decode_arguments.add_frames(parser, "+")
+    decode_arguments.add_recipe(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT",
                         help="light field (.zarr, .npz, .h5); with several frames a folder")  # fmt: skip
     parser.add_argument("--colour", action="store_true", help="views in red, green and blue (default: grey)")
@@ -31,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    darkroom = Darkroom(common.recipe(arguments))
+    darkroom = Darkroom(decode_arguments.recipe(arguments))
     darkroom.check()
     single = len(arguments.frames) == 1 and arguments.output.suffix
     if not single:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.cli import fields
+from dappled.cli import decode_arguments
 from dappled.decode.depth import estimate as depths
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.decode.depth.ranging import DistanceMap
@@ -33,10 +33,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  dappled depth frame.zarr --calibration c.toml --flight FLIGHT --frame 42 -o points.las\n"
         "OUT: .png (false colours), .npz (all of it), .pfm (disparity), .ply, .las, .laz (points)."
     )
-    fields.add_field(parser)
+    decode_arguments.add_field(parser)
     parser.add_argument("--method", choices=tuple(depths.METHODS), default="combined",
                         help="combined (default), contrast, gradient or stereo")  # fmt: skip
-    fields.add_between(parser)
+    decode_arguments.add_between(parser)
     parser.add_argument("--window", type=int, default=depths.WINDOW, metavar="PX",
                         help=f"side of what a pixel is judged by (default: {depths.WINDOW})")  # fmt: skip
     parser.add_argument("--most-sigma", type=float, default=0.1, metavar="SHARE",
@@ -49,7 +49,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    found = fields.opened_field(arguments)
+    found = decode_arguments.opened_field(arguments)
     between = None if arguments.between is None else (arguments.between[0], arguments.between[1])
     made = found.depth(arguments.method, between=between, window=arguments.window)
     distances = found.distances(made) if found.ranging is not None else None

@@ -17,7 +17,8 @@ from typing import Any
 from tqdm import tqdm
 
 from dappled.cli import status
-from dappled.cli.common import answers, stream, whole
+from dappled.cli.arguments import whole
+from dappled.cli.status import is_listening, stream_endpoint
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
 from dappled.daemon.health import frame_checks, go_no_go, host_checks, test_shot
@@ -55,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = configuration.load(arguments.config)
     if arguments.watch:
         return _watch()
-    if not arguments.simulate and answers(endpoint := stream(arguments.config)):
+    if not arguments.simulate and is_listening(endpoint := stream_endpoint(arguments.config)):
         return _beside(endpoint, settings, arguments)
     with tempfile.TemporaryDirectory(prefix="dpl-") as place, ExitStack() as stack:
         folder = Path(place)

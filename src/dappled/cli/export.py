@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dappled.cli import fields
+from dappled.cli import decode_arguments
 from dappled.products.exports import exports, light_files, rerun_log
 from dappled.products.opened import OpenedLightField
 
@@ -22,7 +22,7 @@ KINDS = {
 def configure(parser: argparse.ArgumentParser) -> None:
     lines = "\n".join(f"  {name:6} {what}" for name, what in KINDS.items())
     parser.epilog = f"forms:\n{lines}\nexample: dappled export frame.zarr --as hci -o hci/frame"
-    fields.add_field(parser)
+    decode_arguments.add_field(parser)
     parser.add_argument("--as", dest="kind", choices=tuple(KINDS), required=True, help="the form")
     parser.add_argument("--depth", action="store_true", help="hci, rerun: with a depth map (combined)")
     parser.add_argument("--lenslet", type=int, default=0, metavar="PX",
@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    found = fields.opened_field(arguments)
+    found = decode_arguments.opened_field(arguments)
     print(write(found, arguments.kind, arguments.output, arguments))
     return 0
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from dappled.cli import common, fields
+from dappled.cli.arguments import metres, positive
 from dappled.daemon.pipeline import recipes
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
@@ -53,9 +53,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="neighbours (frames against each other), a base map (GeoTIFF …), or both")  # fmt: skip
     better.add_argument("--gcp", type=Path, metavar="CSV",
                         help="control points: name, frame, column, row, latitude, longitude, altitude")  # fmt: skip
-    better.add_argument("--search", type=common.positive, default=5.0, metavar="M",
+    better.add_argument("--search", type=positive, default=5.0, metavar="M",
                         help="how far off frames are looked for on the base map (default: 5 m)")  # fmt: skip
-    better.add_argument("--pose-sigma", nargs=2, type=common.positive, metavar=("M", "DEG"),
+    better.add_argument("--pose-sigma", nargs=2, type=positive, metavar=("M", "DEG"),
                         help="how well poses are known, 1 σ (default: as recorded)")  # fmt: skip
     parser.add_argument("--json", action="store_true", help="the report as JSON")
 
@@ -74,8 +74,8 @@ def add_placing(parser: argparse.ArgumentParser) -> None:
     camera.add_argument("--camera", metavar="P", help="camera profile (default: the flight's)")
     camera.add_argument("--mask", metavar="P", help="mask profile (default: the flight's)")
     camera.add_argument("--calibration", metavar="FILE", help="mask calibration (default: the flight's)")
-    camera.add_argument("--focal-length", type=common.positive, metavar="MM", help="where frames don't say")
-    camera.add_argument("--f-number", type=common.positive, metavar="N", help="where frames don't say")
+    camera.add_argument("--focal-length", type=positive, metavar="MM", help="where frames don't say")
+    camera.add_argument("--f-number", type=positive, metavar="N", help="where frames don't say")
     camera.add_argument("--view", default="mean", metavar="VIEW",
                         help="mean, ground (all views, refocused there), or row,column of one")  # fmt: skip
     camera.add_argument("--grey", action="store_true", help="in grey (default: in colour where the frames have it)")
@@ -83,11 +83,11 @@ def add_placing(parser: argparse.ArgumentParser) -> None:
                         help="antenna to camera, metres forward, right, down (default: the flight's)")  # fmt: skip
     camera.add_argument("--mount", nargs=9, type=float, metavar="R",
                         help="camera axes to body, row by row (default: the flight's)")  # fmt: skip
-    camera.add_argument("--focus", type=fields.metres, default=math.inf, metavar="M",
+    camera.add_argument("--focus", type=metres, default=math.inf, metavar="M",
                         help="distance that the lens was focused at (default: infinity)")  # fmt: skip
     maps = parser.add_argument_group("map")
     maps.add_argument("--crs", metavar="EPSG:N", help="projection in metres (default: the UTM zone)")
-    maps.add_argument("--gsd", type=common.positive, metavar="M", help="metres a map cell (default: the frames' own)")
+    maps.add_argument("--gsd", type=positive, metavar="M", help="metres a map cell (default: the frames' own)")
     maps.add_argument("--frames", metavar="N,A-B", help="only these frames")
 
 

@@ -1,19 +1,25 @@
-"""`dappled keys`: who may subscribe over the network, and the console's token."""
+"""`dappled keys` and `dappled mavlink`: key files for subscribers, the console and signed MAVLink links."""
 
 from __future__ import annotations
 
 import argparse
+import getpass
 import json
 import secrets
+import sys
 from pathlib import Path
 
-from dappled.cli.actions import Actions
+from dappled.cli.arguments import Actions
 from dappled.daemon.stream import curve
+from dappled.drivers.mavlink.signing import SigningError, make_key
 
 HOME = Path("~/.config/dappled/keys")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
+    if parser.prog.endswith("mavlink"):
+        _configure_mavlink(parser)
+        return
     parser.epilog = (
         "example, a laptop that watches a vehicle:\n"
         "  vehicle$ dappled keys make vehicle\n"
@@ -32,7 +38,26 @@ def configure(parser: argparse.ArgumentParser) -> None:
         one.add_argument("--json", action="store_true", help="as JSON")
 
 
+def _configure_mavlink(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = "examples:\n  dappled mavlink key radio.key\n  dappled mavlink key radio.key --passphrase"
+    key = Actions.of(parser).add(
+        "key",
+        "make a key file for a signed link (see mavlink.keys)",
+        "dappled mavlink key /etc/dappled/radio.key --passphrase",
+    )
+    key.add_argument("file", type=Path, metavar="FILE", help="where to write it; never overwritten")
+    key.add_argument(
+        "--passphrase",
+        action="store_true",
+        help="ask for the passphrase that the ground station was given (default: a random key)",
+    )
+
+
 def run(arguments: argparse.Namespace) -> int:
+    if arguments.verb == "mavlink":
+        make_key(arguments.file, _passphrase() if arguments.passphrase else None)
+        print(f'{arguments.file}: a key for this user alone; set keys = ["{arguments.file.absolute()}"] in [mavlink]')
+        return 0
     match arguments.action:
         case "make":
             public, secret = curve.make(arguments.folder.expanduser(), arguments.name)
@@ -55,3 +80,11 @@ def _token(path: Path) -> str:
     except OSError as error:
         raise curve.KeyFileError(f"{path} can't be written: {error.strerror}") from None
     return f"{path}  name it in console.token; whoever knows what is in it may use the console"
+
+
+def _passphrase() -> str:
+    """Asked for on a terminal, else the first line of standard input."""
+    text = getpass.getpass("passphrase: ") if sys.stdin.isatty() else sys.stdin.readline().rstrip("\n")
+    if not text:
+        raise SigningError("an empty passphrase is no key; type the one that the ground station was given")
+    return text

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.cli import fields
+from dappled.cli import decode_arguments
+from dappled.cli.arguments import metres
 from dappled.decode.lightfield.focal_stack import all_in_focus, focal_stack
 from dappled.decode.lightfield.fourier_refocus import Spectrum4D, difference
 from dappled.decode.lightfield.refocus import magnified
@@ -27,12 +28,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  dappled refocus frame.zarr --stack 0 0.6 9 --all-in-focus -o sharp.png\n"
         "Several planes become one picture with captions. .npy keeps the numbers: linear, 1.0 = sensor white."
     )
-    fields.add_field(parser)
+    decode_arguments.add_field(parser)
     where = parser.add_argument_group("focus (one of them)").add_mutually_exclusive_group()
     where.add_argument("--alpha", nargs="+", type=float, metavar="A",
                        help="Eq 29's α: 1 as taken, below 1 nearer, above 1 farther")  # fmt: skip
     where.add_argument("--disparity", nargs="+", type=float, metavar="D", help="px from view to view")
-    where.add_argument("--distance", nargs="+", type=fields.metres, metavar="M", help="metres; needs distances")
+    where.add_argument("--distance", nargs="+", type=metres, metavar="M", help="metres; needs distances")
     where.add_argument("--stack", nargs=3, type=float, metavar=("FROM", "TO", "N"), help="N disparities")
     parser.add_argument("--magnify", action="store_true",
                         help="with --alpha: Eq 29 to the letter, where the picture grows with α")  # fmt: skip
@@ -51,7 +52,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     _check_mix(arguments)
-    found = fields.opened_field(arguments)
+    found = decode_arguments.opened_field(arguments)
     planes = _planes(found, arguments)
     if arguments.all_in_focus or arguments.index:
         made, captions = [_sharp(found, arguments)], [""]

@@ -11,8 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from dappled.cli import shot_line
-from dappled.cli.common import positive, seconds
+from dappled.cli.arguments import positive, seconds
+from dappled.cli.terminal import frame_json, frame_line
 from dappled.config import settings as configuration
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.decode_process import DecodeProcess
@@ -141,7 +141,7 @@ def _play(
     telemetry = RecordedTelemetry.flown(recorded, recording.telemetry, recording.horizons, recording.vehicles)
 
     def finished(one: PendingShot) -> None:
-        print(shot_line.as_json(one) if arguments.json else shot_line.line(one), flush=True)
+        print(frame_json(one) if arguments.json else frame_line(one), flush=True)
         progress.note(one)
 
     publisher = _publisher(settings, book, developer, stack) if arguments.publish else None

@@ -12,9 +12,8 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from dappled.cli import shot_line
-from dappled.cli.common import seconds, whole
-from dappled.cli.terminal import CameraRemarks, Frames, ProblemRemarks, remark
+from dappled.cli.arguments import seconds, whole
+from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, remark
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
 from dappled.daemon.flight_handover import FlightHandover, flights
@@ -71,7 +70,7 @@ def _run(arguments: argparse.Namespace) -> int:
 def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], Asker] | None) -> int:
     """Run the daemon, flight after flight, until it is told to end, or has had its frames or its time."""
     manager, camera, tally = Notifier(), CameraRemarks(), Tally()
-    frames = Frames(shot_line.as_json if arguments.json else shot_line.line, for_programs=arguments.json)
+    frames = FrameLines(as_json=arguments.json)
     asked, hung_up = threading.Event(), threading.Event()
     goal = StopCondition(tally, arguments.frames, arguments.seconds, ask=ask, ready=lambda: camera.state == "ready")
 

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import socket
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dappled.cli.common import seconds, stream
+from dappled.cli.arguments import seconds
+from dappled.config import settings
 from dappled.daemon.stream.subscriber import Subscriber
+from dappled.daemon.stream.wire import WireError
 from dappled.errors import DappledError
+
+SERVICE_FOLDER = Path("/run/dappled")  # RuntimeDirectory= of systemd/dappled.service
 
 
 class NotRunningError(DappledError):
@@ -27,13 +33,42 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    endpoint = arguments.endpoint or stream(arguments.config)
+    endpoint = arguments.endpoint or stream_endpoint(arguments.config)
     told = health(endpoint, arguments.timeout)
     if arguments.json:
         print(json.dumps(told))
     else:
         print(screen(told))
     return 0
+
+
+def stream_endpoint(config: Path | None, service: Path = SERVICE_FOLDER) -> str:
+    """Endpoint of the daemon on this machine: as the settings name it, else this user's own, else the service's.
+
+    Raises ConfigError; WireError where this user may not look into the service's folder.
+    """
+    endpoint = settings.load(config).publish.slices
+    ours = settings.runtime_folder() / "slices"
+    if endpoint != f"ipc://{ours}" or ours.parent == service or not service.is_dir() or is_listening(endpoint):
+        return endpoint
+    if not os.access(service, os.X_OK):
+        raise WireError(
+            f"{service}: only members of its group may ask the service: sudo usermod -aG dappled $USER, and log in anew"
+        )
+    return f"ipc://{service}/slices"
+
+
+def is_listening(endpoint: str) -> bool:
+    """Whether somebody listens on an ipc endpoint; of others nothing is known, and they don't."""
+    if not endpoint.startswith("ipc://"):
+        return False
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(endpoint.removeprefix("ipc://"))
+        except OSError:
+            return False
+    return True
 
 
 def health(endpoint: str, timeout_s: float) -> Mapping[str, Any]:

@@ -6,17 +6,20 @@ DAPPLED_FRAME=42`.
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import re
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from dappled.daemon.health.log_format import JournalHandler
 from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.daemon.stream import wire
 from dappled.drivers.camera import StateChanged
 from dappled.workers import Worker
 
@@ -48,12 +51,14 @@ class _Line:
     fields: Mapping[str, object]
 
 
-class Frames:
-    """Prints a `line` for each frame on standard output, or in the journal unless `for_programs`. A terminal that
-    stands still holds up nobody."""
+class FrameLines:
+    """Prints a line for each frame: on standard output, or in the journal unless `as_json`.
 
-    def __init__(self, line: Callable[[PendingShot], str], *, for_programs: bool = False) -> None:
-        self._line, self._for_programs = line, for_programs
+    A thread of its own prints, so that a terminal that stands still holds up nothing else.
+    """
+
+    def __init__(self, *, as_json: bool = False) -> None:
+        self._as_json = as_json
         self._lines: Worker[_Line] = Worker("print", self._print, capacity=1000, policy="drop oldest")
         self._lines.start()
 
@@ -61,14 +66,15 @@ class Frames:
         """A shot has come to its end."""
         fields = {"frame": one.shot.index, "state": "safe" if one.frame else "failed", "problem": one.problem}
         level = logging.WARNING if one.problem else logging.INFO
-        self._lines.put(_Line(self._line(one), level, {name: value for name, value in fields.items() if value != ""}))
+        text = frame_json(one) if self._as_json else frame_line(one)
+        self._lines.put(_Line(text, level, {name: value for name, value in fields.items() if value != ""}))
 
     def close(self) -> None:
         """Print what waits, for a second at most."""
         self._lines.stop(1.0)
 
     def _print(self, line: _Line) -> None:
-        if _journalled() and not self._for_programs:
+        if _journalled() and not self._as_json:
             remark(line.text, line.level, **line.fields)
             return
         try:
@@ -126,3 +132,57 @@ class ProblemRemarks:
 
 def _journalled() -> bool:
     return any(isinstance(one, JournalHandler) for one in logging.getLogger().handlers)
+
+
+_SHORT = {"wish to trigger": "wish", "trigger call": "call", "trigger to file": "file"}
+
+
+def frame_line(pending: PendingShot) -> str:
+    """Index, trigger source, time, position, attitude, focal length, carriers found, size, milliseconds per stage."""
+    cause = pending.shot.cause
+    sequence = "" if cause.sequence is None else f" #{cause.sequence}"
+    words = [f"{pending.shot.index:06d}", f"{cause.kind}{sequence} from {cause.source}"]
+    if pending.tag:
+        pose = wire.pose_face(pending.tag)
+        words.append(datetime.fromtimestamp(pending.tag.utc_ns / 1e9, UTC).strftime("%H:%M:%S.%f")[:-3])
+        if pose["latitude_deg"] is None:
+            words.append("no position")
+        else:
+            words.append(f"{pose['latitude_deg']:.7f} {pose['longitude_deg']:.7f} {pose['altitude_msl_m']:.2f} m")
+        if pose["yaw_deg"] is None:
+            words.append("no attitude")
+        else:
+            words.append(f"roll {pose['roll_deg']:.1f} pitch {pose['pitch_deg']:.1f} yaw {pose['yaw_deg']:.1f}")
+        length = pending.tag.focal_length_mm
+        words.append("focal length unknown" if length is None else f"{length:g} mm")
+    if pending.decoded:
+        done = pending.decoded
+        words.append(f"{done.carriers_found}/{done.carriers_predicted} carriers ({done.carriers_from})")
+    if pending.frame:
+        words.append(f"{pending.frame.size / 1e6:.1f} MB")
+    times = " ".join(f"{_SHORT.get(name, name)} {ms:.0f}" for name, ms in pending.ms.items())
+    if times:
+        words.append(f"ms: {times}")
+    if pending.frame is None and pending.follows:
+        words.append(pending.follows)
+    if pending.problem:
+        words.append(f"PROBLEM: {pending.problem}")
+    return "  ".join(words)
+
+
+def frame_json(pending: PendingShot) -> str:
+    """The same as one JSON object."""
+    facts = {
+        "index": pending.shot.index,
+        "cause": asdict(pending.shot.cause),
+        "frame": asdict(pending.frame) if pending.frame else None,
+        "tag": asdict(pending.tag) if pending.tag else None,
+        "carriers_found": pending.decoded.carriers_found if pending.decoded else None,
+        "carriers_predicted": pending.decoded.carriers_predicted if pending.decoded else None,
+        "carriers_from": pending.decoded.carriers_from if pending.decoded else None,
+        "slices_sha256": pending.decoded.sha256 if pending.decoded else None,
+        "ms": {**pending.ms, "decoder": dict(pending.decoded.ms) if pending.decoded else {}},
+        "follows": pending.follows or None,
+        "problem": pending.problem or None,
+    }
+    return json.dumps(facts)

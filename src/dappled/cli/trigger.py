@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from dappled.cli.common import seconds, whole
+from dappled.cli.arguments import seconds, whole
 from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dappled.cli import fields
+from dappled.cli import decode_arguments
 from dappled.decode.depth.evidence import of_light_field
 from dappled.decode.depth.stereo import shifts_from_middle
 from dappled.decode.lightfield.pictures import slice_mosaic
@@ -24,7 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "examples:\n  dappled views frame.zarr -o views.png\n  dappled views frame.zarr --of slices -o slices.png\n"
         "  dappled views frame.zarr --of shifts -o shifts.png"
     )
-    fields.add_field(parser, ranged=False)
+    decode_arguments.add_field(parser, ranged=False)
     parser.add_argument("--of", choices=("views", "slices", "shifts", "slice-shifts"), default="views",
                         help="views (default), slices at their carriers, or shifts: how far each view has\n"
                         "moved from the middle; slice-shifts: the same of slices, as the thesis tried")  # fmt: skip
@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    found = fields.opened_field(arguments)
+    found = decode_arguments.opened_field(arguments)
     made = {"views": _views, "slices": _slices, "shifts": _shifts, "slice-shifts": _slice_shifts}[arguments.of](found)
     prints.save(arguments.output, _small(made))
     count_v, count_u = found.views.shape[:2]

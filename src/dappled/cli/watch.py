@@ -6,7 +6,8 @@ import argparse
 import json
 from pathlib import Path
 
-from dappled.cli.common import seconds, stream, whole
+from dappled.cli.arguments import seconds, whole
+from dappled.cli.status import stream_endpoint
 from dappled.daemon.pipeline.memory import reuse_large_blocks
 from dappled.daemon.stream import watch
 from dappled.daemon.stream.curve import ClientKeys, KeyFileError, load_own, load_public
@@ -38,7 +39,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    endpoint = arguments.endpoint or stream(None)
+    endpoint = arguments.endpoint or stream_endpoint(None)
     ask = arguments.ask or (f"{endpoint}.ask" if endpoint.startswith("ipc://") else "")
     if bool(arguments.keys) != bool(arguments.server_key):
         raise KeyFileError("--keys and --server-key go together: your own secret key, and the vehicle's public one")

@@ -12,7 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from dappled.cli.actions import Actions
+from dappled.cli.arguments import Actions
 from dappled.cli.flight import lines as flight_lines
 from dappled.cli.flight import pickup
 from dappled.config import settings

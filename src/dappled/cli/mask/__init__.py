@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Protocol
 
-from dappled.cli.actions import Actions
+from dappled.cli.arguments import Actions
 from dappled.cli.mask import design, diffraction, make, plan, table
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 
-from dappled.cli import common
+from dappled.cli import decode_arguments
+from dappled.cli.arguments import whole
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.config.schema import ConfigError
@@ -34,13 +35,13 @@ def add_sensor(parser: argparse.ArgumentParser) -> None:
     """--camera and --shape."""
     parser.add_argument("--camera", required=True, metavar="P", help="camera profile or TOML file")
     parser.add_argument(
-        "--shape", type=common.whole, nargs=2, metavar=("H", "W"), help="raw shape (default: the camera's first)"
+        "--shape", type=whole, nargs=2, metavar=("H", "W"), help="raw shape (default: the camera's first)"
     )
 
 
 def add_installation(parser: argparse.ArgumentParser, *, free: bool = False) -> None:
     """--law and --mask-distance; `free` where a design may choose the distance."""
-    common.add_law(parser)
+    decode_arguments.add_law(parser)
     default = "default: free; with --mask the camera's" if free else "default: the camera's"
     parser.add_argument("--mask-distance", type=float, metavar="MM", help=f"mask to sensor ({default})")
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from dappled.cli import main
-from dappled.cli.calibrate_target import from_frames
+from dappled.cli.calibrate.target import from_frames
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, DecodeResult, Recipe
 from dappled.mocks.scene.masked_camera import reference_camera
 from tests.system.test_depth import target

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dappled.cli import calibrate_lens, calibrate_target, common
+from dappled.cli import decode_arguments
+from dappled.cli.calibrate import lens, target
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
 from dappled.decode.calibration import report
@@ -27,10 +28,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "examples:\n  dappled calibrate white-f22.dng --camera canon-eos-450d --mask mask-2 -o calibration.toml\n"
         "  dappled calibrate zoom/*.RAF --mask mask-2 --dark dark.RAF -o calibration.toml"
     )
-    common.frames(parser, "+")
-    common.add_recipe(parser, mask_needed=False)
-    calibrate_lens.add(parser)
-    calibrate_target.add(parser)
+    decode_arguments.add_frames(parser, "+")
+    decode_arguments.add_recipe(parser, mask_needed=False)
+    lens.add(parser)
+    target.add(parser)
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="calibration to write: FILE.toml and FILE.npz"
     )
@@ -40,24 +41,32 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     if arguments.lens:
         arguments.mask = arguments.mask or ""
-        return calibrate_lens.run(
-            common.recipe(arguments), arguments.frames, arguments.board, arguments.output, arguments.focal_length
+        return lens.run(
+            decode_arguments.recipe(arguments),
+            arguments.frames,
+            arguments.board,
+            arguments.output,
+            arguments.focal_length,
         )
     if arguments.target and arguments.mask:
-        return calibrate_target.run(
-            common.recipe(arguments), arguments.frames, arguments.target, arguments.output, arguments.focal_length
+        return target.run(
+            decode_arguments.recipe(arguments),
+            arguments.frames,
+            arguments.target,
+            arguments.output,
+            arguments.focal_length,
         )
     if not arguments.mask:
         raise ConfigError("name the mask to calibrate with --mask: a profile or TOML file")
     if arguments.mask == profiles.LENSLET:
         raise ConfigError("a lenslet array needs no calibration: give its white frame with --white when decoding")
-    darkroom = Darkroom(common.recipe(arguments))
+    darkroom = Darkroom(decode_arguments.recipe(arguments))
     darkroom.check()
-    seen, bad = _sights(darkroom, arguments)
+    seen, bad = _views(darkroom, arguments)
     if not seen:
         raise DarkroomError("no frame is left to calibrate on: each was refused, for the reason above")
     camera = darkroom.camera(seen[0].model)
-    found = _fitted(darkroom, seen, choose_law=not arguments.law)
+    found = fit_views(darkroom, seen, choose_law=not arguments.law)
     written = calibration_files.save(arguments.output, found)
     if arguments.json:
         print(json.dumps(report.as_values(found, camera.mask_distance_mm), indent=2))
@@ -72,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class CalibrationView:
     """What a calibration frame shows, and of which camera and size it is."""
 
     sight: Sight
@@ -80,21 +89,14 @@ class Seen:
     model: str
 
 
-def from_frames(
-    darkroom: Darkroom, frames: list[Path], focal_length_mm: float | None = None, f_number: float | None = None
-) -> Calibration:
-    """The calibration that these frames show. Raises DappledError at the first bad one."""
-    return _fitted(darkroom, [_seen(darkroom, path, focal_length_mm, f_number) for path in frames])
-
-
-def _sights(darkroom: Darkroom, arguments: argparse.Namespace) -> tuple[list[Seen], int]:
+def _views(darkroom: Darkroom, arguments: argparse.Namespace) -> tuple[list[CalibrationView], int]:
     """What the good frames show, and how many were bad; those are told on the way."""
-    good: list[Seen] = []
+    good: list[CalibrationView] = []
     bad = 0
     paths = arguments.frames
     for path in tqdm(paths, unit="frame", disable=len(paths) < 2 or not sys.stderr.isatty()):
         try:
-            one = _seen(darkroom, path, arguments.focal_length, arguments.f_number)
+            one = view_of(darkroom, path, arguments.focal_length, arguments.f_number)
             if good and (one.shape, one.model) != (good[0].shape, good[0].model):
                 first, this = (f"{s.model} {s.shape[0]} × {s.shape[1]}" for s in (good[0], one))
                 raise DarkroomError(f"{path} is of another camera or size ({this}, the first {first})")
@@ -107,7 +109,10 @@ def _sights(darkroom: Darkroom, arguments: argparse.Namespace) -> tuple[list[See
     return good, bad
 
 
-def _seen(darkroom: Darkroom, path: Path, focal_length_mm: float | None, f_number: float | None) -> Seen:
+def view_of(
+    darkroom: Darkroom, path: Path, focal_length_mm: float | None = None, f_number: float | None = None
+) -> CalibrationView:
+    """What one frame shows. Raises DappledError where it can't be used."""
     raw = darkroom.read(path)
     length, stop = focal_length_mm or raw.focal_length_mm, f_number or raw.f_number
     if length is None or stop is None:
@@ -124,10 +129,11 @@ def _seen(darkroom: Darkroom, path: Path, focal_length_mm: float | None, f_numbe
             camera.mask_distance_mm,
             workers=2,
         )
-    return Seen(sight, shape, raw.camera_model or "")
+    return CalibrationView(sight, shape, raw.camera_model or "")
 
 
-def _fitted(darkroom: Darkroom, seen: list[Seen], *, choose_law: bool = False) -> Calibration:
+def fit_views(darkroom: Darkroom, seen: list[CalibrationView], *, choose_law: bool = False) -> Calibration:
+    """The calibration that these frames show together; with `choose_law` also which law explains them best."""
     camera = darkroom.camera(seen[0].model)
     return of_sights(
         [one.sight for one in seen],

@@ -1,0 +1,75 @@
+"""Arguments of any verb: numbers that are checked, and actions, as in `dappled flight show`."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+
+
+def whole(text: str) -> int:
+    """An argument that is a whole number from 1."""
+    if not (text.isdecimal() and int(text) >= 1):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1")
+    return int(text)
+
+
+def seconds(text: str) -> float:
+    """An argument that is a time of 0 s or more."""
+    number = _number(text)
+    if number is None or not (math.isfinite(number) and number >= 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time of 0 s or more")
+    return number
+
+
+def positive(text: str) -> float:
+    """An argument that is a number above 0."""
+    number = _number(text)
+    if number is None or not (math.isfinite(number) and number > 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return number
+
+
+def metres(text: str) -> float:
+    """An argument that is a distance above 0 m; inf too."""
+    number = float(text)
+    if not number > 0 or math.isnan(number):
+        raise argparse.ArgumentTypeError(f"{text} is not a distance above 0 m")
+    return number
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Actions:
+    """The actions of one verb; one must be named, and stands in `arguments.action`."""
+
+    among: argparse._SubParsersAction[argparse.ArgumentParser]
+
+    @classmethod
+    def of(cls, parser: argparse.ArgumentParser) -> Actions:
+        """A verb's actions: none yet."""
+        return cls(parser.add_subparsers(dest="action", required=True, metavar="ACTION"))
+
+    @property
+    def all(self) -> Collection[argparse.ArgumentParser]:
+        """Their parsers, for what all of them take."""
+        return self.among.choices.values()
+
+    def add(self, name: str, line: str, *examples: str) -> argparse.ArgumentParser:
+        """The parser of an action that `line` explains, and calls of it that work."""
+        head = "example" if len(examples) == 1 else "examples"
+        made: argparse.ArgumentParser = self.among.add_parser(
+            name,
+            help=line,
+            description=line[0].upper() + line[1:] + ("" if line.endswith("?") else "."),
+            epilog="\n  ".join((f"{head}:", *examples)),
+            formatter_class=argparse.RawTextHelpFormatter,
+        )
+        return made

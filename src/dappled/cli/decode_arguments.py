@@ -1,0 +1,88 @@
+"""Arguments of verbs that decode frames or read light fields: camera, mask, files, focus and disparities."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from dappled.cli.arguments import metres
+from dappled.decode.depth.ranging import RANGING, Ranging
+from dappled.decode.optics.carriers import LAWS
+from dappled.drivers.raw import calibration_files
+from dappled.drivers.raw.darkroom import Recipe
+from dappled.products import opened
+from dappled.products.opened import OpenedLightField
+
+
+def add_frames(parser: argparse.ArgumentParser, count: str) -> None:
+    """The frames, as positional arguments."""
+    parser.add_argument("frames", nargs=count, type=Path, metavar="FRAME", help="RAF, CR2, DNG, LFP, TIFF, PNG or NPY")
+
+
+def add_law(parser: argparse.ArgumentParser) -> None:
+    """--law; empty where it isn't given."""
+    parser.add_argument("--law", default="", choices=tuple(LAWS), help="carrier law (default: the camera's)")
+
+
+def add_recipe(parser: argparse.ArgumentParser, *, mask_needed: bool = True) -> None:
+    """--camera, --mask, --law, and what files and numbers go with a frame."""
+    parser.add_argument(
+        "--camera", default="auto", metavar="P", help="camera profile or TOML file (default: by the frame)"
+    )
+    parser.add_argument("--mask", required=mask_needed, metavar="P", help="mask profile or TOML file, or lenslet")
+    add_law(parser)
+    parser.add_argument("--calibration", default="", metavar="FILE", help="file written by dappled calibrate")
+    parser.add_argument("--white", default="", metavar="FILE", help="white frame")
+    parser.add_argument("--dark", default="", metavar="FILE", help="dark frame")
+    parser.add_argument("--cfa", default="", metavar="BGGR", help="colour pattern, row by row, where the file has none")
+    parser.add_argument("--black", type=float, metavar="N", help="black level, where the file doesn't say")
+    parser.add_argument("--white-level", type=float, metavar="N", help="level of a full pixel (a 12-bit PNG: 4095)")
+    parser.add_argument("--focal-length", type=float, metavar="MM", help="of the lens, where the file doesn't say")
+    parser.add_argument("--f-number", type=float, metavar="N", help="of the exposure, where the file doesn't say")
+
+
+def recipe(arguments: argparse.Namespace) -> Recipe:
+    """The recipe that these arguments name."""
+    return Recipe(
+        camera=arguments.camera,
+        mask=arguments.mask,
+        law=arguments.law,
+        calibration=arguments.calibration,
+        white=arguments.white,
+        dark=arguments.dark,
+        workers=2,
+        cfa=arguments.cfa,
+        black=arguments.black,
+        white_level=arguments.white_level,
+        colour=getattr(arguments, "colour", False),
+        taper=getattr(arguments, "taper", 0.0),
+    )
+
+
+def add_field(parser: argparse.ArgumentParser, *, ranged: bool = True) -> None:
+    """The light field, and what leads to metres."""
+    parser.add_argument("field", type=Path, metavar="LIGHTFIELD",
+                        help="decoded light field (.zarr, .npz, .h5), or a folder of n × n pictures")  # fmt: skip
+    if ranged:
+        parser.add_argument("--focus", type=metres, metavar="M", help="where the lens was focused, in metres, or inf")
+        parser.add_argument("--calibration", type=Path, metavar="FILE",
+                            help="calibration with targets, as dappled calibrate --target writes it")  # fmt: skip
+
+
+def opened_field(arguments: argparse.Namespace) -> OpenedLightField:
+    """The light field that the arguments name. Raises DappledError."""
+    found = opened.light_field(arguments.field, focus_m=getattr(arguments, "focus", None))
+    calibration = getattr(arguments, "calibration", None)
+    if calibration is not None:
+        tables = calibration_files.tables(calibration)
+        if RANGING not in tables:
+            raise opened.OpenError(f"{calibration} knows no distances: make it anew with dappled calibrate --target")
+        found = OpenedLightField(opened.with_ranging(found.field, Ranging.from_dict(tables[RANGING])), found.path)
+        found.metres()  # asked for by name: refused where it is for another focal length
+    return found
+
+
+def add_between(parser: argparse.ArgumentParser) -> None:
+    """--between."""
+    parser.add_argument("--between", nargs=2, type=float, metavar=("LOW", "HIGH"),
+                        help="disparities to look at, px/view (default: where the scene lies)")  # fmt: skip
