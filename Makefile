@@ -2,7 +2,7 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check test-fast coverage test-slow soak faults bench lock arm64 install uninstall clean
+.PHONY: help setup peers demo test check test-fast coverage test-slow soak faults bench lock arm64 install uninstall clean
 PREFIX ?= /usr/local
 
 help: ## show this list
@@ -11,6 +11,10 @@ help: ## show this list
 setup: ## the environment in .venv (done by the others when needed)
 	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
 	@$(PYTHON) tools/bootstrap.py
+
+peers: ## MAVSDK and MAVProxy, which slow tests talk to, in .venv-peers (done by test-slow when needed)
+	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
+	@$(PYTHON) tools/bootstrap.py peers
 
 demo: setup ## eight simulated frames through the whole daemon, and pictures of the last
 	@tools/demo
@@ -30,7 +34,7 @@ coverage: setup ## the default tests again, and which lines they reach (a third 
 	@$(BIN)/coverage erase
 	@$(BIN)/pytest -q --no-header -n auto --dist worksteal -m "not slow" --cov --cov-report=term
 
-test-slow: setup ## the tests that take longer
+test-slow: setup peers ## the tests that take longer
 	@$(BIN)/pytest -q --no-header -m slow --durations=25
 
 soak: setup ## half an hour in which something goes wrong every few seconds; MINUTES=n for another time
@@ -43,9 +47,11 @@ faults: setup ## every camera fault against the daemon, again and again; ROUNDS=
 bench: setup ## what the performance claims are measured with
 	@for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
 
-lock: setup ## resolve the two locks anew from pyproject.toml: everything, and what flies
+lock: setup ## resolve the locks anew from pyproject.toml: everything, the peers of tests, and what flies
 	@uv=$$(command -v uv || echo .tools/bin/uv); $$uv pip compile -q --universal --python-version 3.11 --generate-hashes \
 	  --no-header --all-extras --group dev pyproject.toml -o requirements.lock; \
+	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --group peers \
+	  -o requirements-peers.lock; \
 	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header -c requirements.lock \
 	  --no-annotate pyproject.toml -o requirements-onboard.lock
 
@@ -59,4 +65,4 @@ uninstall: ## take it away again; settings and flights stay
 	@$(PYTHON) tools/install.py uninstall --prefix $(PREFIX) $(if $(DESTDIR),--destdir $(DESTDIR)) $(if $(SYSCONFDIR),--sysconfdir $(SYSCONFDIR))
 
 clean: ## remove what set-up and tests made
-	rm -rf .venv .tools build .coverage* htmlcov .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .venv-peers .tools build .coverage* htmlcov .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,6 +1,9 @@
 #!/usr/bin/env python3
 """Set up .venv from requirements.lock: with the uv on PATH, or one fetched into .tools/. Touches nothing else.
 
+    python tools/bootstrap.py          the environment of the project, in .venv
+    python tools/bootstrap.py peers    that of MAVSDK and MAVProxy, which some tests talk to, in .venv-peers
+
 Runs on a bare Python >= 3.11 (no pip, no venv module needed). Says nothing when all is in place.
 """
 
@@ -15,13 +18,15 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tempfile
 import urllib.request
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TOOLS = ROOT / ".tools"
 VENV = ROOT / ".venv"
-STAMP = VENV / "dappled-set-up"
+PEERS = ROOT / ".venv-peers"
+STAMP = "dappled-set-up"
 # uv's own releases, for machines whose Python has neither pip nor ensurepip. DAPPLED_UV_RELEASES names a mirror.
 RELEASES = "https://github.com/astral-sh/uv/releases/latest/download"
 
@@ -35,19 +40,36 @@ def find_uv() -> str | None:
 
 
 def fetch_uv() -> str:
-    """A uv in .tools/: by pip where Python has it, else from uv's releases."""
+    """A uv in .tools/: by Python's pip, else by Debian's, else from uv's releases."""
     print("fetching uv into .tools/ …", file=sys.stderr)
     TOOLS.mkdir(exist_ok=True)
-    if importlib.util.find_spec("pip"):
+    with tempfile.TemporaryDirectory() as folder:
+        wheel = None if importlib.util.find_spec("pip") else debian_pip(Path(folder))
         pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "install", "--target", str(TOOLS)]
         pip += ["--root-user-action=ignore", "--upgrade", "uv"]
-        if subprocess.run(pip, check=False).returncode == 0 and (found := find_uv()):
+        environment = {**os.environ, "PYTHONPATH": str(wheel)} if wheel else None
+        if subprocess.run(pip, env=environment, check=False).returncode == 0 and (found := find_uv()):
             return found
     fetch_release(os.environ.get("DAPPLED_UV_RELEASES", RELEASES))
     found = find_uv()
     if not found:
         raise SystemExit("uv could not be fetched: install it (https://docs.astral.sh/uv) and run make again")
     return found
+
+
+def debian_pip(folder: Path) -> Path | None:
+    """Debian's wheel of pip, unpacked in `folder` and installed nowhere; None where it can't be had."""
+    apt, dpkg = shutil.which("apt-get"), shutil.which("dpkg-deb")
+    if apt is None or dpkg is None:
+        return None
+    if os.geteuid() == 0:
+        subprocess.run([apt, "-qq", "update"], check=False)
+    download = [apt, "-qq", "download", "python3-pip-whl"]
+    if subprocess.run(download, cwd=folder, stderr=subprocess.DEVNULL, check=False).returncode:
+        return None
+    for package in folder.glob("*.deb"):
+        subprocess.run([dpkg, "--extract", package.name, "."], cwd=folder, check=False)
+    return next(iter(folder.rglob("pip-*.whl")), None)
 
 
 def fetch_release(releases: str) -> None:
@@ -73,10 +95,10 @@ def fetch_release(releases: str) -> None:
         target.chmod(0o755)
 
 
-def wish() -> str:
-    """What the environment must have been made from."""
-    lock = (ROOT / "requirements.lock").read_bytes() + (ROOT / "pyproject.toml").read_bytes()
-    return hashlib.sha256(lock + sys.version.encode() + str(ROOT).encode()).hexdigest()
+def ingredients(*files: str) -> str:
+    """A hash of what an environment is made from: these files, this Python, this folder."""
+    content = b"".join((ROOT / file).read_bytes() for file in files)
+    return hashlib.sha256(content + sys.version.encode() + str(ROOT).encode()).hexdigest()
 
 
 def same_python(python: str) -> bool:
@@ -87,22 +109,33 @@ def same_python(python: str) -> bool:
     return said.stdout.strip() == sys.version.strip()
 
 
-def main() -> None:
-    if STAMP.is_file() and STAMP.read_text() == wish():
+def make(venv: Path, lock: str, *, project: bool) -> None:
+    """Make an environment from a lock, with the project in it or without. Does nothing where it is made already."""
+    stamp = venv / STAMP
+    wanted = ingredients(lock, *(["pyproject.toml"] if project else []))
+    if stamp.is_file() and stamp.read_text() == wanted:
         return
     uv = find_uv() or fetch_uv()
-    python = str(VENV / "bin" / "python")
+    python = str(venv / "bin" / "python")
 
     def run(*arguments: str) -> None:
         if subprocess.run([uv, *arguments], cwd=ROOT, check=False).returncode:
             raise SystemExit(f"set-up stopped at: uv {' '.join(arguments)}")
 
     if not same_python(python):
-        run("venv", "--quiet", "--clear", "--python", sys.executable, str(VENV))
+        run("venv", "--quiet", "--clear", "--python", sys.executable, str(venv))
     # Compiled once, here: without bytecode every process of the tests would compile MAVLink's dialect anew, in 100 MB.
-    run("pip", "sync", "--quiet", "--compile-bytecode", "--require-hashes", "--python", python, "requirements.lock")
-    run("pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--python", python, "--editable", ".")
-    STAMP.write_text(wish())
+    run("pip", "sync", "--quiet", "--compile-bytecode", "--require-hashes", "--python", python, lock)
+    if project:
+        run("pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--python", python, "--editable", ".")
+    stamp.write_text(wanted)
+
+
+def main() -> None:
+    if sys.argv[1:] == ["peers"]:
+        make(PEERS, "requirements-peers.lock", project=False)
+    else:
+        make(VENV, "requirements.lock", project=True)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,9 +16,12 @@ from dappled.flight import flight_report
 from dappled.mocks.autopilot.autopilot import Autopilot
 from dappled.mocks.body.body import Body, BodyOptions
 from tests.system.flying import Flying, eventually, flying, settings_of
-from tests.system.peers.mavproxy import MavProxy
+from tests.system.peers.mavproxy import PYTHON, MavProxy
 
-pytestmark = pytest.mark.peers
+pytestmark = [
+    pytest.mark.peers,
+    pytest.mark.skipif(not PYTHON.exists(), reason="MAVSDK and MAVProxy are not set up: run `make peers`"),
+]
 PEERS = Path(__file__).parent / "peers"
 
 
@@ -54,7 +56,7 @@ def camera(tmp_path: Path) -> Iterator[Camera]:
 def run(script: str, folder: Path, *arguments: object) -> subprocess.Popen[bytes]:
     """A peer's script in a process of its own, its caches in `folder`."""
     return subprocess.Popen(
-        [sys.executable, "-W", "ignore", str(PEERS / script), *map(str, arguments)],
+        [str(PYTHON), "-W", "ignore", str(PEERS / script), *map(str, arguments)],
         stdin=subprocess.PIPE,
         env={**os.environ, "HOME": str(folder), "XDG_CACHE_HOME": str(folder / "cache")},
     )
@@ -114,6 +116,7 @@ def test_mavsdk_as_autopilot_whose_system_is_adopted_and_whose_triggers_are_shot
     assert flight_report.balance(camera.flying.service.folder).by_source == {"mavlink:7/1": 3}
 
 
+@pytest.mark.slow
 def test_mavproxys_camera_module(camera: Camera, tmp_path: Path) -> None:
     with MavProxy(camera.port(1), tmp_path) as proxy:
         proxy.until(r"loaded \d+ settings")

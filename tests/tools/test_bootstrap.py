@@ -75,5 +75,7 @@ def test_no_network_is_one_sentence(bootstrap: ModuleType) -> None:
 
 
 def test_what_the_environment_is_made_from_is_the_lock(bootstrap: ModuleType) -> None:
-    assert len(bootstrap.wish()) == 64
-    assert bootstrap.wish() == bootstrap.wish()
+    whole = bootstrap.ingredients("requirements.lock", "pyproject.toml")
+    assert len(whole) == 64
+    assert whole == bootstrap.ingredients("requirements.lock", "pyproject.toml")
+    assert whole != bootstrap.ingredients("requirements-peers.lock")

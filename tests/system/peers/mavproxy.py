@@ -5,21 +5,21 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-import sys
-import sysconfig
 import threading
 import time
 from pathlib import Path
+
+PYTHON = Path(__file__).resolve().parents[3] / ".venv-peers" / "bin" / "python"  # `make peers` sets it up
 
 
 class MavProxy:
     """Use as a context manager. `type` sends a line; `until` waits for words that were printed since."""
 
     def __init__(self, port: int, folder: Path) -> None:
-        script = Path(sysconfig.get_path("scripts")) / "mavproxy.py"
         self._process = subprocess.Popen(
             [
-                sys.executable, "-W", "ignore", str(script), "--master", f"udpout:127.0.0.1:{port}",
+                str(PYTHON), "-W", "ignore", str(PYTHON.with_name("mavproxy.py")),
+                "--master", f"udpout:127.0.0.1:{port}",
                 "--default-modules=cmdlong,camera,ftp", "--streamrate=-1", "--source-system=255", "--target-system=1",
                 f"--state-basedir={folder}",
             ],
