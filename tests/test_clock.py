@@ -7,13 +7,20 @@ import time
 
 import pytest
 
-from dappled.clock import RecordedClock, SystemClock
+from dappled.clock import RecordedClock, SystemClock, TimeOfDayClock
 
 
 def test_the_system_clock_keeps_its_offset() -> None:
     clock = SystemClock(5)
     before = clock.monotonic_ns()
     assert before + 5 <= clock.utc_ns() <= clock.monotonic_ns() + 5
+
+
+def test_the_time_of_day_follows_the_system_s_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = TimeOfDayClock()
+    monkeypatch.setattr(time, "time_ns", lambda: 7)
+    assert clock.utc_ns() == 7
+    assert clock.monotonic_ns() > 7
 
 
 def test_a_recorded_clock_moves_only_when_told_and_never_back() -> None:

@@ -44,6 +44,14 @@ class SystemClock:
         return event.wait(max(0.0, timeout_s))
 
 
+class TimeOfDayClock(SystemClock):
+    """The machine's clock. UTC is the system's time of day and follows its steps (NTP, a person)."""
+
+    def utc_ns(self) -> int:
+        """See Clock."""
+        return time.time_ns()
+
+
 class RecordedClock:
     """A clock that stands still until it is told the time: for replays, and for tests.
 

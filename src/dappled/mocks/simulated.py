@@ -19,7 +19,7 @@ from typing import Any
 
 from dappled.config.schema import ConfigError, Source, build, setting
 from dappled.drivers.camera import CameraError, Identity, check_options, seconds_option
-from dappled.drivers.wired.composed import ComposedCamera, Plan
+from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.sources import FolderSource
 from dappled.mocks.body.body import BodyOptions, exposer
 
@@ -53,7 +53,7 @@ def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
     folder = wanted.pop("folder")
     options = BodyOptions(**wanted, truth=None if folder is None else Path(folder))
     card = Path(tempfile.gettempdir()) / f"dappled-card-{secrets.token_hex(8)}"
-    plan = Plan(file_s=seconds_option(settings, "file_s", 30.0), hold_s=_HOLD_S, poll_s=0.02)
+    plan = ComposedSettings(file_s=seconds_option(settings, "file_s", 30.0), hold_s=_HOLD_S, poll_s=0.02)
     identity = Identity("dappled", "Simulated Masked Camera", f"SIM{options.seed:08d}", "simulated")
     return ComposedCamera(identity, Exposing(options, card), FolderSource(card), plan)
 

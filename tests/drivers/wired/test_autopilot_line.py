@@ -11,7 +11,7 @@ import pytest
 from dappled.clock import SystemClock
 from dappled.drivers.camera import Identity
 from dappled.drivers.mavlink.links import MavlinkLinks, Packet, mavlink
-from dappled.drivers.wired.composed import ComposedCamera, Plan
+from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.shutter_line import parse_line
 from dappled.drivers.wired.sources import FolderSource
 from tests.drivers.contract import CameraContract, Rig
@@ -78,7 +78,7 @@ class TestContractOfTheAutopilotAndAFolder(CameraContract):
             companion = Companion(pixhawk.links.port(0))
             companion.links.start(companion)
             stack.callback(companion.links.stop)
-            plan = Plan(hold_s=0.01, poll_s=0.02)
+            plan = ComposedSettings(hold_s=0.01, poll_s=0.02)
             identity = Identity("FUJIFILM", "FinePix S5200", "", request.param)
             camera = ComposedCamera(identity, parse_line(request.param), FolderSource(body.card), plan)
             camera.use_autopilot(companion.order)

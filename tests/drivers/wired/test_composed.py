@@ -11,13 +11,14 @@ from typing import Any
 
 import pytest
 
+from dappled.clock import RecordedClock, SystemClock
 from dappled.drivers.camera import Arrival, CameraError, Companion, Deferred, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.replay import Recorded, ReplayCamera
 from dappled.drivers.wired import composed, folder, fujifilm, matching
-from dappled.drivers.wired.composed import ComposedCamera, Plan
+from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.shutter_line import GpioLine, OutsideLine
-from dappled.drivers.wired.sources import FolderSource, Found, StorageSource
+from dappled.drivers.wired.sources import FolderSource, FoundFile, StorageSource
 from dappled.mocks import simulated
 from dappled.mocks.body.body import pattern
 from dappled.mocks.body.eos450d import thumbnail
@@ -35,7 +36,7 @@ from tests.drivers.contract import (
 from tests.simulated.finepix import FinePix, picture
 
 WHO = Identity("FUJIFILM", "FinePix S5200", "", "gpio")
-FAST = Plan(file_s=20.0, hold_s=0.01, poll_s=0.02, retry_s=0.02)
+FAST = ComposedSettings(file_s=20.0, hold_s=0.01, poll_s=0.02, retry_s=0.02)
 T0 = 1_700_000_000.0
 
 
@@ -44,8 +45,9 @@ def body(tmp_path: Path) -> FinePix:
     return FinePix(tmp_path, write_s=0.0, wall_s=lambda: T0)
 
 
-def utc_ns() -> int:
-    return round(T0 * 1e9)
+def standing_clock() -> RecordedClock:
+    """A clock that the test moves: 1000 s after T0, and 1000 s monotonic."""
+    return RecordedClock(round((T0 + 1000.0) * 1e9), round(T0 * 1e9))
 
 
 def line(body: FinePix) -> GpioLine:
@@ -68,8 +70,9 @@ class TestContractOfAWireAndMassStorage(CameraContract):
     @pytest.fixture
     def rig(self, body: FinePix) -> Iterator[Rig]:
         body.plug()
-        plan = Plan(follows="it follows", hold_s=0.01, poll_s=0.02)
-        camera = ComposedCamera(WHO, line(body), StorageSource(body.mounts, body.places), plan, utc_ns=utc_ns)
+        plan = ComposedSettings(follows="it follows", hold_s=0.01, poll_s=0.02)
+        clock = SystemClock(round(T0 * 1e9) - time.monotonic_ns())
+        camera = ComposedCamera(WHO, line(body), StorageSource(body.mounts, body.places), plan, clock)
         yield Rig(camera, lambda number: picture(number, 6.3, T0), loose=True, follows=True)
         camera.stop()
 
@@ -142,7 +145,7 @@ def test_a_file_that_is_still_written_is_waited_for(tmp_path: Path, monkeypatch:
     source = FolderSource(tmp_path)
     listed, fired, pieces = source.list, threading.Event(), iter(range(60))
 
-    def growing() -> list[Found]:
+    def growing() -> list[FoundFile]:
         """Each look finds the file longer than the last one did, until it is whole."""
         if fired.is_set() and next(pieces, None) is not None:
             with (tmp_path / "slow.dng").open("ab") as file:
@@ -169,7 +172,7 @@ def test_nothing_is_fired_before_the_first_look_says_which_files_are_old(
     source = FolderSource(tmp_path)
     listed, asked, answered = source.list, threading.Event(), threading.Event()
 
-    def slow() -> list[Found]:
+    def slow() -> list[FoundFile]:
         asked.set()
         assert answered.wait(20)
         return listed()
@@ -212,25 +215,25 @@ def test_what_lay_there_before_is_left_alone_and_what_nobody_wished_for_has_no_s
 
 
 def test_no_file_fails_the_shot_and_a_late_one_is_told_by_the_camera_s_clock(tmp_path: Path) -> None:
-    plan = Plan(file_s=0.5, hold_s=0.01, poll_s=0.02)
-    now_s = 1000.0
-    body = FinePix(tmp_path, write_s=0.0, wall_s=lambda: T0 + now_s, clock_offset_s=3600.0)
-    camera = ComposedCamera(WHO, OutsideLine(), FolderSource(body.card), plan, lambda: round(now_s * 1e9))
+    plan = ComposedSettings(file_s=0.5, hold_s=0.01, poll_s=0.02)
+    clock = standing_clock()
+    body = FinePix(tmp_path, write_s=0.0, wall_s=lambda: clock.utc_ns() / 1e9, clock_offset_s=3600.0)
+    camera = ComposedCamera(WHO, OutsideLine(), FolderSource(body.card), plan, clock)
     camera.start()
     try:
         until_state(camera, "ready")
         camera.fire(1)
         body.contact(True)
         _closed(until_shot_ends(camera, 1))
-        now_s += 10
+        clock.advance(10)
         camera.fire(2)
         until(camera, lambda event: isinstance(event, Fired) and event.shot == 2)
-        taken_s = now_s
-        now_s += 20
+        taken_s = clock.utc_ns() / 1e9
+        clock.advance(20)
         failed(camera, 2)
         camera.fire(3)
         until(camera, lambda event: isinstance(event, Fired) and event.shot == 3)
-        (body.card / "DCIM" / "late.RAF").write_bytes(picture(2, 6.3, T0 + taken_s + 3600))
+        (body.card / "DCIM" / "late.RAF").write_bytes(picture(2, 6.3, taken_s + 3600))
         late = until(camera, lambda event: isinstance(event, Arrival))[-1]
         assert isinstance(late, Arrival)
         assert (late.shot, "doubt" in late.facts) == (2, False)
@@ -245,14 +248,14 @@ class Flight:
     """A Fujifilm by wire whose card is plugged when the test says so; its clocks are the test's."""
 
     def __init__(self, folder: Path) -> None:
-        self.now_s = 1000.0
-        self.body = FinePix(folder, write_s=0.0, wall_s=lambda: T0 + self.now_s, clock_offset_s=-3600.0)
+        self.clock = standing_clock()
+        self.body = FinePix(folder, write_s=0.0, wall_s=lambda: self.clock.utc_ns() / 1e9, clock_offset_s=-3600.0)
         self.card = self.body.card / "DCIM" / "100_FUJI"
         self.looks = 0
         source = StorageSource(self.body.mounts, self.body.places)
         listed = source.list
 
-        def counted() -> list[Found]:
+        def counted() -> list[FoundFile]:
             try:
                 return listed()
             finally:
@@ -261,20 +264,13 @@ class Flight:
         dated = source.taken_s
         self.read: list[str] = []
 
-        def taken_s(found: Found) -> float | None:
+        def taken_s(found: FoundFile) -> float | None:
             self.read.append(found.base)
             return dated(found)
 
         source.list, source.taken_s = counted, taken_s  # type: ignore[method-assign]  # count only
-        plan = Plan(follows="it follows", hold_s=0.001, poll_s=0.02)
-        self.camera = ComposedCamera(
-            WHO,
-            line(self.body),
-            source,
-            plan,
-            lambda: round(self.now_s * 1e9),
-            utc_ns=lambda: round((T0 + self.now_s) * 1e9),
-        )
+        plan = ComposedSettings(follows="it follows", hold_s=0.001, poll_s=0.02)
+        self.camera = ComposedCamera(WHO, line(self.body), source, plan, self.clock)
 
     def old(self, count: int, before_s: float = 86_400.0) -> None:
         """Pictures of another flight, 5 s apart."""
@@ -282,7 +278,7 @@ class Flight:
             (self.card / f"OLD{number:04d}.RAF").write_bytes(picture(number, 6.3, T0 - before_s + 5 * number))
 
     def shoot(self, shot: int, after_s: float) -> None:
-        self.now_s += after_s
+        self.clock.advance(after_s)
         self.camera.fire(shot)
         events = until(self.camera, lambda event: isinstance(event, Deferred))
         assert of_shots(events) == [(Fired, shot), (Deferred, shot)]
@@ -433,7 +429,7 @@ def bad() -> BadLine:
 
 @pytest.fixture
 def by_bad_line(bad: BadLine) -> Iterator[ComposedCamera]:
-    camera = ComposedCamera(WHO, bad, None, Plan(follows="later", hold_s=0.01, retry_s=0.02))
+    camera = ComposedCamera(WHO, bad, None, ComposedSettings(follows="later", hold_s=0.01, retry_s=0.02))
     yield camera
     camera.stop()
 
@@ -515,12 +511,12 @@ def test_a_source_that_breaks_in_any_way_is_told_and_its_shots_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = FolderSource(tmp_path)
-    camera = ComposedCamera(WHO, OutsideLine(), source, Plan(file_s=0.2, hold_s=0.01, poll_s=0.02))
+    camera = ComposedCamera(WHO, OutsideLine(), source, ComposedSettings(file_s=0.2, hold_s=0.01, poll_s=0.02))
     camera.start()
     try:
         until_state(camera, "ready")
 
-        def broken() -> list[Found]:
+        def broken() -> list[FoundFile]:
             raise MemoryError("no more")
 
         with monkeypatch.context() as patch:
@@ -542,7 +538,9 @@ def test_a_source_that_breaks_in_any_way_is_told_and_its_shots_end(
 def test_a_shot_without_a_file_says_what_was_wrong_with_the_folder(tmp_path: Path) -> None:
     folder = tmp_path / "card"
     folder.mkdir()
-    camera = ComposedCamera(WHO, OutsideLine(), FolderSource(folder), Plan(file_s=0.2, hold_s=0.01, poll_s=0.02))
+    camera = ComposedCamera(
+        WHO, OutsideLine(), FolderSource(folder), ComposedSettings(file_s=0.2, hold_s=0.01, poll_s=0.02)
+    )
     camera.start()
     try:
         until_state(camera, "ready")
@@ -555,7 +553,7 @@ def test_a_shot_without_a_file_says_what_was_wrong_with_the_folder(tmp_path: Pat
 
 def test_a_line_that_another_program_holds_is_named_and_taken_when_it_is_free(body: FinePix) -> None:
     body.hold_line(True)
-    camera = ComposedCamera(WHO, line(body), None, Plan(follows="later", hold_s=0.01, retry_s=0.02))
+    camera = ComposedCamera(WHO, line(body), None, ComposedSettings(follows="later", hold_s=0.01, retry_s=0.02))
     camera.start()
     try:
         faulted = until_state(camera, "faulted")

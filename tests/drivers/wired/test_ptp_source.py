@@ -10,7 +10,7 @@ import pytest
 
 from dappled.drivers.camera import CameraError, Identity
 from dappled.drivers.wired import composed
-from dappled.drivers.wired.composed import ComposedCamera, Plan
+from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.mocks.body.body import Body, BodyOptions, pattern
 from tests.drivers.contract import CameraContract, Rig
@@ -45,7 +45,7 @@ class TestContractOfAWireAndPtp(CameraContract):
     def rig(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
         monkeypatch.setattr(composed, "_FIRST_LOOK_S", 60.0)  # one shot alone is sure only on a card seen before it
         with Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2")) as body:
-            plan = Plan(follows="it follows", hold_s=0.01, poll_s=0.1)
+            plan = ComposedSettings(follows="it follows", hold_s=0.01, poll_s=0.1)
             identity = Identity("Canon", "EOS 450D", "", "wire")
             camera = ComposedCamera(identity, Wire(body), PtpSource(body.port), plan)
             yield Rig(camera, partial(pattern, size=SIZE), loose=True, follows=True)

@@ -12,13 +12,13 @@ import pytest
 from dappled.drivers.camera import CameraError
 from dappled.drivers.gphoto2.client import open_camera
 from dappled.drivers.wired.ptp_source import PtpSource
-from dappled.drivers.wired.sources import FolderSource, Found, Source, StorageSource, groups, parse_source
+from dappled.drivers.wired.sources import FileSource, FolderSource, FoundFile, StorageSource, groups, parse_source
 from dappled.mocks.body.body import Body, BodyOptions, pattern
 from tests.drivers.contract import content, until_shot_ends, until_state
 from tests.simulated.finepix import FinePix, picture
 
 
-def read(source: Source, found: Found) -> bytes:
+def read(source: FileSource, found: FoundFile) -> bytes:
     blob = source.open(found)
     data = os.pread(blob.fd, blob.size, 0)
     blob.close()
@@ -50,7 +50,7 @@ def test_what_is_gone_is_a_sentence(tmp_path: Path) -> None:
         source.list()
     for ask in (source.open, source.taken_s):
         with pytest.raises(CameraError, match=r"x\.raf can't be read"):
-            ask(Found("x.raf", 1))
+            ask(FoundFile("x.raf", 1))
 
 
 def test_mass_storage_is_found_where_it_is_mounted(tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_a_card_that_is_pulled_while_it_is_listed_is_not_an_empty_one(
 
 
 def test_one_exposure_s_files_are_a_group() -> None:
-    found = [Found("a/1.JPG", 1), Found("a/1.RAF", 1), Found("a/2.RAF", 1), Found("b/1.JPG", 1)]
+    found = [FoundFile("a/1.JPG", 1), FoundFile("a/1.RAF", 1), FoundFile("a/2.RAF", 1), FoundFile("b/1.JPG", 1)]
     made = groups(found)
     assert [(one.main.name, [other.name for other in one.companions]) for one in made] == [
         ("a/1.RAF", ["a/1.JPG"]), ("a/2.RAF", []), ("b/1.JPG", []),

@@ -23,7 +23,7 @@ from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
 from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching, in_order, match
-from dappled.drivers.wired.sources import Found, Group, Source, groups
+from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups
 from dappled.errors import DappledError
 from dappled.flight import FlightsLock, Frame, ImageIndex, Ledger, LedgerReader, Recorder, ShotRow, layout
 from dappled.flight.index import IndexEntry
@@ -53,7 +53,7 @@ class Proposal:
     that the flight has. `offset_s`: the camera's clock minus UTC, as the pairs show it.
     """
 
-    pairs: tuple[tuple[int, Group], ...]
+    pairs: tuple[tuple[int, FileGroup], ...]
     reasons: Mapping[int, str]
     doubts: tuple[str, ...]
     missing: tuple[int, ...]
@@ -71,7 +71,7 @@ class Picked:
     zooms: tuple[str, ...]
 
 
-def propose(flight: Path, source: Source, choice: Choice) -> Proposal:
+def propose(flight: Path, source: FileSource, choice: Choice) -> Proposal:
     """Which files belong to which shots. Changes nothing. Raises PickupError, FlightError, CameraError."""
     folder = layout.open_folder(flight)
     with LedgerReader.open(folder.ledger) as ledger:
@@ -115,7 +115,7 @@ def propose(flight: Path, source: Source, choice: Choice) -> Proposal:
 
 
 def bring(
-    flight: Path, source: Source, proposal: Proposal, utc_ns: Callable[[], int], progress: Callable[[int], Any]
+    flight: Path, source: FileSource, proposal: Proposal, utc_ns: Callable[[], int], progress: Callable[[int], Any]
 ) -> Picked:
     """Record, tag and index what was proposed. `progress` is told the bytes of each file. What was brought when an
     error comes stays; doing it again brings the rest. Raises FlightError, CameraError."""
@@ -174,8 +174,8 @@ def _offset(anchors: list[tuple[float | None, FiredShot]]) -> float | None:
     return median(offsets) if offsets else None
 
 
-def _chosen(choice: Choice, fresh: list[Group], rows: Mapping[int, ShotRow]) -> dict[int, Group]:
-    chosen: dict[int, Group] = {}
+def _chosen(choice: Choice, fresh: list[FileGroup], rows: Mapping[int, ShotRow]) -> dict[int, FileGroup]:
+    chosen: dict[int, FileGroup] = {}
     for index, name in choice.pairs.items():
         row = rows.get(index)
         if row is None or row.state == "safe":
@@ -211,7 +211,7 @@ def _reason(choice: Choice, matched: Matching) -> str:
     return f"by order, count and time (the camera's clock is {matched.offset_s or 0.0:+.1f} s from UTC)"
 
 
-def _record(recorder: Recorder, source: Source, index: int, found: Found, utc_ns: int) -> Frame:
+def _record(recorder: Recorder, source: FileSource, index: int, found: FoundFile, utc_ns: int) -> Frame:
     blob = source.open(found)
     try:
         return recorder.record(index, found.base, blob, arrived_utc_ns=utc_ns)
@@ -219,7 +219,7 @@ def _record(recorder: Recorder, source: Source, index: int, found: Found, utc_ns
         blob.close()
 
 
-def _accompany(recorder: Recorder, source: Source, index: int, found: Found, utc_ns: int) -> None:
+def _accompany(recorder: Recorder, source: FileSource, index: int, found: FoundFile, utc_ns: int) -> None:
     blob = source.open(found)
     try:
         recorder.record_companion(index, found.base, blob, arrived_utc_ns=utc_ns)

@@ -1,16 +1,16 @@
-"""A camera made of a shutter line and a place where its files are picked up: neither knows of the other.
+"""A camera composed of a shutter line, which fires it, and a file source, where its files are picked up.
 
-Where files only come later, each shot is deferred at once; whose file is whose is `file_watch`'s business.
+Where files come only after the flight, each shot is deferred at once. `file_watch` attributes files to shots.
 """
 
 from __future__ import annotations
 
 import queue
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from dappled.clock import Clock, TimeOfDayClock
 from dappled.drivers.attribution import Claim
 from dappled.drivers.camera import (
     Arrival,
@@ -24,8 +24,8 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.drivers.wired.file_watch import FileWatch
-from dappled.drivers.wired.shutter_line import Order, ShutterLine, UsesAutopilot, pressing
-from dappled.drivers.wired.sources import Source
+from dappled.drivers.wired.shutter_line import CommandSender, ShutterLine, UsesAutopilot
+from dappled.drivers.wired.sources import FileSource
 
 _WAITING = 64
 _PRESSED = "the shutter stays pressed"
@@ -33,10 +33,13 @@ _FIRST_LOOK_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """How a composed camera behaves. `follows`: None where files come in flight, within `file_s`; else the sentence how
-    they will come later. `hold_s`: how long the shutter is pressed. `poll_s`: between looks at the source. `retry_s`:
-    between attempts to open the line. `pair_s`: how long a JPEG waits for the raw file beside it."""
+class ComposedSettings:
+    """How a composed camera behaves.
+
+    `follows`: None where files come in flight, within `file_s` of the release; else a sentence that says how they come
+    later. `hold_s`: how long the shutter is pressed. `poll_s`: time between looks at the source. `retry_s`: time
+    between attempts to open the line. `pair_s`: how long a JPEG waits for the raw file beside it.
+    """
 
     file_s: float = 30.0
     follows: str | None = None
@@ -47,21 +50,20 @@ class Plan:
 
 
 class ComposedCamera(PlainCamera):
-    """The driver (`drivers.camera.Camera`). `source` None: nothing is picked up in flight."""
+    """The driver (`drivers.camera.Camera`). Without a source no file is picked up in flight."""
 
     def __init__(
         self,
         identity: Identity,
         line: ShutterLine,
-        source: Source | None,
-        plan: Plan,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
-        *,
-        utc_ns: Callable[[], int] = time.time_ns,
+        source: FileSource | None,
+        settings: ComposedSettings,
+        clock: Clock | None = None,
     ) -> None:
         super().__init__()
-        self._identity, self._line, self._plan, self._clock_ns = identity, line, plan, clock_ns
-        self._orders: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._identity, self._line, self._settings = identity, line, settings
+        self._clock = clock or TimeOfDayClock()
+        self._requested: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._open: dict[int, None] = {}  # shots that have not ended
         self._stopping = threading.Event()
@@ -69,33 +71,28 @@ class ComposedCamera(PlainCamera):
         self._line_fault = "the shutter line is not open"
         self._files_fault = ""
         self._ready = threading.Event()
-        self._arrived = threading.Event()  # a shot was fired: look for its file
-        self._watch = None if source is None else self._watching(source, utc_ns)
-        self._looked = threading.Event()  # what lay at the source before the first shot was seen, or nothing can be
+        self._shot_fired = threading.Event()  # a shot was fired: look for its file
+        self._watch: FileWatch | None = None
+        if source is not None:
+            self._watch = FileWatch(
+                source,
+                self._clock,
+                in_flight=settings.follows is None,
+                file_s=settings.file_s,
+                pair_s=settings.pair_s,
+            )
+        self._looked = threading.Event()  # the files from before the first shot are known, or there is no source
         self._fire_thread = threading.Thread(target=self._fire_all, name="shutter line", daemon=True)
         self._pick_thread = threading.Thread(target=self._pick_up, name="pickup", daemon=True)
 
-    def _watching(self, source: Source, utc_ns: Callable[[], int]) -> FileWatch:
-        plan = self._plan
-        return FileWatch(
-            source,
-            self._deliver,
-            self._give_up,
-            in_flight=plan.follows is None,
-            file_s=plan.file_s,
-            pair_s=plan.pair_s,
-            clock_ns=self._clock_ns,
-            utc_ns=utc_ns,
-        )
-
-    def use_autopilot(self, order: Order) -> None:
-        """See UsesAutopilot: for lines that go there."""
+    def use_autopilot(self, send: CommandSender) -> None:
+        """See UsesAutopilot: hand it on to a line that is fired by the autopilot."""
         if isinstance(self._line, UsesAutopilot):
-            self._line.use_autopilot(order)
+            self._line.use_autopilot(send)
 
     def start(self) -> None:
         """See Camera."""
-        self._events.put(StateChanged("starting", "", self._clock_ns()))
+        self._events.put(StateChanged("starting", "", self._clock.monotonic_ns()))
         self._fire_thread.start()
         if self._watch is not None:
             self._pick_thread.start()
@@ -103,30 +100,31 @@ class ComposedCamera(PlainCamera):
             self._looked.set()
 
     def fire(self, shot: int) -> None:
-        """See Camera: the line is pressed by a thread of its own."""
+        """See Camera: a thread of its own presses the line."""
         with self._lock:
             if shot in self._open:
                 raise CameraError(f"shot {shot} was fired before and has not ended")
             ready = self._ready.is_set() and not self._stopping.is_set() and len(self._open) < _WAITING
             if ready:
                 self._open[shot] = None
-                self._orders.put(shot)
+                self._requested.put(shot)
                 return
-            line = "too many shots wait for their files" if self._ready.is_set() else self._line_fault
-        reason = "the camera was stopped" if self._stopping.is_set() else line
-        self._events.put(ShotFailed(shot, reason, self._clock_ns()))
+            reason = "too many shots wait for their files" if self._ready.is_set() else self._line_fault
+        if self._stopping.is_set():
+            reason = "the camera was stopped"
+        self._events.put(ShotFailed(shot, reason, self._clock.monotonic_ns()))
 
     @property
     def identity(self) -> Identity | None:
-        """See Camera: known once the line was open."""
+        """See Camera: known once the line has been open."""
         return self._identity if self._opened else None
 
     def stop(self) -> None:
         """See Camera."""
         with self._lock:
             self._stopping.set()
-        self._orders.put(-1)
-        self._arrived.set()
+        self._requested.put(-1)
+        self._shot_fired.set()
         self._looked.set()
         for thread in (self._fire_thread, self._pick_thread):
             if thread.is_alive():
@@ -134,31 +132,31 @@ class ComposedCamera(PlainCamera):
         with self._lock:
             left, self._open = list(self._open), {}
         for shot in left:
-            self._events.put(ShotFailed(shot, "the camera was stopped", self._clock_ns()))
+            self._events.put(ShotFailed(shot, "the camera was stopped", self._clock.monotonic_ns()))
 
     # the shutter
 
     def _fire_all(self) -> None:
         opened = self._open_line()
         while opened and not self._stopping.is_set():
-            shot = self._orders.get()
+            shot = self._requested.get()
             if not self._stopping.is_set():
                 opened = self._fire_one(shot)
         if self._opened:
             self._tried(self._line.close)
 
     def _tried(self, call: Callable[[], None]) -> str:
-        """Why a call of the line failed; empty where it did not. A line of anybody's making may raise anything."""
+        """Call the line and return why it failed, "" where it did not. A third party's line may raise anything."""
         try:
             call()
         except CameraError as error:
             return str(error)
-        except Exception as error:  # noqa: BLE001  # as the docstring says: the thread must outlive it
+        except Exception as error:  # noqa: BLE001  # as the docstring says: the thread must survive it
             return f"the shutter line broke: {error!r}"
         return ""
 
     def _open_line(self, fault: str = "", *, pressed: bool = False) -> bool:
-        """Until it is open, and, where it was `pressed`, let go. False when stopping."""
+        """Try until the line is open and, where it was `pressed`, released. Returns False when stopping."""
         said = fault
         while not self._stopping.is_set():
             problem = self._tried(self._line.open)
@@ -174,67 +172,69 @@ class ComposedCamera(PlainCamera):
             if problem != said:
                 said = problem
                 self._line_lost(problem)
-            self._stopping.wait(self._plan.retry_s)
+            self._stopping.wait(self._settings.retry_s)
             if self._opened:
                 self._tried(self._line.close)
         return False
 
     def _await_first_look(self) -> None:
-        """Files that come in flight are told from older ones by that look alone. Where they come later, a source that
-        takes its time must not keep us from shooting."""
-        in_flight = self._plan.follows is None
+        """Wait until the source was listed once: only that look tells new files from older ones.
+
+        Where files come later, a slow source does not hold up shooting for longer than `_FIRST_LOOK_S`.
+        """
+        in_flight = self._settings.follows is None
         while not self._looked.wait(_FIRST_LOOK_S) and in_flight:
-            continue  # a source answers at some time, and `stop` ends this too
+            continue  # a source answers in the end, and `stop` sets the event too
 
     def _line_lost(self, problem: str) -> None:
-        """Say so. Shots that wait must not be fired when it is found again: their moment is over."""
+        """Report it, and fail the shots that wait: when the line is back their moment has passed."""
         with self._lock:
             self._ready.clear()
             self._line_fault = problem
-            self._events.put(StateChanged("faulted", problem, self._clock_ns()))
+            self._events.put(StateChanged("faulted", problem, self._clock.monotonic_ns()))
         while True:
             try:
-                shot = self._orders.get_nowait()
+                shot = self._requested.get_nowait()
             except queue.Empty:
                 return
-            self._end(shot, ShotFailed(shot, problem, self._clock_ns()))
+            self._end(shot, ShotFailed(shot, problem, self._clock.monotonic_ns()))
 
     def _fire_one(self, shot: int) -> bool:
-        """False when stopping."""
-        self._events.put(StateChanged("busy", "", self._clock_ns(), self._identity))
-        times: list[tuple[int, int]] = []
-        problem = self._tried(lambda: times.append(pressing(self._line, self._clock_ns)))
+        """Press, hold and release the line for a shot. Returns False when stopping."""
+        self._events.put(StateChanged("busy", "", self._clock.monotonic_ns(), self._identity))
+        called_ns = self._clock.monotonic_ns()
+        problem = self._tried(self._line.press)
+        returned_ns = self._clock.monotonic_ns()
         if problem:
-            self._end(shot, ShotFailed(shot, problem, self._clock_ns()))
+            self._end(shot, ShotFailed(shot, problem, self._clock.monotonic_ns()))
             self._tried(self._line.close)
             return self._open_line()
-        called_ns, returned_ns = times[0]
         self._events.put(Fired(shot, called_ns, returned_ns))
         if self._watch is not None:
             self._watch.expect(Claim(shot, called_ns))
-            self._arrived.set()
-        if self._plan.follows is not None:
-            self._end(shot, Deferred(shot, self._plan.follows, self._clock_ns()))
-        self._stopping.wait(self._plan.hold_s)
+            self._shot_fired.set()
+        if self._settings.follows is not None:
+            self._end(shot, Deferred(shot, self._settings.follows, self._clock.monotonic_ns()))
+        self._stopping.wait(self._settings.hold_s)
         problem = self._tried(self._line.let_go)
         if not problem:
             self._rest()
             return True
         problem = f"{_PRESSED}: {problem}"
         self._line_lost(problem)
-        self._stopping.wait(self._plan.retry_s)
+        self._stopping.wait(self._settings.retry_s)
         return self._open_line(problem, pressed=True)
 
     def _rest(self) -> None:
-        """Tell the state between shots, where the line is not lost."""
+        """Report the state between shots, unless the line is lost."""
         with self._lock:
             fault = self._files_fault
-            state = StateChanged("faulted" if fault else "ready", fault, self._clock_ns(), self._identity)
+            state = StateChanged("faulted" if fault else "ready", fault, self._clock.monotonic_ns(), self._identity)
             if self._ready.is_set():
                 self._events.put(state)
 
     def _end(self, shot: int, event: ShotFailed | Deferred | Arrival) -> bool:
-        """Tell a shot's end; False where it had ended before."""
+        """Report the end of a shot. Returns False where it had ended before."""
         with self._lock:
             was = shot in self._open
             self._open.pop(shot, None)
@@ -248,17 +248,20 @@ class ComposedCamera(PlainCamera):
         assert self._watch is not None
         while not self._stopping.is_set():
             try:
-                self._watch.look()
+                for event in self._watch.look():
+                    self._deliver(event)
                 fault = ""
-            except Exception as error:  # noqa: BLE001  # whatever a source raises: shots must end, the next look may do
+            except Exception as error:  # noqa: BLE001  # a source may raise anything: shots must end, and the next look may work
                 fault = f"files can't be picked up: {error!r}"
+            for failed in self._watch.overdue():
+                self._end(failed.shot, failed)
             self._looked.set()
             if fault != self._files_fault:
                 self._files_fault = fault
                 self._rest()
-            self._arrived.wait(self._plan.poll_s)
-            self._arrived.clear()
-            self._stopping.wait(self._plan.poll_s / 4)
+            self._shot_fired.wait(self._settings.poll_s)
+            self._shot_fired.clear()
+            self._stopping.wait(self._settings.poll_s / 4)
         self._watch.close()
 
     def _deliver(self, arrival: Arrival | Companion) -> None:
@@ -266,7 +269,3 @@ class ComposedCamera(PlainCamera):
             self._end(arrival.shot, arrival)
         else:
             self._events.put(arrival)
-
-    def _give_up(self, shot: int, trouble: str) -> None:
-        reason = f"no file came within {self._plan.file_s:g} s of the release" + (f": {trouble}" if trouble else "")
-        self._end(shot, ShotFailed(shot, reason, self._clock_ns()))

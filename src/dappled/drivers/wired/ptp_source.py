@@ -1,6 +1,6 @@
 """Files of a camera in PTP mode, through libgphoto2 in a process of its own that only lists and fetches.
 
-A body that sleeps or is pulled out costs this process and no other; the next call starts another one.
+When the body sleeps or is unplugged, only this process is lost; the next call starts another one.
 """
 
 from __future__ import annotations
@@ -19,42 +19,42 @@ from dappled.drivers.child_process import die_with_parent, end_child, start_chil
 from dappled.drivers.gphoto2.protocol import CameraFile, Session, SessionError
 from dappled.drivers.gphoto2.settings import GPhoto2Settings
 from dappled.drivers.process_channel import ChannelError, ChannelMessage, ProcessChannel
-from dappled.drivers.wired.sources import SUFFIXES, Found
+from dappled.drivers.wired.sources import SUFFIXES, FoundFile
 
 _ANSWER_S = 60.0
 _SEND_S = 5.0
 _REST_S = 0.5
-"""A camera that nobody asks anything is let go, so that others may have it."""
+"""After this long without a question the camera is closed, so that other programs can open it."""
 
 
 class PtpSource:
-    """See `pickup.Source`. One thread calls it."""
+    """A FileSource (see `sources`). One thread calls it."""
 
     def __init__(self, port: str) -> None:
         self._port = port
         self._child: tuple[subprocess.Popen[bytes], ProcessChannel] | None = None
         self._taken_s: dict[str, int | None] = {}
 
-    def list(self) -> list[Found]:
-        """See Source. Each call opens the camera anew: libgphoto2 remembers what it listed."""
+    def list(self) -> list[FoundFile]:
+        """See FileSource. Each call opens the camera anew: libgphoto2 remembers what it listed."""
         (fd,) = self._ask({"do": "list"}).fds
         with os.fdopen(fd, "rb") as file:
             file.seek(0)
             rows = json.load(file)
         self._taken_s = {name: taken_s for name, _, taken_s in rows}
-        return [Found(name, size) for name, size, _ in rows]
+        return [FoundFile(name, size) for name, size, _ in rows]
 
-    def taken_s(self, found: Found) -> float | None:
-        """See Source: the body's own note of when the file was made."""
+    def taken_s(self, found: FoundFile) -> float | None:
+        """See FileSource: the body's own note of when the file was made."""
         return self._taken_s.get(found.name)
 
-    def open(self, found: Found) -> Blob:
-        """See Source."""
+    def open(self, found: FoundFile) -> Blob:
+        """See FileSource."""
         answer = self._ask({"do": "fetch", "name": found.name})
         return Blob(answer.fds[0], answer.body["size"])
 
     def close(self) -> None:
-        """See Source."""
+        """See FileSource."""
         child, self._child = self._child, None
         if child is None:
             return
@@ -99,15 +99,15 @@ class _Files:
         self._session: Session | None = None
 
     def answer(self, question: Mapping[str, Any]) -> Blob | str:
-        """What was asked for, or a sentence why it can't be had."""
+        """Return what was requested, or a sentence why it is not available."""
         try:
             return self._list() if question["do"] == "list" else self._fetch(question["name"])
         except SessionError as error:
-            self.rest()  # the next question opens it anew
+            self.rest()  # the next question opens it again
             return str(error)
 
     def rest(self) -> None:
-        """Let go of the camera."""
+        """Close the camera."""
         if self._session is not None:
             self._session.close()
             self._session = None

@@ -1,13 +1,12 @@
-"""Wires and words that open a shutter: a GPIO line, the autopilot's servo, relay or camera trigger, or somebody else.
+"""Lines that fire a shutter: a GPIO line, or the autopilot's servo, relay or camera trigger.
 
-Named in the settings as `gpio:/dev/gpiochip0:17` (`:low` behind it for a line that is active when low),
+The settings name them as `gpio:/dev/gpiochip0:17` (with `:low` appended for a line that is active when low),
 `servo:9:1900:1100` (output, pulse in µs pressed and released), `relay:0`, `autopilot` (its own camera trigger, by
-command), `outside` (who wishes for a shot has fired it already).
+command), and `outside` (the camera is fired by something else, before the shot is requested).
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -21,57 +20,57 @@ HOLD_S = 0.2
 DO_SET_RELAY, DO_SET_SERVO, DO_DIGICAM_CONTROL = 181, 183, 203  # MAV_CMD
 KINDS = "gpio:CHIP:LINE, servo:OUTPUT:PRESSED:RELEASED, relay:NUMBER, autopilot, outside"
 
-Order = Callable[[int, Sequence[float]], str | None]
-"""Give the autopilot a command (MAV_CMD and its parameters); None once it was sent, else a sentence why it was not."""
+CommandSender = Callable[[int, Sequence[float]], str | None]
+"""Send the autopilot a command (MAV_CMD and its parameters). Returns None when sent, else a sentence why it was not."""
 
 
 @runtime_checkable
 class UsesAutopilot(Protocol):
-    """A camera that is fired by the autopilot. The daemon hands it the way there before it starts it."""
+    """A camera or shutter line that the autopilot fires. The daemon gives it a sender before it starts the camera."""
 
-    def use_autopilot(self, order: Order) -> None:
-        """From now on orders go this way."""
+    def use_autopilot(self, send: CommandSender) -> None:
+        """Send commands by this from now on."""
 
 
 class ShutterLine(Protocol):
-    """Opens a shutter. One thread calls it."""
+    """What fires a shutter. One thread calls it."""
 
     def open(self) -> None:
-        """Take hold of the line. Raises CameraError."""
+        """Acquire the line; called again after an error. Raises CameraError."""
 
     def press(self) -> None:
-        """Release the shutter, now. Raises CameraError where that can't be done."""
+        """Press the shutter, now. Raises CameraError."""
 
     def let_go(self) -> None:
-        """The shutter was pressed long enough. Raises CameraError."""
+        """Release the shutter after it was held long enough. Raises CameraError."""
 
     def close(self) -> None:
-        """Leave the line, unpressed."""
+        """Give the line back, released."""
 
 
-class Output(Protocol):
-    """What a line needs of `gpiod.LineRequest`."""
+class TriggerOutput(Protocol):
+    """The part of `gpiod.LineRequest` that a line needs."""
 
     def set_value(self, line: int | str, value: Value) -> None: ...
     def release(self) -> None: ...
 
 
-Request = Callable[[str, int, bool], Output]
+OutputRequest = Callable[[str, int, bool], TriggerOutput]
 
 
-def request_output(chip: str, line: int, active_low: bool) -> Output:
-    """The line as an output, inactive at first. Raises OSError."""
+def request_output(chip: str, line: int, active_low: bool) -> TriggerOutput:
+    """Request the line as an output, inactive at first. Raises OSError."""
     settings = gpiod.LineSettings(direction=Direction.OUTPUT, active_low=active_low, output_value=Value.INACTIVE)
-    requested: Output = gpiod.request_lines(chip, consumer="dappled shutter", config={line: settings})
+    requested: TriggerOutput = gpiod.request_lines(chip, consumer="dappled shutter", config={line: settings})
     return requested
 
 
 class GpioLine:
     """A line of a GPIO chip, by libgpiod: active while the shutter is pressed."""
 
-    def __init__(self, chip: str, line: int, *, active_low: bool = False, request: Request | None = None) -> None:
+    def __init__(self, chip: str, line: int, *, active_low: bool = False, request: OutputRequest | None = None) -> None:
         self._chip, self._line, self._active_low, self._request = chip, line, active_low, request
-        self._output: Output | None = None
+        self._output: TriggerOutput | None = None
 
     def open(self) -> None:
         """See ShutterLine."""
@@ -113,38 +112,38 @@ class GpioLine:
 
 
 @dataclass(frozen=True, slots=True)
-class Words:
-    """What the autopilot is told: a command with parameters, each time None for nothing to say."""
+class TriggerCommands:
+    """The commands that press and release: MAV_CMD and parameters; `released` is None where there is none."""
 
     pressed: tuple[int, tuple[float, ...]]
     released: tuple[int, tuple[float, ...]] | None
 
 
 class AutopilotLine:
-    """The autopilot presses the shutter for us."""
+    """A shutter that the autopilot presses by command."""
 
-    def __init__(self, words: Words) -> None:
-        self._words = words
-        self._order: Order | None = None
+    def __init__(self, commands: TriggerCommands) -> None:
+        self._commands = commands
+        self._sender: CommandSender | None = None
 
-    def use_autopilot(self, order: Order) -> None:
+    def use_autopilot(self, send: CommandSender) -> None:
         """See UsesAutopilot."""
-        self._order = order
+        self._sender = send
 
     def open(self) -> None:
-        """See ShutterLine: the way to the autopilot is the daemon's."""
+        """See ShutterLine: the daemon opens the link to the autopilot."""
 
     def press(self) -> None:
         """See ShutterLine."""
-        self._say(self._words.pressed)
+        self._send(self._commands.pressed)
 
     def let_go(self) -> None:
         """See ShutterLine."""
-        if self._words.released is not None:
-            self._say(self._words.released)
+        if self._commands.released is not None:
+            self._send(self._commands.released)
 
-    def _say(self, words: tuple[int, tuple[float, ...]]) -> None:
-        problem = "no MAVLink link is configured: set mavlink.url" if self._order is None else self._order(*words)
+    def _send(self, command: tuple[int, tuple[float, ...]]) -> None:
+        problem = "no MAVLink link is configured: set mavlink.url" if self._sender is None else self._sender(*command)
         if problem is not None:
             raise CameraError(f"the autopilot was not told to fire: {problem}")
 
@@ -153,7 +152,7 @@ class AutopilotLine:
 
 
 class OutsideLine:
-    """Somebody else fires: the autopilot on its mission, a hand. A wish is the word that it happened."""
+    """A camera that something else fires (the autopilot on its mission, a person) before the shot is requested."""
 
     def open(self) -> None:
         """See ShutterLine."""
@@ -169,7 +168,7 @@ class OutsideLine:
 
 
 def parse_line(text: str) -> ShutterLine:
-    """The line that a setting names. Raises CameraError."""
+    """Return the line that a setting names. Raises CameraError."""
     kind, *parts = text.split(":")
     try:
         return _LINES[kind](parts)
@@ -186,18 +185,18 @@ def _gpio(parts: list[str]) -> ShutterLine:
 
 def _servo(parts: list[str]) -> ShutterLine:
     output, pressed, released = (int(part) for part in parts)
-    return AutopilotLine(Words((DO_SET_SERVO, (output, pressed)), (DO_SET_SERVO, (output, released))))
+    return AutopilotLine(TriggerCommands((DO_SET_SERVO, (output, pressed)), (DO_SET_SERVO, (output, released))))
 
 
 def _relay(parts: list[str]) -> ShutterLine:
     (number,) = (int(part) for part in parts)
-    return AutopilotLine(Words((DO_SET_RELAY, (number, 1)), (DO_SET_RELAY, (number, 0))))
+    return AutopilotLine(TriggerCommands((DO_SET_RELAY, (number, 1)), (DO_SET_RELAY, (number, 0))))
 
 
 def _autopilot(parts: list[str]) -> ShutterLine:
     if parts:
         raise ValueError(parts)
-    return AutopilotLine(Words((DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1)), None))
+    return AutopilotLine(TriggerCommands((DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1)), None))
 
 
 def _outside(parts: list[str]) -> ShutterLine:
@@ -215,15 +214,8 @@ _LINES: Mapping[str, Callable[[list[str]], ShutterLine]] = {
 }
 
 
-def pressing(line: ShutterLine, clock_ns: Callable[[], int] = time.monotonic_ns) -> tuple[int, int]:
-    """Press; the times around it. Raises CameraError."""
-    called_ns = clock_ns()
-    line.press()
-    return called_ns, clock_ns()
-
-
 def hold_s(options: Mapping[str, Any]) -> float:
-    """How long the shutter is to be pressed, from a driver's options. Raises CameraError."""
+    """Return how long the shutter is pressed, from a driver's options. Raises CameraError."""
     value = options.get("hold_ms", HOLD_S * 1e3)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 1 <= value <= 10_000:
         raise CameraError(f"camera.options.hold_ms must be 1 to 10000 ms, not {value!r}")

@@ -1,7 +1,7 @@
-"""Where files are picked up that a camera keeps: a folder, a card, mass storage when it appears, a camera in PTP mode.
+"""Sources of the files that a camera keeps: a folder or card, or a removable disk when it appears.
 
-A source lists and opens; it never writes. Named in settings and commands as a folder's path or `folder:DIR`, `storage`
-(the first removable disk with a DCIM folder), or a libgphoto2 port (`usb:`, `ptpip:…`).
+A source lists and opens files; it never writes. Settings and commands name it as a folder's path or `folder:DIR`, as
+`storage` (the first removable disk with a DCIM folder), or as a libgphoto2 port (`usb:`, `ptpip:…`; see `ptp_source`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _MANY = 100_000
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FoundFile:
     """A file at a source: its name there (with folders), and its size in bytes."""
 
     name: str
@@ -37,7 +37,7 @@ class Found:
 
     @property
     def stem(self) -> str:
-        """What raw file and JPEG of one exposure have in common."""
+        """The part of the name that raw file and JPEG of one exposure share."""
         return self.name.rpartition(".")[0]
 
     @property
@@ -46,39 +46,39 @@ class Found:
         return self.name.lower().endswith(RAW_SUFFIXES)
 
 
-class Source(Protocol):
-    """Files that may be picked up. All calls may block for as long as a disk or a bus does, but not for ever."""
+class FileSource(Protocol):
+    """Files that can be picked up. A call may block for as long as a disk or a bus does, but not for ever."""
 
-    def list(self) -> list[Found]:
-        """All pictures, in the order of their names. Raises CameraError with a sentence where nothing is there."""
+    def list(self) -> list[FoundFile]:
+        """List all pictures in the order of their names. Raises CameraError where the source is not there."""
 
-    def taken_s(self, found: Found) -> float | None:
-        """The camera's time of a file, as if it were UTC; None where it says none. Raises CameraError."""
+    def taken_s(self, found: FoundFile) -> float | None:
+        """Return the camera's time of a file, as if it were UTC; None where it has none. Raises CameraError."""
 
-    def open(self, found: Found) -> Blob:
-        """Its bytes. Raises CameraError."""
+    def open(self, found: FoundFile) -> Blob:
+        """Open its bytes. Raises CameraError."""
 
     def close(self) -> None:
-        """Let go of the source."""
+        """Close the source."""
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class FileGroup:
     """The files of one exposure: the frame, and what stands beside it."""
 
-    main: Found
-    companions: tuple[Found, ...] = ()
+    main: FoundFile
+    companions: tuple[FoundFile, ...] = ()
 
 
-def groups(found: list[Found]) -> list[Group]:
-    """Files with one stem are of one exposure; the raw file is the frame."""
-    by_stem: dict[str, list[Found]] = {}
+def groups(found: list[FoundFile]) -> list[FileGroup]:
+    """Group files by stem: those of one exposure. The raw file is the frame."""
+    by_stem: dict[str, list[FoundFile]] = {}
     for one in found:
         by_stem.setdefault(one.stem, []).append(one)
     made = []
     for files in by_stem.values():
         main, *others = sorted(files, key=lambda one: (not one.raw, one.name))
-        made.append(Group(main, tuple(others)))
+        made.append(FileGroup(main, tuple(others)))
     return sorted(made, key=lambda group: group.main.name)
 
 
@@ -88,8 +88,8 @@ class FolderSource:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def list(self) -> list[Found]:
-        """See Source."""
+    def list(self) -> list[FoundFile]:
+        """See FileSource."""
         try:
             if not self.folder.is_dir():
                 raise CameraError(f"{self.folder} is not there: check the path, or mount the card")
@@ -97,7 +97,7 @@ class FolderSource:
         except OSError as error:
             raise CameraError(f"{self.folder} can't be read: {error.strerror}") from None
 
-    def _walk(self) -> Iterator[Found]:
+    def _walk(self) -> Iterator[FoundFile]:
         count = 0
         for place, folders, names in os.walk(self.folder, onerror=self._unreadable):
             folders[:] = [name for name in folders if not name.startswith(".")]
@@ -109,25 +109,25 @@ class FolderSource:
                 if count > _MANY:
                     raise CameraError(f"{self.folder} holds more than {_MANY} pictures: give the folder of the flight")
                 try:
-                    yield Found(path.relative_to(self.folder).as_posix(), path.stat().st_size)
+                    yield FoundFile(path.relative_to(self.folder).as_posix(), path.stat().st_size)
                 except OSError:
                     continue  # gone again
 
     def _unreadable(self, error: OSError) -> None:
-        """A card that is pulled must not look like one with fewer files; a folder inside that is not ours may be."""
+        """Raise, so that a card that is pulled doesn't look like one with fewer files; skip folders of other users."""
         if not isinstance(error, PermissionError) or error.filename == str(self.folder):
             raise error
 
-    def taken_s(self, found: Found) -> float | None:
-        """See Source: from EXIF."""
+    def taken_s(self, found: FoundFile) -> float | None:
+        """See FileSource: from EXIF."""
         try:
             with (self.folder / found.name).open("rb") as file:
                 return seconds(read_exif(file).taken)
         except OSError as error:
             raise self._lost(found, error) from None
 
-    def open(self, found: Found) -> Blob:
-        """See Source."""
+    def open(self, found: FoundFile) -> Blob:
+        """See FileSource."""
         try:
             fd = os.open(self.folder / found.name, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -138,11 +138,11 @@ class FolderSource:
             os.close(fd)
             raise self._lost(found, error) from None
 
-    def _lost(self, found: Found, error: OSError) -> CameraError:
+    def _lost(self, found: FoundFile, error: OSError) -> CameraError:
         return CameraError(f"{self.folder / found.name} can't be read: {error.strerror}")
 
     def close(self) -> None:
-        """See Source."""
+        """See FileSource."""
 
 
 class StorageSource(FolderSource):
@@ -152,8 +152,8 @@ class StorageSource(FolderSource):
         super().__init__(Path("/nonexistent"))
         self._mounts, self._places = mounts or MOUNTS, places or PLACES
 
-    def list(self) -> list[Found]:
-        """See Source."""
+    def list(self) -> list[FoundFile]:
+        """See FileSource."""
         unreadable = ""
         for where in self._mounted():
             try:
@@ -175,8 +175,8 @@ class StorageSource(FolderSource):
         return (Path(place) for place in places if place.startswith(self._places))
 
 
-def parse_source(text: str, ptp: Callable[[str], Source]) -> Source:
-    """The source that a setting or an argument names; `ptp` opens a libgphoto2 port."""
+def parse_source(text: str, ptp: Callable[[str], FileSource]) -> FileSource:
+    """Return the source that a setting or an argument names; `ptp` opens a libgphoto2 port."""
     if text == "storage":
         return StorageSource()
     if text.startswith(("usb:", "ptpip:")):
