@@ -270,7 +270,7 @@ def latency(root: Path, frames: int) -> dict[str, float]:
         )
     )
     with Simulation(World(seed=2), settings, root) as simulated:
-        service = Service(simulated, watchers=Observer(finished=ears.finished, settled=ears.settled))
+        service = Service(simulated, observer=Observer(finished=ears.finished, settled=ears.settled))
         service.start()
         threads = [threading.Thread(target=work) for work in (service.run, ears.listen, ears.listen_die_and_come_back)]
         for thread in threads:
@@ -278,7 +278,7 @@ def latency(root: Path, frames: int) -> dict[str, float]:
         try:
             _wait(lambda: service.health()["camera"]["state"] == "ready")
             for number in range(frames + 1):  # by the last one's seq who came late sees what there was before
-                service.wish(CaptureRequest("benchmark", "console", number))
+                service.request(CaptureRequest("benchmark", "console", number))
                 _wait(lambda: len(ears.decode_ms) > number)  # noqa: B023  # it is called before the next round
             threads[2].join(DEADLINE_S)
         finally:

@@ -19,6 +19,7 @@ import tempfile
 import threading
 import time
 from collections import deque
+from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.clock import SystemClock
@@ -97,6 +98,29 @@ class SlowDeveloper:
         return DecodedFrame(body, "0" * 64, [], [[0.0] * 4], "predicted", 1, 1, "geometric", unit, b"", (0, 0))
 
 
+@dataclass(frozen=True)
+class Sink:
+    """Notes each shot in the flight and hands it to the pipeline."""
+
+    flight: recording.Recording
+    writer: LedgerWriter
+    pipeline: Pipeline
+
+    def obstacle(self) -> None:
+        """There is none."""
+
+    def note(self, shot: Shot) -> None:
+        self.flight.journal.note(shot)
+        self.writer.requested(shot)
+        self.pipeline.expect(shot)
+
+    def fire(self, shot: Shot) -> None:
+        self.pipeline.fire(shot.index)
+
+    def refused(self, request: CaptureRequest, reason: str) -> None:
+        raise AssertionError(reason)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
@@ -121,7 +145,7 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
     neither decoded nor noted as not decoded. Memory: the growth from the second quarter to the last."""
     clock, wishes_ms = SystemClock(), []
     flight = recording.begin(root, clock.utc_ns, {})
-    book, record_ms, over = LedgerWriter(flight, clock), [], threading.Semaphore(0)
+    writer, record_ms, over = LedgerWriter(flight, clock), [], threading.Semaphore(0)
 
     def finished(pending: PendingShot) -> None:
         record_ms.append(pending.ms.get("record", 0.0))
@@ -136,22 +160,17 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
     shutters: list[Shutter] = []
     pipeline = Pipeline(
         camera=SteadyCamera(size),
-        book=book,
+        writer=writer,
         poses=pose,
-        developer=SlowDeveloper(decode_s),
+        decoder=SlowDeveloper(decode_s),
         publisher=None,
         latency=BodyLatency(60.0, 15.0, "benchmark"),
         names=Names("benchmark", "mask", "geometric"),
-        watchers=Observer(settled=settled, finished=finished),
+        observer=Observer(settled=settled, finished=finished),
         decode_queue=QUEUE,
     )
 
-    def note(shot: Shot) -> None:
-        flight.journal.note(shot)
-        book.wished(shot)
-        pipeline.expect(shot)
-
-    shutters.append(Shutter(next_index=0, note=note, fire=pipeline.fire, clock=clock, capacity=1000))
+    shutters.append(Shutter(Sink(flight, writer, pipeline), clock, next_index=0, capacity=1000))
     memory = Memory()
     pipeline.start()
     count = round(seconds * rate)
@@ -159,7 +178,7 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
     for number in range(count):
         time.sleep(max(0.0, start + number / rate - time.monotonic()))
         began = time.perf_counter()
-        shutters[0].wish(CaptureRequest("benchmark", "console", number))
+        shutters[0].request(CaptureRequest("benchmark", "console", number))
         wishes_ms.append((time.perf_counter() - began) * 1e3)
         memory.look()
     behind_s = time.monotonic() - start - (count - 1) / rate

@@ -113,7 +113,7 @@ class FakeCamera:
         self.stopped = True
 
 
-class FakeDeveloper:
+class FakeDecoder:
     """Every frame decodes to the same few bytes, unless `problem` says otherwise."""
 
     def __init__(self) -> None:
@@ -141,13 +141,13 @@ class Rig:
     camera: FakeCamera
     pipeline: Pipeline
     shutter: Shutter
-    developer: FakeDeveloper | None
+    decoder: FakeDecoder | None
     shots: list[PendingShot] = field(default_factory=list)
     settled: list[tuple[int, bool]] = field(default_factory=list)
     tagged: list[int] = field(default_factory=list)
 
-    def wish(self, number: int) -> ShotDecision:
-        return self.shutter.wish(CaptureRequest("test", "console", number))
+    def request(self, number: int) -> ShotDecision:
+        return self.shutter.request(CaptureRequest("test", "console", number))
 
     def ended(self, index: int) -> PendingShot:
         """The story of a shot, once it is finished."""
@@ -161,6 +161,57 @@ class Rig:
 
     def events(self) -> list[str]:
         return [f"{event.kind}: {event.text}" for event in self.flight.ledger.events()]
+
+
+class FakeSink:
+    """A ShotSink that keeps what it is given: `done` in order. `problem` stands in the way of every shot."""
+
+    def __init__(self) -> None:
+        self.problem: str | None = None
+        self.note_error: OSError | None = None
+        self.done: list[tuple[str, int]] = []
+        self.refusals: list[str] = []
+
+    @property
+    def fired(self) -> list[int]:
+        return [index for act, index in self.done if act == "fire"]
+
+    def obstacle(self) -> str | None:
+        return self.problem
+
+    def note(self, shot: Shot) -> None:
+        if self.note_error:
+            raise self.note_error
+        self.done.append(("note", shot.index))
+
+    def fire(self, shot: Shot) -> None:
+        self.done.append(("fire", shot.index))
+
+    def refused(self, request: CaptureRequest, reason: str) -> None:
+        self.refusals.append(reason)
+
+
+@dataclass(frozen=True)
+class FlightSink:
+    """A ShotSink that notes shots in a flight and hands them to a pipeline."""
+
+    flight: recording.Recording
+    writer: LedgerWriter
+    pipeline: Pipeline
+
+    def obstacle(self) -> None:
+        """There is none."""
+
+    def note(self, shot: Shot) -> None:
+        self.flight.journal.note(shot)
+        self.writer.requested(shot)
+        self.pipeline.expect(shot)
+
+    def fire(self, shot: Shot) -> None:
+        self.pipeline.fire(shot.index)
+
+    def refused(self, request: CaptureRequest, reason: str) -> None:
+        """Only the sender hears it."""
 
 
 def eventually(condition: Callable[[], object], what: str) -> None:
@@ -183,29 +234,24 @@ def rig(
     """A street at work on a new flight in `flights`; stopped and closed at the end."""
     clock = SystemClock()
     flight = recording.begin(flights, clock.utc_ns, {})
-    book = LedgerWriter(flight, clock)
+    writer = LedgerWriter(flight, clock)
     camera = camera or FakeCamera(script)
-    developer = FakeDeveloper() if decode else None
+    decoder = FakeDecoder() if decode else None
     made: list[Rig] = []
 
     def settled(index: int, ok: bool) -> None:
         made[0].settled.append((index, ok))
         made[0].shutter.settled(index, ok)
 
-    def note(shot: Shot) -> None:
-        flight.journal.note(shot)
-        book.wished(shot)
-        made[0].pipeline.expect(shot)
-
     pipeline = Pipeline(
         camera=camera,
-        book=book,
+        writer=writer,
         poses=lambda index, exposure: (exposure, no_pose(exposure.utc_ns)),
-        developer=developer,
+        decoder=decoder,
         publisher=None,
         latency=BodyLatency(60.0, 15.0, "test"),
         names=Names("test", "mask", "geometric"),
-        watchers=Observer(
+        observer=Observer(
             settled,
             lambda pending: made[0].tagged.append(pending.shot.index),
             lambda pending: made[0].shots.append(pending),  # noqa: PLW0108  # a test may take the list away
@@ -214,8 +260,8 @@ def rig(
     )
     now_ns = clock.utc_ns()  # it stands still, so that a slow machine makes no new wish of a retry
     steady = RecordedClock(now_ns, now_ns - clock.monotonic_ns())
-    shutter = Shutter(next_index=flight.next_index, note=note, fire=pipeline.fire, clock=steady, capacity=1000)
-    made.append(Rig(flight, camera, pipeline, shutter, developer))
+    shutter = Shutter(FlightSink(flight, writer, pipeline), steady, next_index=flight.next_index, capacity=1000)
+    made.append(Rig(flight, camera, pipeline, shutter, decoder))
     pipeline.start()
     try:
         yield made[0]

@@ -129,11 +129,11 @@ def test_a_clock_stepped_by_an_hour(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     """NTP, or a person, sets the machine's clock in mid-flight: no stamp of the flight jumps, and it replays."""
     truly = time.time_ns
     with rig(tmp_path) as one:
-        one.wish(0)
+        one.request(0)
         one.ended(0)
         monkeypatch.setattr(time, "time_ns", lambda: truly() + step_s * 10**9)
         for number in (1, 2):
-            one.wish(number)
+            one.request(number)
             one.ended(number)
         rows, frames = one.flight.ledger.shots(), one.flight.ledger.frames()
         events = one.flight.ledger.events()

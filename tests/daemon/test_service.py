@@ -46,7 +46,7 @@ def settings(tmp_path: Path) -> Iterator[Settings]:
 
 
 def started(settings: Settings, shots: list[PendingShot]) -> Service:
-    service = Service(settings, watchers=Observer(finished=shots.append))
+    service = Service(settings, observer=Observer(finished=shots.append))
     service.start()
     eventually(lambda: service.health()["camera"]["state"] == "ready", "the camera is ready")
     return service
@@ -61,30 +61,30 @@ def told(flight: Path) -> list[str]:
 def test_a_wish_goes_to_the_end_and_can_be_looked_up_in_the_next_flight(camera: FakeCamera, settings: Settings) -> None:
     shots: list[PendingShot] = []
     service = started(settings, shots)
-    assert service.wish(CaptureRequest("test", "console", 1)).index == 0
+    assert service.request(CaptureRequest("test", "console", 1)).index == 0
     eventually(lambda: shots, "the shot's end")
-    assert service.wished == 1
+    assert service.requested == 1
     service.stop()
     assert check.check(service.folder).intact
     assert camera.stopped
     after = started(settings, shots)
-    found = after._parts._lookup(0)
+    found = after._parts.lookup(0)
     assert found is not None
     assert (found.ok, found.url) == (True, "frames/000000.dng")
-    assert after.wish(CaptureRequest("test", "console", 1)).index == 1
+    assert after.request(CaptureRequest("test", "console", 1)).index == 1
     after.stop()
 
 
 def test_an_old_flight_that_was_moved_away_is_unknown(camera: FakeCamera, settings: Settings) -> None:
     shots: list[PendingShot] = []
     first = started(settings, shots)
-    first.wish(CaptureRequest("test", "console", 1))
+    first.request(CaptureRequest("test", "console", 1))
     eventually(lambda: shots, "the shot's end")
     first.stop()
     second = started(settings, shots)
     first.folder.rename(first.folder.parent.parent / "moved")
-    assert second._parts._lookup(0) is None
-    assert second._parts._lookup(99) is None
+    assert second._parts.lookup(0) is None
+    assert second._parts.lookup(99) is None
     second.stop()
 
 
@@ -98,8 +98,8 @@ def test_a_disk_that_can_t_be_asked_refuses_in_words(
 
     with monkeypatch.context() as broken:
         broken.setattr(layout, "free_bytes", refuse)
-        verdict = service.wish(CaptureRequest("test", "console", 1))
-    assert (verdict.outcome, verdict.reason) == ("refused", "cannot ask for the free space of the disk")
+        decision = service.request(CaptureRequest("test", "console", 1))
+    assert (decision.outcome, decision.reason) == ("refused", "cannot ask for the free space of the disk")
     service.stop()
     assert not camera.fired
 
@@ -160,7 +160,7 @@ def test_a_lens_that_was_zoomed_between_two_frames_is_told(
     shots: list[PendingShot] = []
     service = started(settings, shots)
     try:
-        service.wish(CaptureRequest("test", "console", 1))
+        service.request(CaptureRequest("test", "console", 1))
         eventually(lambda: shots, "the shot's end")
         (pending,) = shots
         component, said = service._parts.component, list[str]()
@@ -187,12 +187,12 @@ def test_a_battery_that_runs_empty_is_told_until_there_is_another(camera: FakeCa
 
 def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, settings: Settings) -> None:
     after, shots = FlightHandover(settings), list[PendingShot]()
-    service = Service(settings, watchers=Observer(finished=shots.append), after=after)
+    service = Service(settings, observer=Observer(finished=shots.append), after=after)
     service.start()
     eventually(lambda: service.health()["camera"]["state"] == "ready", "the camera is ready")
     knobs = service._parts.component._parameters._knobs
     camera.script = lambda _: []
-    assert service.wish(CaptureRequest("test", "console", 1)).index == 0
+    assert service.request(CaptureRequest("test", "console", 1)).index == 0
     with pytest.raises(CameraError, match="1 shots are under way"):
         knobs.turn("LF_MASK", "mask-3")
     for event in good(0):
@@ -209,7 +209,7 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
         camera.say(event)
     eventually(lambda: service._parts.shutter.statistics().pending == 0, "the interval's shot's end")
     assert knobs.turn("LF_MASK", "mask-3")
-    assert "next flight begins" in str(service.wish(CaptureRequest("test", "console", 3)).reason)
+    assert "next flight begins" in str(service.request(CaptureRequest("test", "console", 3)).reason)
     service.run()  # ends by itself
     service.stop()
     assert after.next == replace(settings, mask=MaskSettings("mask-3"))

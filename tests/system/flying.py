@@ -60,17 +60,17 @@ class Flying:
     def until_ready(self) -> None:
         eventually(lambda: self.camera == "ready", f"camera ready: {self.problems}")
 
-    def wish(self) -> ShotDecision:
+    def request(self) -> ShotDecision:
         self._wishes += 1
-        return self.service.wish(CaptureRequest("test", "console", self._wishes))
+        return self.service.request(CaptureRequest("test", "console", self._wishes))
 
     def shoot(self) -> PendingShot:
         """One shot to its end."""
         self.until_ready()
-        verdict = self.wish()
-        assert verdict.outcome == "shot", verdict.reason
-        eventually(lambda: any(one.shot.index == verdict.index for one in self.shots), f"shot {verdict.index}")
-        return next(one for one in self.shots if one.shot.index == verdict.index)
+        decision = self.request()
+        assert decision.outcome == "shot", decision.reason
+        eventually(lambda: any(one.shot.index == decision.index for one in self.shots), f"shot {decision.index}")
+        return next(one for one in self.shots if one.shot.index == decision.index)
 
 
 @contextmanager
@@ -80,7 +80,7 @@ def flying(settings: Settings) -> Iterator[Flying]:
     settled: list[tuple[int, bool]] = []
     service = Service(
         settings,
-        watchers=Observer(finished=shots.append, settled=lambda index, ok: settled.append((index, ok))),
+        observer=Observer(finished=shots.append, settled=lambda index, ok: settled.append((index, ok))),
     )
     service.start()
     folder = service.folder

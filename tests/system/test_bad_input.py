@@ -140,9 +140,9 @@ def test_no_camera_on_the_bus(here: Path) -> None:
     with flying(settings) as daemon:
         eventually(lambda: "the camera is absent" in daemon.problems, "a problem that names the camera")
         assert gone.port in daemon.problems
-        verdict = daemon.wish()
-        assert verdict.outcome == "refused"
-        assert "absent" in str(verdict.reason)
+        decision = daemon.request()
+        assert decision.outcome == "refused"
+        assert "absent" in str(decision.reason)
     assert not daemon.shots
 
 
@@ -167,7 +167,7 @@ def test_a_camera_that_another_program_holds_is_taken_when_it_is_free(body: Body
     body.fault("refuse")
     with flying(before(body, here)) as daemon:
         eventually(lambda: "another program" in daemon.problems, "a problem that says who holds it")
-        assert "another program" in str(daemon.wish().reason)
+        assert "another program" in str(daemon.request().reason)
         body.fault("clear")
         assert daemon.shoot().frame is not None
 
@@ -205,7 +205,7 @@ def test_a_camera_that_is_gone_mid_shot_comes_back(here: Path) -> None:
         flying(before(body, here)) as daemon,
     ):
         daemon.until_ready()
-        index = daemon.wish().index
+        index = daemon.request().index
         eventually(lambda: body.releases == 1, "the release")
         body.fault("drop")
         eventually(lambda: any(index == done for done, _ in daemon.settled), "the end of the shot")
@@ -216,12 +216,12 @@ def test_a_body_that_dies_mid_shot_fails_the_shot(here: Path) -> None:
     with Body.start(BodyOptions(picture="pattern:100000:dng", delay_s=5)) as body:
         with flying(before(body, here, camera={"file_timeout_s": 1.0})) as daemon:
             daemon.until_ready()
-            assert daemon.wish().outcome == "shot"
+            assert daemon.request().outcome == "shot"
             eventually(lambda: body.releases == 1, "the release")
             body.stop()
             eventually(lambda: daemon.settled == [(0, False)], "the shot has failed")
             eventually(lambda: "the camera is" in daemon.problems, "a problem that names the camera")
-            assert daemon.wish().outcome == "refused"
+            assert daemon.request().outcome == "refused"
         assert daemon.shots[0].problem
 
 
@@ -230,7 +230,7 @@ def test_a_silent_camera_fails_the_shot(body: Body, here: Path) -> None:
     with flying(before(body, here, camera={"file_timeout_s": 1.0})) as daemon:
         daemon.until_ready()
         body.fault("silence 15")
-        assert daemon.wish().outcome == "shot"
+        assert daemon.request().outcome == "shot"
         eventually(lambda: daemon.settled, "the end of the shot", 60)
         body.fault("clear")
         assert daemon.shoot() is not None
@@ -317,7 +317,7 @@ def test_a_decoder_that_is_killed_loses_one_decode_at_most(frame: Path, here: Pa
         kill_decoders()  # between two frames
         assert daemon.shoot().decoded is not None
         stopped = stop_decoders()
-        index = daemon.wish().index
+        index = daemon.request().index
         eventually(lambda: (index, True) in daemon.settled, "the frame is safe")
         eventually(lambda: daemon.service.health()["stages"][1]["waiting"], "the frame is with the decoder")
         for process in stopped:
@@ -334,7 +334,7 @@ def test_a_decoder_that_hangs_does_not_keep_the_daemon(frame: Path, here: Path) 
     with Body.start(BodyOptions(picture=str(frame))) as body, flying(before(body, here, **MASKED)) as daemon:
         assert daemon.shoot().decoded is not None
         stop_decoders()
-        daemon.wish()
+        daemon.request()
         eventually(lambda: (1, True) in daemon.settled, "the frame is safe")
     eventually(lambda: len(daemon.shots) == 2, "the end of the second shot")
     assert "not decoded" in daemon.shots[1].problem
@@ -392,9 +392,9 @@ def test_a_subscriber_that_never_reads_costs_nothing(frame: Path, here: Path) ->
 def test_a_disk_that_is_nearly_full_refuses_new_shots(body: Body, here: Path) -> None:
     with flying(before(body, here, record={"min_free_mb": 10_000_000})) as daemon:
         daemon.until_ready()
-        verdict = daemon.wish()
-        assert verdict.outcome == "refused"
-        assert "the disk is nearly full" in str(verdict.reason)
+        decision = daemon.request()
+        assert decision.outcome == "refused"
+        assert "the disk is nearly full" in str(decision.reason)
         assert "disk nearly full" in daemon.problems
     assert not daemon.shots
     balance = flight_report.balance(daemon.service.folder)

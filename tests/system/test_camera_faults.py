@@ -77,10 +77,10 @@ def never_still(daemon: Flying) -> Iterator[None]:
 
 def wished(daemon: Flying) -> int:
     """A shot is on its way to the camera."""
-    verdict = daemon.wish()
-    assert verdict.outcome == "shot", verdict.reason
-    assert verdict.index is not None
-    return verdict.index
+    decision = daemon.request()
+    assert decision.outcome == "shot", decision.reason
+    assert decision.index is not None
+    return decision.index
 
 
 def fired(daemon: Flying, index: int) -> None:
@@ -127,9 +127,9 @@ def test_unplugged_while_idle(here: Path) -> None:
     with a_body() as body, daemon_before(here, body) as daemon:
         body.fault("unplug")
         eventually(lambda: daemon.camera == "absent", "the camera is absent")
-        verdict = daemon.wish()
-        assert verdict.outcome == "refused"
-        assert "absent" in str(verdict.reason)
+        decision = daemon.request()
+        assert decision.outcome == "refused"
+        assert "absent" in str(decision.reason)
         body.fault("clear")
         back_in_service(daemon, body)
 
@@ -216,7 +216,7 @@ def test_two_bodies_of_one_model(here: Path) -> None:
         body.fault("unplug")
         eventually(lambda: daemon.camera == "absent", "the wanted body is absent")
         assert "0000000001" in daemon.problems
-        assert daemon.wish().outcome == "refused"
+        assert daemon.request().outcome == "refused"
         body.fault("clear")
         back_in_service(daemon, body)
         assert other.releases == 0

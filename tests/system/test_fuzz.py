@@ -63,9 +63,9 @@ def test_a_body_that_answers_with_noise(seed: int, tmp_path: Path) -> None:
     """PTP answers are parsed in the camera's process; it may die of them, the daemon says so and refuses wishes."""
     with liar(seed) as port, flying(settings_of(tmp_path, camera={"port": f"ptpip:127.0.0.1:{port}:{port}"})) as daemon:
         eventually(lambda: daemon.camera in ("absent", "faulted"), "the noise is no camera")
-        verdict = daemon.wish()
-        assert verdict.outcome != "shot"
-        assert verdict.reason
+        decision = daemon.request()
+        assert decision.outcome != "shot"
+        assert decision.reason
         threading.Event().wait(3.0)  # let it try again and again
         assert daemon.service.healthy()
         assert daemon.shots == []

@@ -99,23 +99,23 @@ def run(arguments: argparse.Namespace) -> int:
             results = stack.enter_context(RunWriter(arguments.flight, Run(name, recipe, names), time.time_ns))
             recipe, keep = results.run.recipe, results.decoded
             print(f"results stand beside the old ones as run {name}", file=sys.stderr)
-        book = replay.book(recording, keep)
-        developer = DecodeProcess(recipe) if recipe else None
-        if developer:
-            stack.callback(developer.close)
-            developer.warm_up()
+        writer = replay.writer(recording, keep)
+        decoder = DecodeProcess(recipe) if recipe else None
+        if decoder:
+            stack.callback(decoder.close)
+            decoder.warm_up()
         bad = _play(
             arguments,
             settings,
             recording,
-            book=book,
-            developer=developer,
+            writer=writer,
+            decoder=decoder,
             flown=(names, latency, recorded),
             stack=stack,
         )
     if not arguments.verify:
         return 1 if bad else 0
-    problems += book.verdict(decoded=recipe is not None)
+    problems += writer.verdict(decoded=recipe is not None)
     for text in problems:
         print(f"different: {text}", file=sys.stderr)
     count = sum(one.frame is not None for one in recording.expected)
@@ -130,8 +130,8 @@ def _play(
     settings: configuration.Settings,
     recording: replay.RecordedFlight,
     *,
-    book: ReplayVerifier,
-    developer: DecodeProcess | None,
+    writer: ReplayVerifier,
+    decoder: DecodeProcess | None,
     flown: tuple[Names, BodyLatency, configuration.Settings],
     stack: ExitStack,
 ) -> int:
@@ -144,20 +144,20 @@ def _play(
         print(frame_json(one) if arguments.json else frame_line(one), flush=True)
         progress.note(one)
 
-    publisher = _publisher(settings, book, developer, stack) if arguments.publish else None
+    publisher = _publisher(settings, writer, decoder, stack) if arguments.publish else None
     if publisher:
         header = wire.start_header(settings.publish, clock.utc_ns(), camera=names.camera, mask=names.mask)
         publisher.publish("start", header)
     identity = Identity("dappled", "recording", "", str(arguments.flight))
     pipeline = Pipeline(
         camera=ReplayCamera(recording.files, identity, clock.monotonic_ns),
-        book=book,
+        writer=writer,
         poses=telemetry.pose,
-        developer=developer,
+        decoder=decoder,
         publisher=publisher,
         latency=latency,
         names=names,
-        watchers=Observer(finished=finished),
+        observer=Observer(finished=finished),
         decode_queue=1000,
     )
     pipeline.start()
@@ -218,9 +218,9 @@ def _as_recorded(
 
 
 def _publisher(
-    settings: configuration.Settings, book: ReplayVerifier, developer: DecodeProcess | None, stack: ExitStack
+    settings: configuration.Settings, writer: ReplayVerifier, decoder: DecodeProcess | None, stack: ExitStack
 ) -> Publisher:
-    answers = Answers(book, developer)
+    answers = Answers(writer, decoder)
     publisher = Publisher(
         settings.publish.slices,
         settings.publish.ask,
@@ -231,7 +231,7 @@ def _publisher(
     )
     answers.start()
     stack.callback(answers.stop)
-    publisher.start(book.root.absolute().name)
+    publisher.start(writer.root.absolute().name)
     stack.callback(publisher.stop)
     return publisher
 

@@ -80,7 +80,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
 
     def fly(flown: Settings, after: FlightHandover) -> bool:
         """One flight; whether another may follow."""
-        service = Service(flown, watchers=Observer(finished=finished, camera=camera.changed), after=after)
+        service = Service(flown, observer=Observer(finished=finished, camera=camera.changed), after=after)
         problems = ProblemRemarks(service.health, lambda record: manager.status(health.line(record)))
 
         def turn() -> bool:
@@ -103,7 +103,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
             remark(f"stream {flown.publish.slices}")
             if service.console_url:
                 remark(f"console {service.console_url}")
-            goal.begin(lambda: service.wished)
+            goal.begin(lambda: service.requested)
             service.run(turn)
             problems.tell(now=True)
             manager.working(time.monotonic_ns(), now=True)  # closing one flight and opening the next takes a while

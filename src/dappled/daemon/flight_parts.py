@@ -10,7 +10,7 @@ from dappled.config.settings import Settings
 from dappled.daemon import flight_handover
 from dappled.daemon.camera_protocol import distance_sensor, ground_facts
 from dappled.daemon.camera_protocol.camera_settings import Knobs, OwnKnob
-from dappled.daemon.camera_protocol.component import Captured, Component
+from dappled.daemon.camera_protocol.component import CameraFacts, Captured, Component, Storage
 from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.health import record
 from dappled.daemon.health.logbook import Logbook
@@ -26,6 +26,7 @@ from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher
+from dappled.decode.geometry.pose import Pose
 from dappled.drivers.camera import Camera, CameraError
 from dappled.drivers.mavlink.links import MavlinkLinks, Packet
 from dappled.drivers.raw.darkroom import Recipe
@@ -67,32 +68,17 @@ class FlightParts:
         self._after, self._end, self._publisher = after, end, publisher
         now = settings()
         self.alarms = Alarms()
-        self.book = LedgerWriter(recording, clock)
+        self.writer = LedgerWriter(recording, clock)
         self.navigation = Navigation(settings, clock, recording, utc_known=utc_known)
-        self.developer = None if recipe is None else DecodeProcess(recipe)
+        self.decoder = None if recipe is None else DecodeProcess(recipe)
         self.depth = self._depth_of(recipe, publisher) if recipe is not None and now.decode.depth else None
-        self.shutter = Shutter(
-            next_index=recording.next_index,
-            note=self._note,
-            fire=self._fire,
-            clock=clock,
-            capacity=now.camera.max_pending,
-            obstacle=self._obstacle,
-            on_change=self._changed,
-            on_refused=self._refused,
-        )
+        self.shutter = Shutter(self, clock, next_index=recording.next_index, capacity=now.camera.max_pending)
         self.component = Component(
             links,
             self.shutter,
             clock,
             self._knobs(camera, names),
-            facts=lambda: self.herald.facts(),  # noqa: PLW0108  # the herald is made after the component
-            storage=lambda: ground_facts.storage(recording.folder.path),
-            lookup=self._lookup,
-            healthy=self.healthy,
-            troubled=lambda: self.alarms.troubled,
-            pose=self.navigation.pose_now,
-            mount=now.pose.mount,
+            self,
             feedback_is_shot=now.mavlink.feedback_is_shot,
         )
         self.herald = ShotEvents(
@@ -107,18 +93,18 @@ class FlightParts:
         )
         self.pipeline = Pipeline(
             camera=camera,
-            book=self.book,
+            writer=self.writer,
             poses=self.navigation.pose,
-            developer=self.developer,
+            decoder=self.decoder,
             publisher=publisher,
             latency=BodyLatency.of(now.camera),
             names=names,
-            watchers=self.herald.watchers(),
+            observer=self.herald.observer(),
             decode_queue=now.decode.queue,
             preview_interval_s=now.publish.preview_interval_s,
         )
         self._vital: tuple[Part, ...] = (self.pipeline, links, self.shutter)
-        self.answers = Answers(self.book, self.developer, self.pipeline.decoding_idle)
+        self.answers = Answers(self.writer, self.decoder, self.pipeline.decoding_idle)
 
     def dead_threads(self) -> list[str]:
         """Threads that have ended without being asked to: none, unless there is a bug."""
@@ -144,7 +130,7 @@ class FlightParts:
             DecodeProcess(recipe),
             method=decode.depth,
             interval_s=decode.depth_interval_s,
-            path=lambda pending: self.book.path(pending.frame) if pending.frame else "",
+            path=lambda pending: self.writer.path(pending.frame) if pending.frame else "",
             publish=publisher.publish,
             give_way=lambda: self.pipeline.decoding_idle(),  # noqa: PLW0108  # the street is made after depth
             tell=self._tell_distance if decode.depth_to_autopilot else lambda _: None,
@@ -157,42 +143,64 @@ class FlightParts:
             "Decode in flight",
             lambda: "on" if self.pipeline.decoding else "off",
             ("on", "off"),
-            self._decode_in_flight if self.developer else None,
+            self._decode_in_flight if self.decoder else None,
         )
         return Knobs(camera, (decoding, *flight_handover.knobs(names, self._after, self._settings, self._hand_over)))
 
-    # the shutter asks
+    # for the shutter (ShotSink)
 
-    def _note(self, shot: Shot) -> None:
+    def note(self, shot: Shot) -> None:
+        """See ShotSink."""
         self._recording.journal.note(shot)
-        self.book.wished(shot)
+        self.writer.requested(shot)
         self.pipeline.expect(shot)
 
-    def _fire(self, index: int) -> None:
-        self.pipeline.fire(index)
+    def fire(self, shot: Shot) -> None:
+        """See ShotSink."""
+        self.pipeline.fire(shot.index)
 
-    def _obstacle(self) -> str | None:
+    def obstacle(self) -> str | None:
+        """See ShotSink."""
         if self._after is not None and self._after.next is not None:
             return "the next flight begins in a moment, with what the ground station has set"
         return record.obstacle(self.pipeline, self._recording.folder.path, self._settings().record.min_free_mb)
 
-    def _changed(self) -> None:
-        self.component.state_changed()
+    def refused(self, request: CaptureRequest, reason: str) -> None:
+        """See ShotSink."""
+        self.writer.later("refused", f"{request.kind} from {request.source}: {reason}")
 
-    def _refused(self, refused: tuple[CaptureRequest, str]) -> None:
-        wish, reason = refused
-        self.book.later("refused", f"{wish.kind} from {wish.source}: {reason}")
+    # for the ground station (CameraModel)
 
-    # the ground station asks
+    @property
+    def mount(self) -> tuple[float, ...]:
+        """See CameraModel."""
+        return self._settings().pose.mount
 
-    def _lookup(self, index: int) -> Captured | None:
+    def facts(self) -> CameraFacts:
+        """See CameraModel."""
+        return self.herald.facts()
+
+    def storage(self) -> Storage | None:
+        """See CameraModel."""
+        return ground_facts.storage(self._recording.folder.path)
+
+    def lookup(self, index: int) -> Captured | None:
+        """See CameraModel."""
         if self.pipeline.in_hand(index):
             return None  # its own message will come
         return ground_facts.of_record(index, self._recording.index)
 
+    def pose(self) -> Pose | None:
+        """See CameraModel."""
+        return self.navigation.pose_now()
+
+    def troubled(self) -> bool:
+        """See CameraModel."""
+        return self.alarms.troubled
+
     def _decode_in_flight(self, value: str) -> None:
         self.pipeline.decoding = value == "on"
-        self.book.later("decoding", f"{value} from now on, by the ground station")
+        self.writer.later("decoding", f"{value} from now on, by the ground station")
 
     def _hand_over(self, following: Settings, text: str) -> None:
         """The ground station has set what belongs to a flight: this one ends between two frames, and the next follows.
@@ -204,7 +212,7 @@ class FlightParts:
         if now.pending:
             raise CameraError(f"{text} would begin another flight: {now.pending} shots are under way, ask again")
         self._after.next = following
-        self.book.later("next flight", f"{text} from there on, by the ground station")
+        self.writer.later("next flight", f"{text} from there on, by the ground station")
         self._end()
 
     # depth tells

@@ -42,7 +42,7 @@ STOP_S = 5.0
 class Service:
     """One flight, from `start` to `stop`. `run` is the working loop between them.
 
-    `watchers` are told what the street does; `after` takes what the next flight is to be flown with, where there may
+    `observer` are told what the street does; `after` takes what the next flight is to be flown with, where there may
     be one. Raises DappledError from `start` when a part can't be had; what was opened is closed again. A camera that
     isn't there, a link without an autopilot and a recipe without a mask are no such failures: the daemon says so and
     goes on.
@@ -52,12 +52,12 @@ class Service:
         self,
         settings: Settings,
         *,
-        watchers: Observer | None = None,
+        observer: Observer | None = None,
         clock: Clock | None = None,
         after: FlightHandover | None = None,
     ) -> None:
         self.settings = settings
-        self._outside, self._after = watchers or Observer(), after
+        self._outside, self._after = observer or Observer(), after
         self._clock = clock or SystemClock()
         self._began_monotonic_ns = self._clock.monotonic_ns()
         self._logbook = Logbook(self._clock.utc_ns)
@@ -136,9 +136,9 @@ class Service:
         """The end of the street first: whatever is handed on finds somebody at work. What begins badly is stopped
         too."""
         parts = self._parts
-        if parts.developer is not None:
-            stack.callback(parts.developer.close)
-            parts.developer.begin_warm_up()
+        if parts.decoder is not None:
+            stack.callback(parts.decoder.close)
+            parts.decoder.begin_warm_up()
         stack.callback(parts.answers.stop)
         parts.answers.start()
         self._publisher.start(self._recording.folder.name)
@@ -155,7 +155,7 @@ class Service:
 
     def _say_end(self) -> None:
         try:
-            self._parts.book.write_later()
+            self._parts.writer.write_later()
         except DappledError as error:
             report(log, "events", error)
         now = self._parts.shutter.statistics()
@@ -182,7 +182,7 @@ class Service:
         """What the working loop does, in this order. Without the loop there is no heartbeat."""
         parts = self._parts
         chores = [
-            PeriodicTask("events", parts.book.write_later),
+            PeriodicTask("events", parts.writer.write_later),
             PeriodicTask("health", self._tell_health, every_ns=HEALTH_NS),
         ]
         if not self.settings.mavlink.url:
@@ -226,7 +226,7 @@ class Service:
             folder=self.folder,
             clock=navigation.telemetry.boot_clock(),
             vehicle=navigation.pose_now(),
-            decoding=parts.developer is not None,
+            decoding=parts.decoder is not None,
             utc_known=navigation.utc.known,
             dead_threads=parts.dead_threads(),
             doubts=[text for text in (*doubts, *(chore.problem for chore in self._chores)) if text],
@@ -252,13 +252,13 @@ class Service:
         return self._parts.navigation.utc.learnt is not None
 
     @property
-    def wished(self) -> int:
+    def requested(self) -> int:
         """Shots so far."""
         return self._parts.shutter.statistics().shots
 
-    def wish(self, wish: CaptureRequest) -> ShotDecision:
+    def request(self, request: CaptureRequest) -> ShotDecision:
         """A wish from this side of the links: a console, or a test."""
-        return self._parts.shutter.wish(wish)
+        return self._parts.shutter.request(request)
 
     def reload(self, wanted: Settings) -> list[str]:
         """Take from these settings what can change in flight; a sentence for each change, taken or refused."""

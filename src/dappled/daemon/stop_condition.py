@@ -59,19 +59,19 @@ class StopCondition:
         self._ask, self._ready, self._clock_s = ask, ready, clock_s
         self._until_s: float | None = None
         self._asker: Asker | None = None
-        self._wished: Callable[[], int] = lambda: 0
+        self._requested: Callable[[], int] = lambda: 0
 
     @property
     def short(self) -> bool:
         """Whether good frames are missing of those wanted."""
         return self._frames is not None and self._tally.good < self._frames
 
-    def begin(self, wished: Callable[[], int]) -> None:
+    def begin(self, requested: Callable[[], int]) -> None:
         """A flight has begun: what it counts as wished comes on top of the shots of those before, which have ended."""
         if self._until_s is None and self._seconds is not None:
             self._until_s = self._clock_s() + self._seconds
         earlier = self._tally.count
-        self._wished = lambda: earlier + wished()
+        self._requested = lambda: earlier + requested()
 
     def reached(self) -> bool:
         """Whether it is time to end."""
@@ -83,4 +83,4 @@ class StopCondition:
             self._asker = self._ask()
         if self._tally.count >= self._frames:
             return True
-        return self._asker is not None and not self._asker.running() and self._tally.count >= self._wished()
+        return self._asker is not None and not self._asker.running() and self._tally.count >= self._requested()

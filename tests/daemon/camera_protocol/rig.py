@@ -11,13 +11,14 @@ from types import TracebackType
 
 from dappled.clock import Clock, RecordedClock, SystemClock
 from dappled.daemon.camera_protocol.camera_settings import Knobs
+from dappled.daemon.camera_protocol.camera_status import DOWN
 from dappled.daemon.camera_protocol.component import CameraFacts, Captured, Component, Storage
 from dappled.daemon.navigation.navigation import Telemetry
-from dappled.daemon.pipeline.shutter import Shutter
+from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink.links import MavlinkLinks, Message, Packet, mavlink, pack
 from dappled.drivers.mavlink.signing import Signing
-from dappled.flight import Cause
+from dappled.flight import Cause, Shot
 from tests.daemon.fakes import eventually
 
 
@@ -55,23 +56,8 @@ class Camera:
             clock=self.clock,
             signing=signing,
         )
-        self.shutter = Shutter(
-            next_index=first,
-            note=lambda shot: self.causes.append(shot.cause),
-            fire=self._fired.put,
-            clock=self.clock,
-            capacity=capacity,
-            on_change=lambda: self.component.state_changed(),  # noqa: PLW0108  # the component is made after the shutter
-        )
-        self.component = Component(
-            self.links,
-            self.shutter,
-            self.clock,
-            Knobs(self),
-            facts=lambda: CameraFacts("dappled", "test", (0, 1, 0)),
-            storage=lambda: Storage(2**34, 2**33, 2**33),
-            lookup=self.done.get,
-        )
+        self.shutter = Shutter(self, self.clock, next_index=first, capacity=capacity)
+        self.component = Component(self.links, self.shutter, self.clock, Knobs(self), self)
         self.component._identity.settled = settled
         self._worker = threading.Thread(target=self._work)
 
@@ -110,6 +96,38 @@ class Camera:
     def failures(self) -> int:
         """Packets whose handling raised: always a bug."""
         return sum(link.failures for link in self.links.statistics())
+
+    def obstacle(self) -> None:
+        """There is none."""
+
+    def note(self, shot: Shot) -> None:
+        self.causes.append(shot.cause)
+
+    def fire(self, shot: Shot) -> None:
+        self._fired.put(shot.index)
+
+    def refused(self, request: CaptureRequest, reason: str) -> None:
+        """Told to the sender alone."""
+
+    mount = DOWN
+
+    def facts(self) -> CameraFacts:
+        return CameraFacts("dappled", "test", (0, 1, 0))
+
+    def storage(self) -> Storage:
+        return Storage(2**34, 2**33, 2**33)
+
+    def lookup(self, index: int) -> Captured | None:
+        return self.done.get(index)
+
+    def pose(self) -> None:
+        """Not known."""
+
+    def healthy(self) -> bool:
+        return True
+
+    def troubled(self) -> bool:
+        return False
 
     def settings(self) -> tuple[Setting, ...]:
         return (Setting("iso", "100", ("100", "200")),)

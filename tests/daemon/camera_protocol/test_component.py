@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 
 from dappled.clock import RecordedClock
 from dappled.daemon.camera_protocol.camera_settings import Knobs, OwnKnob, code
+from dappled.daemon.camera_protocol.camera_status import DOWN
 from dappled.daemon.camera_protocol.component import CameraFacts, Captured, Component, Storage
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Setting, SettingName, check_change
 from dappled.drivers.mavlink.links import Message, Packet, mavlink, pack
+from tests.daemon.fakes import FakeSink
 
 NAN = math.nan
 GCS = (255, 190)
@@ -51,31 +53,36 @@ class Rig:
         self.copies = 1
         self.trusted = True
         self.sent: list[Message] = []
-        self.fired: list[int] = []
-        self.obstacle: str | None = None
-        self.well, self.troubled = True, False
+        self.well, self.critical = True, False
         self.clock = RecordedClock(10**18, 10**18 - 10**9)
-        self.shutter = Shutter(
-            next_index=5,
-            note=lambda _: None,
-            fire=self.fired.append,
-            clock=self.clock,
-            obstacle=lambda: self.obstacle,
-            capacity=capacity,
-            on_change=lambda: self.component.state_changed(),  # noqa: PLW0108 (the component is made after the shutter)
-        )
-        self.component = Component(
-            self,
-            self.shutter,
-            self.clock,
-            Knobs(self.body, (own,)),
-            feedback_is_shot=feedback_is_shot,
-            facts=lambda: CameraFacts("Canon", "EOS 450D", (0, 1, 0), 50.0, 22.2, 14.8, 4272, 2848),
-            storage=lambda: Storage(2**34, 2**33, 2**33),
-            lookup=lambda index: Captured(index, ok=index != 3) if index < 5 else None,
-            healthy=lambda: self.well,
-            troubled=lambda: self.troubled,
-        )
+        self.sink = FakeSink()
+        self.shutter = Shutter(self.sink, self.clock, next_index=5, capacity=capacity)
+        knobs = Knobs(self.body, (own,))
+        self.component = Component(self, self.shutter, self.clock, knobs, self, feedback_is_shot=feedback_is_shot)
+
+    @property
+    def fired(self) -> list[int]:
+        return self.sink.fired
+
+    mount = DOWN
+
+    def facts(self) -> CameraFacts:
+        return CameraFacts("Canon", "EOS 450D", (0, 1, 0), 50.0, 22.2, 14.8, 4272, 2848)
+
+    def storage(self) -> Storage:
+        return Storage(2**34, 2**33, 2**33)
+
+    def lookup(self, index: int) -> Captured | None:
+        return Captured(index, ok=index != 3) if index < 5 else None
+
+    def pose(self) -> None:
+        """Not known."""
+
+    def healthy(self) -> bool:
+        return self.well
+
+    def troubled(self) -> bool:
+        return self.critical
 
     def _decode(self, value: str) -> None:
         self.decode = value
@@ -152,7 +159,7 @@ def test_a_broadcast_that_the_network_doubled_is_one_shot_and_the_next_one_anoth
 def test_a_refusal_says_why_and_pushes_the_status() -> None:
     rig = Rig()
     rig.tick(4)
-    rig.obstacle = "no camera on the bus"
+    rig.sink.problem = "no camera on the bus"
     result = rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, 1)
     assert result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED
     assert any("no camera on the bus" in str(m) for m in rig.sent)
@@ -291,7 +298,7 @@ def test_heartbeats_time_requests_and_streams_come_in_time_and_none_while_faulte
     assert seen.count("HEARTBEAT") == 2
     assert seen.count("TIMESYNC") == 10
     assert {m.system_status for m in rig.of("HEARTBEAT")} == {mavlink.MAV_STATE_ACTIVE}
-    rig.troubled = True
+    rig.critical = True
     rig.sent.clear()
     rig.tick(1.5)
     assert {m.system_status for m in rig.of("HEARTBEAT")} == {mavlink.MAV_STATE_CRITICAL}

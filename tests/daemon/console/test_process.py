@@ -24,7 +24,7 @@ from dappled.daemon.console.process import Console, ConsoleError
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.daemon.stream.curve import KeyFileError
-from tests.daemon.fakes import Rig, rig
+from tests.daemon.fakes import FakeSink, Rig, rig
 
 TOKEN = "a-token-of-many-letters"  # noqa: S105  # it opens nothing
 
@@ -181,7 +181,7 @@ def test_a_number_that_comes_twice_is_one_wish(pipeline: Rig) -> None:
 
 
 def test_an_interval_and_its_end() -> None:
-    shutter = Shutter(next_index=0, note=lambda _: None, fire=lambda _: None, clock=SystemClock(), capacity=1000)
+    shutter = Shutter(FakeSink(), SystemClock(), next_index=0, capacity=1000)
     shutter.start()
     assert do(shutter, do="interval", sequence=1, interval_s=0.05, count=0)["ok"]
     until = time.monotonic() + 20

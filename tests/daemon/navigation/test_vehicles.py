@@ -135,7 +135,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Settin
 
 def test_the_daemon_tags_with_the_place_of_its_own_vehicle(settings: Settings) -> None:
     shots: list[PendingShot] = []
-    service = Service(settings, watchers=Observer(finished=shots.append))
+    service = Service(settings, observer=Observer(finished=shots.append))
     service.start()
     loop = threading.Thread(target=service.run)
     loop.start()
@@ -155,7 +155,7 @@ def test_the_daemon_tags_with_the_place_of_its_own_vehicle(settings: Settings) -
     try:
         eventually(lambda: service._parts.component.vehicle, "it is decided whose camera this is")
         eventually(lambda: (service.health()["vehicle"] or {}).get("latitude_deg") == pytest.approx(47), "our place")
-        service.wish(CaptureRequest("test", "console", 1))
+        service.request(CaptureRequest("test", "console", 1))
         eventually(lambda: shots, "the shot's end")
     finally:
         over.set()

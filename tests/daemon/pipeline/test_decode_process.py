@@ -28,95 +28,95 @@ def frame(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture
-def developer() -> Iterator[DecodeProcess]:
+def decoder() -> Iterator[DecodeProcess]:
     one = DecodeProcess(RECIPE)
     yield one
     one.close()
 
 
-def pid(developer: DecodeProcess) -> int:
-    assert developer._process is not None
-    return developer._process.pid
+def pid(decoder: DecodeProcess) -> int:
+    assert decoder._process is not None
+    return decoder._process.pid
 
 
-def test_bad_frames_cost_nothing_but_themselves(developer: DecodeProcess, frame: str, tmp_path: Path) -> None:
+def test_bad_frames_cost_nothing_but_themselves(decoder: DecodeProcess, frame: str, tmp_path: Path) -> None:
     junk = tmp_path / "junk.dng"
     junk.write_bytes(b"II*\0" + bytes(range(256)) * 100)
     for path in (str(junk), str(tmp_path / "nothing.dng"), str(tmp_path)):
         with pytest.raises(DecodeProcessError) as caught:
-            developer.develop(path, None, None)
+            decoder.develop(path, None, None)
         assert path in str(caught.value)
         assert "\n" not in str(caught.value)
-    done = developer.develop(frame, None, None)
+    done = decoder.develop(frame, None, None)
     assert hashlib.sha256(done.body).hexdigest() == done.sha256
     assert done.arrays[0]["shape"][0] == len(done.carriers)
     assert done.preview.startswith(b"\xff\xd8")
-    assert developer.restarts == 0
+    assert decoder.restarts == 0
 
 
 def test_a_recipe_that_can_t_work_is_told_at_the_warm_up() -> None:
-    developer = DecodeProcess(Recipe("reference-36mm", "no-such-mask"))
+    decoder = DecodeProcess(Recipe("reference-36mm", "no-such-mask"))
     with pytest.raises(DecodeProcessError, match="no-such-mask"):
-        developer.warm_up()
-    developer.close()
+        decoder.warm_up()
+    decoder.close()
 
 
-def test_a_worker_that_died_between_two_frames_is_replaced_unseen(developer: DecodeProcess, frame: str) -> None:
-    first = developer.develop(frame, None, None)
-    os.kill(pid(developer), signal.SIGKILL)
-    assert developer._process is not None
-    developer._process.wait(5)
-    assert developer.develop(frame, None, None).sha256 == first.sha256
-    assert developer.restarts == 1
+def test_a_worker_that_died_between_two_frames_is_replaced_unseen(decoder: DecodeProcess, frame: str) -> None:
+    first = decoder.develop(frame, None, None)
+    os.kill(pid(decoder), signal.SIGKILL)
+    assert decoder._process is not None
+    decoder._process.wait(5)
+    assert decoder.develop(frame, None, None).sha256 == first.sha256
+    assert decoder.restarts == 1
 
 
 def test_a_worker_that_hangs_is_given_up_and_replaced(frame: str) -> None:
-    developer = DecodeProcess(RECIPE, timeout_s=20.0)
-    developer.warm_up()
-    os.kill(pid(developer), signal.SIGSTOP)
-    developer._timeout_s = 0.2
+    decoder = DecodeProcess(RECIPE, timeout_s=20.0)
+    decoder.warm_up()
+    os.kill(pid(decoder), signal.SIGSTOP)
+    decoder._timeout_s = 0.2
     with pytest.raises(DecodeProcessError, match="given up"):
-        developer.develop(frame, None, None)
-    developer._timeout_s = 20.0
-    assert developer.develop(frame, None, None).sha256
-    developer.close()
+        decoder.develop(frame, None, None)
+    decoder._timeout_s = 20.0
+    assert decoder.develop(frame, None, None).sha256
+    decoder.close()
 
 
 def test_a_worker_that_keeps_dying_is_not_started_without_end(frame: str) -> None:
     now_ns = [0]
     budget = RestartBudget(limit=2, window_s=60.0)
-    developer = DecodeProcess(RECIPE, budget=budget, clock_ns=lambda: now_ns[0])
+    decoder = DecodeProcess(RECIPE, budget=budget, clock_ns=lambda: now_ns[0])
     for _ in range(2):
-        developer.warm_up()
-        os.kill(pid(developer), signal.SIGKILL)
-        assert developer._process is not None
-        developer._process.wait(5)
+        decoder.warm_up()
+        os.kill(pid(decoder), signal.SIGKILL)
+        assert decoder._process is not None
+        decoder._process.wait(5)
     now_ns[0] = 20 * 10**9
     with pytest.raises(DecodeProcessError, match="keeps dying: it starts again in 40 s"):
-        developer.develop(frame, None, None)
+        decoder.develop(frame, None, None)
     now_ns[0] = 61 * 10**9
-    assert developer.develop(frame, None, None).sha256
-    developer.close()
+    assert decoder.develop(frame, None, None).sha256
+    decoder.close()
 
 
 @pytest.mark.timeout(40)  # the frame itself would take for ever
 def test_close_does_not_wait_for_a_frame_in_hand(frame: str) -> None:
-    developer = DecodeProcess(RECIPE, timeout_s=3600)
-    developer.warm_up()
-    os.kill(pid(developer), signal.SIGSTOP)
+    decoder = DecodeProcess(RECIPE, timeout_s=3600)
+    decoder.warm_up()
+    os.kill(pid(decoder), signal.SIGSTOP)
     problems: list[Exception] = []
 
     def develop() -> None:
         try:
-            developer.develop(frame, None, None)
+            decoder.develop(frame, None, None)
         except DecodeProcessError as error:
             problems.append(error)
 
     thread = threading.Thread(target=develop)
     thread.start()
-    eventually(developer._turn.locked, "it is at work")
-    developer.close()
+    eventually(decoder._turn.locked, "it is at work")
+    decoder.close()
     thread.join(5)
     assert len(problems) == 1
     with pytest.raises(DecodeProcessError, match="stopped"):
-        developer.develop(frame, None, None)
+        decoder.develop(frame, None, None)

@@ -31,9 +31,9 @@ def frame(index: int) -> Frame:
     return Frame(index, f"frames/{index}.dng", "IMG.DNG", 10, "0" * 64, 0)
 
 
-def begun(watchers: Observer, count: int) -> tuple[PendingShots, list[PendingShot], Events]:
+def begun(observer: Observer, count: int) -> tuple[PendingShots, list[PendingShot], Events]:
     events = Events()
-    shots = PendingShots(cast(FlightWriter, events), watchers)
+    shots = PendingShots(cast(FlightWriter, events), observer)
     for index in range(count):
         shots.expect(shot(index))
     return shots, [cast(PendingShot, shots.in_hand(index)) for index in range(count)], events

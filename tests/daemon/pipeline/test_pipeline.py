@@ -27,7 +27,7 @@ def states(flight: Path) -> dict[int, ShotState]:
 
 def test_a_shot_goes_all_the_way(tmp_path: Path) -> None:
     with rig(tmp_path) as one:
-        assert one.wish(1).index == 0
+        assert one.request(1).index == 0
         pending = one.ended(0)
         assert pending.problem == ""
         assert pending.frame is not None
@@ -44,9 +44,9 @@ def test_a_driver_that_raises_fails_the_shot_and_the_next_works(tmp_path: Path) 
         return [CameraError("no film")] if shot == 0 else good(shot)
 
     with rig(tmp_path, script) as one:
-        assert one.wish(1).outcome == "shot"
+        assert one.request(1).outcome == "shot"
         assert "no film" in one.ended(0).problem
-        one.wish(2)
+        one.request(2)
         assert one.ended(1).frame is not None
         assert one.settled == [(0, False), (1, True)]
     assert states(one.flight.folder.path) == {0: "failed", 1: "safe"}
@@ -54,13 +54,13 @@ def test_a_driver_that_raises_fails_the_shot_and_the_next_works(tmp_path: Path) 
 
 def test_a_driver_s_bug_in_next_event_does_not_end_the_capture(tmp_path: Path) -> None:
     with rig(tmp_path, lambda shot: [RuntimeError("bug"), *good(shot)]) as one:
-        one.wish(1)
+        one.request(1)
         assert one.ended(0).frame is not None
 
 
 def test_a_file_that_comes_twice_is_one_frame(tmp_path: Path) -> None:
     with rig(tmp_path, lambda shot: [*good(shot), arrival(shot)]) as one:
-        one.wish(1)
+        one.request(1)
         one.ended(0)
         eventually(lambda: len(one.camera.released) == 2, "the second is released too")
         assert (len(one.shots), one.settled, one.tagged) == (1, [(0, True)], [0])
@@ -69,11 +69,11 @@ def test_a_file_that_comes_twice_is_one_frame(tmp_path: Path) -> None:
 
 def test_a_second_file_of_a_shot_is_a_stray_and_undoes_nothing(tmp_path: Path) -> None:
     with rig(tmp_path, lambda shot: [*good(shot), arrival(shot, b"other")]) as one:
-        assert one.developer is not None
-        one.developer.gate.clear()  # the first is still on the street
-        one.wish(1)
+        assert one.decoder is not None
+        one.decoder.gate.clear()  # the first is still on the street
+        one.request(1)
         eventually(one.flight.ledger.strays, "the stray")
-        one.developer.gate.set()
+        one.decoder.gate.set()
         assert one.ended(0).problem == ""
         assert one.settled == [(0, True)]
     assert check.check(one.flight.folder.path).intact
@@ -81,7 +81,7 @@ def test_a_second_file_of_a_shot_is_a_stray_and_undoes_nothing(tmp_path: Path) -
 
 def test_a_failure_after_the_file_undoes_nothing(tmp_path: Path) -> None:
     with rig(tmp_path, lambda shot: [*good(shot), failed(shot)]) as one:
-        one.wish(1)
+        one.request(1)
         assert one.ended(0).problem == ""
         eventually(lambda: one.camera.released, "released")
     assert (states(one.flight.folder.path), one.settled) == ({0: "safe"}, [(0, True)])
@@ -90,7 +90,7 @@ def test_a_failure_after_the_file_undoes_nothing(tmp_path: Path) -> None:
 def test_a_file_after_the_failure_is_a_frame_after_all(tmp_path: Path) -> None:
     with rig(tmp_path) as one:
         one.camera.script = lambda shot: [fired(shot), failed(shot)]
-        one.wish(1)
+        one.request(1)
         assert one.ended(0).problem == "the mirror is stuck"
         one.camera.say(arrival(0))
         eventually(lambda: one.flight.ledger.result(0), "it is decoded too")
@@ -103,7 +103,7 @@ def test_a_file_after_the_failure_is_a_frame_after_all(tmp_path: Path) -> None:
 
 def test_a_trigger_told_after_the_file_does_not_change_the_tag(tmp_path: Path) -> None:
     with rig(tmp_path, lambda shot: [arrival(shot), fired(shot)]) as one:
-        one.wish(1)
+        one.request(1)
         pending = one.ended(0)
         assert pending.tag is not None
         assert pending.tag.utc_ns == pending.shot.wished_utc_ns + 60_000_000
@@ -122,7 +122,7 @@ def test_a_file_of_nobody_is_a_stray(tmp_path: Path) -> None:
 def test_an_empty_file_fails_the_shot(tmp_path: Path) -> None:
     with rig(tmp_path) as one:
         one.camera.script = lambda shot: [fired(shot)]
-        one.wish(1)
+        one.request(1)
         empty = arrival(0, b"x")
         one.camera.say(type(empty)(0, empty.name, type(empty.blob)(empty.blob.fd, 0), empty.monotonic_ns))
         assert "empty" in one.ended(0).problem
@@ -131,7 +131,7 @@ def test_an_empty_file_fails_the_shot(tmp_path: Path) -> None:
 
 def test_a_shot_that_brings_nothing_fails_when_the_flight_ends(tmp_path: Path) -> None:
     with rig(tmp_path, lambda _: [], stop_s=0.1) as one:
-        one.wish(1)
+        one.request(1)
     assert one.settled == [(0, False)]
     assert "the flight ended" in one.ended(0).problem
     assert states(one.flight.folder.path) == {0: "failed"}
@@ -150,7 +150,7 @@ def test_a_file_that_comes_as_the_camera_is_let_go_of_is_taken_though_the_driver
             self.say(arrival(0))
 
     with rig(tmp_path, camera=Late(lambda shot: [fired(shot)]), stop_s=0.1) as one:
-        one.wish(1)
+        one.request(1)
     assert one.settled == [(0, True)]
     assert states(one.flight.folder.path) == {0: "safe"}
 
@@ -159,23 +159,23 @@ def test_a_watcher_that_raises_stops_nobody(tmp_path: Path) -> None:
     with rig(tmp_path) as one:
         shots = one.shots
         one.shots = None  # type: ignore[assignment]  # as a bug in a watcher would
-        one.wish(1)
+        one.request(1)
         eventually(lambda: one.flight.ledger.result(0), "decoded all the same")
         one.shots = shots
-        one.wish(2)
+        one.request(2)
         assert one.ended(1).problem == ""
 
 
 def test_a_full_decode_queue_leaves_frames_in_the_record(tmp_path: Path) -> None:
     with rig(tmp_path, queue_=1) as one:
-        assert one.developer is not None
-        one.developer.gate.clear()
-        one.wish(1)
-        eventually(lambda: one.developer and one.developer.seen, "the first is being decoded")
+        assert one.decoder is not None
+        one.decoder.gate.clear()
+        one.request(1)
+        eventually(lambda: one.decoder and one.decoder.seen, "the first is being decoded")
         for number in (2, 3, 4):
-            one.wish(number)
+            one.request(number)
         assert "the queue was full" in one.ended(3).problem
-        one.developer.gate.set()
+        one.decoder.gate.set()
         assert one.ended(1).problem == ""
     assert set(states(one.flight.folder.path).values()) == {"safe"}
     assert len(one.shots) == 4
@@ -183,12 +183,12 @@ def test_a_full_decode_queue_leaves_frames_in_the_record(tmp_path: Path) -> None
 
 def test_a_frame_that_does_not_decode_is_told_and_the_next_does(tmp_path: Path) -> None:
     with rig(tmp_path) as one:
-        assert one.developer is not None
-        one.developer.problem = "no carriers"
-        one.wish(1)
+        assert one.decoder is not None
+        one.decoder.problem = "no carriers"
+        one.request(1)
         assert one.ended(0).problem == "not decoded: no carriers"
-        one.developer.problem = ""
-        one.wish(2)
+        one.decoder.problem = ""
+        one.request(2)
         assert one.ended(1).problem == ""
         assert "not decoded: no carriers" in one.events()
 
@@ -197,7 +197,7 @@ def test_frames_are_told_as_left_undecoded_where_that_was_switched_off(tmp_path:
     with rig(tmp_path) as one:
         for number, decoding in enumerate((True, False, True)):
             one.pipeline.decoding = decoding
-            one.wish(number)
+            one.request(number)
             pending = one.ended(number)
             assert ((pending.decoded is not None), pending.problem) == (decoding, "")
         assert [text for text in one.events() if text.startswith("not decoded")] == [
@@ -207,7 +207,7 @@ def test_frames_are_told_as_left_undecoded_where_that_was_switched_off(tmp_path:
 
 def test_a_flight_that_decodes_nothing_tells_it_of_no_frame(tmp_path: Path) -> None:
     with rig(tmp_path, decode=False) as one:
-        one.wish(1)
+        one.request(1)
         assert one.ended(0).problem == ""
         assert not any(text.startswith("not decoded") for text in one.events())
 
@@ -223,9 +223,9 @@ def test_a_ledger_that_refuses_once_costs_one_shot_at_most(
                 raise RuntimeError("nobody foresaw this")
 
             broken.setattr(one.flight.ledger, method, refuse)
-            one.wish(1)
+            one.request(1)
             one.ended(0)
-        one.wish(2)
+        one.request(2)
         assert one.ended(1).problem == ""
         assert one.ended(1).decoded is not None
     assert len(one.shots) == 2
@@ -269,10 +269,10 @@ def test_every_wish_is_one_shot_and_every_shot_ends_once(plan: list[tuple[list[t
     with tempfile.TemporaryDirectory() as folder:
         with rig(Path(folder), script, stop_s=0.05) as one:
             for number, (_, _, twice) in enumerate(plan):
-                verdict = one.wish(number)
-                assert (verdict.outcome, verdict.index) == ("shot", number)
+                decision = one.request(number)
+                assert (decision.outcome, decision.index) == ("shot", number)
                 if twice:
-                    assert (one.wish(number).outcome, one.wish(number).index) == ("duplicate", number)
+                    assert (one.request(number).outcome, one.request(number).index) == ("duplicate", number)
         flight = one.flight.folder.path
         assert check.check(flight).problems == ()
         balance = flight_report.balance(flight)
@@ -296,7 +296,7 @@ def with_companion(shot: int) -> list[CameraEvent | Exception]:
 
 def test_a_companion_stands_beside_its_frame_in_the_record(tmp_path: Path) -> None:
     with rig(tmp_path, with_companion) as one:
-        index = one.wish(1).index
+        index = one.request(1).index
         assert index is not None
         one.ended(index)
         eventually(lambda: one.camera.released == [index, index], "both copies at the camera may go")
@@ -314,7 +314,7 @@ def deferred(shot: int) -> list[CameraEvent | Exception]:
 
 def test_a_shot_whose_file_follows_is_told_where_it_was_and_has_failed_until_then(tmp_path: Path) -> None:
     with rig(tmp_path, deferred) as one:
-        index = one.wish(1).index
+        index = one.request(1).index
         assert index is not None
         pending = one.ended(index)
         assert pending.where is not None
@@ -339,7 +339,7 @@ def test_a_zoom_that_changed_is_told(tmp_path: Path) -> None:
 
     with rig(tmp_path, zooming) as one:
         for number in range(3):
-            index = one.wish(number).index
+            index = one.request(number).index
             assert index is not None
             one.ended(index)
         told = [text for text in one.events() if text.startswith("zoom")]
@@ -356,7 +356,7 @@ def test_a_shot_in_doubt_teaches_no_time(tmp_path: Path, doubt: str, by: str) ->
 
     with rig(tmp_path, script) as one:
         for number in range(4):
-            index = one.wish(number).index
+            index = one.request(number).index
             assert index is not None
             last = one.ended(index)
     assert last.tag is not None

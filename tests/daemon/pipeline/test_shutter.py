@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import threading
 import time
 
 import pytest
@@ -14,6 +13,7 @@ from dappled.clock import RecordedClock, SystemClock
 from dappled.daemon.pipeline import shutter as module
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.flight import Shot
+from tests.daemon.fakes import FakeSink, eventually
 
 PILOT = "mavlink:255/190"
 VEHICLE = "mavlink:1/1"
@@ -24,29 +24,19 @@ class Rig:
 
     def __init__(self, capacity: int = 1000) -> None:
         self.clock = RecordedClock(10**18, 10**18 - 10**9)
-        self.done: list[tuple[str, int]] = []
-        self.obstacle: str | None = None
-        self.note_error: OSError | None = None
-        self.shutter = Shutter(
-            next_index=42,
-            note=self._note,
-            fire=lambda index: self.done.append(("fire", index)),
-            clock=self.clock,
-            capacity=capacity,
-            obstacle=lambda: self.obstacle,
-        )
+        self.sink = FakeSink()
+        self.shutter = Shutter(self.sink, self.clock, next_index=42, capacity=capacity)
 
-    def _note(self, shot: Shot) -> None:
-        if self.note_error:
-            raise self.note_error
-        self.done.append(("note", shot.index))
+    @property
+    def done(self) -> list[tuple[str, int]]:
+        return self.sink.done
 
     def fired(self) -> list[int]:
-        return [index for act, index in self.done if act == "fire"]
+        return self.sink.fired
 
     def press(self, after_s: float = 0.0, *, sequence: int = 0, confirmation: int = 0, link: int = 0) -> str:
         self.clock.advance(after_s)
-        return self.shutter.wish(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", sequence, confirmation, link)).outcome
+        return self.shutter.request(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", sequence, confirmation, link)).outcome
 
     def tick(self, seconds: float, step_s: float = 0.05) -> None:
         for _ in range(round(seconds / step_s)):
@@ -56,8 +46,8 @@ class Rig:
 
 def test_a_wish_is_written_down_before_the_camera_is_touched() -> None:
     rig = Rig()
-    verdict = rig.shutter.wish(CaptureRequest("console", "button"))
-    assert (verdict.outcome, verdict.index) == ("shot", 42)
+    decision = rig.shutter.request(CaptureRequest("console", "button"))
+    assert (decision.outcome, decision.index) == ("shot", 42)
     assert rig.done == [("note", 42), ("fire", 42)]
 
 
@@ -99,7 +89,7 @@ def test_px4s_triple_on_several_links_is_one_shot_a_trigger(
         order.shuffle(messages)
         for kind, link in messages:
             sequence = None if kind == "DO_DIGICAM_CONTROL" else trigger + 1
-            rig.shutter.wish(
+            rig.shutter.request(
                 CaptureRequest(VEHICLE, kind, sequence, 0, link, acknowledged=kind == "IMAGE_START_CAPTURE")
             )
             rig.clock.advance(0.05 / len(messages))
@@ -112,7 +102,7 @@ def test_broadcast_203_without_a_number_is_a_shot_each_time(gaps: list[float]) -
     rig = Rig()
     for gap in gaps:
         rig.clock.advance(gap)
-        rig.shutter.wish(CaptureRequest(VEHICLE, "DO_DIGICAM_CONTROL", None, 0, 0, acknowledged=False))
+        rig.shutter.request(CaptureRequest(VEHICLE, "DO_DIGICAM_CONTROL", None, 0, 0, acknowledged=False))
     assert len(rig.fired()) == len(gaps)
 
 
@@ -132,32 +122,32 @@ def test_the_books_balance_and_no_index_is_used_twice(messages: list[tuple[float
     rig = Rig(capacity=5)
     for gap, source, kind, sequence, link in messages:
         rig.clock.advance(gap)
-        verdict = rig.shutter.wish(CaptureRequest(source, kind, sequence, 0, link))
-        assert verdict.accepted == (verdict.index is not None)
-        if verdict.outcome == "shot" and (verdict.index or 0) % 2:
-            rig.shutter.settled(verdict.index or 0, ok=verdict.index != 43)
+        decision = rig.shutter.request(CaptureRequest(source, kind, sequence, 0, link))
+        assert decision.accepted == (decision.index is not None)
+        if decision.outcome == "shot" and (decision.index or 0) % 2:
+            rig.shutter.settled(decision.index or 0, ok=decision.index != 43)
     now = rig.shutter.statistics()
     assert rig.done == [(act, index) for index in rig.fired() for act in ("note", "fire")]
     assert rig.fired() == list(range(42, now.next_index))
-    assert now.wishes == len(messages) == now.shots + now.duplicates + now.refused
+    assert now.requests == len(messages) == now.shots + now.duplicates + now.refused
     assert now.shots == now.pending + now.succeeded + now.failed
     assert now.pending <= 5
 
 
 def test_refusals_say_why_and_use_no_index() -> None:
     rig = Rig(capacity=1)
-    rig.obstacle = "no camera on the bus"
-    assert rig.shutter.wish(CaptureRequest(PILOT, "x", 1)).reason == "no camera on the bus"
-    rig.obstacle, rig.note_error = None, OSError(28, "No space left on device")
-    assert "No space left" in (rig.shutter.wish(CaptureRequest(PILOT, "x", 2)).reason or "")
-    rig.note_error = None
-    assert rig.shutter.wish(CaptureRequest(PILOT, "x", 3)).index == 42
-    assert "waiting for the camera" in (rig.shutter.wish(CaptureRequest(PILOT, "x", 4)).reason or "")
+    rig.sink.problem = "no camera on the bus"
+    assert rig.shutter.request(CaptureRequest(PILOT, "x", 1)).reason == "no camera on the bus"
+    rig.sink.problem, rig.sink.note_error = None, OSError(28, "No space left on device")
+    assert "No space left" in (rig.shutter.request(CaptureRequest(PILOT, "x", 2)).reason or "")
+    rig.sink.note_error = None
+    assert rig.shutter.request(CaptureRequest(PILOT, "x", 3)).index == 42
+    assert "waiting for the camera" in (rig.shutter.request(CaptureRequest(PILOT, "x", 4)).reason or "")
     rig.shutter.settled(42, ok=True)
     rig.shutter.settled(42, ok=False)
-    assert rig.shutter.wish(CaptureRequest(PILOT, "x", 5)).index == 43
+    assert rig.shutter.request(CaptureRequest(PILOT, "x", 5)).index == 43
     rig.shutter.stop()
-    assert rig.shutter.wish(CaptureRequest(PILOT, "x", 6)).reason == "the daemon is stopping"
+    assert rig.shutter.request(CaptureRequest(PILOT, "x", 6)).reason == "the daemon is stopping"
 
 
 def test_an_interval_counts_to_its_end_and_a_single_shot_does_not_cancel_it() -> None:
@@ -245,11 +235,11 @@ def test_a_burst_before_a_camera_that_is_gone_asks_once_a_second() -> None:
     rig = Rig()
     rig.shutter.start_interval(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", 1), 0.0, 0)
     rig.shutter.settled(42, ok=True)
-    rig.obstacle = "the camera is absent"
+    rig.sink.problem = "the camera is absent"
     for _ in range(100):
         rig.tick(0.05)
     assert 4 <= rig.shutter.statistics().refused <= 6  # each is an event of the record
-    rig.obstacle = None
+    rig.sink.problem = None
     rig.tick(1.0)
     assert rig.fired() == [42, 43]
 
@@ -262,63 +252,47 @@ def test_a_senseless_interval_is_refused(interval_s: float, count: int) -> None:
 
 
 def test_the_thread_serves_intervals_on_the_real_clock() -> None:
-    enough, fired = threading.Event(), []
-
-    def fire(index: int) -> None:
-        fired.append(index)
-        if len(fired) == 3:
-            enough.set()
-
-    shutter = Shutter(next_index=0, note=lambda _: None, fire=fire, clock=SystemClock())
+    sink = FakeSink()
+    shutter = Shutter(sink, SystemClock(), next_index=0)
     shutter.start()
     try:
         began = time.monotonic()
         shutter.start_interval(CaptureRequest(PILOT, "x"), 0.1, 3)
-        assert enough.wait(10)
+        eventually(lambda: len(sink.fired) == 3, "three shots")
         assert time.monotonic() - began > 0.19
     finally:
         shutter.stop()
-    assert fired == [0, 1, 2]
+    assert sink.fired == [0, 1, 2]
 
 
 def test_an_interval_outlives_whoever_notes_going_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_AGAIN_S", 0.01)
-    enough, noted, fired = threading.Event(), list[int](), list[int]()
 
-    def note(shot: Shot) -> None:
-        noted.append(shot.index)
-        if len(noted) == 2:
-            raise RuntimeError("nobody foresaw this")
+    class Forgetful(FakeSink):
+        def note(self, shot: Shot) -> None:
+            super().note(shot)
+            if sum(act == "note" for act, _ in self.done) == 2:
+                raise RuntimeError("nobody foresaw this")
 
-    def fire(index: int) -> None:
-        fired.append(index)
-        if len(fired) == 3:
-            enough.set()
-
-    shutter = Shutter(next_index=0, note=note, fire=fire, clock=SystemClock())
+    sink = Forgetful()
+    shutter = Shutter(sink, SystemClock(), next_index=0)
     shutter.start()
     try:
         shutter.start_interval(CaptureRequest(PILOT, "x"), 0.1, 3)
-        assert enough.wait(20)
+        eventually(lambda: len(sink.fired) == 3, "three shots")
         assert shutter.dead_threads() == []
     finally:
         shutter.stop()
-    assert (noted, fired) == ([0, 1, 1, 2], [0, 1, 2])
+    assert [index for act, index in sink.done if act == "note"] == [0, 1, 1, 2]
+    assert sink.fired == [0, 1, 2]
 
 
 def test_every_refusal_is_told() -> None:
-    told: list[str] = []
-    shutter = Shutter(
-        next_index=0,
-        note=lambda _: None,
-        fire=lambda _: None,
-        clock=RecordedClock(10**18),
-        capacity=1,
-        on_refused=lambda refused: told.append(refused[1]),
-    )
+    sink = FakeSink()
+    shutter = Shutter(sink, RecordedClock(10**18), next_index=0, capacity=1)
     shutter.start_interval(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", 1), -1.0, 0)
     for sequence in (2, 3):
-        shutter.wish(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", sequence))
-    assert len(told) == shutter.statistics().refused == 2
-    assert "an interval is" in told[0]
-    assert "waiting for the camera" in told[1]
+        shutter.request(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", sequence))
+    assert len(sink.refusals) == shutter.statistics().refused == 2
+    assert "an interval is" in sink.refusals[0]
+    assert "waiting for the camera" in sink.refusals[1]

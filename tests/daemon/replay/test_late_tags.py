@@ -44,7 +44,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Settin
 def killed(settings: Settings, tmp_path: Path) -> Path:
     """What stands on the disk when a daemon is killed: one frame tagged, one safe and waiting for its pose."""
     shots: list[PendingShot] = []
-    service = Service(settings, watchers=Observer(finished=shots.append))
+    service = Service(settings, observer=Observer(finished=shots.append))
     service.start()
     loop = threading.Thread(target=service.run)
     loop.start()
@@ -66,9 +66,9 @@ def killed(settings: Settings, tmp_path: Path) -> Path:
         try:
             eventually(lambda: heard(service._parts.component.vehicle), "whose camera this is")
             eventually(lambda: heard(service.health()["vehicle"]), "a position")
-            service.wish(CaptureRequest("test", "console", 1))
+            service.request(CaptureRequest("test", "console", 1))
             eventually(lambda: heard(shots), "the first shot's end")
-            service.wish(CaptureRequest("test", "console", 2))
+            service.request(CaptureRequest("test", "console", 2))
             eventually(lambda: _safe(service.folder) == 2, "the second frame is safe")
             assert len(shots) == 1
             shutil.copytree(service.folder, left)

@@ -16,14 +16,14 @@ from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayP
 from dappled.drivers.camera import Arrival, CameraEvent, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.replay import ReplayCamera
 from dappled.flight import Cause, FlightError, Shot
-from tests.daemon.fakes import FakeDeveloper, failed, fired, good, rig
+from tests.daemon.fakes import FakeDecoder, failed, fired, good, rig
 
 
 def record(flights: Path) -> Path:
     """A flight of two frames, with a failed shot between."""
     with rig(flights, lambda shot: [fired(shot), failed(shot)] if shot == 1 else good(shot)) as one:
         for number in range(3):
-            one.wish(number)
+            one.request(number)
             one.ended(number)
     return one.flight.folder.path
 
@@ -31,7 +31,7 @@ def record(flights: Path) -> Path:
 def again(flight: Path, pace: replay.Pace | None = None) -> list[str]:
     """The verdict of a replay."""
     recording = replay.of_flight(flight)
-    book = replay.book(recording)
+    writer = replay.writer(recording)
     progress = ReplayProgress.begin()
     ended: list[PendingShot] = []
 
@@ -41,13 +41,13 @@ def again(flight: Path, pace: replay.Pace | None = None) -> list[str]:
 
     pipeline = Pipeline(
         camera=ReplayCamera(recording.files, Identity("dappled", "recording", "", "")),
-        book=book,
+        writer=writer,
         poses=RecordedTelemetry(recording.telemetry, recording.horizons, wait_s=0.0).pose,
-        developer=FakeDeveloper(),
+        decoder=FakeDecoder(),
         publisher=None,
         latency=BodyLatency(60.0, 15.0, "test"),
         names=Names("test", "mask", "geometric"),
-        watchers=Observer(finished=finished),
+        observer=Observer(finished=finished),
         decode_queue=100,
     )
     pipeline.start()
@@ -56,7 +56,7 @@ def again(flight: Path, pace: replay.Pace | None = None) -> list[str]:
     finally:
         pipeline.stop(5)
     assert len(ended) == len(recording.shots)
-    return [text for text in book.verdict() if "unreadable" not in text]  # the fake's frames are no raw files
+    return [text for text in writer.verdict() if "unreadable" not in text]  # the fake's frames are no raw files
 
 
 def test_the_same_flight_gives_the_same(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_what_was_told_of_a_shot_in_flight_is_no_difference(tmp_path: Path) -> N
         return [dataclasses.replace(arrival, facts={"doubt": "it came late"})]
 
     with rig(tmp_path, untold) as one:
-        one.wish(0)
+        one.request(0)
         one.ended(0)
         told = one.flight.ledger.tag(0)
         assert told is not None

@@ -44,9 +44,9 @@ def recipe(tmp_path: Path) -> Recipe:
 def test_a_run_stands_beside_the_flight_and_can_be_had_again(flight: Recording, recipe: Recipe, tmp_path: Path) -> None:
     flight.close()
     folder = flight.folder.path
-    with RunWriter(folder, Run("second", recipe, NAMES), lambda: 5) as book:
-        book.decoded(replace(RESULT, slices_sha256="b" * 64))
-        assert book.run.recipe.white == str(folder / "inputs" / "second" / "white.npy")
+    with RunWriter(folder, Run("second", recipe, NAMES), lambda: 5) as writer:
+        writer.decoded(replace(RESULT, slices_sha256="b" * 64))
+        assert writer.run.recipe.white == str(folder / "inputs" / "second" / "white.npy")
     with LedgerReader.open(flight.folder.ledger) as ledger:
         assert ledger.runs() == {"live": 1, "second": 1}
         assert ledger.results()[0] == RESULT

@@ -14,21 +14,21 @@ from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.stream import answers, wire
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.wire import Message, WireError
-from tests.daemon.fakes import FakeDeveloper, Rig, eventually, rig
+from tests.daemon.fakes import FakeDecoder, Rig, eventually, rig
 
 
 @pytest.fixture
 def flown(tmp_path: Path) -> Iterator[Rig]:
     """A flight with one frame, still open."""
     with rig(tmp_path) as one:
-        one.wish(1)
+        one.request(1)
         one.ended(0)
         yield one
 
 
-def asked(flown: Rig, developer: FakeDeveloper | None, request: dict[str, Any]) -> Message:
+def asked(flown: Rig, decoder: FakeDecoder | None, request: dict[str, Any]) -> Message:
     replies: list[Message] = []
-    one = Answers(LedgerWriter(flown.flight, SystemClock()), developer)
+    one = Answers(LedgerWriter(flown.flight, SystemClock()), decoder)
     one.start()
     one.answer(request, replies.append)
     one.stop()
@@ -40,7 +40,7 @@ def asked(flown: Rig, developer: FakeDeveloper | None, request: dict[str, Any]) 
 def test_a_frame_and_its_slices_are_had_again(flown: Rig) -> None:
     frame = asked(flown, None, {"get": "frame", "frame": 0})
     assert (frame.topic, frame.header["frame"]) == ("frame", 0)
-    slices = asked(flown, FakeDeveloper(), {"get": "slices", "frame": 0})
+    slices = asked(flown, FakeDecoder(), {"get": "slices", "frame": 0})
     assert (slices.topic, slices.header["slices_sha256"]) == ("slices", "0" * 64)
     assert len(slices.body) == 16
     envelope = {"schema": "dappled/frame", "version": 1, "flight": "f", "seq": None, "dropped": 0}
@@ -56,15 +56,15 @@ def test_a_frame_and_its_slices_are_had_again(flown: Rig) -> None:
     ],
 )
 def test_what_can_t_be_answered_is_told(flown: Rig, request_: dict[str, Any], decode: bool, words: str) -> None:
-    reply = asked(flown, FakeDeveloper() if decode else None, request_)
+    reply = asked(flown, FakeDecoder() if decode else None, request_)
     assert reply.topic == "error"
     assert words in reply.header["error"]
 
 
 def test_a_decoder_s_sentence_is_passed_on(flown: Rig) -> None:
-    developer = FakeDeveloper()
-    developer.problem = "no carriers"
-    assert asked(flown, developer, {"get": "slices", "frame": 0}).header["error"] == "no carriers"
+    decoder = FakeDecoder()
+    decoder.problem = "no carriers"
+    assert asked(flown, decoder, {"get": "slices", "frame": 0}).header["error"] == "no carriers"
 
 
 def test_too_many_questions_are_refused(flown: Rig) -> None:

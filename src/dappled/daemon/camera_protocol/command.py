@@ -65,8 +65,8 @@ class Answer:
     words: str | None = None
 
 
-def judged(verdict: ShotDecision) -> Answer:
+def judged(decision: ShotDecision) -> Answer:
     """The answer to a wish: accepted means that it will be attempted."""
-    if verdict.accepted:
+    if decision.accepted:
         return Answer(ACCEPTED)
-    return Answer(REJECTED, words=f"no photo: {verdict.reason}")
+    return Answer(REJECTED, words=f"no photo: {decision.reason}")

@@ -54,12 +54,12 @@ class CameraCommands:
 
     def _start_capture(self, command: Command) -> Answer:
         count = command.whole(3, 1)
-        wish = CaptureRequest(
+        request = CaptureRequest(
             command.source, "IMAGE_START_CAPTURE", command.whole(4), command.confirmation, command.link
         )
         if count == 1:
-            return judged(self._shutter.wish(wish))
-        return judged(self._shutter.start_interval(wish, command.number(2), count))
+            return judged(self._shutter.request(request))
+        return judged(self._shutter.start_interval(request, command.number(2), count))
 
     def _stop_capture(self, command: Command) -> Answer:
         self._shutter.stop_interval(command.source)
@@ -68,7 +68,7 @@ class CameraCommands:
     def _digicam_control(self, command: Command) -> Answer:
         if command.whole(5) != 1:
             return Answer(ACCEPTED if command.broadcast else UNSUPPORTED)
-        wish = CaptureRequest(
+        request = CaptureRequest(
             command.source,
             "DO_DIGICAM_CONTROL",
             None,
@@ -76,7 +76,7 @@ class CameraCommands:
             command.link,
             acknowledged=not command.broadcast,
         )
-        return judged(self._shutter.wish(wish))
+        return judged(self._shutter.request(request))
 
     # questions
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 from dappled.clock import Clock
 from dappled.daemon.camera_protocol import messages
 from dappled.daemon.camera_protocol.autopilot import Links, OwnAutopilot
 from dappled.daemon.camera_protocol.camera_settings import Knobs
-from dappled.daemon.camera_protocol.camera_status import DOWN, Telling
+from dappled.daemon.camera_protocol.camera_status import Telling
 from dappled.daemon.camera_protocol.command import ACCEPTED, UNSUPPORTED, Answer, Command
 from dappled.daemon.camera_protocol.commands import CameraCommands
 from dappled.daemon.camera_protocol.ftp_server import FtpServer
@@ -28,19 +29,45 @@ from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Message, Packet, mavlink
 
-__all__ = ["CameraFacts", "Captured", "Component", "Storage"]
+__all__ = ["CameraFacts", "CameraModel", "Captured", "Component", "Storage"]
 
 HEARTBEAT_NS = 10**9
 STATUS_NS = 100_000_000
 _OLD_IMAGES_A_TICK = 2
 
 
-class Component:
-    """One camera on all links. Give the shutter `on_change=component.state_changed`, so that 262 follows each change.
+class CameraModel(Protocol):
+    """What the component reports about the camera. Every method but `lookup` answers from memory.
 
-    `facts()`, `storage()`, `pose()` and `healthy()` answer from memory; `lookup(index)` may read a disk and tells how
-    an old shot ended, None for one that never was. `healthy()` False: no heartbeat; `troubled()` True: one with
-    MAV_STATE_CRITICAL. `feedback_is_shot`: the autopilot fires the camera, and each of its CAMERA_FEEDBACK is a shot.
+    `mount` turns camera axes to body axes (nine numbers, row by row).
+    """
+
+    @property
+    def mount(self) -> tuple[float, ...]: ...
+
+    def facts(self) -> CameraFacts:
+        """Make, model, lens and sensor, as far as they are known."""
+
+    def storage(self) -> Storage | None:
+        """The disk that frames go to; None while it can't be read."""
+
+    def lookup(self, index: int) -> Captured | None:
+        """How an old shot ended; None for one that never was. May read a disk."""
+
+    def pose(self) -> Pose | None:
+        """The vehicle's pose now; None while it is unknown."""
+
+    def healthy(self) -> bool:
+        """Whether a heartbeat is sent."""
+
+    def troubled(self) -> bool:
+        """Whether the heartbeat says MAV_STATE_CRITICAL."""
+
+
+class Component:
+    """One camera on all links.
+
+    `feedback_is_shot`: the autopilot fires the camera, and each of its CAMERA_FEEDBACK is a shot.
     """
 
     def __init__(
@@ -49,21 +76,21 @@ class Component:
         shutter: Shutter,
         clock: Clock,
         knobs: Knobs,
+        model: CameraModel,
         *,
-        facts: Callable[[], CameraFacts],
-        storage: Callable[[], Storage | None],
-        lookup: Callable[[int], Captured | None],
-        healthy: Callable[[], bool] = lambda: True,
-        troubled: Callable[[], bool] = lambda: False,
-        pose: Callable[[], Pose | None] = lambda: None,
-        mount: tuple[float, ...] = DOWN,
         feedback_is_shot: bool = False,
     ) -> None:
         self._links, self._shutter, self._clock = links, shutter, clock
-        self._lookup, self._feedback_is_shot = lookup, feedback_is_shot
-        self._healthy, self._troubled = healthy, troubled
+        self._model, self._feedback_is_shot = model, feedback_is_shot
         self._telling = Telling(
-            shutter, clock, knobs, links.component_id, facts=facts, storage=storage, pose=pose, mount=mount
+            shutter,
+            clock,
+            knobs,
+            links.component_id,
+            facts=model.facts,
+            storage=model.storage,
+            pose=model.pose,
+            mount=model.mount,
         )
         self._intervals = MessageIntervals()
         self._commands = CameraCommands(shutter, clock, self._telling, knobs, self._intervals)
@@ -76,6 +103,7 @@ class Component:
         self._results: deque[tuple[Command, int]] = deque(maxlen=64)
         self._heartbeat_due_ns = self._status_due_ns = 0
         self._status_wanted = threading.Event()
+        self._reported = shutter.statistics()
 
     @property
     def system_id(self) -> int:
@@ -156,9 +184,9 @@ class Component:
             return
         source = f"mavlink:{message.get_srcSystem()}/{message.get_srcComponent()}"
         sequence = message.seq if name == "CAMERA_TRIGGER" else message.img_idx
-        verdict = self._shutter.wish(CaptureRequest(source, name, sequence, 0, packet.link, acknowledged=False))
-        if not verdict.accepted:
-            self.say(f"no photo: {verdict.reason}")
+        decision = self._shutter.request(CaptureRequest(source, name, sequence, 0, packet.link, acknowledged=False))
+        if not decision.accepted:
+            self.say(f"no photo: {decision.reason}")
             self.state_changed()
 
     def _parameter(self, packet: Packet) -> None:
@@ -231,16 +259,19 @@ class Component:
         if not self._identity.decide(now_ns):
             return
         self._links.system_id = self._identity.system_id
-        if now_ns >= self._heartbeat_due_ns and self._healthy():
+        if now_ns >= self._heartbeat_due_ns and self._model.healthy():
             on_time_ns = self._heartbeat_due_ns + HEARTBEAT_NS
             self._heartbeat_due_ns = on_time_ns if on_time_ns > now_ns else now_ns + HEARTBEAT_NS
-            state = mavlink.MAV_STATE_CRITICAL if self._troubled() else mavlink.MAV_STATE_ACTIVE
+            state = mavlink.MAV_STATE_CRITICAL if self._model.troubled() else mavlink.MAV_STATE_ACTIVE
             self._links.send(
                 mavlink.MAVLink_heartbeat_message(
                     mavlink.MAV_TYPE_CAMERA, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, state, 3
                 )
             )
         self._autopilot.ask()
+        if (counts := self._shutter.statistics()) != self._reported:
+            self._reported = counts
+            self._status_wanted.set()
         if self._status_wanted.is_set() and now_ns >= self._status_due_ns:
             self._status_wanted.clear()
             self._status_due_ns = now_ns + STATUS_NS
@@ -265,7 +296,7 @@ class Component:
         wanted = self._commands.wanted_images
         for _ in range(min(_OLD_IMAGES_A_TICK, len(wanted))):  # each may open a ledger: heartbeats go on
             index, link = wanted.popleft()
-            captured = self._lookup(index)
+            captured = self._model.lookup(index)
             if captured is None:
                 self.say(f"image {index} is in none of the flights here, or has not ended yet")
             else:

@@ -17,7 +17,7 @@ def act(request: Mapping[str, Any], shutter: Shutter, logbook: Logbook) -> dict[
     wishes, and a number that comes twice is one wish."""
     match request.get("do"):
         case "shoot":
-            return _told(shutter.wish(CaptureRequest(SOURCE, "console", request["sequence"])))
+            return _told(shutter.request(CaptureRequest(SOURCE, "console", request["sequence"])))
         case "interval":
             wish = CaptureRequest(SOURCE, "console interval", request["sequence"])
             return _told(shutter.start_interval(wish, float(request["interval_s"]), int(request["count"])))
@@ -30,8 +30,8 @@ def act(request: Mapping[str, Any], shutter: Shutter, logbook: Logbook) -> dict[
             return {"ok": True}
 
 
-def _told(verdict: ShotDecision) -> dict[str, Any]:
-    if not verdict.accepted:
-        return {"ok": False, "error": verdict.reason, "index": None}
-    text = f"shot {verdict.index}" if verdict.outcome == "shot" else f"already shot {verdict.index}"
-    return {"ok": True, "index": verdict.index, "text": text}
+def _told(decision: ShotDecision) -> dict[str, Any]:
+    if not decision.accepted:
+        return {"ok": False, "error": decision.reason, "index": None}
+    text = f"shot {decision.index}" if decision.outcome == "shot" else f"already shot {decision.index}"
+    return {"ok": True, "index": decision.index, "text": text}

@@ -60,7 +60,7 @@ def daemon(settings: Settings, sockets: Path, record: Path) -> Iterator[Trial]:
             shots.append(pending)
             ended.notify_all()
 
-    service = Service(ours, watchers=Observer(finished=finished))
+    service = Service(ours, observer=Observer(finished=finished))
     service.start()
     loop = threading.Thread(target=service.run, name="trial")
     loop.start()
@@ -77,7 +77,7 @@ class Trial:
 
     def __init__(self, service: Service, shots: list[PendingShot], ended: threading.Condition) -> None:
         self._service, self._shots, self._ended = service, shots, ended
-        self._wishes = 0
+        self._requests = 0
 
     @property
     def flight(self) -> Path:
@@ -95,13 +95,13 @@ class Trial:
     def shoot(self, timeout_s: float = END_S) -> PendingShot:
         """One shot to its end. Raises TrialError where it is refused, or does not end."""
         self.until_ready()
-        self._wishes += 1
-        verdict = self._service.wish(CaptureRequest("doctor", "test shot", self._wishes, acknowledged=False))
-        if verdict.index is None or not verdict.accepted:
-            raise TrialError(f"the shot was refused: {verdict.reason}")
+        self._requests += 1
+        decision = self._service.request(CaptureRequest("doctor", "test shot", self._requests, acknowledged=False))
+        if decision.index is None or not decision.accepted:
+            raise TrialError(f"the shot was refused: {decision.reason}")
         until = time.monotonic() + timeout_s
         with self._ended:
-            while not (found := [one for one in self._shots if one.shot.index == verdict.index]):
+            while not (found := [one for one in self._shots if one.shot.index == decision.index]):
                 if not self._ended.wait(until - time.monotonic()):
                     raise TrialError(f"the shot did not come to an end within {timeout_s:g} s")
         return found[0]

@@ -36,12 +36,12 @@ class Capture:
     def __init__(
         self,
         camera: Camera,
-        book: FlightWriter,
+        writer: FlightWriter,
         shots: PendingShots,
-        watchers: Observer,
+        observer: Observer,
         hand_on: Callable[[PendingShot], object],
     ) -> None:
-        self._camera, self._book, self._shots, self._watchers = camera, book, shots, watchers
+        self._camera, self._writer, self._shots, self._observer = camera, writer, shots, observer
         self._hand_on = hand_on
         self._unfired: deque[ShotFailed] = deque()
         self._stopping, self._give_up_at = threading.Event(), 0.0
@@ -119,17 +119,17 @@ class Capture:
             elif isinstance(event, Deferred):
                 self._deferred(event)
             elif isinstance(event, SettingsChanged):
-                self._shots.tell(self._watchers.settings, event)
+                self._shots.tell(self._observer.settings, event)
         except Exception as error:  # noqa: BLE001  # one event that goes wrong must not end the capture
             report(log, "capture", error)
 
     def _state_changed(self, change: StateChanged) -> None:
         self.state, self.reason = change.state, change.reason
         if not self._stopping.is_set():
-            self._shots.tell(self._watchers.camera, change)
+            self._shots.tell(self._observer.camera, change)
 
     def _fired(self, event: Fired) -> None:
-        self._book.fired(event)  # raises for a second time, or one after the file: the first word counts
+        self._writer.fired(event)  # raises for a second time, or one after the file: the first word counts
         if pending := self._shots.in_hand(event.shot):
             pending.fired = event
             pending.ms["wish to trigger"] = (event.called_monotonic_ns - pending.shot.wished_monotonic_ns) / 1e6
@@ -141,7 +141,7 @@ class Capture:
             self._shots.note("contradiction", f"its file is safe, and then the driver says: {reason}", index)
             return
         try:
-            self._book.failed(index, reason)
+            self._writer.failed(index, reason)
         finally:
             if pending is not None:
                 self._shots.fail(pending, reason)
@@ -151,7 +151,7 @@ class Capture:
         index = arrival.shot
         pending = None if index is None else self._shots.of_file(index)
         try:
-            frame = self._book.record(index, arrival.name, arrival.blob)
+            frame = self._writer.record(index, arrival.name, arrival.blob)
         except Exception as error:
             # The recorder has noted it as far as the disk lets it. A second file doesn't undo the first one.
             if pending is not None and pending.frame is None and not pending.over:
@@ -170,12 +170,12 @@ class Capture:
             pending.ms["trigger to file"] = (arrival.monotonic_ns - pending.fired.returned_monotonic_ns) / 1e6
         pending.ms["record"] = (time.monotonic_ns() - began) / 1e6
         self._shots.welcome(pending, frame.index, arrival.name)
-        self._shots.tell(self._watchers.settled, frame.index, True)
+        self._shots.tell(self._observer.settled, frame.index, True)
         self._hand_on(pending)
 
     def _accompanied(self, companion: Companion) -> None:
         try:
-            self._book.companion(companion.shot, companion.name, companion.blob)
+            self._writer.companion(companion.shot, companion.name, companion.blob)
         finally:
             companion.blob.close()
         self._shots.tell(self._camera.release, companion)
@@ -183,7 +183,7 @@ class Capture:
     def _deferred(self, event: Deferred) -> None:
         """The end of a shot whose file comes later: where it was exposed can be told now."""
         try:
-            self._book.follows(event.shot, event.reason)
+            self._writer.follows(event.shot, event.reason)
         finally:
             pending = self._shots.in_hand(event.shot)
             if pending is not None and pending.frame is None:

@@ -63,58 +63,60 @@ class Recent:
     """The wishes of the last ten seconds (at most 256), and the image index that each one got."""
 
     def __init__(self) -> None:
-        self._wishes: list[_Remembered] = []
+        self._requests: list[_Remembered] = []
 
-    def same(self, wish: CaptureRequest, now_ns: int) -> int | None:
+    def same(self, request: CaptureRequest, now_ns: int) -> int | None:
         """The image index of the shot that this wish already has; None for a new wish. Times are monotonic."""
-        self._wishes = [w for w in self._wishes if now_ns - w.last_ns <= CONFIRMED_RETRY_NS][-_REMEMBERED:]
-        found = self._retry(wish, now_ns) or self._part(wish, now_ns)
+        self._requests = [w for w in self._requests if now_ns - w.last_ns <= CONFIRMED_RETRY_NS][-_REMEMBERED:]
+        found = self._retry(request, now_ns) or self._part(request, now_ns)
         if found is None:
             return None
-        found.parts[wish.kind, wish.link] = wish.sequence
-        if (wish.kind, wish.sequence) == (found.kind, found.sequence):
+        found.parts[request.kind, request.link] = request.sequence
+        if (request.kind, request.sequence) == (found.kind, found.sequence):
             found.last_ns = max(found.last_ns, now_ns)
         else:  # a part that may itself be retried: remembered under its own name
-            self._wishes.append(
-                _Remembered(found.index, wish.source, wish.kind, wish.sequence, None, now_ns, now_ns, found.parts)
+            self._requests.append(
+                _Remembered(
+                    found.index, request.source, request.kind, request.sequence, None, now_ns, now_ns, found.parts
+                )
             )
         return found.index
 
-    def add(self, wish: CaptureRequest, now_ns: int, index: int) -> None:
+    def add(self, request: CaptureRequest, now_ns: int, index: int) -> None:
         """A new wish became shot `index`."""
-        parts = {(wish.kind, wish.link): wish.sequence}
-        self._wishes.append(
-            _Remembered(index, wish.source, wish.kind, wish.sequence, wish.series, now_ns, now_ns, parts)
+        parts = {(request.kind, request.link): request.sequence}
+        self._requests.append(
+            _Remembered(index, request.source, request.kind, request.sequence, request.series, now_ns, now_ns, parts)
         )
 
-    def forget(self, wish: CaptureRequest) -> None:
+    def forget(self, request: CaptureRequest) -> None:
         """The next message like it is a new wish."""
-        self._wishes = [known for known in self._wishes if known.key() != _key(wish)]
+        self._requests = [known for known in self._requests if known.key() != _key(request)]
 
-    def _retry(self, wish: CaptureRequest, now_ns: int) -> _Remembered | None:
-        if not wish.acknowledged and wish.sequence is None:
+    def _retry(self, request: CaptureRequest, now_ns: int) -> _Remembered | None:
+        if not request.acknowledged and request.sequence is None:
             return None
-        for known in reversed(self._wishes):
-            if known.key() != _key(wish):
+        for known in reversed(self._requests):
+            if known.key() != _key(request):
                 continue
-            if wish.confirmation > 0:
+            if request.confirmation > 0:
                 return known if now_ns - known.last_ns <= CONFIRMED_RETRY_NS else None
             recent = now_ns - known.last_ns <= RETRY_NS and now_ns - known.first_ns <= RETRY_LIMIT_NS
             return known if recent else None
         return None
 
-    def _part(self, wish: CaptureRequest, now_ns: int) -> _Remembered | None:
-        if wish.series is not None:
+    def _part(self, request: CaptureRequest, now_ns: int) -> _Remembered | None:
+        if request.series is not None:
             return None
-        for known in self._wishes:
-            if known.series is not None or known.source != wish.source or now_ns - known.first_ns > TRIGGER_NS:
+        for known in self._requests:
+            if known.series is not None or known.source != request.source or now_ns - known.first_ns > TRIGGER_NS:
                 continue
-            if (wish.kind, wish.link) in known.parts:
+            if (request.kind, request.link) in known.parts:
                 continue
-            if all(sequence == wish.sequence for (kind, _), sequence in known.parts.items() if kind == wish.kind):
+            if all(sequence == request.sequence for (kind, _), sequence in known.parts.items() if kind == request.kind):
                 return known
         return None
 
 
-def _key(wish: CaptureRequest) -> _Key:
-    return wish.source, wish.kind, wish.sequence, wish.series
+def _key(request: CaptureRequest) -> _Key:
+    return request.source, request.kind, request.sequence, request.series

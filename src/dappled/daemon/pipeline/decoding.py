@@ -19,13 +19,13 @@ class Decoding:
 
     def __init__(
         self,
-        book: FlightWriter,
+        writer: FlightWriter,
         shots: PendingShots,
-        developer: FrameDecoder,
+        decoder: FrameDecoder,
         publisher: Publisher | None,
         preview_interval_s: float,
     ) -> None:
-        self._book, self._shots, self._developer, self._publisher = book, shots, developer, publisher
+        self._writer, self._shots, self._decoder, self._publisher = writer, shots, decoder, publisher
         self._preview_interval_s, self._last_preview_s = preview_interval_s, -1e9
 
     def work(self, pending: PendingShot) -> None:
@@ -34,9 +34,9 @@ class Decoding:
         assert frame is not None
         assert tag is not None
         began = time.monotonic_ns()
-        decoded = self._developer.develop(self._book.path(frame), tag.focal_length_mm, tag.f_number)
+        decoded = self._decoder.develop(self._writer.path(frame), tag.focal_length_mm, tag.f_number)
         pending.decoded = decoded
-        self._book.decoded(decoded.result(frame.index, (time.monotonic_ns() - began) / 1e6))
+        self._writer.decoded(decoded.result(frame.index, (time.monotonic_ns() - began) / 1e6))
         pending.ms["decode"] = (time.monotonic_ns() - began) / 1e6
         began = time.monotonic_ns()
         self._publish(tag, decoded)

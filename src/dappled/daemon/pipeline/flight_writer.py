@@ -25,13 +25,13 @@ class LedgerWriter:
     def __init__(self, recording: Recording, clock: Clock) -> None:
         self._recording, self._clock = recording, clock
         self._lock = threading.Lock()
-        self._wished: dict[int, Shot] = {}
+        self._requested: dict[int, Shot] = {}
         self._later: deque[tuple[str, str]] = deque(maxlen=_LATER)
 
-    def wished(self, shot: Shot) -> None:
+    def requested(self, shot: Shot) -> None:
         """A shot is in the journal and on its way to the camera."""
         with self._lock:
-            self._wished[shot.index] = shot
+            self._requested[shot.index] = shot
 
     def frame(self, index: int) -> Frame | None:
         """See FlightWriter."""
@@ -108,11 +108,11 @@ class LedgerWriter:
 
     def _enter(self, index: int) -> None:
         with self._lock:
-            shot = self._wished.get(index)
+            shot = self._requested.get(index)
         if shot is not None:
             self._recording.ledger.add_shot(shot)  # where it can't be entered now, the next event tries again
             with self._lock:
-                self._wished.pop(index, None)
+                self._requested.pop(index, None)
 
     def _index(self, index: int) -> None:
         """The index over flights is made from the ledgers: a shot is no worse for not standing there yet."""

@@ -23,8 +23,8 @@ class PendingShots:
     camera, is kept a while longer: its file may come after all.
     """
 
-    def __init__(self, book: FlightWriter, watchers: Observer) -> None:
-        self._book, self._watchers = book, watchers
+    def __init__(self, writer: FlightWriter, observer: Observer) -> None:
+        self._writer, self._observer = writer, observer
         self._lock = threading.Lock()
         self._in_hand: dict[int, PendingShot] = {}
         self._given_up: dict[int, PendingShot] = {}
@@ -81,7 +81,7 @@ class PendingShots:
         with self._lock:
             self._following[pending.shot.index] = pending
             _forget_oldest(self._following, FOLLOWING)
-        self.tell(self._watchers.settled, pending.shot.index, False)
+        self.tell(self._observer.settled, pending.shot.index, False)
 
     # how a story ends
 
@@ -91,8 +91,8 @@ class PendingShots:
         with self._lock:
             self._given_up[pending.shot.index] = pending
             _forget_oldest(self._given_up, GIVEN_UP)
-        self.tell(self._watchers.settled, pending.shot.index, False)
-        self.tell(self._watchers.tagged, pending)
+        self.tell(self._observer.settled, pending.shot.index, False)
+        self.tell(self._observer.tagged, pending)
         self.finish(pending)
 
     def leave(self, pending: PendingShot, what: str, why: str) -> None:
@@ -108,13 +108,13 @@ class PendingShots:
                 del self._in_hand[pending.shot.index]
             told, pending.over = pending.over, True
         if not told:
-            self.tell(self._watchers.finished, pending)
+            self.tell(self._observer.finished, pending)
 
     # who hears of it
 
     def note(self, kind: str, text: str, index: int) -> None:
         """An event for the record, which goes on without it where the record refuses."""
-        self.tell(self._book.event, kind, text, index)
+        self.tell(self._writer.event, kind, text, index)
 
     def tell(self, told: Callable[..., Any], *facts: object) -> None:
         """Call somebody whose troubles are not the street's."""

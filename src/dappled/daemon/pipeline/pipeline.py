@@ -26,36 +26,36 @@ _TAG_QUEUE = 1000
 
 
 class Pipeline:
-    """Runs the stages. `developer` None: frames are recorded and tagged, and decoded later."""
+    """Runs the stages. `decoder` None: frames are recorded and tagged, and decoded later."""
 
     def __init__(
         self,
         *,
         camera: Camera,
-        book: FlightWriter,
+        writer: FlightWriter,
         poses: PoseSource,
-        developer: FrameDecoder | None,
+        decoder: FrameDecoder | None,
         publisher: Publisher | None,
         latency: BodyLatency,
         names: Names,
-        watchers: Observer,
+        observer: Observer,
         decode_queue: int,
         preview_interval_s: float = 0.0,
     ) -> None:
-        self._decodes = developer is not None
+        self._decodes = decoder is not None
         self.decoding = self._decodes  # off: frames are recorded and tagged, and decoded on the ground
-        self._shots = PendingShots(book, watchers)
+        self._shots = PendingShots(writer, observer)
         tagging = Tagging(
-            book,
+            writer,
             self._shots,
-            watchers,
+            observer,
             publisher,
             poses=poses,
             latency=latency,
             names=names,
             hand_on=self._tagged,
         )
-        decoding = developer and Decoding(book, self._shots, developer, publisher, preview_interval_s)
+        decoding = decoder and Decoding(writer, self._shots, decoder, publisher, preview_interval_s)
         self._tag: Worker[PendingShot] = Worker(
             "tag",
             tagging.work,
@@ -70,7 +70,7 @@ class Pipeline:
             on_failure=lambda pending, error: self._shots.leave(pending, "not decoded", sentence(error)),
             on_drop=self._dropped("not decoded"),
         )
-        self._capture = Capture(camera, book, self._shots, watchers, self._tag.put)
+        self._capture = Capture(camera, writer, self._shots, observer, self._tag.put)
         self.stages = (self._tag, self._decode)
 
     def start(self) -> None:

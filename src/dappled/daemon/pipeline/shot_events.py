@@ -46,7 +46,7 @@ class ShotEvents:
         self._chip = ground_facts.chip(settings, "")
         self._battery_doubt: str | None = None
 
-    def watchers(self) -> Observer:
+    def observer(self) -> Observer:
         """For the street."""
         return Observer(self._settled, self._tagged, self._finished, self._camera_changed, self._settings_changed)
 

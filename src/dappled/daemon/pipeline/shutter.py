@@ -1,13 +1,12 @@
-"""The shutter: every wish becomes exactly one shot, or is refused in words. Nothing here waits for the camera."""
+"""Turn each capture request into exactly one shot, or refuse it with a reason. Nothing here waits for the camera."""
 
 from __future__ import annotations
 
 import logging
 import math
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Protocol
 
 from dappled.clock import Clock
 from dappled.daemon.pipeline.capture_requests import CaptureRequest, Recent
@@ -24,7 +23,7 @@ _AGAIN_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class ShotDecision:
-    """What became of a wish: a new shot, a message more of a known shot, or nothing. `reason` is a sentence."""
+    """What became of a request: a new shot, a message more of a known shot, or nothing. `reason` is a sentence."""
 
     outcome: Literal["shot", "duplicate", "refused"]
     index: int | None = None
@@ -32,18 +31,18 @@ class ShotDecision:
 
     @property
     def accepted(self) -> bool:
-        """Whether there is a shot for the wish."""
+        """Whether there is a shot for the request."""
         return self.outcome != "refused"
 
 
 @dataclass(frozen=True, slots=True)
 class ShutterStatistics:
-    """Counters of this flight. wishes = shots + duplicates + refused; shots = pending + succeeded + failed.
+    """Counters of this flight. requests = shots + duplicates + refused; shots = pending + succeeded + failed.
 
-    An interval's shots each count as a wish. `interval_s` is None while no interval runs.
+    An interval's shots each count as a request. `interval_s` is None while no interval runs.
     """
 
-    wishes: int
+    requests: int
     shots: int
     duplicates: int
     refused: int
@@ -64,44 +63,38 @@ class _Interval:
     taken: int = 1
 
 
+class ShotSink(Protocol):
+    """What the shutter does with a capture request. Every method returns within a millisecond."""
+
+    def obstacle(self) -> str | None:
+        """Why no shot can be taken now (no camera, disk full), in a sentence; None where one can."""
+
+    def note(self, shot: Shot) -> None:
+        """Write a shot down before the camera is touched. Raises FlightError or OSError, which refuses the request."""
+
+    def fire(self, shot: Shot) -> None:
+        """Hand a noted shot to the camera."""
+
+    def refused(self, request: CaptureRequest, reason: str) -> None:
+        """A request became no shot."""
+
+
 class Shutter:
-    """Wishes in, shots out.
+    """Turn capture requests into shots.
 
-    `next_index`: the image index of the next shot. `note(shot)` writes the shot down before the camera is touched; a
-    FlightError or OSError from it refuses the wish, and its sentence is the reason. `fire(index)` is the driver's
-    call, which returns at once. `obstacle()` says in a sentence why no shot can be taken now (no camera, disk full),
-    else None. At most `capacity` shots may be pending (fired, not yet settled). `on_change` is called, without a lock
-    held, when what a ground station may be shown has changed.
-
-    All methods may be called from any thread, and return within a millisecond as long as `note`, `fire` and
-    `obstacle` do.
+    `next_index`: the image index of the next shot. At most `capacity` shots may be pending (fired, not yet settled).
+    All methods may be called from any thread, and return within a millisecond as long as those of `sink` do.
     """
 
-    def __init__(
-        self,
-        *,
-        next_index: int,
-        note: Callable[[Shot], None],
-        fire: Callable[[int], None],
-        clock: Clock,
-        capacity: int = 8,
-        obstacle: Callable[[], str | None] = lambda: None,
-        on_change: Callable[[], None] = lambda: None,
-        on_refused: Callable[[tuple[CaptureRequest, str]], None] = lambda refused: None,
-    ) -> None:
+    def __init__(self, sink: ShotSink, clock: Clock, *, next_index: int, capacity: int = 8) -> None:
+        self._sink, self._clock = sink, clock
         self._next_index = next_index
-        self._note = note
-        self._fire = fire
-        self._clock = clock
         self._capacity = capacity
-        self._obstacle = obstacle
-        self._on_change = on_change
-        self._on_refused = on_refused
         self._lock = threading.Lock()
         self._recent = Recent()
         self._pending: set[int] = set()
         self._interval: _Interval | None = None
-        self._wishes = self._shots = self._duplicates = self._refused = self._succeeded = self._failed = 0
+        self._requests = self._shots = self._duplicates = self._refused = self._succeeded = self._failed = 0
         self._wake = threading.Event()
         self._stopped = False
         self._thread = threading.Thread(target=self._run, name="shutter intervals", daemon=True)
@@ -123,14 +116,12 @@ class Shutter:
         """The thread's name where it has ended without being asked to: never, unless there is a bug."""
         return [] if self._stopped or self._thread.is_alive() else [self._thread.name]
 
-    def wish(self, wish: CaptureRequest) -> ShotDecision:
+    def request(self, request: CaptureRequest) -> ShotDecision:
         """One message that asks for one shot."""
         with self._lock:
-            verdict = self._judge(wish)
-        self._on_change()
-        return verdict
+            return self._judge(request)
 
-    def start_interval(self, wish: CaptureRequest, interval_s: float, count: int) -> ShotDecision:
+    def start_interval(self, request: CaptureRequest, interval_s: float, count: int) -> ShotDecision:
         """A shot now and then every `interval_s` (0: as soon as the last one is settled, or a second after one that was
         refused), `count` in all, 0 for ever.
 
@@ -140,19 +131,18 @@ class Shutter:
         """
         if not (math.isfinite(interval_s) and 0 <= interval_s <= 86400) or count < 0:
             with self._lock:
-                self._wishes += 1
-                return self._refuse(wish, "an interval is 0 to 86400 s, and a count 0 or more")
-        wish = replace(wish, series=(interval_s, float(count)))
+                self._requests += 1
+                return self._refuse(request, "an interval is 0 to 86400 s, and a count 0 or more")
+        request = replace(request, series=(interval_s, float(count)))
         with self._lock:
-            verdict = self._judge(wish)
-            if verdict.outcome == "shot" and count != 1:
+            decision = self._judge(request)
+            if decision.outcome == "shot" and count != 1:
                 step_ns = round(max(interval_s, _SHORTEST_S if interval_s > 0 else 0.0) * 1e9)
                 left = None if count == 0 else count - 1
-                self._end_interval(wish.source)
-                self._interval = _Interval(wish.source, step_ns, left, self._clock.monotonic_ns() + step_ns, wish)
+                self._end_interval(request.source)
+                self._interval = _Interval(request.source, step_ns, left, self._clock.monotonic_ns() + step_ns, request)
                 self._wake.set()
-        self._on_change()
-        return verdict
+        return decision
 
     def stop_interval(self, source: str | None = None) -> bool:
         """End a running interval, whoever started it; the same command from the same `source` then starts it again.
@@ -160,7 +150,6 @@ class Shutter:
         with self._lock:
             ran = self._interval is not None
             self._end_interval(source)
-        self._on_change()
         return ran
 
     def settled(self, index: int, ok: bool) -> None:
@@ -173,19 +162,16 @@ class Shutter:
             self._failed += not ok
             if self._interval is not None and self._interval.interval_ns == 0:
                 self._wake.set()
-        self._on_change()
 
     def serve(self) -> float:
         """Take the interval's shot if one is due; seconds until there is something to do. The thread's work."""
-        taken = False
         with self._lock:
             now_ns = self._clock.monotonic_ns()
             interval = self._interval
             if interval is None or (interval.interval_ns == 0 and self._pending):
                 return _IDLE_S
             if now_ns >= interval.due_ns:
-                verdict = self._judge(CaptureRequest(interval.source, "interval", interval.taken, acknowledged=False))
-                taken = True
+                decision = self._judge(CaptureRequest(interval.source, "interval", interval.taken, acknowledged=False))
                 interval.taken += 1
                 if interval.left is not None:
                     interval.left -= 1
@@ -195,17 +181,14 @@ class Shutter:
                     behind = (now_ns - interval.due_ns) // interval.interval_ns
                     interval.due_ns += (1 + behind) * interval.interval_ns  # late ticks are missed, not bunched
                 else:
-                    interval.due_ns = now_ns + round((_SHORTEST_S if verdict.accepted else _AGAIN_S) * 1e9)
-            wait_s = _IDLE_S if interval is None else max(0, interval.due_ns - now_ns) / 1e9
-        if taken:
-            self._on_change()
-        return wait_s
+                    interval.due_ns = now_ns + round((_SHORTEST_S if decision.accepted else _AGAIN_S) * 1e9)
+            return _IDLE_S if interval is None else max(0, interval.due_ns - now_ns) / 1e9
 
     def statistics(self) -> ShutterStatistics:
         """Counters."""
         with self._lock:
             return ShutterStatistics(
-                self._wishes,
+                self._requests,
                 self._shots,
                 self._duplicates,
                 self._refused,
@@ -222,30 +205,32 @@ class Shutter:
             self._recent.forget(self._interval.command)
         self._interval = None
 
-    def _judge(self, wish: CaptureRequest) -> ShotDecision:
-        self._wishes += 1
+    def _judge(self, request: CaptureRequest) -> ShotDecision:
+        self._requests += 1
         now_ns = self._clock.monotonic_ns()
-        if wish.kind != "interval":
-            known = self._recent.same(wish, now_ns)
+        if request.kind != "interval":
+            known = self._recent.same(request, now_ns)
             if known is not None:
                 self._duplicates += 1
                 return ShotDecision("duplicate", index=known)
         reason = self._why_not()
         if reason is None:
-            shot = Shot(self._next_index, Cause(wish.source, wish.kind, wish.sequence), self._clock.utc_ns(), now_ns)
+            shot = Shot(
+                self._next_index, Cause(request.source, request.kind, request.sequence), self._clock.utc_ns(), now_ns
+            )
             try:
-                self._note(shot)
+                self._sink.note(shot)
             except (OSError, FlightError) as error:
-                reason = f"the wish could not be written down: {error}"
+                reason = f"the request could not be written down: {error}"
         if reason is not None:
-            return self._refuse(wish, reason)
+            return self._refuse(request, reason)
         self._next_index += 1
         self._shots += 1
         self._pending.add(shot.index)
-        if wish.kind != "interval":
-            self._recent.add(wish, now_ns, shot.index)
+        if request.kind != "interval":
+            self._recent.add(request, now_ns, shot.index)
         try:
-            self._fire(shot.index)
+            self._sink.fire(shot)
         except Exception:
             # The shot is noted, so it exists; whoever owns the driver sees the exception and the failed count.
             self._pending.discard(shot.index)
@@ -253,10 +238,10 @@ class Shutter:
             raise
         return ShotDecision("shot", index=shot.index)
 
-    def _refuse(self, wish: CaptureRequest, reason: str) -> ShotDecision:
+    def _refuse(self, request: CaptureRequest, reason: str) -> ShotDecision:
         self._refused += 1
-        self._on_refused((wish, reason))
-        log.warning("A shot was refused (%s, %s): %s", wish.source, wish.kind, reason)
+        self._sink.refused(request, reason)
+        log.warning("A shot was refused (%s, %s): %s", request.source, request.kind, reason)
         return ShotDecision("refused", reason=reason)
 
     def _why_not(self) -> str | None:
@@ -264,7 +249,7 @@ class Shutter:
             return "the daemon is stopping"
         if len(self._pending) >= self._capacity:
             return f"{len(self._pending)} shots are waiting for the camera already"
-        return self._obstacle()
+        return self._sink.obstacle()
 
     def _run(self) -> None:
         while not self._stopped:

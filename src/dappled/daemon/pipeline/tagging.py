@@ -28,9 +28,9 @@ class Tagging:
 
     def __init__(
         self,
-        book: FlightWriter,
+        writer: FlightWriter,
         shots: PendingShots,
-        watchers: Observer,
+        observer: Observer,
         publisher: Publisher | None,
         *,
         poses: PoseSource,
@@ -38,7 +38,7 @@ class Tagging:
         names: Names,
         hand_on: Callable[[PendingShot], object],
     ) -> None:
-        self._book, self._shots, self._watchers, self._publisher = book, shots, watchers, publisher
+        self._writer, self._shots, self._observer, self._publisher = writer, shots, observer, publisher
         self._poses, self._latency, self._names, self._hand_on = poses, latency, names, hand_on
         self._zoom = Zoom()
         self._camera_clock = CameraClock()
@@ -47,7 +47,7 @@ class Tagging:
         """Tag a story's frame. Where its file stays at the camera, tell where it was exposed, and end it."""
         if pending.frame is None:
             pending.where = self._poses(pending.shot.index, self._expected(pending, tagger.FrameSettings()))
-            self._shots.tell(self._watchers.tagged, pending)
+            self._shots.tell(self._observer.tagged, pending)
             self._shots.finish(pending)
             return
         self._tag(pending, pending.frame)
@@ -55,7 +55,7 @@ class Tagging:
 
     def failed(self, pending: PendingShot, why: str) -> None:
         """A frame that can't be tagged."""
-        self._shots.tell(self._watchers.tagged, pending)
+        self._shots.tell(self._observer.tagged, pending)
         self._shots.leave(pending, "not tagged", why)
 
     def _tag(self, pending: PendingShot, frame: Frame) -> None:
@@ -72,15 +72,15 @@ class Tagging:
             exposure = replace(exposure, source=f"{exposure.source}; in doubt: {pending.doubt}")
         camera = camera_name(self._names.camera, settings.model)
         pending.tag = tagger.tag(frame, exposure, settings, camera=camera, mask=self._names.mask, pose=pose)
-        self._book.tagged(pending.tag)
+        self._writer.tagged(pending.tag)
         pending.ms["tag"] = (time.monotonic_ns() - began) / 1e6
-        self._shots.tell(self._watchers.tagged, pending)
+        self._shots.tell(self._observer.tagged, pending)
         if self._publisher:
             self._publisher.publish("frame", frame_header(pending.tag, frame, self._names.law or None))
 
     def _settings(self, frame: Frame) -> tagger.FrameSettings:
         try:
-            return tagger.FrameSettings.of(reading.read_metadata(self._book.path(frame)))
+            return tagger.FrameSettings.of(reading.read_metadata(self._writer.path(frame)))
         except DappledError as error:
             self._shots.note("unreadable", str(error), frame.index)
             return tagger.FrameSettings()

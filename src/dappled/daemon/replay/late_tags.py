@@ -78,21 +78,21 @@ def add_missing(flight: Path, utc_ns: Callable[[], int]) -> list[int]:
     with ExitStack() as stack:
         stack.enter_context(FlightsLock(flight.absolute().parent))
         ledger = stack.enter_context(Ledger(folder.ledger, utc_ns))
-        book = MissingTagWriter(recording, ledger)
+        writer = MissingTagWriter(recording, ledger)
         pipeline = Pipeline(
             camera=ReplayCamera(recording.files, Identity("dappled", "recording", "", str(flight)), time.monotonic_ns),
-            book=book,
+            writer=writer,
             poses=RecordedTelemetry.flown(settings, recording.telemetry, recording.horizons, recording.vehicles).pose,
-            developer=None,
+            decoder=None,
             publisher=None,
             latency=BodyLatency.of(settings.camera),
             names=Names(**facts["names"]),
-            watchers=Observer(finished=progress.note),
+            observer=Observer(finished=progress.note),
             decode_queue=1,
         )
         pipeline.start()
         stack.callback(pipeline.stop, 5.0)
         replay.play(recording, pipeline, progress, time=time, pace=None)
-        for index in book.added:
+        for index in writer.added:
             ledger.add_event("tagged late", "the recording ended before its tag was made; it is made now", index)
-    return book.added
+    return writer.added

@@ -233,7 +233,7 @@ def play(
                 raise ReplayError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
 
 
-def book(recording: RecordedFlight, keep: Callable[[Result], object] | None = None) -> ReplayVerifier:
+def writer(recording: RecordedFlight, keep: Callable[[Result], object] | None = None) -> ReplayVerifier:
     """The book that compares this recording with what comes down the street, but for results that `keep` takes."""
     return ReplayVerifier(recording.root, recording.expected, keep)
 
