@@ -22,12 +22,11 @@ from dataclasses import dataclass
 from pathlib import Path as File
 from typing import TypeVar
 
-from dappled.daemon.navigation import pose as telemetry_pose
-from dappled.daemon.navigation.camera_clock import CameraClock, exposure_from_camera
+from dappled.daemon.navigation import navigation
+from dappled.daemon.navigation.clocks import BodyLatency, CameraClock, ExposureTime, exposure_from_camera, mid_exposure
 from dappled.daemon.navigation.navigation import Telemetry
 from dappled.daemon.navigation.samples import AttitudeSample, PositionSample, attitude, position
 from dappled.daemon.navigation.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
-from dappled.daemon.pipeline.tagger import BodyLatency, ExposureTime, mid_exposure
 from dappled.decode.geometry.interpolation import metres_per_radian, turn_rad
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Message, PacketParser, mavlink
@@ -159,7 +158,7 @@ def _samples(log: File) -> tuple[list[PositionSample], list[AttitudeSample]]:
 
 
 def _position_miss(before: PositionSample, left_out: PositionSample, after: PositionSample) -> tuple[float, float]:
-    found, doubt_m, _ = telemetry_pose.position((before, after), left_out.boot_ns)
+    found, doubt_m, _ = navigation.position_at((before, after), left_out.boot_ns)
     north_m, east_m = metres_per_radian(left_out.latitude_rad, left_out.altitude_msl_m)
     north = (found.latitude_rad - left_out.latitude_rad) * north_m
     east = (found.longitude_rad - left_out.longitude_rad) * east_m
@@ -167,7 +166,7 @@ def _position_miss(before: PositionSample, left_out: PositionSample, after: Posi
 
 
 def _attitude_miss(before: AttitudeSample, left_out: AttitudeSample, after: AttitudeSample) -> tuple[float, float]:
-    found, doubt_rad = telemetry_pose.attitude((before, after), left_out.boot_ns)
+    found, doubt_rad = navigation.attitude_at((before, after), left_out.boot_ns)
     return math.degrees(turn_rad(found, left_out.attitude)), math.degrees(doubt_rad)
 
 

@@ -23,13 +23,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.clock import SystemClock
-from dappled.daemon.navigation.pose import nothing
+from dappled.daemon.navigation.clocks import BodyLatency, ExposureTime
+from dappled.daemon.navigation.navigation import unknown_pose
 from dappled.daemon.pipeline.decode_process import DecodedFrame
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
-from dappled.daemon.pipeline.tagger import BodyLatency, ExposureTime
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.camera import (
     Arrival,
@@ -152,7 +152,7 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
         over.release()
 
     def pose(index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
-        return exposure, nothing(exposure.utc_ns, 0)
+        return exposure, unknown_pose(exposure.utc_ns, 0)
 
     def settled(index: int, ok: bool) -> None:
         shutters[0].settled(index, ok)

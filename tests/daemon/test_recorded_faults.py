@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from dappled.daemon.navigation import clocks
+from dappled.daemon.navigation.clocks import BodyLatency
 from dappled.daemon.navigation.navigation import Telemetry
 from dappled.daemon.pipeline import tagger
-from dappled.daemon.pipeline.tagger import BodyLatency, FrameSettings
+from dappled.daemon.pipeline.tagger import FrameSettings
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Message, PacketParser, mavlink
 from dappled.flight import Cause, LedgerReader, Result, Shot, recording
@@ -59,7 +61,7 @@ def fly(flights: Path, packets: Packets, exposures_s: list[float]) -> Path:
         begun.ledger.fired(index, called_ns, called_ns)
         with held(b"frame %d" % index) as blob:
             frame = begun.recorder.record(index, "IMG.DNG", blob, arrived_utc_ns=START_NS + called_ns + 10**8)
-        exposure, pose = telemetry.locate(tagger.mid_exposure(START_NS + called_ns, LATENCY, None))
+        exposure, pose = telemetry.locate(clocks.mid_exposure(START_NS + called_ns, LATENCY, None))
         begun.ledger.add_tag(tagger.tag(frame, exposure, FrameSettings(), camera="test", mask="mask", pose=pose))
         begun.ledger.add_result(Result(index, "0" * 64, 1, 1, "geometric", "calibrated"))
 

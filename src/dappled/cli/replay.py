@@ -14,12 +14,12 @@ from typing import Any
 from dappled.cli.arguments import positive, seconds
 from dappled.cli.terminal import frame_json, frame_line
 from dappled.config import settings as configuration
+from dappled.daemon.navigation.clocks import BodyLatency
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.decode_process import DecodeProcess
 from dappled.daemon.pipeline.flight_writer import ReplayVerifier
 from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
-from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.replay import replay, runs
 from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayProgress
 from dappled.daemon.replay.runs import Run, RunWriter

@@ -15,6 +15,7 @@ from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.health import record
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.health.status_text import Alarms
+from dappled.daemon.navigation.clocks import BodyLatency
 from dappled.daemon.navigation.navigation import Navigation
 from dappled.daemon.pipeline.decode_process import DecodeProcess
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
@@ -23,7 +24,6 @@ from dappled.daemon.pipeline.pending_shot import Names, Observer
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.shot_events import ShotEvents
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
-from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher
 from dappled.decode.geometry.pose import Pose

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.daemon.navigation.boot_clock import from_arrivals
+from dappled.daemon.navigation.clocks import from_arrivals
 from dappled.daemon.navigation.navigation import Telemetry
 from dappled.decode.geometry.interpolation import (
     conjugate,

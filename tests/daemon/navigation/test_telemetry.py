@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dappled.daemon.navigation.boot_clock import TimesyncAnswer, from_arrivals, from_timesync
+from dappled.daemon.navigation.clocks import TimesyncAnswer, from_arrivals, from_timesync
 from dappled.daemon.navigation.navigation import HISTORY_NS, Telemetry, first_position_utc_ns
 from dappled.daemon.navigation.vehicle_history import MOST_SAMPLES
 from dappled.decode.geometry.interpolation import from_euler, hermite, metres_per_radian, normalised, slerp, turn_rad

@@ -17,10 +17,10 @@ from dappled.config.settings import MavlinkSettings, PoseSettings, PublishSettin
 from dappled.daemon import service as module
 from dappled.daemon.camera_protocol import identity
 from dappled.daemon.camera_protocol.identity import Identity
+from dappled.daemon.navigation.clocks import ExposureTime
 from dappled.daemon.navigation.navigation import Navigation, Telemetry, recorded_vehicles
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
-from dappled.daemon.pipeline.tagger import ExposureTime
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.daemon.service import Service

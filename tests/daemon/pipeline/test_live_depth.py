@@ -10,11 +10,12 @@ import jsonschema
 import numpy as np
 import pytest
 
+from dappled.daemon.navigation.clocks import ExposureTime
 from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcessError, FrameDepth
 from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.pending_shot import PendingShot
-from dappled.daemon.pipeline.tagger import ExposureTime, tag
 from dappled.daemon.pipeline.tagger import FrameSettings as Shown
+from dappled.daemon.pipeline.tagger import tag
 from dappled.daemon.stream import wire
 from dappled.flight import Cause, Frame, Shot
 from tests.daemon.fakes import eventually, no_pose

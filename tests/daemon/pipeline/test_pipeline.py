@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from dappled.daemon.navigation import camera_clock
-from dappled.daemon.pipeline import capture, tagger
+from dappled.daemon.navigation import clocks
+from dappled.daemon.pipeline import capture
 from dappled.drivers.camera import Blob, CameraError, CameraEvent, Companion, Deferred
 from dappled.flight import ShotState, check, flight_report
 from tests.daemon.fakes import FakeCamera, arrival, eventually, failed, fired, good, rig
@@ -346,7 +346,7 @@ def test_a_zoom_that_changed_is_told(tmp_path: Path) -> None:
     assert told == ["zoom: the focal length is 24 mm; it was 10 mm at frame 1"]
 
 
-@pytest.mark.parametrize(("doubt", "by"), [("", camera_clock.SOURCE), ("it may be another's", tagger.WISH_SOURCE)])
+@pytest.mark.parametrize(("doubt", "by"), [("", clocks.CAMERA_SOURCE), ("it may be another's", clocks.REQUEST_SOURCE)])
 def test_a_shot_in_doubt_teaches_no_time(tmp_path: Path, doubt: str, by: str) -> None:
     taken = time.strftime("%Y:%m:%d %H:%M:%S", time.gmtime())
 

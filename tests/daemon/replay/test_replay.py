@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from dappled.daemon.navigation.clocks import BodyLatency
 from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
-from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayProgress
 from dappled.drivers.camera import Arrival, CameraEvent, Fired, Identity, ShotFailed, StateChanged

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from dappled.daemon.camera_protocol.ground_client import GroundClient, GroundError
-from dappled.daemon.navigation.boot_clock import BootClock
+from dappled.daemon.navigation.clocks import BootClock
 from dappled.decode.geometry.interpolation import turn_rad
 from dappled.mocks.autopilot.autopilot import Autopilot, BootTime
 from dappled.mocks.autopilot.ground_station import GroundStation

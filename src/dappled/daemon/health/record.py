@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled.config.settings import Settings
-from dappled.daemon.navigation.boot_clock import BootClock
+from dappled.daemon.navigation.clocks import BootClock
 from dappled.daemon.navigation.navigation import TelemetryStatistics
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.shutter import ShutterStatistics

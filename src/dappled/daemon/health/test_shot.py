@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dappled.config.settings import Settings
-from dappled.daemon.pipeline import tagger
+from dappled.daemon.navigation import clocks
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import Service
@@ -111,7 +111,7 @@ def latency(pending: PendingShot) -> Latency:
     """What one shot took."""
     to_exposure = to_file = None
     if pending.fired is not None and pending.tag is not None and pending.tag.time_source.startswith("hot shoe"):
-        called_utc_ns = tagger.called_utc_ns(pending.shot, pending.fired.called_monotonic_ns)
+        called_utc_ns = clocks.called_utc_ns(pending.shot, pending.fired.called_monotonic_ns)
         opened_utc_ns = pending.tag.utc_ns - round((pending.tag.exposure_s or 0.0) / 2 * 1e9)
         to_exposure = (opened_utc_ns - called_utc_ns) / 1e6
     if "trigger to file" in pending.ms and "trigger call" in pending.ms:

@@ -11,16 +11,32 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 
 from dappled.clock import Clock
 from dappled.config.settings import Settings
-from dappled.daemon.navigation import hot_shoe, pose
-from dappled.daemon.navigation.boot_clock import BootClock
+from dappled.daemon.navigation.clocks import (
+    CONTACT_SIGMA_NS,
+    BootClock,
+    ExposureTime,
+    choose_feedback,
+    reach_ns,
+    refine,
+)
+from dappled.daemon.navigation.samples import HALF_MS_NS, AttitudeSample, GnssSample, PositionSample
 from dappled.daemon.navigation.utc import UtcCorrection, UtcLearner
-from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, Counts, VehicleHistory
-from dappled.daemon.pipeline.tagger import ExposureTime
-from dappled.decode.geometry.pose import Pose
+from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, Around, Counts, VehicleHistory
+from dappled.decode.geometry.interpolation import (
+    hermite,
+    hermite_doubt,
+    metres_per_radian,
+    norm,
+    slerp,
+    slerp_doubt,
+    turn_rad,
+    turned_by_heading,
+)
+from dappled.decode.geometry.pose import Gnss, Pose, Quaternion, Symmetric, Vector3
 from dappled.drivers.mavlink.links import Message, Packet
 from dappled.flight import LedgerReader, Recording
 
@@ -30,6 +46,8 @@ _VEHICLES = "vehicles"  # the ledger's fact: [number of the first packet, system
 _HINT_NS = 50_000_000  # a new fit while one frame waits changes the clock by less
 _PRUNE_EVERY = 256
 _LOOK_S = 0.005
+# A single-frequency receiver under open sky, where it reports a dilution only; GPS_FIX_TYPE → metres for each unit.
+METRES_PER_DOP = {2: 2.5, 3: 2.5, 4: 1.0, 5: 0.3, 6: 0.02, 7: 0.02, 8: 0.05}
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,24 +127,25 @@ class Telemetry:
         Samples from after it have arrived, and, from an autopilot that reports the hot shoe, everything that it could
         report about this exposure.
         """
-        later_ns = hot_shoe.reach_ns(exposure) if self._counts.feedbacks else 0
+        later_ns = reach_ns(exposure) if self._counts.feedbacks else 0
         return self.bracketed(exposure.utc_ns + later_ns)
 
     def locate(self, exposure: ExposureTime, *, upto_packet: int | None = None) -> tuple[ExposureTime, Pose]:
         """When and where a frame was exposed, from the packets below `upto_packet` (all so far).
 
-        Where the autopilot saw the hot shoe close, its time replaces the expected one (see `hot_shoe`). That time is on
-        the autopilot's own clock, as the poses are, so the error between the two machines' clocks doesn't count.
+        Where the autopilot saw the hot shoe close, its time replaces the expected one (see `clocks.choose_feedback`).
+        That time is on the autopilot's own clock, as the poses are: the error between the machines' clocks doesn't
+        count.
         """
         with self._lock:
             limit = self._packets if upto_packet is None else upto_packet
             clock = self._history.clock(limit)
             events = self._history.feedbacks(limit)
-        event = None if clock is None else hot_shoe.choose(events, exposure, clock)
+        event = None if clock is None else choose_feedback(events, exposure, clock)
         if clock is None or event is None:
             return exposure, self.pose_at(exposure.utc_ns, exposure.sigma_ns, upto_packet=limit)
-        better, boot_ns = hot_shoe.refined(exposure, event, clock)
-        return better, self.pose_at(better.utc_ns, hot_shoe.CONTACT_SIGMA_NS, upto_packet=limit, boot_ns=boot_ns)
+        better, boot_ns = refine(exposure, event, clock)
+        return better, self.pose_at(better.utc_ns, CONTACT_SIGMA_NS, upto_packet=limit, boot_ns=boot_ns)
 
     def pose_at(
         self, utc_ns: int, utc_sigma_ns: float, *, upto_packet: int | None = None, boot_ns: int | None = None
@@ -135,7 +154,7 @@ class Telemetry:
 
         Positions are interpolated over gaps up to 2.5 s, attitudes over gaps up to 1.5 s. Outside of that the nearest
         sample up to 10 s away is used, marked "nearest", with its age in the sigma; else what is missing is None, and
-        without a position the source is "none". See `navigation.pose`.
+        without a position the source is "none". See `pose_around`.
 
         `boot_ns`, where given, is the same instant on the autopilot's own clock; sigma is then of that.
         """
@@ -143,13 +162,13 @@ class Telemetry:
             limit = self._packets if upto_packet is None else upto_packet
             clock = self._history.clock(limit)
             if clock is None:
-                return pose.nothing(utc_ns, limit)
+                return unknown_pose(utc_ns, limit)
             if boot_ns is None:
                 boot_ns, sigma_ns = clock.boot_ns(utc_ns), (utc_sigma_ns**2 + clock.sigma_ns**2) ** 0.5
             else:
                 sigma_ns = utc_sigma_ns
             at = self._history.around(utc_ns, boot_ns, sigma_ns, limit)
-        return pose.pose(at, packets=limit, attitude_sigma_rad=self._attitude_sigma_rad)
+        return pose_around(at, packets=limit, attitude_sigma_rad=self._attitude_sigma_rad)
 
     def utc_correction(self) -> UtcCorrection | None:
         """This machine's UTC against that of the autopilot's satellites; None while either is unknown."""
@@ -240,3 +259,159 @@ def first_position_utc_ns(packets: Iterable[tuple[int, int, Message]]) -> int | 
         if message.get_type() == "GLOBAL_POSITION_INT" and (message.lat or message.lon):
             return stamp_us * 1000
     return None
+
+
+def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) -> Pose:
+    """The pose at an instant, from `packets` packets.
+
+    Position: cubic Hermite with the reported velocities. Attitude and gimbal: slerp. With one sample only, that one,
+    marked "nearest". Sigmas: time (exposure and clocks) × speed and × turn rate, with the age of a single sample; what
+    interpolation leaves in doubt; the receiver's accuracy (without one the position's sigmas are None); the attitude's
+    own, as the autopilot tells it, else `attitude_sigma_rad`.
+    """
+    sigma_s = math.hypot(at.sigma_ns, HALF_MS_NS / math.sqrt(3)) / 1e9
+    attitude, attitude_sigma, attitude_covariance = _attitude(at, sigma_s, attitude_sigma_rad)
+    gimbal, gimbal_source = _gimbal(at, attitude)
+    made = replace(
+        unknown_pose(at.utc_ns, packets),
+        boot_us=at.boot_ns // 1000,
+        attitude=attitude,
+        attitude_sigma_rad=attitude_sigma,
+        gnss=_gnss(at),
+        gimbal_attitude=gimbal,
+        gimbal_source=gimbal_source,
+        attitude_covariance_rad2=attitude_covariance,
+    )
+    if not at.positions:
+        return made
+    found, across_doubt_m, upright_doubt_m = position_at(at.positions, at.boot_ns)
+    age_s = min(abs(sample.boot_ns - at.boot_ns) for sample in at.positions) / 1e9
+    blur_s = sigma_s if len(at.positions) == 2 else math.hypot(sigma_s, age_s)
+    north, east, down = found.velocity_ned_m_s
+    across_m = _receiver_sigma_m(at.gnss, at.gnss.horizontal_accuracy_m, at.gnss.hdop) if at.gnss else None
+    upright_m = _receiver_sigma_m(at.gnss, at.gnss.vertical_accuracy_m, at.gnss.vdop) if at.gnss else None
+    covariance = None
+    if across_m is not None and upright_m is not None:
+        across = (across_m**2 + across_doubt_m**2) / 2  # of each axis
+        covariance = _symmetric(found.velocity_ned_m_s, blur_s, (across, across, upright_m**2 + upright_doubt_m**2))
+    return replace(
+        made,
+        source="interpolated" if len(at.positions) == 2 and len(at.attitudes) != 1 else "nearest",
+        latitude_rad=found.latitude_rad,
+        longitude_rad=found.longitude_rad,
+        altitude_msl_m=found.altitude_msl_m,
+        height_above_home_m=found.height_above_home_m,
+        velocity_ned_m_s=found.velocity_ned_m_s,
+        position_sigma_m=None
+        if across_m is None
+        else math.hypot(across_m, math.hypot(north, east) * blur_s, across_doubt_m),
+        vertical_sigma_m=None if upright_m is None else math.hypot(upright_m, down * blur_s, upright_doubt_m),
+        position_covariance_m2=covariance,
+        age_ms=age_s * 1e3,
+    )
+
+
+def unknown_pose(utc_ns: int, packets: int) -> Pose:
+    """A pose of which nothing is known."""
+    return Pose("none", utc_ns, None, None, None, None, None, None, None, None, None, None, packets)
+
+
+def position_at(samples: Sequence[PositionSample], boot_ns: int) -> tuple[PositionSample, float, float]:
+    """The sample that would stand at `boot_ns`, from one or two; and how many metres (1 σ) two leave it in doubt,
+    horizontally and vertically."""
+    a = samples[0]
+    if len(samples) == 1:
+        return a, 0.0, 0.0
+    b = samples[1]
+    span_s = (b.boot_ns - a.boot_ns) / 1e9
+    share = (boot_ns - a.boot_ns) / (b.boot_ns - a.boot_ns)
+    north_m, east_m = metres_per_radian(a.latitude_rad, a.altitude_msl_m)
+    va, vb = a.velocity_ned_m_s, b.velocity_ned_m_s
+    to_b = (
+        (b.latitude_rad - a.latitude_rad) * north_m,
+        math.remainder(b.longitude_rad - a.longitude_rad, 2 * math.pi) * east_m,
+        a.altitude_msl_m - b.altitude_msl_m,
+    )
+    north, east, down = (hermite((0.0, to_b[i]), (va[i], vb[i]), span_s, share) for i in range(3))
+    height = b.height_above_home_m - a.height_above_home_m
+    vn, ve, vd = ((1 - share) * va[i] + share * vb[i] for i in range(3))
+    found = PositionSample(
+        b.number,
+        b.stamp_ns,
+        boot_ns,
+        a.latitude_rad + north / north_m,
+        math.remainder(a.longitude_rad + east / east_m, 2 * math.pi),
+        a.altitude_msl_m - down,
+        a.height_above_home_m + hermite((0.0, height), (-va[2], -vb[2]), span_s, share),
+        (vn, ve, vd),
+    )
+    doubts = [hermite_doubt(to_b[i], (va[i], vb[i]), span_s, share) for i in range(3)]
+    return found, math.hypot(doubts[0], doubts[1]), doubts[2]
+
+
+def attitude_at(samples: Sequence[AttitudeSample], boot_ns: int) -> tuple[Quaternion, float]:
+    """The attitude at `boot_ns`, from one or two samples; and how far (1 σ, radians) two leave it in doubt."""
+    a = samples[0]
+    if len(samples) == 1:
+        return a.attitude, 0.0
+    b = samples[1]
+    share = (boot_ns - a.boot_ns) / (b.boot_ns - a.boot_ns)
+    span_s = (b.boot_ns - a.boot_ns) / 1e9
+    doubt = (
+        0.0
+        if a.rates_rad_s is None or b.rates_rad_s is None
+        else slerp_doubt((a.attitude, b.attitude), (a.rates_rad_s, b.rates_rad_s), span_s, share)
+    )
+    return slerp(a.attitude, b.attitude, share), doubt
+
+
+def _attitude(at: Around, sigma_s: float, own_rad: float) -> tuple[Quaternion | None, float | None, Symmetric | None]:
+    """Attitude, σ of the whole turn, and the covariance where the body's rates are known."""
+    samples = at.attitudes
+    if not samples:
+        return None, None, None
+    found, doubt = attitude_at(samples, at.boot_ns)
+    told = max((sample.sigma_rad for sample in samples if sample.sigma_rad is not None), default=own_rad)
+    rates = max((s.rates_rad_s for s in samples if s.rates_rad_s is not None), key=norm, default=None)
+    if len(samples) == 1:
+        sigma_s = math.hypot(sigma_s, abs(samples[0].boot_ns - at.boot_ns) / 1e9)
+    if rates is not None:
+        each = (doubt**2 + told**2) / 3  # of each axis
+        covariance = _symmetric(rates, sigma_s, (each, each, each))
+        return found, math.hypot(norm(rates) * sigma_s, doubt, told), covariance
+    if len(samples) == 1:
+        return found, None, None
+    span_s = (samples[1].boot_ns - samples[0].boot_ns) / 1e9
+    rate = turn_rad(samples[0].attitude, samples[1].attitude) / span_s
+    return found, math.hypot(rate * sigma_s, doubt, told), None
+
+
+def _symmetric(way: Vector3, sigma_s: float, own: Vector3) -> Symmetric:
+    """The covariance of what moves along `way` (per second) for a time known to `sigma_s`, with its own variances."""
+    x, y, z = (part * sigma_s for part in way)
+    return x * x + own[0], x * y, x * z, y * y + own[1], y * z, z * z + own[2]
+
+
+def _gimbal(at: Around, vehicle: Quaternion | None) -> tuple[Quaternion | None, str | None]:
+    """The head's attitude to north-east-down; None where it follows the vehicle, whose heading is not known."""
+    if not at.gimbals:
+        return None, None
+    a, b = at.gimbals[0], at.gimbals[-1]
+    share = 0.0 if a is b else (at.gimbal_boot_ns - a.boot_ns) / (b.boot_ns - a.boot_ns)
+    head = slerp(a.attitude, b.attitude, share)
+    if not a.follows_vehicle:
+        return head, a.kind
+    return (None, None) if vehicle is None else (turned_by_heading(head, vehicle), a.kind)
+
+
+def _gnss(at: Around) -> Gnss | None:
+    if at.gnss is None:
+        return None
+    told = {name: value for name, value in asdict(at.gnss).items() if name not in ("number", "stamp_ns")}
+    return Gnss(**told, age_ms=abs(at.utc_ns - at.gnss.stamp_ns) / 1e6)
+
+
+def _receiver_sigma_m(receiver: GnssSample, accuracy_m: float | None, dilution: float | None) -> float | None:
+    """The receiver's own accuracy, else what its dilution of precision suggests."""
+    each_m = METRES_PER_DOP.get(receiver.fix_type)
+    return accuracy_m or (None if dilution is None or each_m is None else dilution * each_m)

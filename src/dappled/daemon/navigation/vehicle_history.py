@@ -10,11 +10,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from dappled.daemon.navigation import hot_shoe
 from dappled.daemon.navigation import samples as telemetry_samples
-from dappled.daemon.navigation.boot_clock import BootClock, TimesyncAnswer, from_arrivals, from_timesync
-from dappled.daemon.navigation.hot_shoe import EPOCH_US, Feedback
-from dappled.daemon.navigation.pose import NEAREST_NS, Around
+from dappled.daemon.navigation.clocks import (
+    EPOCH_US,
+    BootClock,
+    Feedback,
+    TimesyncAnswer,
+    feedback_boot_ns,
+    from_arrivals,
+    from_timesync,
+)
 from dappled.daemon.navigation.samples import (
     GIMBAL_COMPONENTS,
     HALF_MS_NS,
@@ -25,6 +30,7 @@ from dappled.daemon.navigation.samples import (
 )
 from dappled.drivers.mavlink.links import Message
 
+NEAREST_NS = 10 * 10**9
 POSITION_GAP_NS = 2_500_000_000
 ATTITUDE_GAP_NS = 1_500_000_000
 GIMBAL_GAP_NS = 1_500_000_000
@@ -69,6 +75,24 @@ class Counts:
     attitudes: int = 0
     feedbacks: int = 0
     out_of_order: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Around:
+    """The samples around an instant: of position, attitude and gimbal two, the nearest one, or none; of the receiver
+    the nearest one.
+
+    `boot_ns` is the instant on the autopilot's clock, known to `sigma_ns` (1 σ); `gimbal_boot_ns` on the gimbal's.
+    """
+
+    utc_ns: int
+    boot_ns: int
+    sigma_ns: float
+    positions: Sequence[PositionSample] = ()
+    attitudes: Sequence[AttitudeSample] = ()
+    gnss: GnssSample | None = None
+    gimbals: Sequence[GimbalSample] = ()
+    gimbal_boot_ns: int = 0
 
 
 class AutopilotTime:
@@ -321,7 +345,7 @@ class VehicleHistory:
     def _feedback(self, number: int, stamp_ns: int, message: Message) -> None:
         if not self._ours(message):
             return
-        boot_ns, now_ns = hot_shoe.boot_ns(message, self.time.unix_minus_boot_ns), self.time.now_boot_ns
+        boot_ns, now_ns = feedback_boot_ns(message, self.time.unix_minus_boot_ns), self.time.now_boot_ns
         if boot_ns is None or now_ns is None or abs(boot_ns - now_ns) > NEAREST_NS:
             return
         self.counts.feedbacks += 1

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from dappled.daemon.navigation.clocks import ExposureTime
 from dappled.daemon.pipeline.decode_process import DecodedFrame
-from dappled.daemon.pipeline.tagger import ExposureTime
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.camera import Blob, Fired, SettingsChanged, StateChanged
 from dappled.flight import Frame, Result, Shot, Tag

@@ -16,9 +16,11 @@ from statistics import median
 from typing import Any
 
 from dappled.config import settings as configuration
+from dappled.daemon.navigation import clocks
+from dappled.daemon.navigation.clocks import BodyLatency
 from dappled.daemon.navigation.navigation import recorded_vehicles
 from dappled.daemon.pipeline import tagger
-from dappled.daemon.pipeline.tagger import BodyLatency, Zoom
+from dappled.daemon.pipeline.tagger import Zoom
 from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
@@ -146,7 +148,7 @@ def bring(
             row = ledger.shot(number)
             assert row is not None
             facts_of = _settings(folder.path / frame.name)
-            exposure = tagger.mid_exposure(_called_utc_ns(row), latency, facts_of.exposure_s)
+            exposure = clocks.mid_exposure(_called_utc_ns(row), latency, facts_of.exposure_s)
             exposure, pose = telemetry.pose(number, exposure)
             camera = camera_name(names.get("camera", "auto"), facts_of.model)
             ledger.add_tag(tagger.tag(frame, exposure, facts_of, camera=camera, mask=names.get("mask", ""), pose=pose))
@@ -166,7 +168,7 @@ def _fired(row: ShotRow) -> FiredShot:
 
 def _called_utc_ns(row: ShotRow) -> int:
     assert row.fired_called_monotonic_ns is not None
-    return tagger.called_utc_ns(row.shot, row.fired_called_monotonic_ns)
+    return clocks.called_utc_ns(row.shot, row.fired_called_monotonic_ns)
 
 
 def _offset(anchors: list[tuple[float | None, FiredShot]]) -> float | None:

@@ -9,12 +9,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from dappled.daemon.navigation.clocks import BodyLatency
 from dappled.daemon.pipeline.capture import Capture
 from dappled.daemon.pipeline.decode_process import FrameDecoder
 from dappled.daemon.pipeline.decoding import Decoding
 from dappled.daemon.pipeline.pending_shot import FlightWriter, Names, Observer, PendingShot, PoseSource
 from dappled.daemon.pipeline.pending_shots import PendingShots
-from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.pipeline.tagging import Tagging
 from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import BodyState, Camera

@@ -7,12 +7,12 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from dappled.daemon.navigation import camera_clock
-from dappled.daemon.navigation.camera_clock import CameraClock
+from dappled.daemon.navigation import clocks
+from dappled.daemon.navigation.clocks import BodyLatency, CameraClock, ExposureTime
 from dappled.daemon.pipeline import tagger
 from dappled.daemon.pipeline.pending_shot import FlightWriter, Names, Observer, PendingShot, PoseSource
 from dappled.daemon.pipeline.pending_shots import PendingShots
-from dappled.daemon.pipeline.tagger import BodyLatency, ExposureTime, Zoom
+from dappled.daemon.pipeline.tagger import Zoom
 from dappled.daemon.stream.publisher import Publisher
 from dappled.daemon.stream.wire import frame_header
 from dappled.drivers.raw import reading
@@ -66,7 +66,7 @@ class Tagging:
             self._shots.note("zoom", zoomed, frame.index)
         exposure, pose = self._poses(frame.index, self._expected(pending, settings))
         # A file that may be another shot's would teach another shot's time.
-        if pending.fired and not pending.doubt and (told := camera_clock.shown(settings.taken)):
+        if pending.fired and not pending.doubt and (told := clocks.camera_time(settings.taken)):
             self._camera_clock = self._camera_clock.learnt(*told, exposure)
         if pending.doubt:
             exposure = replace(exposure, source=f"{exposure.source}; in doubt: {pending.doubt}")
@@ -90,13 +90,13 @@ class Tagging:
         by the camera's own clock, where the driver never said when it fired; else by the wish."""
         shot = pending.shot
         if pending.fired is not None:
-            called_utc_ns = tagger.called_utc_ns(shot, pending.fired.called_monotonic_ns)
-            return tagger.mid_exposure(called_utc_ns, self._latency, settings.exposure_s)
-        told = camera_clock.shown(settings.taken)
-        by_camera = told and camera_clock.exposure_from_camera(self._camera_clock, *told, settings.exposure_s)
+            called_utc_ns = clocks.called_utc_ns(shot, pending.fired.called_monotonic_ns)
+            return clocks.mid_exposure(called_utc_ns, self._latency, settings.exposure_s)
+        told = clocks.camera_time(settings.taken)
+        by_camera = told and clocks.exposure_from_camera(self._camera_clock, *told, settings.exposure_s)
         if by_camera:
             self._shots.note("untimed", "the driver never said when it fired: the camera's clock is used", shot.index)
             return by_camera
         self._shots.note("untimed", "the driver never said when it fired: the wish's time is used", shot.index)
         arrived_utc_ns = pending.frame.arrived_utc_ns if pending.frame else None
-        return tagger.by_wish(shot.wished_utc_ns, arrived_utc_ns, self._latency, settings.exposure_s)
+        return clocks.mid_exposure_by_request(shot.wished_utc_ns, arrived_utc_ns, self._latency, settings.exposure_s)

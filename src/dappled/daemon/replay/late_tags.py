@@ -11,10 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from dappled.config import settings as configuration
+from dappled.daemon.navigation.clocks import BodyLatency
 from dappled.daemon.pipeline.flight_writer import ReplayVerifier
 from dappled.daemon.pipeline.pending_shot import Names, Observer
 from dappled.daemon.pipeline.pipeline import Pipeline
-from dappled.daemon.pipeline.tagger import BodyLatency
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import RecordedFlight, RecordedTelemetry, ReplayProgress
 from dappled.drivers.camera import Blob, Identity

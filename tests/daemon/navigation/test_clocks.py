@@ -10,12 +10,18 @@ from typing import Any
 
 import pytest
 
-from dappled.daemon.navigation import hot_shoe
-from dappled.daemon.navigation.boot_clock import BootClock
-from dappled.daemon.navigation.camera_clock import CameraClock, exposure_from_camera, shown
-from dappled.daemon.navigation.hot_shoe import Feedback
+from dappled.daemon.navigation import clocks
+from dappled.daemon.navigation.clocks import (
+    BodyLatency,
+    BootClock,
+    CameraClock,
+    ExposureTime,
+    Feedback,
+    camera_time,
+    exposure_from_camera,
+    mid_exposure,
+)
 from dappled.daemon.navigation.navigation import Telemetry
-from dappled.daemon.pipeline.tagger import BodyLatency, ExposureTime, mid_exposure
 from dappled.drivers.mavlink.links import Message, mavlink
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath
@@ -32,9 +38,9 @@ def event(after_call_ms: float, number: int = 0) -> Feedback:
 
 
 def test_the_contact_is_taken_and_half_the_exposure_added() -> None:
-    chosen = hot_shoe.choose([event(55)], EXPECTED, CLOCK)
+    chosen = clocks.choose_feedback([event(55)], EXPECTED, CLOCK)
     assert chosen == event(55)
-    better, boot_ns = hot_shoe.refined(EXPECTED, event(55), CLOCK)
+    better, boot_ns = clocks.refine(EXPECTED, event(55), CLOCK)
     assert boot_ns == 10**9 + 56 * MS
     assert better.utc_ns == START_NS + boot_ns
     assert better.source == "hot shoe (CAMERA_FEEDBACK)"
@@ -43,15 +49,15 @@ def test_the_contact_is_taken_and_half_the_exposure_added() -> None:
 
 @pytest.mark.parametrize("after_call_ms", [-200, -30, 0, 2.5])
 def test_the_word_for_a_mere_wish_is_not_taken(after_call_ms: float) -> None:
-    assert hot_shoe.choose([event(after_call_ms)], EXPECTED, CLOCK) is None
-    assert hot_shoe.choose([event(after_call_ms), event(64, 1)], EXPECTED, CLOCK) == event(64, 1)
+    assert clocks.choose_feedback([event(after_call_ms)], EXPECTED, CLOCK) is None
+    assert clocks.choose_feedback([event(after_call_ms), event(64, 1)], EXPECTED, CLOCK) == event(64, 1)
 
 
 def test_what_is_far_off_or_of_two_minds_is_not_taken() -> None:
-    assert hot_shoe.choose([event(152)], EXPECTED, CLOCK) is None
-    assert hot_shoe.choose([event(50), event(71, 1)], EXPECTED, CLOCK) is None
-    assert hot_shoe.choose([event(55), event(55, 1)], EXPECTED, CLOCK) == event(55)  # the same, on a second link
-    assert hot_shoe.choose([event(55)], ExposureTime(EXPECTED.utc_ns, 10 * MS, "given"), CLOCK) is None
+    assert clocks.choose_feedback([event(152)], EXPECTED, CLOCK) is None
+    assert clocks.choose_feedback([event(50), event(71, 1)], EXPECTED, CLOCK) is None
+    assert clocks.choose_feedback([event(55), event(55, 1)], EXPECTED, CLOCK) == event(55)  # the same, on a second link
+    assert clocks.choose_feedback([event(55)], ExposureTime(EXPECTED.utc_ns, 10 * MS, "given"), CLOCK) is None
 
 
 def made(message: Message, component: int = 1) -> Message:
@@ -126,11 +132,11 @@ def test_a_camera_clock_that_was_set_is_learnt_anew() -> None:
 
 
 def test_what_exif_shows() -> None:
-    assert shown("1970-01-02T00:00:01") == (86_401 * 10**9, 10**9)
-    assert shown("1970-01-01T00:00:01.25") == (1_250 * MS, 10 * MS)
-    assert shown("not a time") is None
-    assert shown("1970-01-01T00:00:01.x") is None
-    assert shown(None) is None
+    assert camera_time("1970-01-02T00:00:01") == (86_401 * 10**9, 10**9)
+    assert camera_time("1970-01-01T00:00:01.25") == (1_250 * MS, 10 * MS)
+    assert camera_time("not a time") is None
+    assert camera_time("1970-01-01T00:00:01.x") is None
+    assert camera_time(None) is None
 
 
 def benchmark() -> ModuleType:
@@ -172,3 +178,24 @@ def test_each_sample_of_a_real_flight_is_predicted_by_its_neighbours(shared_data
         assert 0.8 <= row["doubt_over_error"] <= 1.2
         assert row["within_2_doubts"] > 0.9
         assert row["refused"] < 20
+
+
+BODY = BodyLatency(60.0, 15.0, "measured")
+
+
+def test_mid_exposure_is_latency_and_half_the_exposure_after_the_call() -> None:
+    found = clocks.mid_exposure(1_000, BODY, 0.02)
+    assert (found.utc_ns, found.sigma_ns, found.source) == (70_001_000, 15_000_000, "measured")
+    assert clocks.mid_exposure(0, BODY, None).utc_ns == 60_000_000
+
+
+def test_without_a_trigger_call_the_request_and_the_file_bound_the_exposure() -> None:
+    """The time of the trigger call is unknown: it was made between the request and the file."""
+    found = clocks.mid_exposure_by_request(0, 3_070_000_000, BODY, 0.02)
+    assert found.utc_ns == 70_000_000
+    assert found.source == "wish + body latency"
+    assert found.sigma_ns == pytest.approx(2.99e9 / 3**0.5, rel=1e-3)
+    assert found.called_utc_ns == 0
+    early = clocks.mid_exposure_by_request(0, 10_000_000, BODY, None)
+    assert early.sigma_ns == 15_000_000  # a stamp before the exposure bounds nothing
+    assert clocks.mid_exposure_by_request(0, None, BODY, None).sigma_ns > 500_000_000

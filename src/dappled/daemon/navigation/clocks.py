@@ -1,0 +1,326 @@
+"""Say when a frame was exposed, from the clocks of this machine, the autopilot and the camera.
+
+The expected time is the trigger call's plus the body's latency. The autopilot's hot-shoe feedback replaces it; the
+camera's own clock stands in where the trigger call is unknown. Pure functions of what was observed, so a replay gets
+the same numbers.
+
+Hot-shoe feedback is CAMERA_FEEDBACK (ArduPilot: boot time with a feedback pin, else GPS epoch) and CAMERA_TRIGGER (PX4:
+boot time). Both are also sent for the mere command to fire, without a contact in the hot shoe. Such a message is
+recognised by its time: it is not after our own trigger call, and nothing exposes before that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.config.settings import CameraSettings
+from dappled.drivers.mavlink.links import Message
+from dappled.flight import Shot
+
+Array = NDArray[np.float64]
+
+LATENCY_SOURCE = "trigger call + body latency"
+REQUEST_SOURCE = "wish + body latency"
+CAMERA_SOURCE = "camera clock (EXIF)"
+CONTACT_SIGMA_NS = 1_000_000  # interrupt and contact bounce; the best bodies were measured at 0.56 ms
+EPOCH_US = 10**15  # 2001; no autopilot has been running for that long
+DRIFT_SIGMA = 50e-6  # crystals of autopilots: some tens of ppm between two machines
+_UNSEEN_NS = 10**9  # how late a trigger call may be, where not even the file's arrival bounds it
+_REACH_SIGMAS = 4
+_REACH_NS = 50_000_000
+_AFTER_CALL_NS = 3_000_000
+_CAMERA_SHOTS_KEPT = 256
+_CAMERA_SHOTS_LEAST = 3
+_PRIOR = np.diag([0.0, 1 / (DRIFT_SIGMA * 1e9) ** 2])  # of level (ns) and slope (ns/s)
+_TIMESYNC_FLOOR_NS = 50_000.0
+_TIMESYNC_ASYMMETRY = 0.05  # share of the least round trip by which the two ways may differ; not observable
+_ARRIVAL_FLOOR_NS = 5e6  # the shortest way through radio, UART and scheduler; not observable from one side
+
+
+@dataclass(frozen=True, slots=True)
+class BodyLatency:
+    """From the trigger call to the start of the exposure: mean and 1 σ, and where the figure comes from."""
+
+    mean_ms: float
+    sigma_ms: float
+    source: str
+
+    @classmethod
+    def of(cls, settings: CameraSettings) -> Self:
+        """As configured."""
+        return cls(settings.latency_ms, settings.latency_sigma_ms, LATENCY_SOURCE)
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureTime:
+    """Mid-exposure in UTC with its 1 σ, and where it comes from.
+
+    `half_ns` is half the exposure as far as known. `called_utc_ns` is when the trigger call was made: nothing exposes
+    before it; None where that is unknown.
+    """
+
+    utc_ns: int
+    sigma_ns: int
+    source: str
+    half_ns: int = 0
+    called_utc_ns: int | None = None
+
+
+def called_utc_ns(shot: Shot, called_monotonic_ns: int) -> int:
+    """When the trigger call was made, on the clock of the capture request: the same to the nanosecond in a replay."""
+    return called_monotonic_ns + shot.wished_utc_ns - shot.wished_monotonic_ns
+
+
+def mid_exposure(fired_utc_ns: int, latency: BodyLatency, exposure_s: float | None) -> ExposureTime:
+    """The trigger call's time plus the body's latency plus half the exposure (none, where it is not known)."""
+    half_ns = round((exposure_s or 0.0) / 2 * 1e9)
+    return ExposureTime(
+        fired_utc_ns + round(latency.mean_ms * 1e6) + half_ns,
+        round(latency.sigma_ms * 1e6),
+        latency.source,
+        half_ns,
+        fired_utc_ns,
+    )
+
+
+def mid_exposure_by_request(
+    requested_utc_ns: int, arrived_utc_ns: int | None, latency: BodyLatency, exposure_s: float | None
+) -> ExposureTime:
+    """The capture request's time plus the body's latency, where the time of the trigger call is unknown.
+
+    The call may have been made at any time up to the file's arrival: sigma contains this as a uniform distribution.
+    """
+    exposure = mid_exposure(requested_utc_ns, latency, exposure_s)
+    late_ns = _UNSEEN_NS if arrived_utc_ns is None else max(0, arrived_utc_ns - exposure.utc_ns - exposure.half_ns)
+    sigma_ns = round(math.hypot(exposure.sigma_ns, late_ns / math.sqrt(3)))
+    return replace(exposure, sigma_ns=sigma_ns, source=REQUEST_SOURCE)
+
+
+@dataclass(frozen=True, slots=True)
+class TimesyncAnswer:
+    """One answer to our TIMESYNC request: the autopilot's time, between our sending and our receiving."""
+
+    number: int
+    sent_utc_ns: int
+    received_utc_ns: int
+    boot_ns: int
+
+    @property
+    def stamp_ns(self) -> int:
+        """When it arrived."""
+        return self.received_utc_ns
+
+    @property
+    def delay_ns(self) -> int:
+        """Round trip."""
+        return self.received_utc_ns - self.sent_utc_ns
+
+    @property
+    def offset_ns(self) -> int:
+        """UTC minus boot time, if both ways took equally long."""
+        return (self.sent_utc_ns + self.received_utc_ns) // 2 - self.boot_ns
+
+
+@dataclass(frozen=True, slots=True)
+class BootClock:
+    """UTC = boot time + offset + drift × (boot time − reference). Sigma is one standard deviation of UTC."""
+
+    source: Literal["timesync", "arrival"]
+    reference_boot_ns: int
+    offset_ns: int
+    drift: float
+    sigma_ns: float
+
+    def utc_ns(self, boot_ns: int) -> int:
+        """UTC at a boot time."""
+        return boot_ns + self.offset_ns + round(self.drift * (boot_ns - self.reference_boot_ns))
+
+    def boot_ns(self, utc_ns: int) -> int:
+        """Boot time at a UTC."""
+        near = utc_ns - self.offset_ns
+        return near - round(self.drift / (1 + self.drift) * (near - self.reference_boot_ns))
+
+
+def from_timesync(answers: Sequence[TimesyncAnswer]) -> BootClock | None:
+    """Fit a line through the answers, with most weight on quick ones; None from fewer than three.
+
+    An answer that took `e` longer than the quickest one is wrong by at most e/2, if all of that was lost on one way.
+    Its weight is 1 / (s² + (e/2)²). `s` is half the lower quartile of e, so that on a link where delays spread evenly
+    (no answer is much better than the next) all answers count. The slope has a prior of 0 ± 50 ppm. Sigma comes from
+    the residuals, each at its own weight (White's estimate), so it is right even where the weights are not.
+    """
+    if len(answers) < 3:
+        return None
+    reference = answers[-1]
+    delay = np.array([answer.delay_ns for answer in answers], dtype=np.float64)
+    x = np.array([answer.boot_ns - reference.boot_ns for answer in answers], dtype=np.float64) / 1e9
+    y = np.array([answer.offset_ns - reference.offset_ns for answer in answers], dtype=np.float64)
+    half = (delay - delay.min()) / 2
+    weight = 1 / (max(_TIMESYNC_FLOOR_NS, float(np.sort(half)[len(half) // 4])) ** 2 + half**2)
+    freedom = len(answers) - 2
+    _, _, left = _line(x, y, weight)
+    weight /= max(float(weight @ left**2) / freedom, 1e-4)  # now in the prior's own measure
+    (level, slope), inverse, left = _line(x, y, weight)
+    sides = np.stack([np.ones_like(x), x]) * (weight * left)
+    scatter = sides @ sides.T * (len(answers) / freedom) + _PRIOR
+    variance = max(float((inverse @ scatter @ inverse)[0, 0]), 0.1 * float(inverse[0, 0]))
+    return BootClock(
+        "timesync",
+        reference.boot_ns,
+        reference.offset_ns + round(level),
+        float(slope) / 1e9,
+        math.hypot(math.sqrt(variance), _TIMESYNC_ASYMMETRY * float(delay.min())),
+    )
+
+
+def _line(x: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Weighted least squares with the prior: (level, slope), the inverse of the normal matrix, the residuals."""
+    sides = np.stack([np.ones_like(x), x])
+    inverse = np.asarray(np.linalg.inv((sides * weight) @ sides.T + _PRIOR), dtype=np.float64)
+    found = inverse @ (sides @ (weight * y))
+    return found, inverse, y - found @ sides
+
+
+def from_arrivals(arrivals: Sequence[tuple[int, int]]) -> BootClock | None:
+    """Take the least of (arrival − boot time) over `arrivals`, pairs (boot_ns, received_utc_ns); None from none.
+
+    It is late by the delay of the quickest packet, which can't be observed: sigma allows 5 ms for it, and a tenth of
+    the median excess.
+    """
+    if not arrivals:
+        return None
+    offsets = sorted(received - boot for boot, received in arrivals)
+    median_excess = offsets[len(offsets) // 2] - offsets[0]
+    return BootClock("arrival", arrivals[-1][0], offsets[0], 0.0, math.hypot(_ARRIVAL_FLOOR_NS, 0.1 * median_excess))
+
+
+@dataclass(frozen=True, slots=True)
+class Feedback:
+    """One message: the contact's time since boot. `number` is its packet's in the log."""
+
+    number: int
+    stamp_ns: int
+    boot_ns: int
+    kind: str
+
+
+def feedback_boot_ns(message: Message, unix_minus_boot_ns: int | None) -> int | None:
+    """When the contact closed, in time since boot; None for a GPS time before SYSTEM_TIME has given the offset."""
+    time_us = int(message.time_usec)
+    if time_us < EPOCH_US:
+        return time_us * 1000 if time_us > 0 else None
+    return None if unix_minus_boot_ns is None else time_us * 1000 - unix_minus_boot_ns
+
+
+def reach_ns(exposure: ExposureTime) -> int:
+    """How far from its expected time an exposure may be."""
+    return _REACH_SIGMAS * exposure.sigma_ns + _REACH_NS
+
+
+def choose_feedback(events: Sequence[Feedback], exposure: ExposureTime, clock: BootClock) -> Feedback | None:
+    """Choose the event of this exposure; None where there is none.
+
+    It is the one nearest to when the exposure was expected to begin, within 4 σ + 50 ms of that (σ of the body and of
+    the clocks), and after the trigger call. None also where two are so near that either may be it (half the nearer
+    one's distance + 5 ms): a wrong time would be worse than a wide one.
+    """
+    if exposure.called_utc_ns is None:
+        return None
+    within_ns = reach_ns(exposure) + _REACH_SIGMAS * clock.sigma_ns
+    expected_ns = clock.boot_ns(exposure.utc_ns - exposure.half_ns)
+    # command and contact can be told apart no better than the clocks agree
+    earliest_ns = clock.boot_ns(exposure.called_utc_ns) + max(_AFTER_CALL_NS, 3 * clock.sigma_ns)
+    near = sorted(
+        (abs(event.boot_ns - expected_ns), event.number, event)
+        for event in events
+        if event.boot_ns >= earliest_ns and abs(event.boot_ns - expected_ns) <= within_ns
+    )
+    if not near:
+        return None
+    doubtful_ns = near[0][0] * 1.5 + 5_000_000
+    if any(distance <= doubtful_ns and event.boot_ns != near[0][2].boot_ns for distance, _, event in near[1:]):
+        return None
+    return near[0][2]
+
+
+def refine(exposure: ExposureTime, event: Feedback, clock: BootClock) -> tuple[ExposureTime, int]:
+    """The exposure as the hot shoe timed it, and mid-exposure in time since boot."""
+    middle_boot_ns = event.boot_ns + exposure.half_ns
+    sigma_ns = round(math.hypot(CONTACT_SIGMA_NS, clock.sigma_ns))
+    source = f"hot shoe ({event.kind})"
+    return replace(exposure, utc_ns=clock.utc_ns(middle_boot_ns), sigma_ns=sigma_ns, source=source), middle_boot_ns
+
+
+@dataclass(frozen=True, slots=True)
+class CameraClock:
+    """The camera's own clock, which EXIF gives in whole seconds and without a zone.
+
+    `shots` are (camera time − UTC, its 1 σ, its step) in nanoseconds, from shots with a better time. Each offset is
+    early by a part of the clock's step that is uniform over it.
+    """
+
+    shots: tuple[tuple[int, int, int], ...] = ()
+
+    def learnt(self, shown_ns: int, step_ns: int, exposure: ExposureTime) -> CameraClock:
+        """With one more shot, whose start is known otherwise. The last 256 count; only this one where it contradicts
+        them: then the camera's clock was set in between."""
+        offset_ns = shown_ns - (exposure.utc_ns - exposure.half_ns)
+        shots = (*self.shots, (offset_ns, exposure.sigma_ns, step_ns))[-_CAMERA_SHOTS_KEPT:]
+        return CameraClock(shots if _agree(shots) else shots[-1:])
+
+    def offset_ns(self) -> tuple[int, int] | None:
+        """The camera's time minus UTC with 1 σ; None from fewer than three shots."""
+        if len(self.shots) < _CAMERA_SHOTS_LEAST:
+            return None
+        centre, (sigma, step) = self.shots[-1][0], _spread(self.shots)
+        shifts = [offset - centre for offset, _, _ in self.shots]
+        # A cut-off time is uniform over one step: its mean is half a step early, with step / √12 a shot.
+        mean = sum(shifts) / len(shifts) + step / 2
+        by_mean = math.hypot(sigma, step / math.sqrt(12)) / math.sqrt(len(shifts))
+        return centre + round(mean), round(by_mean)
+
+
+def _spread(shots: tuple[tuple[int, int, int], ...]) -> tuple[float, int]:
+    """(1 σ of their times, the clock's step)."""
+    return math.sqrt(sum(s * s for _, s, _ in shots) / len(shots)), max(step for _, _, step in shots)
+
+
+def _agree(shots: tuple[tuple[int, int, int], ...]) -> bool:
+    sigma, step = _spread(shots)
+    offsets = [offset for offset, _, _ in shots]
+    return max(offsets) - min(offsets) <= step + 8 * sigma
+
+
+def exposure_from_camera(
+    clock: CameraClock, shown_ns: int, step_ns: int, exposure_s: float | None
+) -> ExposureTime | None:
+    """Mid-exposure by the camera's clock: the middle of the second (or `step_ns`) that it shows. None while the clock's
+    offset is unknown."""
+    offset = clock.offset_ns()
+    if offset is None:
+        return None
+    half_ns = round((exposure_s or 0.0) / 2 * 1e9)
+    sigma_ns = round(math.hypot(offset[1], step_ns / math.sqrt(12)))
+    return ExposureTime(shown_ns - offset[0] + step_ns // 2 + half_ns, sigma_ns, CAMERA_SOURCE, half_ns)
+
+
+def camera_time(taken: str | None) -> tuple[int, int] | None:
+    """(time, step) in nanoseconds of an EXIF time, ISO 8601 without a zone, read as if it were UTC."""
+    if taken is None:
+        return None
+    whole, _, fraction = taken.partition(".")
+    if fraction and not (fraction.isascii() and fraction.isdigit()):
+        return None
+    try:
+        seconds = round(datetime.fromisoformat(whole).replace(tzinfo=UTC).timestamp())
+    except ValueError:
+        return None
+    digits = fraction[:9]
+    return seconds * 10**9 + int(digits.ljust(9, "0") or 0), 10 ** (9 - len(digits))
