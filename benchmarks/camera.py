@@ -31,7 +31,7 @@ from dappled.clock import SystemClock
 from dappled.drivers.camera import Arrival, Fired, ShotFailed, StateChanged
 from dappled.drivers.gphoto2.client import GPhoto2Camera, open_camera
 from dappled.flight import Cause, Shot, durable, recording
-from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.body.body import BodyOptions, SimulatedBody
 
 SIZE = 17_582_091  # of a real EOS 450D's CR2
 _BURN = """
@@ -44,7 +44,7 @@ while True:
 
 
 @contextlib.contextmanager
-def camera_at(body: Body, **settings: Any) -> Iterator[GPhoto2Camera]:
+def camera_at(body: SimulatedBody, **settings: Any) -> Iterator[GPhoto2Camera]:
     """A driver that is ready."""
     camera = open_camera({"port": body.port, **settings})
     camera.start()
@@ -86,7 +86,7 @@ def trigger(shots: int) -> dict[str, Any]:
     """Milliseconds from `fire` to the trigger call."""
     times = []
     with (
-        Body.start(BodyOptions(picture="pattern:20000:cr2")) as body,
+        SimulatedBody.start(BodyOptions(picture="pattern:20000:cr2")) as body,
         camera_at(body, capture_target="ram") as camera,
         loaded(os.cpu_count() or 2),
     ):
@@ -111,7 +111,10 @@ def file_move(repeats: int, place: Path) -> dict[str, Any]:
     flight = recording.begin(place / "flights", clock.utc_ns, {})
     ours: list[float] = []
     plain: list[float] = []
-    with Body.start(BodyOptions(picture=str(source))) as body, camera_at(body, delete_after_download=True) as camera:
+    with (
+        SimulatedBody.start(BodyOptions(picture=str(source))) as body,
+        camera_at(body, delete_after_download=True) as camera,
+    ):
         before = peak = _memory(camera)
         for shot in range(repeats):
             flight.ledger.add_shot(Shot(shot, Cause("benchmark", "shot"), clock.utc_ns(), clock.monotonic_ns()))
@@ -135,7 +138,7 @@ def file_move(repeats: int, place: Path) -> dict[str, Any]:
     }
 
 
-def _before(body: Body) -> None:
+def _before(body: SimulatedBody) -> None:
     """The body is hardware: it waits for no core. (Each thread has a priority of its own.)"""
     with contextlib.suppress(PermissionError):
         for thread in Path(f"/proc/{body._process.pid}/task").iterdir():
@@ -163,7 +166,7 @@ def _memory(camera: GPhoto2Camera) -> int:
 
 def stall() -> dict[str, Any]:
     """The longest pause of a thread beside the driver, while the body is silent in the middle of a shot."""
-    with Body.start(BodyOptions(picture="pattern:20000:cr2")) as body, camera_at(body) as camera:
+    with SimulatedBody.start(BodyOptions(picture="pattern:20000:cr2")) as body, camera_at(body) as camera:
         _before(body)
         longest_s, done = 0.0, threading.Event()
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 from dappled.cli import main
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
-from dappled.mocks.body import dng
+from dappled.mocks.scene import dng
 from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 from tests.simulated.calibration import from_frame
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dappled.cli import main
-from dappled.mocks.body.dng import Exif, encode
+from dappled.mocks.scene.dng import Exif, encode
 from dappled.mocks.scene.lens import Installation
 from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.products.exports import light_files

@@ -20,10 +20,10 @@ from dappled.drivers.raw.darkroom import Recipe
 from dappled.flight import Tag, recording
 from dappled.mocks import simulation
 from dappled.mocks.autopilot.path import FlightPath, TruePose
-from dappled.mocks.scene import terrain
-from dappled.mocks.scene.flyover import Terrain
+from dappled.mocks.scene import landscape
+from dappled.mocks.scene.flyover import TerrainScene
+from dappled.mocks.scene.landscape import DETAIL_TEXEL_M, EXTENT_M, TEXEL_M
 from dappled.mocks.scene.masked_camera import MaskedCamera, Truth, reference_camera
-from dappled.mocks.scene.terrain import DETAIL_TEXEL_M, EXTENT_M, TEXEL_M
 from dappled.mocks.simulation import CAMERA, MASK
 from tests.flight.makers import deliver, wish
 
@@ -42,7 +42,7 @@ class Flown:
     recipe: Recipe
     path: FlightPath
     truths: tuple[Truth, ...]
-    ground: terrain.Ground
+    ground: landscape.Landscape
 
     def to_geodetic(
         self, north_m: NDArray[np.float64], east_m: NDArray[np.float64]
@@ -77,7 +77,7 @@ def fly(
     if not noise:
         camera = replace(camera, sensor=replace(camera.sensor, shot_noise=False, read_noise_e=0.0))
     scene = camera.scene
-    assert isinstance(scene, Terrain)
+    assert isinstance(scene, TerrainScene)
     begun = recording.begin(folder / "flights", lambda: START_NS)
     truths = []
     for index, time_s in enumerate(times_s):

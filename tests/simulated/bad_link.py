@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class Faults:
+class LinkFaults:
     """What happens to a packet, as shares of 1. `late_s`: at most so late, each by its own chance, so that packets
     overtake each other. `garbage`: random bytes come before it; `torn`: only its beginning arrives."""
 
@@ -29,7 +29,7 @@ class Faults:
 class BadLink:
     """The relay in a thread of its own; use as a context manager. `port` is where the ground station connects to."""
 
-    def __init__(self, camera_port: int, faults: Faults, seed: int = 1) -> None:
+    def __init__(self, camera_port: int, faults: LinkFaults, seed: int = 1) -> None:
         self._faults = faults
         self._random = random.Random(seed)  # noqa: S311  # a simulation
         self._near, self._far = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))

@@ -16,9 +16,9 @@ from dappled.config import profiles
 from dappled.decode.optics.carriers import Lattice, Sensor
 from dappled.decode.optics.masks import Mask
 from dappled.decode.spectrum.stagger import spread_sensor
-from dappled.mocks.body.dng import Exif
 from dappled.mocks.scene import lens, synthesis
 from dappled.mocks.scene.bench import Bench, WhiteCard, boards
+from dappled.mocks.scene.dng import Exif
 from dappled.mocks.scene.lens import Floats, Installation, Optics, Rays
 from dappled.mocks.scene.synthesis import Grid
 
@@ -29,7 +29,7 @@ MASK_AT_MM = 1.01
 
 
 @dataclass(frozen=True, slots=True)
-class Finepix:
+class MaskedFinePix:
     """A body at one focal length. `installation` is drawn from `seed`: rotation ±2°, shift, distance ±10 %."""
 
     seed: int

@@ -23,7 +23,7 @@ from dappled.daemon.service import Service
 from dappled.drivers.mavlink.links import LinkError
 from dappled.errors import DappledError
 from dappled.flight import LedgerReader, check, flight_report
-from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.scene.masked_camera import reference_camera
 from tests.system.flying import Flying, assert_whole, eventually, flying, settings_of, told
 
@@ -32,9 +32,9 @@ MASKED = {"camera": {"profile": "reference-36mm"}, "mask": {"profile": "referenc
 
 
 @pytest.fixture
-def body() -> Iterator[Body]:
+def body() -> Iterator[SimulatedBody]:
     """A body whose pictures are no pictures: made safe all the same."""
-    with Body.start(BodyOptions(picture="pattern:100000:dng")) as one:
+    with SimulatedBody.start(BodyOptions(picture="pattern:100000:dng")) as one:
         yield one
 
 
@@ -54,7 +54,7 @@ def here(sockets: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def before(body: Body, here: Path, **tables: dict[str, Any]) -> Settings:
+def before(body: SimulatedBody, here: Path, **tables: dict[str, Any]) -> Settings:
     """Settings for a daemon before this body."""
     camera = {"port": body.port, **tables.pop("camera", {})}
     return settings_of(here, camera=camera, **tables)
@@ -135,7 +135,7 @@ def test_a_wrong_call_exits_2(words: list[str], capfd: pytest.CaptureFixture[str
 
 
 def test_no_camera_on_the_bus(here: Path) -> None:
-    with Body.start(BodyOptions(picture="pattern:1000:jpg")) as gone:
+    with SimulatedBody.start(BodyOptions(picture="pattern:1000:jpg")) as gone:
         settings = before(gone, here)
     with flying(settings) as daemon:
         eventually(lambda: "the camera is absent" in daemon.problems, "a problem that names the camera")
@@ -163,7 +163,7 @@ def test_without_a_camera_run_ends_0_when_its_time_is_over(here: Path, tmp_path:
     assert not (here / "s.ask").exists()
 
 
-def test_a_camera_that_another_program_holds_is_taken_when_it_is_free(body: Body, here: Path) -> None:
+def test_a_camera_that_another_program_holds_is_taken_when_it_is_free(body: SimulatedBody, here: Path) -> None:
     body.fault("refuse")
     with flying(before(body, here)) as daemon:
         eventually(lambda: "another program" in daemon.problems, "a problem that says who holds it")
@@ -173,7 +173,7 @@ def test_a_camera_that_another_program_holds_is_taken_when_it_is_free(body: Body
 
 
 @pytest.mark.parametrize("fault", ["busy 0.3", "drop-transfer", "short"])
-def test_a_fault_that_passes_costs_no_frame(body: Body, here: Path, fault: str) -> None:
+def test_a_fault_that_passes_costs_no_frame(body: SimulatedBody, here: Path, fault: str) -> None:
     with flying(before(body, here)) as daemon:
         daemon.until_ready()
         body.fault(fault)
@@ -181,14 +181,14 @@ def test_a_fault_that_passes_costs_no_frame(body: Body, here: Path, fault: str) 
             assert daemon.shoot().frame is not None
 
 
-def test_an_event_that_is_lost_costs_no_frame(body: Body, here: Path) -> None:
+def test_an_event_that_is_lost_costs_no_frame(body: SimulatedBody, here: Path) -> None:
     with flying(before(body, here)) as daemon:
         daemon.until_ready()
         body.fault("no-event")
         assert daemon.shoot().frame is not None
 
 
-def test_a_camera_that_refuses_fails_one_shot(body: Body, here: Path) -> None:
+def test_a_camera_that_refuses_fails_one_shot(body: SimulatedBody, here: Path) -> None:
     with flying(before(body, here)) as daemon:
         daemon.until_ready()
         body.fault("error")
@@ -201,7 +201,7 @@ def test_a_camera_that_refuses_fails_one_shot(body: Body, here: Path) -> None:
 
 def test_a_camera_that_is_gone_mid_shot_comes_back(here: Path) -> None:
     with (
-        Body.start(BodyOptions(picture="pattern:100000:dng", delay_s=0.3)) as body,
+        SimulatedBody.start(BodyOptions(picture="pattern:100000:dng", delay_s=0.3)) as body,
         flying(before(body, here)) as daemon,
     ):
         daemon.until_ready()
@@ -213,7 +213,7 @@ def test_a_camera_that_is_gone_mid_shot_comes_back(here: Path) -> None:
 
 
 def test_a_body_that_dies_mid_shot_fails_the_shot(here: Path) -> None:
-    with Body.start(BodyOptions(picture="pattern:100000:dng", delay_s=5)) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:100000:dng", delay_s=5)) as body:
         with flying(before(body, here, camera={"file_timeout_s": 1.0})) as daemon:
             daemon.until_ready()
             assert daemon.request().outcome == "shot"
@@ -226,7 +226,7 @@ def test_a_body_that_dies_mid_shot_fails_the_shot(here: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_silent_camera_fails_the_shot(body: Body, here: Path) -> None:
+def test_a_silent_camera_fails_the_shot(body: SimulatedBody, here: Path) -> None:
     with flying(before(body, here, camera={"file_timeout_s": 1.0})) as daemon:
         daemon.until_ready()
         body.fault("silence 15")
@@ -242,7 +242,7 @@ def test_a_silent_camera_fails_the_shot(body: Body, here: Path) -> None:
 def photographed(picture: str | Path, here: Path, **tables: dict[str, Any]) -> tuple[Flying, Path]:
     """One shot of a file by the masked reference camera; the frame is safe, byte for byte."""
     with (
-        Body.start(BodyOptions(picture=str(picture))) as body,
+        SimulatedBody.start(BodyOptions(picture=str(picture))) as body,
         flying(before(body, here, **MASKED, **tables)) as daemon,
     ):
         pending = daemon.shoot()
@@ -312,7 +312,7 @@ def test_a_frame_without_its_focal_length(frame: Path, here: Path, tmp_path: Pat
 
 
 def test_a_decoder_that_is_killed_loses_one_decode_at_most(frame: Path, here: Path) -> None:
-    with Body.start(BodyOptions(picture=str(frame))) as body, flying(before(body, here, **MASKED)) as daemon:
+    with SimulatedBody.start(BodyOptions(picture=str(frame))) as body, flying(before(body, here, **MASKED)) as daemon:
         assert daemon.shoot().decoded is not None
         kill_decoders()  # between two frames
         assert daemon.shoot().decoded is not None
@@ -331,7 +331,7 @@ def test_a_decoder_that_is_killed_loses_one_decode_at_most(frame: Path, here: Pa
 @pytest.mark.slow
 @pytest.mark.timeout(40)  # the decode itself would be given up after 60 s
 def test_a_decoder_that_hangs_does_not_keep_the_daemon(frame: Path, here: Path) -> None:
-    with Body.start(BodyOptions(picture=str(frame))) as body, flying(before(body, here, **MASKED)) as daemon:
+    with SimulatedBody.start(BodyOptions(picture=str(frame))) as body, flying(before(body, here, **MASKED)) as daemon:
         assert daemon.shoot().decoded is not None
         stop_decoders()
         daemon.request()
@@ -343,7 +343,7 @@ def test_a_decoder_that_hangs_does_not_keep_the_daemon(frame: Path, here: Path) 
 # --- links and endpoints
 
 
-def test_an_endpoint_that_is_in_use(body: Body, here: Path) -> None:
+def test_an_endpoint_that_is_in_use(body: SimulatedBody, here: Path) -> None:
     with flying(before(body, here)) as daemon:
         other = before(body, here, record={"directory": str(here / "other")})
         sentence = raises_sentence(other)
@@ -352,7 +352,7 @@ def test_an_endpoint_that_is_in_use(body: Body, here: Path) -> None:
         assert daemon.shoot().frame is not None
 
 
-def test_a_mavlink_port_that_is_in_use(body: Body, here: Path) -> None:
+def test_a_mavlink_port_that_is_in_use(body: SimulatedBody, here: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
@@ -373,7 +373,7 @@ def test_a_subscriber_that_never_reads_costs_nothing(frame: Path, here: Path) ->
     settings = {"publish": {"high_water_mark": 1, "preview_interval_s": 0.0}}
     try:
         with (
-            Body.start(BodyOptions(picture=str(frame))) as body,
+            SimulatedBody.start(BodyOptions(picture=str(frame))) as body,
             flying(before(body, here, **MASKED, **settings)) as one,
         ):
             lazy.connect(f"ipc://{here}/s")
@@ -389,7 +389,7 @@ def test_a_subscriber_that_never_reads_costs_nothing(frame: Path, here: Path) ->
 # --- the disk
 
 
-def test_a_disk_that_is_nearly_full_refuses_new_shots(body: Body, here: Path) -> None:
+def test_a_disk_that_is_nearly_full_refuses_new_shots(body: SimulatedBody, here: Path) -> None:
     with flying(before(body, here, record={"min_free_mb": 10_000_000})) as daemon:
         daemon.until_ready()
         decision = daemon.request()
@@ -413,7 +413,7 @@ def no_file_above(size: int) -> Iterator[None]:
 
 
 def test_a_frame_that_the_disk_does_not_take_fails_its_shot_only(here: Path) -> None:
-    with Body.start(BodyOptions(picture="pattern:3000000:dng")) as body, flying(before(body, here)) as daemon:
+    with SimulatedBody.start(BodyOptions(picture="pattern:3000000:dng")) as body, flying(before(body, here)) as daemon:
         daemon.until_ready()
         with no_file_above(2_000_000):
             failed = daemon.shoot()
@@ -440,7 +440,7 @@ def small_disk(here: Path) -> Iterator[Path]:
 
 
 def test_a_disk_that_fills_up_keeps_what_is_safe(small_disk: Path, here: Path) -> None:
-    with Body.start(BodyOptions(picture="pattern:3000000:dng")) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:3000000:dng")) as body:
         with flying(before(body, here, record={"directory": str(small_disk)})) as daemon:
             shots = [daemon.shoot() for _ in range(3)]
             assert [pending.frame is not None for pending in shots] == [True, True, False]
@@ -449,7 +449,7 @@ def test_a_disk_that_fills_up_keeps_what_is_safe(small_disk: Path, here: Path) -
 
 
 @pytest.mark.parametrize("inside", ["", "/deeper"])
-def test_a_flights_folder_that_is_a_file(body: Body, here: Path, inside: str) -> None:
+def test_a_flights_folder_that_is_a_file(body: SimulatedBody, here: Path, inside: str) -> None:
     (here / "file").write_text("")
     sentence = raises_sentence(before(body, here, record={"directory": f"{here}/file{inside}"}))
     assert f"{here}/file" in sentence
@@ -458,17 +458,17 @@ def test_a_flights_folder_that_is_a_file(body: Body, here: Path, inside: str) ->
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_flights_folder_that_can_t_be_written(body: Body, here: Path) -> None:
+def test_a_flights_folder_that_can_t_be_written(body: SimulatedBody, here: Path) -> None:
     (here / "flights").mkdir(mode=0o500)
     assert "permission denied" in raises_sentence(before(body, here))
 
 
-def test_a_read_only_disk(body: Body, here: Path) -> None:
+def test_a_read_only_disk(body: SimulatedBody, here: Path) -> None:
     sentence = raises_sentence(before(body, here, record={"directory": "/proc/dappled"}))
     assert "/proc/dappled" in sentence
 
 
-def test_a_decoder_s_input_that_vanishes_leaves_no_flight(body: Body, here: Path, frame: Path) -> None:
+def test_a_decoder_s_input_that_vanishes_leaves_no_flight(body: SimulatedBody, here: Path, frame: Path) -> None:
     """The copy into the flight fails after the flight has begun."""
     white = here / "white.dng"
     white.write_bytes(frame.read_bytes())
@@ -482,7 +482,7 @@ def test_a_decoder_s_input_that_vanishes_leaves_no_flight(body: Body, here: Path
         assert daemon.shoot().frame is not None
 
 
-def test_two_daemons_on_one_flights_folder(body: Body, here: Path) -> None:
+def test_two_daemons_on_one_flights_folder(body: SimulatedBody, here: Path) -> None:
     with flying(before(body, here)) as daemon:
         sentence = raises_sentence(before(body, here, publish={"slices": f"ipc://{here}/t"}))
         assert f"process {os.getpid()}" in sentence
@@ -503,7 +503,7 @@ def dappled_run(config: Path, *words: str) -> subprocess.CompletedProcess[str]:
 class Daemon:
     """`dappled run` in a process of its own, before a body, with an interval of shots asked for over MAVLink."""
 
-    def __init__(self, body: Body, here: Path, **record: Any) -> None:
+    def __init__(self, body: SimulatedBody, here: Path, **record: Any) -> None:
         from dappled.daemon.camera_protocol.ground_client import GroundClient  # noqa: PLC0415  # only these two tests fly by radio
         from dappled.mocks.simulation import free_port  # noqa: PLC0415  # as above
 
@@ -538,7 +538,7 @@ class Daemon:
 
 def test_sigterm_in_the_middle_of_a_shot_finishes_the_frame(here: Path) -> None:
     with (
-        Body.start(BodyOptions(picture="pattern:100000:dng", delay_s=0.7)) as body,
+        SimulatedBody.start(BodyOptions(picture="pattern:100000:dng", delay_s=0.7)) as body,
         Daemon(body, here) as daemon,
     ):
         daemon.until_ready()
@@ -556,7 +556,7 @@ def test_sigterm_in_the_middle_of_a_shot_finishes_the_frame(here: Path) -> None:
 
 
 def test_a_killed_daemon_is_put_in_order_by_the_next(here: Path) -> None:
-    with Body.start(BodyOptions(picture="pattern:100000:dng", delay_s=0.3)) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:100000:dng", delay_s=0.3)) as body:
         with Daemon(body, here) as daemon:
             daemon.until_ready()
             (first,) = daemon.ground.capture(1, timeout_s=30)

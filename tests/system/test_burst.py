@@ -8,7 +8,7 @@ import pytest
 
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.flight import Frame, LedgerReader
-from dappled.mocks.body.body import Body, BodyOptions, pattern
+from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from tests.system.flying import eventually, flying, settings_of
 
 SIZE, SHOTS = 1_000_001, 5
@@ -18,7 +18,7 @@ def test_an_interval_of_0_s_is_a_burst_that_loses_and_doubles_nothing(sockets: P
     here = sockets / tmp_path.name[-12:]
     here.mkdir()
     with (
-        Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2")) as body,
+        SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2")) as body,
         flying(settings_of(here, camera={"port": body.port})) as daemon,
     ):
         daemon.until_ready()
@@ -43,7 +43,7 @@ def test_in_a_burst_each_shot_ends_once_whatever_the_body_does(sockets: Path, tm
     here = sockets / tmp_path.name[-12:]
     here.mkdir()
     with (
-        Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", delay_s=0.1)) as body,
+        SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", delay_s=0.1)) as body,
         flying(settings_of(here, camera={"port": body.port, "file_timeout_s": 20})) as daemon,
     ):
         daemon.until_ready()

@@ -19,7 +19,7 @@ import pytest
 
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.flight import LedgerReader
-from dappled.mocks.body.body import Body, BodyOptions, pattern
+from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from dappled.mocks.body.eos450d import thumbnail
 from tests.system.flying import Flying, eventually, flying, settings_of, told
 
@@ -37,12 +37,12 @@ def here(sockets: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def a_body(**options: Any) -> Body:
-    return Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", **options))
+def a_body(**options: Any) -> SimulatedBody:
+    return SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", **options))
 
 
 @contextmanager
-def daemon_before(here: Path, *bodies: Body, **camera: Any) -> Iterator[Flying]:
+def daemon_before(here: Path, *bodies: SimulatedBody, **camera: Any) -> Iterator[Flying]:
     """A daemon before these bodies, and a watch over its standing still; one good shot is behind it."""
     ports = ",".join(body.port for body in bodies)
     camera = {"port": ports, "file_timeout_s": 20, **camera}
@@ -114,7 +114,7 @@ def is_frame(daemon: Flying, index: int, release: int) -> None:
     assert path.read_bytes() == pattern(release, SIZE)
 
 
-def back_in_service(daemon: Flying, body: Body) -> None:
+def back_in_service(daemon: Flying, body: SimulatedBody) -> None:
     """The body is ready within the time that is asked for, and its next shot is its own."""
     eventually(lambda: daemon.camera == "ready", f"ready again: {daemon.problems}", BACK_S)
     pending = daemon.shoot()
@@ -299,7 +299,7 @@ def test_raw_and_jpeg(here: Path) -> None:
         assert (flight / jpeg.name).read_bytes() == thumbnail(1)
 
 
-def camera_process(body: Body) -> int:
+def camera_process(body: SimulatedBody) -> int:
     """The process that holds this body, a child of ours."""
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():

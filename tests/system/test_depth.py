@@ -22,7 +22,7 @@ import dappled
 from dappled.cli.calibrate.target import from_frames as targets_from_frames
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
-from dappled.mocks.scene.bench import Bench, Plane
+from dappled.mocks.scene.bench import Bench, TexturedPlane
 from dappled.mocks.scene.masked_camera import LEVEL, MaskedCamera, Truth, reference_camera
 from dappled.mocks.scene.synthesis import PASS, Grid
 from dappled.products.opened import OpenedFrame, OpenedLightField, with_ranging
@@ -62,14 +62,14 @@ def strips(camera: MaskedCamera, seed: int, metres: tuple[float, ...] = METRES) 
     finest = PASS * min(Grid.of(camera.sensor.shape, camera.lattice).half_band)
     quarter = width / 4
     left = [-width, *(-width / 2 + k * quarter for k in (1, 2, 3))]
-    near = [Plane(z, extent_mm=(-height, height, left[k], left[k + 1])) for k, z in enumerate(metres[:3])]
-    return replace(camera, scene=Bench.of(seed, (Plane(metres[3]), *near), camera.sensor.pitch_mm / finest))
+    near = [TexturedPlane(z, extent_mm=(-height, height, left[k], left[k + 1])) for k, z in enumerate(metres[:3])]
+    return replace(camera, scene=Bench.of(seed, (TexturedPlane(metres[3]), *near), camera.sensor.pitch_mm / finest))
 
 
 def target(camera: MaskedCamera, seed: int, metres: float) -> MaskedCamera:
     """One board that fills the picture."""
     finest = PASS * min(Grid.of(camera.sensor.shape, camera.lattice).half_band)
-    return replace(camera, scene=Bench.of(seed, (Plane(metres),), camera.sensor.pitch_mm / finest))
+    return replace(camera, scene=Bench.of(seed, (TexturedPlane(metres),), camera.sensor.pitch_mm / finest))
 
 
 @cache

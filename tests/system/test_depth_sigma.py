@@ -16,10 +16,10 @@ import tomli_w
 import dappled
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.mocks.autopilot.path import FlightPath
-from dappled.mocks.scene.bench import Bench, Plane
+from dappled.mocks.scene.bench import Bench, TexturedPlane
+from dappled.mocks.scene.landscape import noise
 from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 from dappled.mocks.scene.synthesis import PASS, Grid
-from dappled.mocks.scene.terrain import noise
 from dappled.products.opened import OpenedFrame
 from tests.simulated.calibration import from_frame
 from tests.system.test_depth import BORDER, CAMERA, MASK, SCALE, sampled, say, with_snr
@@ -58,11 +58,11 @@ class Case:
 
         def board(
             shift_px: float, extent_mm: tuple[float, float, float, float] | None = None, lean: float = 0
-        ) -> Plane:
+        ) -> TexturedPlane:
             mean = 0.4 + 0.05 * rng.standard_normal(3) + self.chroma * rng.uniform(-0.3, 0.3, 3)
             red, green, blue = (float(v) for v in np.clip(mean, 0.05, 0.6))
             metres = optics.depth_m(shift_px * pitch_mm, optics.mask.views_per_axis)
-            return Plane(metres, (red, green, blue), (0.6 * lean, -0.8 * lean), extent_mm, self.contrast)
+            return TexturedPlane(metres, (red, green, blue), (0.6 * lean, -0.8 * lean), extent_mm, self.contrast)
 
         if self.scene == "oblique":
             planes = [board(3.0, lean=0.75 * optics.focal_length_mm / width)]

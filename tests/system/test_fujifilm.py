@@ -17,7 +17,7 @@ from dappled.drivers.gphoto2 import client
 from dappled.drivers.mavlink.links import mavlink
 from dappled.drivers.wired import shutter_line
 from dappled.flight import LedgerReader, check, flight_report
-from dappled.mocks.body.body import Body, BodyOptions, pattern
+from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from dappled.mocks.simulation import free_port
 from tests.drivers.contract import content, until_shot_ends, until_state
 from tests.simulated.finepix import FinePix
@@ -208,7 +208,7 @@ def test_fired_by_the_autopilot_s_relay_and_the_ground_station_is_told(here: Pat
 
 
 @contextmanager
-def other_hand(body: Body) -> Iterator[Callable[[int], None]]:
+def other_hand(body: SimulatedBody) -> Iterator[Callable[[int], None]]:
     """Somebody else fires a body whose files lie on its card."""
     camera = client.open_camera({"port": body.port})
     camera.start()
@@ -224,13 +224,13 @@ def other_hand(body: Body) -> Iterator[Callable[[int], None]]:
         camera.stop()
 
 
-def outside(here: Path, body: Body, pickup: str) -> Any:
+def outside(here: Path, body: SimulatedBody, pickup: str) -> Any:
     return settings_of(here, camera={"driver": "fujifilm", "shutter": "outside", "port": "", "pickup": pickup})
 
 
 @pytest.mark.slow
 def test_files_are_picked_up_over_ptp_after_landing(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    with Body.start(BodyOptions(picture="pattern:200001:cr2", pairs=True, clock_offset_s=-7200.0)) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:200001:cr2", pairs=True, clock_offset_s=-7200.0)) as body:
         with other_hand(body) as press, flying(outside(here, body, "later")) as daemon:
             flight = daemon.service.folder
             for number in range(3):
@@ -251,7 +251,7 @@ def test_files_are_picked_up_over_ptp_after_landing(here: Path, capfd: pytest.Ca
 @pytest.mark.slow
 def test_files_are_picked_up_over_ptp_in_flight(here: Path) -> None:
     with (
-        Body.start(BodyOptions(picture="pattern:200001:cr2")) as body,
+        SimulatedBody.start(BodyOptions(picture="pattern:200001:cr2")) as body,
         flying(outside(here, body, body.port)) as daemon,
     ):
         body.fault("unplug")  # while it is fired it is no camera on the bus

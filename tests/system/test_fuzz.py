@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.body.ptp import init_command_ack
 from dappled.mocks.scene.masked_camera import reference_camera
 from tests.system.flying import eventually, flying, settings_of
@@ -84,7 +84,10 @@ def test_raw_files_of_noise_end_no_flight(tmp_path: Path) -> None:
         picture.write_bytes(bad)
         options = BodyOptions(picture=str(picture))
         tables = {"mask": {"profile": "reference-5x5"}, "record": {"directory": str(tmp_path / f"flights{turn}")}}
-        with Body.start(options) as body, flying(settings_of(tmp_path, camera={"port": body.port}, **tables)) as daemon:
+        with (
+            SimulatedBody.start(options) as body,
+            flying(settings_of(tmp_path, camera={"port": body.port}, **tables)) as daemon,
+        ):
             pending = daemon.shoot()
             assert pending.frame is not None
             assert (daemon.service.folder / pending.frame.name).read_bytes() == bytes(bad)

@@ -16,7 +16,7 @@ from dappled.drivers.mavlink import signing as mavlink_signing
 from dappled.drivers.mavlink.links import mavlink
 from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
 from dappled.flight import LedgerReader
-from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import Simulation, World, free_port
 from tests.daemon.camera_protocol.rig import Peer
 from tests.system.conftest import dappled
@@ -39,7 +39,7 @@ def shoot(peer: Peer, sequence: int) -> tuple[int, int]:
 
 
 def test_indices_go_on_and_every_photograph_of_an_earlier_flight_can_be_asked_for(tmp_path: Path) -> None:
-    with Body.start(BodyOptions(picture="pattern:50000:CR2")) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:50000:CR2")) as body:
         settings = settings_of(tmp_path, camera={"port": body.port}, mavlink={"url": URL})
         with flying(settings) as daemon, ground(daemon) as peer:
             peer.heartbeat()
@@ -62,7 +62,7 @@ def test_indices_go_on_and_every_photograph_of_an_earlier_flight_can_be_asked_fo
 def test_a_signed_link_through_a_restart(tmp_path: Path) -> None:
     mavlink_signing.make_key(tmp_path / "radio.key")
     key = mavlink_signing.read_key(tmp_path / "radio.key")
-    with Body.start(BodyOptions(picture="pattern:50000:CR2")) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:50000:CR2")) as body:
         settings = settings_of(
             tmp_path, camera={"port": body.port}, mavlink={"url": URL, "keys": [str(tmp_path / "radio.key")]}
         )
@@ -89,7 +89,7 @@ def test_a_signed_link_through_a_restart(tmp_path: Path) -> None:
 
 
 def test_a_pilot_is_told_of_a_camera_that_went_and_came_back(tmp_path: Path) -> None:
-    with Body.start(BodyOptions(picture="pattern:50000:CR2")) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:50000:CR2")) as body:
         settings = settings_of(tmp_path, camera={"port": body.port}, mavlink={"url": URL})
         with flying(settings) as daemon, ground(daemon) as peer:
             peer.heartbeat()

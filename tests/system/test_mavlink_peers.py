@@ -14,7 +14,7 @@ import pytest
 
 from dappled.flight import flight_report
 from dappled.mocks.autopilot.autopilot import Autopilot
-from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from tests.system.flying import Flying, eventually, flying, settings_of
 from tests.system.peers.mavproxy import PYTHON, MavProxy
 
@@ -46,7 +46,7 @@ class Camera:
 
 @pytest.fixture
 def camera(tmp_path: Path) -> Iterator[Camera]:
-    with Body.start(BodyOptions(picture="pattern:200000:CR2")) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:200000:CR2")) as body:
         links = ["udpin:127.0.0.1:0", "udpin:127.0.0.1:0"]
         with flying(settings_of(tmp_path, camera={"port": body.port}, mavlink={"url": links})) as daemon:
             daemon.until_ready()

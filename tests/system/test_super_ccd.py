@@ -12,7 +12,7 @@ from scipy import ndimage
 from dappled.cli import main
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.mocks.scene.synthesis import Grid
-from tests.simulated.super_ccd import Finepix
+from tests.simulated.super_ccd import MaskedFinePix
 
 MASK = "mask-2-full"
 MARGINS = 30, 4  # samples of the whole file outside of the active area, above and to the left
@@ -26,7 +26,7 @@ def _psnr(error: np.ndarray) -> float:
 
 @pytest.mark.parametrize("seed", [3])
 def test_a_masked_raf_is_calibrated_and_decoded(seed: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    body = Finepix(seed)
+    body = MaskedFinePix(seed)
     white, frame, calibration = tmp_path / "white.RAF", tmp_path / "frame.RAF", tmp_path / "calibration.toml"
     white.write_bytes(body.expose("white", 8 * WIDE_OPEN)[0])
     assert main(["calibrate", str(white), "--mask", MASK, "-o", str(calibration)]) == 0

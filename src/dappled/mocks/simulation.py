@@ -24,7 +24,7 @@ from dappled.decode.spectrum.plane import to_plane
 from dappled.drivers.raw import reading
 from dappled.mocks.autopilot.autopilot import Autopilot
 from dappled.mocks.autopilot.ground_station import GroundStation
-from dappled.mocks.body.body import Body, BodyOptions
+from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 
 LATENCY_MS, LATENCY_SIGMA_MS = 60.0, 15.0 / 3**0.5  # the body's is spread evenly over 60 ± 15 ms
@@ -58,7 +58,7 @@ class Simulation:
         camera = reference_camera(world.seed, scale=world.scale, scene="white")
         calibration = write_calibration(camera, self._folder)
         with ExitStack() as stack:
-            self.body = body = Body.start(
+            self.body = body = SimulatedBody.start(
                 BodyOptions(
                     seed=world.seed,
                     scale=world.scale,

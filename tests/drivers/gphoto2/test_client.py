@@ -23,7 +23,7 @@ from dappled.drivers.gphoto2.client import GPhoto2Camera, Spawn, open_camera, sp
 from dappled.drivers.gphoto2.messages import Before
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
 from dappled.drivers.process_channel import ProcessChannel
-from dappled.mocks.body.body import Body, BodyOptions, pattern
+from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from dappled.mocks.body.eos450d import thumbnail
 from tests.drivers.contract import (
     CameraContract,
@@ -43,13 +43,13 @@ Make = Callable[..., GPhoto2Camera]
 
 
 @pytest.fixture
-def body() -> Iterator[Body]:
-    with Body.start(BodyOptions(picture=f"pattern:{SIZE}:dng")) as body:
+def body() -> Iterator[SimulatedBody]:
+    with SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:dng")) as body:
         yield body
 
 
 @pytest.fixture
-def make(body: Body) -> Iterator[Make]:
+def make(body: SimulatedBody) -> Iterator[Make]:
     """Drivers for the body, all stopped at the end."""
     made: list[GPhoto2Camera] = []
 
@@ -105,7 +105,7 @@ class TestContractOfTheVirtualUsbCamera(CameraContract):
         camera.stop()
 
 
-def test_identity_is_what_the_body_says(make: Make, body: Body) -> None:
+def test_identity_is_what_the_body_says(make: Make, body: SimulatedBody) -> None:
     camera = make()
     camera.start()
     ready = until_state(camera, "ready")
@@ -114,7 +114,7 @@ def test_identity_is_what_the_body_says(make: Make, body: Body) -> None:
     assert (ready.identity.serial, ready.identity.port) == ("0830412345", body.port)
 
 
-def test_a_file_on_the_card_keeps_its_name_and_stays_until_released(ready: Make, body: Body) -> None:
+def test_a_file_on_the_card_keeps_its_name_and_stays_until_released(ready: Make, body: SimulatedBody) -> None:
     camera = ready(delete_after_download=True)
     camera.fire(0)
     arrival = arrived(camera, 0)
@@ -128,7 +128,7 @@ def test_a_file_on_the_card_keeps_its_name_and_stays_until_released(ready: Make,
     assert body.card == ["IMG_0002.DNG"]
 
 
-def test_by_default_the_card_is_left_alone(ready: Make, body: Body) -> None:
+def test_by_default_the_card_is_left_alone(ready: Make, body: SimulatedBody) -> None:
     camera = ready()
     for shot in range(2):
         camera.fire(shot)
@@ -152,7 +152,7 @@ def test_only_the_body_with_the_serial_number_is_taken(make: Make) -> None:
 
 
 def test_no_camera_says_what_to_do_and_goes_on_looking() -> None:
-    with Body.start(BodyOptions(picture="pattern:1000:jpg")) as gone:
+    with SimulatedBody.start(BodyOptions(picture="pattern:1000:jpg")) as gone:
         port = gone.port
     camera = open_camera({"port": port, "timeouts": {"retry_s": 0.05}})
     camera.start()
@@ -164,7 +164,7 @@ def test_no_camera_says_what_to_do_and_goes_on_looking() -> None:
         camera.stop()
 
 
-def test_a_camera_held_by_another_program_is_named_and_taken_when_it_is_free(make: Make, body: Body) -> None:
+def test_a_camera_held_by_another_program_is_named_and_taken_when_it_is_free(make: Make, body: SimulatedBody) -> None:
     body.fault("refuse")
     camera = make(timeouts={"retry_s": 0.05})
     camera.start()
@@ -174,7 +174,7 @@ def test_a_camera_held_by_another_program_is_named_and_taken_when_it_is_free(mak
 
 
 @pytest.mark.parametrize("target", ["card", "ram"])
-def test_a_busy_body_is_asked_again(ready: Make, body: Body, target: str) -> None:
+def test_a_busy_body_is_asked_again(ready: Make, body: SimulatedBody, target: str) -> None:
     camera = ready(capture_target=target)
     body.fault("busy 0.3")
     camera.fire(1)
@@ -183,7 +183,7 @@ def test_a_busy_body_is_asked_again(ready: Make, body: Body, target: str) -> Non
 
 
 @pytest.mark.slow
-def test_a_body_that_stays_busy_fails_the_shot_and_takes_the_next(ready: Make, body: Body) -> None:
+def test_a_body_that_stays_busy_fails_the_shot_and_takes_the_next(ready: Make, body: SimulatedBody) -> None:
     camera = ready(timeouts={"busy_s": 0.2})
     body.fault("busy")
     camera.fire(1)
@@ -193,7 +193,7 @@ def test_a_body_that_stays_busy_fails_the_shot_and_takes_the_next(ready: Make, b
     assert of_shots(_ended(until_shot_ends(camera, 2))) == [(Fired, 2), (Arrival, 2)]
 
 
-def test_a_refused_release_fails_the_shot_and_takes_the_next(ready: Make, body: Body) -> None:
+def test_a_refused_release_fails_the_shot_and_takes_the_next(ready: Make, body: SimulatedBody) -> None:
     camera = ready()
     body.fault("error")
     camera.fire(1)
@@ -202,7 +202,7 @@ def test_a_refused_release_fails_the_shot_and_takes_the_next(ready: Make, body: 
 
 
 def test_a_full_card_fails_the_shot_with_a_hint() -> None:
-    with Body.start(BodyOptions(picture="pattern:1000:cr2", card_bytes=1500)) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:1000:cr2", card_bytes=1500)) as body:
         camera = open_camera({"port": body.port})
         camera.start()
         try:
@@ -216,7 +216,7 @@ def test_a_full_card_fails_the_shot_with_a_hint() -> None:
             camera.stop()
 
 
-def test_a_lost_event_s_file_is_found_on_the_card(ready: Make, body: Body) -> None:
+def test_a_lost_event_s_file_is_found_on_the_card(ready: Make, body: SimulatedBody) -> None:
     camera = ready(timeouts={"complete_s": 0.2})
     camera.fire(1)
     _ended(until_shot_ends(camera, 1))
@@ -227,14 +227,14 @@ def test_a_lost_event_s_file_is_found_on_the_card(ready: Make, body: Body) -> No
     assert content(arrival) == pattern(2, SIZE)
 
 
-def test_a_lost_event_s_file_in_memory_fails_the_shot(ready: Make, body: Body) -> None:
+def test_a_lost_event_s_file_in_memory_fails_the_shot(ready: Make, body: SimulatedBody) -> None:
     camera = ready(capture_target="ram", timeouts={"file_s": 0.5})
     body.fault("no-event")
     camera.fire(1)
     assert "0.5 s" in failed(camera, 1)
 
 
-def test_a_file_of_the_wrong_length_is_asked_for_again(ready: Make, body: Body) -> None:
+def test_a_file_of_the_wrong_length_is_asked_for_again(ready: Make, body: SimulatedBody) -> None:
     camera = ready()
     body.fault("short")
     camera.fire(1)
@@ -242,7 +242,9 @@ def test_a_file_of_the_wrong_length_is_asked_for_again(ready: Make, body: Body) 
     assert content(arrival) == pattern(1, SIZE)
 
 
-def test_a_file_that_stays_of_the_wrong_length_fails_the_shot_and_stays_on_the_card(ready: Make, body: Body) -> None:
+def test_a_file_that_stays_of_the_wrong_length_fails_the_shot_and_stays_on_the_card(
+    ready: Make, body: SimulatedBody
+) -> None:
     camera = ready()
     body.fault("short 1000")
     camera.fire(1)
@@ -252,7 +254,7 @@ def test_a_file_that_stays_of_the_wrong_length_fails_the_shot_and_stays_on_the_c
     assert body.card == ["IMG_0001.DNG"]
 
 
-def test_a_link_dropped_while_idle_comes_back(ready: Make, body: Body) -> None:
+def test_a_link_dropped_while_idle_comes_back(ready: Make, body: SimulatedBody) -> None:
     camera = ready()
     body.fault("drop")
     assert until_state(camera, "faulted").reason
@@ -261,7 +263,7 @@ def test_a_link_dropped_while_idle_comes_back(ready: Make, body: Body) -> None:
     assert of_shots(_ended(until_shot_ends(camera, 1))) == [(Fired, 1), (Arrival, 1)]
 
 
-def test_a_link_dropped_in_mid_transfer_loses_no_file_on_the_card(ready: Make, body: Body) -> None:
+def test_a_link_dropped_in_mid_transfer_loses_no_file_on_the_card(ready: Make, body: SimulatedBody) -> None:
     camera = ready()
     body.fault("drop-transfer")
     camera.fire(1)
@@ -274,7 +276,7 @@ def test_a_link_dropped_in_mid_transfer_loses_no_file_on_the_card(ready: Make, b
 
 
 def test_a_link_dropped_in_mid_exposure_loses_no_file_on_the_card() -> None:
-    with Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", delay_s=0.5)) as body:
+    with SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", delay_s=0.5)) as body:
         camera = open_camera({"port": body.port})
         camera.start()
         try:
@@ -290,7 +292,7 @@ def test_a_link_dropped_in_mid_exposure_loses_no_file_on_the_card() -> None:
 
 
 @pytest.mark.slow
-def test_a_silent_body_costs_the_shot_and_the_process_but_not_the_camera(ready: Make, body: Body) -> None:
+def test_a_silent_body_costs_the_shot_and_the_process_but_not_the_camera(ready: Make, body: SimulatedBody) -> None:
     camera = ready(timeouts={"answer_s": 1.5})
     body.fault("silence")
     camera.fire(1)
@@ -302,7 +304,7 @@ def test_a_silent_body_costs_the_shot_and_the_process_but_not_the_camera(ready: 
 
 
 @pytest.mark.slow
-def test_a_silent_body_is_given_up_by_libgphoto2_itself_and_served_again(ready: Make, body: Body) -> None:
+def test_a_silent_body_is_given_up_by_libgphoto2_itself_and_served_again(ready: Make, body: SimulatedBody) -> None:
     camera = ready()
     body.fault("silence")
     camera.fire(1)
@@ -318,7 +320,7 @@ def test_a_silent_body_is_given_up_by_libgphoto2_itself_and_served_again(ready: 
 
 
 @pytest.mark.slow
-def test_stop_does_not_wait_for_a_silent_body(ready: Make, body: Body) -> None:
+def test_stop_does_not_wait_for_a_silent_body(ready: Make, body: SimulatedBody) -> None:
     camera = ready()
     body.fault("silence")
     camera.fire(1)
@@ -340,7 +342,7 @@ def _recorded(
     return spawn
 
 
-def test_a_crash_of_the_process_fails_its_shots_and_is_made_good(body: Body) -> None:
+def test_a_crash_of_the_process_fails_its_shots_and_is_made_good(body: SimulatedBody) -> None:
     body.fault("no-event")
     started: list[subprocess.Popen[bytes]] = []
     camera = GPhoto2Camera(parse_settings({"port": body.port}), spawn=_recorded(started))
@@ -360,7 +362,7 @@ def test_a_crash_of_the_process_fails_its_shots_and_is_made_good(body: Body) -> 
         camera.stop()
 
 
-def test_what_a_dead_process_had_fired_is_fetched_by_the_next_one(body: Body) -> None:
+def test_what_a_dead_process_had_fired_is_fetched_by_the_next_one(body: SimulatedBody) -> None:
     """Also when its file was on the card before the next process looked there for the first time."""
     started: list[subprocess.Popen[bytes]] = []
     camera = GPhoto2Camera(parse_settings({"port": body.port}), spawn=_recorded(started))
@@ -384,7 +386,7 @@ def test_what_a_dead_process_had_fired_is_fetched_by_the_next_one(body: Body) ->
 
 
 @pytest.mark.slow
-def test_a_process_that_keeps_dying_is_not_started_for_ever(body: Body) -> None:
+def test_a_process_that_keeps_dying_is_not_started_for_ever(body: SimulatedBody) -> None:
     started: list[subprocess.Popen[bytes]] = []
 
     def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
@@ -401,7 +403,7 @@ def test_a_process_that_keeps_dying_is_not_started_for_ever(body: Body) -> None:
         camera.stop()
 
 
-def test_the_process_dies_with_its_parent(body: Body) -> None:
+def test_the_process_dies_with_its_parent(body: SimulatedBody) -> None:
     """A parent that is killed can't say goodbye; its child must go all the same."""
     script = (
         "import sys\n"
@@ -465,7 +467,7 @@ def test_budget_allows_its_number_in_any_window() -> None:
 
 @pytest.mark.parametrize("target", ["card", "ram"])
 def test_raw_and_jpeg_are_one_frame_and_its_companion(target: str) -> None:
-    with Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", pairs=True)) as body:
+    with SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", pairs=True)) as body:
         camera = open_camera({"port": body.port, "capture_target": target, "delete_after_download": True})
         camera.start()
         try:
@@ -487,7 +489,7 @@ def test_raw_and_jpeg_are_one_frame_and_its_companion(target: str) -> None:
             camera.stop()
 
 
-def test_no_focus_fails_the_shot_soon_and_takes_the_next(ready: Make, body: Body) -> None:
+def test_no_focus_fails_the_shot_soon_and_takes_the_next(ready: Make, body: SimulatedBody) -> None:
     camera = ready(timeouts={"complete_s": 0.5})
     body.fault("no-focus")
     camera.fire(1)
@@ -496,7 +498,7 @@ def test_no_focus_fails_the_shot_soon_and_takes_the_next(ready: Make, body: Body
     assert of_shots(_ended(until_shot_ends(camera, 2))) == [(Fired, 2), (Arrival, 2)]
 
 
-def test_a_slow_transfer_is_waited_for(ready: Make, body: Body) -> None:
+def test_a_slow_transfer_is_waited_for(ready: Make, body: SimulatedBody) -> None:
     camera = ready(timeouts={"file_s": 1.0})
     body.fault("slow 1.5")
     camera.fire(1)
@@ -508,8 +510,8 @@ def test_a_slow_transfer_is_waited_for(ready: Make, body: Body) -> None:
 def test_of_two_bodies_of_one_model_the_one_with_the_serial_number_is_taken(wanted: str) -> None:
     numbers = ("0000000001", "0000000002")
     with (
-        Body.start(BodyOptions(picture="pattern:1000:cr2", serial=numbers[0])) as one,
-        Body.start(BodyOptions(picture="pattern:1000:cr2", serial=numbers[1])) as other,
+        SimulatedBody.start(BodyOptions(picture="pattern:1000:cr2", serial=numbers[0])) as one,
+        SimulatedBody.start(BodyOptions(picture="pattern:1000:cr2", serial=numbers[1])) as other,
     ):
         camera = open_camera({"port": f"{one.port},{other.port}", "serial": wanted})
         camera.start()
@@ -527,8 +529,8 @@ def test_of_two_bodies_of_one_model_the_one_with_the_serial_number_is_taken(want
 @pytest.mark.slow
 def test_after_a_break_the_same_body_is_taken_again_and_not_its_twin() -> None:
     with (
-        Body.start(BodyOptions(picture="pattern:1000:cr2", serial="0000000001")) as one,
-        Body.start(BodyOptions(picture="pattern:1000:cr2", serial="0000000002")) as other,
+        SimulatedBody.start(BodyOptions(picture="pattern:1000:cr2", serial="0000000001")) as one,
+        SimulatedBody.start(BodyOptions(picture="pattern:1000:cr2", serial="0000000002")) as other,
     ):
         one.fault("unplug")
         camera = open_camera({"port": f"{one.port},{other.port}", "timeouts": {"retry_s": 0.1}})
@@ -546,7 +548,7 @@ def test_after_a_break_the_same_body_is_taken_again_and_not_its_twin() -> None:
             camera.stop()
 
 
-def test_a_process_that_can_t_be_started_now_is_tried_again(body: Body) -> None:
+def test_a_process_that_can_t_be_started_now_is_tried_again(body: SimulatedBody) -> None:
     problems = [OSError(errno.EMFILE, os.strerror(errno.EMFILE)), OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))]
 
     def spawn(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
@@ -568,7 +570,7 @@ def test_a_process_that_can_t_be_started_now_is_tried_again(body: Body) -> None:
 
 
 def test_a_body_that_comes_back_under_another_address_is_found() -> None:
-    with Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", addresses=2)) as body:
+    with SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", addresses=2)) as body:
         camera = open_camera({"port": body.port, "timeouts": {"retry_s": 0.1}})
         camera.start()
         try:
@@ -588,7 +590,7 @@ def test_a_body_that_comes_back_under_another_address_is_found() -> None:
 
 
 @pytest.mark.slow
-def test_a_silent_body_on_usb_has_its_port_reset(body: Body) -> None:
+def test_a_silent_body_on_usb_has_its_port_reset(body: SimulatedBody) -> None:
     resets: list[str] = []
     settings = parse_settings({"port": body.port, "timeouts": {"answer_s": 1.5}})
     camera = GPhoto2Camera(settings, reset=resets.append)

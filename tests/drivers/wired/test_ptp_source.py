@@ -12,7 +12,7 @@ from dappled.drivers.camera import CameraError, Identity
 from dappled.drivers.wired import composed
 from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.ptp_source import PtpSource
-from dappled.mocks.body.body import Body, BodyOptions, pattern
+from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from tests.drivers.contract import CameraContract, Rig
 
 SIZE = 100_001
@@ -22,7 +22,7 @@ _PATIENCE_S = 20.0
 class Wire:
     """A line to the body's remote socket. The contact stays closed until the body, which may be busy, has fired."""
 
-    def __init__(self, body: Body) -> None:
+    def __init__(self, body: SimulatedBody) -> None:
         self._body = body
 
     def open(self) -> None: ...
@@ -44,7 +44,7 @@ class TestContractOfAWireAndPtp(CameraContract):
     @pytest.fixture
     def rig(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
         monkeypatch.setattr(composed, "_FIRST_LOOK_S", 60.0)  # one shot alone is sure only on a card seen before it
-        with Body.start(BodyOptions(picture=f"pattern:{SIZE}:cr2")) as body:
+        with SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2")) as body:
             plan = ComposedSettings(follows="it follows", hold_s=0.01, poll_s=0.1)
             identity = Identity("Canon", "EOS 450D", "", "wire")
             camera = ComposedCamera(identity, Wire(body), PtpSource(body.port), plan)

@@ -13,7 +13,7 @@ from dappled.drivers.camera import CameraError
 from dappled.drivers.gphoto2.client import open_camera
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import FileSource, FolderSource, FoundFile, StorageSource, groups, parse_source
-from dappled.mocks.body.body import Body, BodyOptions, pattern
+from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from tests.drivers.contract import content, until_shot_ends, until_state
 from tests.simulated.finepix import FinePix, picture
 
@@ -121,7 +121,7 @@ def test_sources_by_name(tmp_path: Path) -> None:
 
 
 def test_a_camera_in_ptp_mode_lists_and_sends_its_card() -> None:
-    with Body.start(BodyOptions(picture="pattern:300001:cr2", pairs=True)) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:300001:cr2", pairs=True)) as body:
         camera = open_camera({"port": body.port})
         camera.start()
         until_state(camera, "ready")
@@ -146,7 +146,7 @@ def test_a_camera_in_ptp_mode_lists_and_sends_its_card() -> None:
 
 
 def test_no_camera_in_ptp_mode_is_a_sentence() -> None:
-    with Body.start(BodyOptions(picture="pattern:1000:cr2")) as gone:
+    with SimulatedBody.start(BodyOptions(picture="pattern:1000:cr2")) as gone:
         port = gone.port
     source = PtpSource(port)
     with pytest.raises(CameraError, match="no camera answers"):

@@ -9,15 +9,15 @@ import pytest
 from dappled.mocks.autopilot.ground_station import GroundStation
 from tests.daemon.camera_protocol.rig import Camera
 from tests.daemon.fakes import eventually
-from tests.simulated.bad_link import BadLink, Faults
+from tests.simulated.bad_link import BadLink, LinkFaults
 
 
 @pytest.mark.parametrize(
     "faults",
-    [Faults(loss=0.1, doubles=0.3, late_s=0.1), Faults(garbage=0.5, torn=0.1, late_s=0.05)],
+    [LinkFaults(loss=0.1, doubles=0.3, late_s=0.1), LinkFaults(garbage=0.5, torn=0.1, late_s=0.05)],
     ids=["loses, doubles, reorders", "spoils"],
 )
-def test_a_bad_radio_makes_no_photograph_twice_and_loses_no_report(faults: Faults) -> None:
+def test_a_bad_radio_makes_no_photograph_twice_and_loses_no_report(faults: LinkFaults) -> None:
     """A wish whose four requests are all lost is told as not answered; that is the radio's right."""
     with Camera() as camera, BadLink(camera.links.port(0), faults) as radio:
         ground = GroundStation.start(f"udpout:127.0.0.1:{radio.port}", 4, timeout_s=40)

@@ -9,11 +9,11 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from dappled.mocks.body.body import Body, BodyError, BodyOptions, exposer, pattern
+from dappled.mocks.body.body import BodyError, BodyOptions, SimulatedBody, exposer, pattern
 
 
 def test_a_body_listens_obeys_and_ends() -> None:
-    with Body.start(BodyOptions(picture="pattern:1000:jpg", faults=("busy 1",))) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:1000:jpg", faults=("busy 1",))) as body:
         assert [body.port] == [f"ptpip:127.0.0.1:{port}:{port}" for port in body.tcp_ports]
         assert body.releases == 0
         assert body.card == []
@@ -25,11 +25,11 @@ def test_a_body_listens_obeys_and_ends() -> None:
 
 
 def test_a_wire_fires_a_body_that_nobody_is_connected_to_and_not_while_it_works() -> None:
-    with Body.start(BodyOptions(picture="pattern:1000:cr2", delay_s=20.0)) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:1000:cr2", delay_s=20.0)) as body:
         assert body.contact()
         assert not body.contact()
         assert body.releases == 1
-    with Body.start(BodyOptions(picture="pattern:1000:cr2")) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:1000:cr2")) as body:
         assert body.contact()
         deadline = time.monotonic() + 20
         while body.card != ["IMG_0001.CR2"]:
@@ -50,7 +50,7 @@ def test_a_body_ends_with_its_input() -> None:
 @pytest.mark.parametrize("options", [BodyOptions(picture="/nowhere.cr2"), BodyOptions("pattern:9:x", faults=("x",))])
 def test_a_body_that_can_not_start_says_so(options: BodyOptions, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(BodyError, match="did not start"):
-        Body.start(options)
+        SimulatedBody.start(options)
     assert "body: " in capfd.readouterr().err
 
 

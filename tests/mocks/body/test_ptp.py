@@ -17,7 +17,7 @@ u32 = st.integers(0, 2**32 - 1)
 def test_a_request_is_read_as_it_was_written(code: int, transaction: int, parameters: list[int]) -> None:
     raw = struct.pack(f"<IHI{len(parameters)}I", 1, code, transaction, *parameters)
     request = ptp.parse_request(raw)
-    assert request == ptp.Request(code, transaction, tuple(parameters))
+    assert request == ptp.PtpRequest(code, transaction, tuple(parameters))
     assert request.parameter(5, 17) == 17
 
 
@@ -30,8 +30,8 @@ def test_bytes_are_a_request_or_refused(raw: bytes) -> None:
             ptp.parse_request(raw)
 
 
-@given(st.sampled_from(ptp.Packet), st.binary(max_size=50))
-def test_a_packet_s_header_says_its_type_and_length(kind: ptp.Packet, payload: bytes) -> None:
+@given(st.sampled_from(ptp.PtpPacket), st.binary(max_size=50))
+def test_a_packet_s_header_says_its_type_and_length(kind: ptp.PtpPacket, payload: bytes) -> None:
     raw = ptp.packet(kind, payload)
     assert ptp.header(raw[:8]) == (kind, len(payload))
     assert raw[8:] == payload

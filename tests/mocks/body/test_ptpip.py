@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from dappled.mocks.body.eos450d import Eos450d
-from dappled.mocks.body.faults import Faults
+from dappled.mocks.body.faults import BodyFaults
 from dappled.mocks.body.ptpip import Responder
 
 OK, GENERAL_ERROR, NOT_OPEN, NOT_SUPPORTED, BAD_HANDLE, BUSY = 0x2001, 0x2002, 0x2003, 0x2005, 0x2009, 0x2019
@@ -26,7 +26,7 @@ DESTINATION = 0xD11C
 class Bench:
     """A body whose exposures end when the test says so."""
 
-    faults: Faults
+    faults: BodyFaults
     eos: Eos450d
     responder: Responder
     exposed: threading.Event
@@ -43,7 +43,7 @@ def bench() -> Iterator[Bench]:
         assert exposed.wait(20)
         return f"picture {shot_number}".encode() * 10000, "dng"
 
-    faults = Faults(time.monotonic_ns)
+    faults = BodyFaults(time.monotonic_ns)
     eos = Eos450d(expose, faults)
     responder = Responder(eos, faults)
     yield Bench(faults, eos, responder, exposed, triggers)

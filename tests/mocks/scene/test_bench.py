@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dappled.decode.optics.masks import Mask
-from dappled.mocks.scene.bench import Bench, Plane, RealViews, WhiteCard
+from dappled.mocks.scene.bench import Bench, RealViews, TexturedPlane, WhiteCard
 from dappled.mocks.scene.lens import Optics, Rays
 
 OPTICS = Optics(50.0, 7.4, 6.7, Mask(15.5, 2), 0.48)
@@ -42,7 +42,7 @@ def test_neighbouring_views_of_a_board_differ_by_what_its_distance_says(focus_m:
     optics = replace(OPTICS, focus_m=focus_m)
     distance = optics.depth_m(0.03, 5)  # 3 px of 10 µm
     points = optics.aperture_points_mm(7.4)
-    bench = Bench.of(1, (Plane(distance),), 0.2)
+    bench = Bench.of(1, (TexturedPlane(distance),), 0.2)
     seen = bench.render(rays(points[2, 2:4], focus_m), None)
     down = bench.render(rays(points[2:4, 2], focus_m), None)
     rows, columns = shift_of(seen.radiance[1, 1], seen.radiance[0, 1])
@@ -52,7 +52,7 @@ def test_neighbouring_views_of_a_board_differ_by_what_its_distance_says(focus_m:
 
 
 def test_a_nearer_board_hides_the_backdrop_and_says_its_depth() -> None:
-    bench = Bench.of(1, (Plane(3.0), Plane(2.0, extent_mm=(-2.0, 2.0, -3.0, 1.0))), 0.2)
+    bench = Bench.of(1, (TexturedPlane(3.0), TexturedPlane(2.0, extent_mm=(-2.0, 2.0, -3.0, 1.0))), 0.2)
     look = rays(np.array([[0.0, 0.0]]))
     depth = bench.render(look, None).depth_m
     assert depth is not None
@@ -63,7 +63,10 @@ def test_a_nearer_board_hides_the_backdrop_and_says_its_depth() -> None:
 
 
 def test_the_edge_of_a_board_moves_with_the_board() -> None:
-    flat = (Plane(3.0, (0.1, 0.1, 0.1), contrast=0), Plane(2.0, (0.9, 0.9, 0.9), extent_mm=(-2, 2, -2, 2), contrast=0))
+    flat = (
+        TexturedPlane(3.0, (0.1, 0.1, 0.1), contrast=0),
+        TexturedPlane(2.0, (0.9, 0.9, 0.9), extent_mm=(-2, 2, -2, 2), contrast=0),
+    )
     theta = 30.0
     seen = Bench.of(1, flat, 0.2).render(rays(np.array([[0.0, 0.0], [0.0, theta]])), None).radiance[:, 1, 100]
     edges = [float((line > 0.5).argmax()) for line in seen]
@@ -72,12 +75,12 @@ def test_the_edge_of_a_board_moves_with_the_board() -> None:
 
 def test_a_leaning_board_lies_in_its_plane() -> None:
     look = rays(np.zeros((1, 2)))
-    depth = Bench.of(1, (Plane(2.0, tilt=(0.5, -0.8)),), 0.2).render(look, None).depth_m
+    depth = Bench.of(1, (TexturedPlane(2.0, tilt=(0.5, -0.8)),), 0.2).render(look, None).depth_m
     assert depth is not None
     y, x = look.y_mm[:, None] / 50 * depth, look.x_mm[None, :] / 50 * depth
     np.testing.assert_allclose(depth, 2.0 + 0.5 * y - 0.8 * x, rtol=1e-5)
     with pytest.raises(ValueError, match="tilted along the view"):
-        Bench.of(1, (Plane(2.0, tilt=(0.0, 10.0)),), 0.2).render(look, None)
+        Bench.of(1, (TexturedPlane(2.0, tilt=(0.0, 10.0)),), 0.2).render(look, None)
 
 
 def test_a_white_card_is_white() -> None:

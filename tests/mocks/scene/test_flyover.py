@@ -11,15 +11,16 @@ from numpy.typing import NDArray
 from dappled.decode.geometry.interpolation import from_euler
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.scene import flyover
-from dappled.mocks.scene.flyover import Terrain
+from dappled.mocks.scene.flyover import TerrainScene
 from dappled.mocks.scene.lens import Rays
+from tests.mocks.scene import oracles
 
 V_MM = 50.0
 
 
 @pytest.fixture(scope="module")
-def terrain() -> Terrain:
-    return Terrain.of(3)
+def terrain() -> TerrainScene:
+    return TerrainScene.of(3)
 
 
 def rays(points: NDArray[np.float64] | None = None, step_mm: float = 0.1) -> Rays:
@@ -48,12 +49,12 @@ def bowtie_centre(grey: NDArray[np.float32], near: tuple[float, float]) -> tuple
     return found
 
 
-def test_painted_targets_are_found_where_the_pose_projects_them(terrain: Terrain) -> None:
+def test_painted_targets_are_found_where_the_pose_projects_them(terrain: TerrainScene) -> None:
     seen = 0
     for number, target in enumerate(terrain.ground.targets):
         pose = above(target.north_m + 1.0, target.east_m - 0.8, 12.0, roll=0.06, pitch=-0.04, yaw=0.7 * number)
         look = rays()
-        y, x = flyover.project(pose, (target.north_m, target.east_m, -target.height_m), V_MM)
+        y, x = oracles.place_on_sensor_mm(pose, (target.north_m, target.east_m, -target.height_m), V_MM)
         expected = (y - look.y_mm[0]) / 0.1, (x - look.x_mm[0]) / 0.1
         grey = terrain.render(look, pose).radiance[0].mean(axis=0)
         row, column = bowtie_centre(grey, expected)
@@ -65,15 +66,15 @@ def test_painted_targets_are_found_where_the_pose_projects_them(terrain: Terrain
 
 def test_the_top_of_the_picture_is_the_nose_and_the_right_is_the_right() -> None:
     north_facing = above(0, 0, 12.0)
-    assert flyover.project(north_facing, (2.0, 0.0, 0.0), V_MM)[0] < 0
-    assert flyover.project(north_facing, (0.0, 2.0, 0.0), V_MM)[1] > 0
+    assert oracles.place_on_sensor_mm(north_facing, (2.0, 0.0, 0.0), V_MM)[0] < 0
+    assert oracles.place_on_sensor_mm(north_facing, (0.0, 2.0, 0.0), V_MM)[1] > 0
     east_facing = above(0, 0, 12.0, yaw=math.pi / 2)
-    assert flyover.project(east_facing, (0.0, 2.0, 0.0), V_MM)[0] < 0
+    assert oracles.place_on_sensor_mm(east_facing, (0.0, 2.0, 0.0), V_MM)[0] < 0
     with pytest.raises(ValueError, match="not below"):
-        flyover.project(north_facing, (0.0, 0.0, -20.0), V_MM)
+        oracles.place_on_sensor_mm(north_facing, (0.0, 0.0, -20.0), V_MM)
 
 
-def test_depth_times_ray_lies_on_the_ground(terrain: Terrain) -> None:
+def test_depth_times_ray_lies_on_the_ground(terrain: TerrainScene) -> None:
     pose = FlightPath(3).pose(12.0)
     look = rays(step_mm=0.2)
     depth = terrain.render(look, pose).depth_m
@@ -90,7 +91,7 @@ def test_depth_times_ray_lies_on_the_ground(terrain: Terrain) -> None:
     assert np.median(error) < 0.01
 
 
-def test_another_aperture_point_sees_the_ground_shifted_by_its_parallax(terrain: Terrain) -> None:
+def test_another_aperture_point_sees_the_ground_shifted_by_its_parallax(terrain: TerrainScene) -> None:
     # 40 cm apart and focused at infinity, 12 m above flat ground: v/Z of it on the sensor
     pose = above(5.0, -3.0, 14.0)
     centre = terrain.render(rays(), pose)
@@ -105,7 +106,7 @@ def test_another_aperture_point_sees_the_ground_shifted_by_its_parallax(terrain:
     assert other[0, 1] < same[0, 1] - 0.2
 
 
-def test_bad_views_of_the_ground_are_refused(terrain: Terrain) -> None:
+def test_bad_views_of_the_ground_are_refused(terrain: TerrainScene) -> None:
     with pytest.raises(ValueError, match="path"):
         terrain.render(rays(), None)
     with pytest.raises(ValueError, match="horizon"):
@@ -114,14 +115,14 @@ def test_bad_views_of_the_ground_are_refused(terrain: Terrain) -> None:
         terrain.render(rays(), above(0, 0, -3.0))
 
 
-def test_the_same_seed_builds_the_same_ground(terrain: Terrain) -> None:
-    again = Terrain.of(3).ground
+def test_the_same_seed_builds_the_same_ground(terrain: TerrainScene) -> None:
+    again = TerrainScene.of(3).ground
     np.testing.assert_array_equal(again.relief, terrain.ground.relief)
     np.testing.assert_array_equal(again.albedo, terrain.ground.albedo)
     assert again.targets == terrain.ground.targets
 
 
-def test_no_texture_is_finer_than_asked_for(terrain: Terrain) -> None:
+def test_no_texture_is_finer_than_asked_for(terrain: TerrainScene) -> None:
     detail = terrain.ground.detail
     spectrum = np.abs(np.fft.rfft2(detail)) ** 2
     frequency = np.hypot(np.fft.fftfreq(len(detail), 0.0125)[:, None], np.fft.rfftfreq(len(detail), 0.0125)[None, :])

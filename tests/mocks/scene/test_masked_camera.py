@@ -12,14 +12,15 @@ import pytest
 import rawpy
 from numpy.typing import NDArray
 
-from dappled.mocks.scene.masked_camera import Exposure, MaskedCamera, SensorModel, Truth, reference_camera
+from dappled.mocks.scene.masked_camera import MaskedCamera, SensorModel, SimulatedExposure, Truth, reference_camera
+from tests.mocks.scene import oracles
 
 
 def quiet(sensor: SensorModel) -> SensorModel:
     return replace(sensor, shot_noise=False, read_noise_e=0.0)
 
 
-def plane_of(camera: MaskedCamera, exposure: Exposure) -> NDArray[np.float64]:
+def plane_of(camera: MaskedCamera, exposure: SimulatedExposure) -> NDArray[np.float64]:
     sensor = camera.sensor
     return np.asarray((exposure.raw.astype(np.float64) - sensor.black) / (sensor.white - sensor.black))
 
@@ -165,8 +166,8 @@ def test_an_oracle_decodes_the_views_from_the_noisy_bench_frame(bench: MaskedCam
     k, h, w = slices.shape
     n = truth.mask.views_per_axis
 
-    plain = angular_matrix(truth, truth.view_points_mm(n)).conj().T @ slices.reshape(k, -1)
-    expected = inside(truth.band_views(n))
+    plain = angular_matrix(truth, oracles.view_points_mm(truth, n)).conj().T @ slices.reshape(k, -1)
+    expected = inside(oracles.band_views(truth, n))
     assert psnr(inside(plain.real.reshape(n, n, h, w)), expected) > 32
 
     # with the aperture's true size known, the aperture's own samples come back
@@ -183,9 +184,9 @@ def test_projected_on_an_ideal_mask_the_views_are_themselves(bench: MaskedCamera
     n, points = 5, truth.aperture_points_mm
     spacing = points[1, 1, 0] - points[0, 0, 0]
     ideal = replace(truth, angular_frequency_per_mm=1 / (n * spacing), mask_rotation_rad=0.0)
-    np.testing.assert_allclose(ideal.view_points_mm(n), points, atol=1e-12)
-    np.testing.assert_allclose(ideal.band_views(n), truth.views, atol=1e-5)
-    np.testing.assert_allclose(truth.band_views(n).mean(), truth.views.mean(), rtol=0.02)
+    np.testing.assert_allclose(oracles.view_points_mm(ideal, n), points, atol=1e-12)
+    np.testing.assert_allclose(oracles.band_views(ideal, n), truth.views, atol=1e-5)
+    np.testing.assert_allclose(oracles.band_views(truth, n).mean(), truth.views.mean(), rtol=0.02)
 
 
 def test_truth_is_saved_without_what_is_not_known(bench: MaskedCamera, flying: MaskedCamera, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from dappled.mocks.scene import lens
 from dappled.mocks.scene.lens import Installation, Optics, Rays, Rendering
 from dappled.mocks.scene.masked_camera import MaskedCamera, SensorModel
 from dappled.mocks.scene.synthesis import MARGIN, SITES, Grid, band_limited
+from tests.mocks.scene import oracles
 
 Array = NDArray[np.floating]
 SENSOR = SensorModel((180, 230), 0.01)
@@ -66,7 +67,7 @@ def ray_sum(optics: Optics, f_number: float, lattice: Lattice | None = None) -> 
         else:
             matrix = lattice.matrix() / optics.mask.frequency_per_mm
             at = [matrix[i, 0] * rows[:, None] + matrix[i, 1] * columns[None, :] + aside[i] for i in (0, 1)]
-        through = lens.mask_values(optics.mask, at[0], at[1])
+        through = oracles.mask_values(optics.mask, at[0], at[1])
         for (top, left), channel in SITES:
             light = Waves().value(channel, y[top::2], x[:, left::2], theta)
             frame[top::2, left::2] += light * through[top::2, left::2]
@@ -83,7 +84,7 @@ def quick(optics: Optics, f_number: float) -> tuple[Array, Lattice]:
 
 def mean_transmission(mask: Mask) -> float:
     axis = np.arange(256) / 256 / mask.frequency_per_mm
-    return float(lens.mask_values(mask, axis[:, None], axis[None, :]).mean())
+    return float(oracles.mask_values(mask, axis[:, None], axis[None, :]).mean())
 
 
 @pytest.mark.parametrize(

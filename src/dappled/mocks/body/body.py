@@ -17,7 +17,7 @@ from pathlib import Path
 from dappled.errors import DappledError
 from dappled.mocks.body.eos450d import SERIAL, Eos450d, Expose
 from dappled.mocks.body.eos_card import CARD_BYTES
-from dappled.mocks.body.faults import Faults
+from dappled.mocks.body.faults import BodyFaults
 from dappled.mocks.body.ptpip import Responder
 
 _START_S = 30.0
@@ -79,7 +79,7 @@ class BodyOptions:
         return [*given, *(text for fault in self.faults for text in ("--fault", fault))]
 
 
-class Body:
+class SimulatedBody:
     """A running body. `start` returns once it listens; use it as a context manager or call `stop`."""
 
     def __init__(self, process: subprocess.Popen[bytes], lines: _Lines, ports: list[int]) -> None:
@@ -88,7 +88,7 @@ class Body:
         self.tcp_ports = ports
 
     @classmethod
-    def start(cls, options: BodyOptions | None = None) -> Body:
+    def start(cls, options: BodyOptions | None = None) -> SimulatedBody:
         """Start a body's process. Raises BodyError where it doesn't listen within 30 s."""
         command = [sys.executable, "-m", "dappled.mocks.body.body", *(options or BodyOptions()).arguments()]
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
@@ -144,7 +144,7 @@ class Body:
         """End the process; returns when it is gone."""
         _end(self._process)
 
-    def __enter__(self) -> Body:
+    def __enter__(self) -> SimulatedBody:
         return self
 
     def __exit__(self, *_exc: object) -> None:
@@ -239,7 +239,7 @@ def _simulated(options: BodyOptions) -> Expose:
     return expose
 
 
-def _obey(line: str, eos: Eos450d, responder: Responder, faults: Faults) -> str:
+def _obey(line: str, eos: Eos450d, responder: Responder, faults: BodyFaults) -> str:
     if line == "releases":
         return f"ok {eos.releases}"
     if line == "contact":
@@ -284,7 +284,7 @@ def _say(text: str) -> None:
 
 def serve(options: BodyOptions, lines: Iterable[str]) -> None:
     """Be a body until the lines end."""
-    faults = Faults(time.monotonic_ns)
+    faults = BodyFaults(time.monotonic_ns)
     for fault in options.faults:
         faults.command(fault)
     eos = Eos450d(

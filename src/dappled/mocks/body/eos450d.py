@@ -21,8 +21,8 @@ from PIL import Image
 
 from dappled.mocks.body import ptp
 from dappled.mocks.body.eos_card import CARD_BYTES, FOLDER, STORAGE, Card, StoredObject
-from dappled.mocks.body.faults import Faults
-from dappled.mocks.body.ptp import Answer, Code, EosEvent, Format, Handler, Op, Request
+from dappled.mocks.body.faults import BodyFaults
+from dappled.mocks.body.ptp import Code, EosEvent, Format, Handler, Op, PtpRequest, PtpResponse
 
 Expose: TypeAlias = Callable[[int, int], tuple[bytes, str]]
 """(trigger_monotonic_ns, shot_number) -> (the file's bytes, its extension without a dot)."""
@@ -45,7 +45,7 @@ class Eos450d:
     def __init__(
         self,
         expose: Expose,
-        faults: Faults,
+        faults: BodyFaults,
         *,
         serial: str = SERIAL,
         card_bytes: int = CARD_BYTES,
@@ -93,7 +93,7 @@ class Eos450d:
     def contact(self) -> bool:
         """The contact of its remote socket closes: an exposure, whoever is connected. False where it makes none."""
         with self._lock:
-            return self._release(Request(Op.EOS_REMOTE_RELEASE, 0, ()), b"").code == Code.OK
+            return self._release(PtpRequest(Op.EOS_REMOTE_RELEASE, 0, ()), b"").code == Code.OK
 
     def disconnected(self) -> None:
         """The link is gone: the session with it; the card, and what the body works on, stay."""
@@ -101,20 +101,20 @@ class Eos450d:
             self._session = False
             self._properties.forget_events()
 
-    def answer(self, request: Request, data: bytes) -> Answer:
+    def answer(self, request: PtpRequest, data: bytes) -> PtpResponse:
         """The body's answer to one transaction; `data` is what came with it."""
         handler = self._handlers.get(request.code)
         if handler is None:
-            return Answer(Code.OPERATION_NOT_SUPPORTED)
+            return PtpResponse(Code.OPERATION_NOT_SUPPORTED)
         with self._lock:
             if not self._session and request.code not in (Op.GET_DEVICE_INFO, Op.OPEN_SESSION):
-                return Answer(Code.SESSION_NOT_OPEN)
+                return PtpResponse(Code.SESSION_NOT_OPEN)
             return handler(request, data)
 
     # --- identity and session
 
-    def _device_info(self, _request: Request, _data: bytes) -> Answer:
-        return Answer(
+    def _device_info(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
+        return PtpResponse(
             data=ptp.device_info(
                 model=MODEL,
                 version="3-1.0.4",
@@ -126,52 +126,52 @@ class Eos450d:
             )
         )
 
-    def _eos_device_info(self, _request: Request, _data: bytes) -> Answer:
-        return Answer(data=ptp.eos_device_info(tuple(EosEvent), tuple(Prop)))
+    def _eos_device_info(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
+        return PtpResponse(data=ptp.eos_device_info(tuple(EosEvent), tuple(Prop)))
 
-    def _prop_desc(self, request: Request, _data: bytes) -> Answer:
+    def _prop_desc(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         prop = request.parameter(0)
         texts = {0xD402: MODEL, 0xD406: "Unknown Initiator"}
         if prop in texts:
             value = ptp.string(texts[prop])
-            return Answer(data=struct.pack("<HHB", prop, 0xFFFF, 0) + value + value + b"\0")
+            return PtpResponse(data=struct.pack("<HHB", prop, 0xFFFF, 0) + value + value + b"\0")
         if prop == 0xD407:
-            return Answer(data=struct.pack("<HHBIIB", prop, 6, 0, 1, 1, 0))
-        return Answer(Code.DEVICE_PROP_NOT_SUPPORTED)
+            return PtpResponse(data=struct.pack("<HHBIIB", prop, 6, 0, 1, 1, 0))
+        return PtpResponse(Code.DEVICE_PROP_NOT_SUPPORTED)
 
-    def _open(self, _request: Request, _data: bytes) -> Answer:
+    def _open(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
         if self._session:
-            return Answer(Code.SESSION_ALREADY_OPEN)
+            return PtpResponse(Code.SESSION_ALREADY_OPEN)
         self._session = True
-        return Answer()
+        return PtpResponse()
 
-    def _close(self, _request: Request, _data: bytes) -> Answer:
+    def _close(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
         self._session = False
-        return Answer()
+        return PtpResponse()
 
-    def _nothing(self, _request: Request, _data: bytes) -> Answer:
-        return Answer()
+    def _nothing(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
+        return PtpResponse()
 
     # --- captures
 
-    def _release(self, _request: Request, _data: bytes) -> Answer:
+    def _release(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
         triggered_ns = self._clock_ns()
         if self._working or self._faults.lasts("busy"):
-            return Answer(Code.DEVICE_BUSY)
+            return PtpResponse(Code.DEVICE_BUSY)
         if self._faults.take("error"):
-            return Answer(Code.GENERAL_ERROR)
+            return PtpResponse(Code.GENERAL_ERROR)
         to_memory = self._properties.to_memory
         full = not to_memory and (self._card.full or self._faults.lasts("full"))
         if full or not self._properties.shots_left:
             # A real body says OK and parameter 7, which libgphoto2 reads over USB only: its PTP/IP drops parameters.
-            return Answer(Code.STORE_FULL)
+            return PtpResponse(Code.STORE_FULL)
         self._working = True
         self._releases += 1
         self._properties.announce(ptp.eos_status(1))
         work = (triggered_ns, self._releases, to_memory)
         capture = self._hunt if self._faults.take("no-focus") else self._capture
         threading.Thread(target=capture, args=work, name="capture", daemon=True).start()
-        return Answer(parameters=(0,))
+        return PtpResponse(parameters=(0,))
 
     def _hunt(self, _triggered_ns: int, _number: int, _to_memory: bool) -> None:
         """The autofocus finds nothing, and no picture is taken."""
@@ -312,46 +312,46 @@ class Properties:
             Op.EOS_PC_HDD_CAPACITY: self._room,
         }
 
-    def _event_mode(self, request: Request, _data: bytes) -> Answer:
+    def _event_mode(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         if request.parameter(0):
             self.forget_events()
             self.announce(*(ptp.eos_property(prop, value) for prop, value in self._values.items()))
             self.announce(*(ptp.eos_choices(prop, len(values), values) for prop, values in _CHOICES.items()))
             flat = [word for each in _FORMATS for word in each]
             self.announce(ptp.eos_choices(Prop.IMAGE_FORMAT, len(_FORMATS), flat))
-        return Answer()
+        return PtpResponse()
 
-    def _get_event(self, _request: Request, _data: bytes) -> Answer:
+    def _get_event(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
         records = tuple(self._events)
         self.forget_events()
-        return Answer(data=ptp.eos_events(records))
+        return PtpResponse(data=ptp.eos_events(records))
 
-    def _request(self, request: Request, _data: bytes) -> Answer:
+    def _request(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         prop = request.parameter(0)
         if prop not in self._values:
-            return Answer(Code.GENERAL_ERROR)
+            return PtpResponse(Code.GENERAL_ERROR)
         self.announce(ptp.eos_property(prop, self._values[prop]))
-        return Answer()
+        return PtpResponse()
 
-    def _set(self, _request: Request, data: bytes) -> Answer:
+    def _set(self, _request: PtpRequest, data: bytes) -> PtpResponse:
         if len(data) < 12:
-            return Answer(Code.GENERAL_ERROR)
+            return PtpResponse(Code.GENERAL_ERROR)
         _size, prop = struct.unpack_from("<II", data)
         if prop not in self._values:
-            return Answer(Code.DEVICE_PROP_NOT_SUPPORTED)
+            return PtpResponse(Code.DEVICE_PROP_NOT_SUPPORTED)
         value = data[8:]
         if prop in _CHOICES and struct.unpack_from("<I", value)[0] not in _CHOICES[Prop(prop)]:
-            return Answer(Code.GENERAL_ERROR)
+            return PtpResponse(Code.GENERAL_ERROR)
         if prop == Prop.IMAGE_FORMAT and value not in map(_words, _FORMATS):
-            return Answer(Code.GENERAL_ERROR)
+            return PtpResponse(Code.GENERAL_ERROR)
         self._put(prop, value)
         if prop == Prop.CAPTURE_DESTINATION:
             self._put(Prop.AVAILABLE_SHOTS, _u32(0 if self.to_memory else 100))
-        return Answer()
+        return PtpResponse()
 
-    def _room(self, request: Request, _data: bytes) -> Answer:
+    def _room(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         self._put(Prop.AVAILABLE_SHOTS, _u32(min(request.parameter(0) // 4096, 9999)))
-        return Answer()
+        return PtpResponse()
 
     def _put(self, prop: int, value: bytes) -> None:
         self._values[prop] = value

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from dappled.mocks.body import ptp
-from dappled.mocks.body.faults import Faults
-from dappled.mocks.body.ptp import Answer, Code, Format, Handler, Op, Request
+from dappled.mocks.body.faults import BodyFaults
+from dappled.mocks.body.ptp import Code, Format, Handler, Op, PtpRequest, PtpResponse
 
 CARD_BYTES = 512 << 20
 """A card for about a hundred small frames: it lies in this process' memory."""
@@ -37,7 +37,7 @@ class StoredObject:
 class Card:
     """All objects of a body. Whoever calls holds the body's lock. The fault "short" cuts an object's data."""
 
-    def __init__(self, size: int, faults: Faults, unix_s: int) -> None:
+    def __init__(self, size: int, faults: BodyFaults, unix_s: int) -> None:
         self._size = size
         self._faults = faults
         self._frame_bytes = 0  # of the largest so far: room for one more like it is asked for
@@ -89,11 +89,11 @@ class Card:
         used = sum(len(each.data) for each in self._objects.values())
         return max(self._size - used, 0)
 
-    def _storage_ids(self, _request: Request, _data: bytes) -> Answer:
-        return Answer(data=ptp.array32((STORAGE,)))
+    def _storage_ids(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
+        return PtpResponse(data=ptp.array32((STORAGE,)))
 
-    def _storage_info(self, _request: Request, _data: bytes) -> Answer:
-        return Answer(data=ptp.storage_info(self._size, self._free()))
+    def _storage_info(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
+        return PtpResponse(data=ptp.storage_info(self._size, self._free()))
 
     def _children(self, parent: int) -> list[StoredObject]:
         folder = 0 if parent == ptp.ROOT else parent
@@ -102,17 +102,17 @@ class Card:
     def _found(self, parent: int) -> list[StoredObject]:
         return list(self._objects.values()) if parent == 0 else self._children(parent)
 
-    def _handles(self, request: Request, _data: bytes) -> Answer:
-        return Answer(data=ptp.array32(each.handle for each in self._found(request.parameter(2))))
+    def _handles(self, request: PtpRequest, _data: bytes) -> PtpResponse:
+        return PtpResponse(data=ptp.array32(each.handle for each in self._found(request.parameter(2))))
 
-    def _count(self, request: Request, _data: bytes) -> Answer:
-        return Answer(parameters=(len(self._found(request.parameter(2))),))
+    def _count(self, request: PtpRequest, _data: bytes) -> PtpResponse:
+        return PtpResponse(parameters=(len(self._found(request.parameter(2))),))
 
-    def _info(self, request: Request, _data: bytes) -> Answer:
+    def _info(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         found = self._objects.get(request.parameter(0))
         if found is None:
-            return Answer(Code.INVALID_OBJECT_HANDLE)
-        return Answer(
+            return PtpResponse(Code.INVALID_OBJECT_HANDLE)
+        return PtpResponse(
             data=ptp.object_info(
                 storage=STORAGE,
                 code=found.code,
@@ -123,26 +123,26 @@ class Card:
             )
         )
 
-    def _folder(self, request: Request, _data: bytes) -> Answer:
+    def _folder(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         rows = self._children(request.parameter(1))
-        return Answer(
+        return PtpResponse(
             data=ptp.eos_folder(
                 (each.handle, STORAGE, each.code, len(each.data), each.parent, each.name, each.unix_s) for each in rows
             )
         )
 
-    def _whole(self, request: Request, _data: bytes) -> Answer:
+    def _whole(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         found = self._objects.get(request.parameter(0))
         if found is None:
-            return Answer(Code.INVALID_OBJECT_HANDLE)
-        return Answer(data=self._sent(found, 0, len(found.data)))
+            return PtpResponse(Code.INVALID_OBJECT_HANDLE)
+        return PtpResponse(data=self._sent(found, 0, len(found.data)))
 
-    def _part(self, request: Request, _data: bytes) -> Answer:
+    def _part(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         found = self._objects.get(request.parameter(0))
         if found is None:
-            return Answer(Code.INVALID_OBJECT_HANDLE)
+            return PtpResponse(Code.INVALID_OBJECT_HANDLE)
         piece = self._sent(found, request.parameter(1), request.parameter(2))
-        return Answer(parameters=(len(piece),), data=piece)
+        return PtpResponse(parameters=(len(piece),), data=piece)
 
     def _sent(self, found: StoredObject, offset: int, count: int) -> memoryview:
         end = min(offset + count, len(found.data))
@@ -150,15 +150,15 @@ class Card:
             end = max(end - 1024, offset)
         return memoryview(found.data)[offset:end]
 
-    def _no_thumb(self, _request: Request, _data: bytes) -> Answer:
-        return Answer(Code.NO_THUMBNAIL_PRESENT)
+    def _no_thumb(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
+        return PtpResponse(Code.NO_THUMBNAIL_PRESENT)
 
-    def _delete(self, request: Request, _data: bytes) -> Answer:
+    def _delete(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         found = self._objects.pop(request.parameter(0), None)
-        return Answer(Code.INVALID_OBJECT_HANDLE) if found is None else Answer()
+        return PtpResponse(Code.INVALID_OBJECT_HANDLE) if found is None else PtpResponse()
 
-    def _transferred(self, request: Request, _data: bytes) -> Answer:
+    def _transferred(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         """The file has been fetched from memory, which lets go of it."""
         if request.parameter(0) < DCIM:
             self._objects.pop(request.parameter(0), None)
-        return Answer()
+        return PtpResponse()

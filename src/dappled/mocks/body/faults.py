@@ -21,7 +21,7 @@ kilobyte early. drop-transfer: the link is cut in the middle of an object's data
 until "clear". no-focus: a release is answered OK, and no picture is taken."""
 
 
-class Faults:
+class BodyFaults:
     """The faults in force. All methods may be called from any thread. `drop` is called to cut the links."""
 
     def __init__(self, clock_ns: Callable[[], int]) -> None:

@@ -13,7 +13,7 @@ from enum import IntEnum
 from typing import TypeAlias
 
 
-class Packet(IntEnum):
+class PtpPacket(IntEnum):
     """PTP/IP packet types (CIPA DC-005, table 4)."""
 
     INIT_COMMAND_REQUEST = 1
@@ -116,7 +116,7 @@ class MalformedPacketError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class PtpRequest:
     """An operation request: code, transaction, at most five parameters."""
 
     code: int
@@ -129,7 +129,7 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class PtpResponse:
     """What a body says to a request: response code, response parameters, data (None: no data phase)."""
 
     code: int = Code.OK
@@ -137,11 +137,11 @@ class Answer:
     data: bytes | memoryview | None = None
 
 
-Handler: TypeAlias = Callable[[Request, bytes], Answer]
+Handler: TypeAlias = Callable[[PtpRequest, bytes], PtpResponse]
 """What answers one operation; the bytes are those that came with the request."""
 
 
-def packet(kind: Packet, payload: bytes = b"") -> bytes:
+def packet(kind: PtpPacket, payload: bytes = b"") -> bytes:
     """A whole packet: length (with this header), type, payload."""
     return struct.pack("<II", 8 + len(payload), kind) + payload
 
@@ -156,34 +156,34 @@ def header(data: bytes) -> tuple[int, int]:
     return kind, length - 8
 
 
-def parse_request(payload: bytes) -> Request:
+def parse_request(payload: bytes) -> PtpRequest:
     """The payload of a REQUEST packet. Raises MalformedPacketError."""
     if len(payload) < 10 or (len(payload) - 10) % 4 or len(payload) > 30:
         raise MalformedPacketError(f"an operation request has 10 to 30 bytes in steps of 4, not {len(payload)}")
     _phase, code, transaction = struct.unpack_from("<IHI", payload)
     count = (len(payload) - 10) // 4
-    return Request(code, transaction, struct.unpack_from(f"<{count}I", payload, 10))
+    return PtpRequest(code, transaction, struct.unpack_from(f"<{count}I", payload, 10))
 
 
 def response(code: int, transaction: int, parameters: Sequence[int] = ()) -> bytes:
     """A RESPONSE packet."""
-    return packet(Packet.RESPONSE, struct.pack(f"<HI{len(parameters)}I", code, transaction, *parameters))
+    return packet(PtpPacket.RESPONSE, struct.pack(f"<HI{len(parameters)}I", code, transaction, *parameters))
 
 
 def start_data(transaction: int, size: int) -> bytes:
     """The packet that opens a data phase of `size` bytes."""
-    return packet(Packet.START_DATA, struct.pack("<IQ", transaction, size))
+    return packet(PtpPacket.START_DATA, struct.pack("<IQ", transaction, size))
 
 
 def end_data_header(transaction: int, size: int) -> bytes:
     """The head of the one packet that carries all `size` bytes of a data phase; the bytes follow."""
-    return struct.pack("<III", 12 + size, Packet.END_DATA, transaction)
+    return struct.pack("<III", 12 + size, PtpPacket.END_DATA, transaction)
 
 
 def init_command_ack(connection: int, guid: bytes, name: str) -> bytes:
     """The responder's answer to a connection: number, 16-byte GUID, friendly name, protocol version 1.0."""
     text = name.encode("utf-16-le") + b"\0\0"
-    return packet(Packet.INIT_COMMAND_ACK, struct.pack("<I", connection) + guid + text + struct.pack("<HH", 0, 1))
+    return packet(PtpPacket.INIT_COMMAND_ACK, struct.pack("<I", connection) + guid + text + struct.pack("<HH", 0, 1))
 
 
 _CANON = 0x0000000B

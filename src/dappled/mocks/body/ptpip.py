@@ -13,8 +13,8 @@ from typing import Protocol
 
 from dappled.mocks.body import ptp
 from dappled.mocks.body.eos450d import MODEL
-from dappled.mocks.body.faults import Faults
-from dappled.mocks.body.ptp import Answer, Packet
+from dappled.mocks.body.faults import BodyFaults
+from dappled.mocks.body.ptp import PtpPacket, PtpResponse
 
 _SILENCE_STEP_S = 0.02
 _SLOW_BYTES = 40_000  # at a time, 50 times a second
@@ -23,7 +23,7 @@ _SLOW_BYTES = 40_000  # at a time, 50 times a second
 class Transactions(Protocol):
     """What a responder needs of a body."""
 
-    def answer(self, request: ptp.Request, data: bytes) -> Answer:
+    def answer(self, request: ptp.PtpRequest, data: bytes) -> PtpResponse:
         """The answer to one transaction."""
 
     def disconnected(self) -> None:
@@ -34,7 +34,7 @@ class Responder:
     """Serves a body on ports of its own choosing; `close` ends all its threads. The body answers at the first of its
     `addresses`, at the others nobody is there; `move` takes it to the next one."""
 
-    def __init__(self, body: Transactions, faults: Faults, host: str = "127.0.0.1", addresses: int = 1) -> None:
+    def __init__(self, body: Transactions, faults: BodyFaults, host: str = "127.0.0.1", addresses: int = 1) -> None:
         self._body = body
         self._faults = faults
         faults.drop = self.drop
@@ -99,9 +99,9 @@ class Responder:
             self._links.add(link)
         try:
             kind, _payload = _read(link)
-            if kind == Packet.INIT_COMMAND_REQUEST:
+            if kind == PtpPacket.INIT_COMMAND_REQUEST:
                 self._serve(link)
-            elif kind == Packet.INIT_EVENT_REQUEST:
+            elif kind == PtpPacket.INIT_EVENT_REQUEST:
                 self._hold(link)
         except (OSError, ptp.MalformedPacketError):
             pass  # the initiator is gone, or was none; the link ends below
@@ -115,7 +115,7 @@ class Responder:
             taken = self._taken or self._faults.lasts("refuse")
             self._taken = self._taken or not taken
         if taken:
-            link.sendall(ptp.packet(Packet.INIT_FAIL, b"\2\0\0\0"))  # 2: busy
+            link.sendall(ptp.packet(PtpPacket.INIT_FAIL, b"\2\0\0\0"))  # 2: busy
             return
         try:
             self._wait_out_silence()
@@ -134,15 +134,15 @@ class Responder:
         """The event connection: acknowledged, probes answered, otherwise silent (EOS events are polled)."""
         with self._lock:
             self._event = link
-        link.sendall(ptp.packet(Packet.INIT_EVENT_ACK))
+        link.sendall(ptp.packet(PtpPacket.INIT_EVENT_ACK))
         while True:
             kind, _payload = _read(link)
-            if kind == Packet.PROBE_REQUEST:
-                link.sendall(ptp.packet(Packet.PROBE_RESPONSE))
+            if kind == PtpPacket.PROBE_REQUEST:
+                link.sendall(ptp.packet(PtpPacket.PROBE_RESPONSE))
 
     def _transact(self, link: socket.socket) -> None:
         kind, payload = _read(link)
-        if kind != Packet.REQUEST:
+        if kind != PtpPacket.REQUEST:
             return  # a cancel, or data that nobody asked for
         request = ptp.parse_request(payload)
         data = _read_data(link) if request.code in ptp.WITH_DATA_OUT else b""
@@ -183,9 +183,9 @@ def _read_data(link: socket.socket) -> bytes:
     pieces: list[bytes] = []
     while True:
         kind, payload = _read(link)
-        if kind in (Packet.DATA, Packet.END_DATA):
+        if kind in (PtpPacket.DATA, PtpPacket.END_DATA):
             pieces.append(payload[4:])
-        if kind == Packet.END_DATA:
+        if kind == PtpPacket.END_DATA:
             return b"".join(pieces)
 
 

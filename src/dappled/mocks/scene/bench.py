@@ -13,15 +13,15 @@ from PIL import Image
 from scipy import ndimage
 
 from dappled.mocks.autopilot.path import TruePose
+from dappled.mocks.scene.landscape import noise
 from dappled.mocks.scene.lens import Floats, Optics, Rays, Rendering
-from dappled.mocks.scene.terrain import noise
 
 TEXTURE_SIDE = 2048
 THREADS = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Plane:
+class TexturedPlane:
     """A textured board. Its depth is `distance_m` on the axis plus `tilt` (y, x), metres for each metre sideways.
 
     `extent_mm` (top, bottom, left, right) is what it covers on the sensor as seen from the aperture's centre, None for
@@ -43,12 +43,12 @@ class Bench:
     detail as fine as the slices do, whatever its distance.
     """
 
-    planes: tuple[Plane, ...]
+    planes: tuple[TexturedPlane, ...]
     texture: Floats
     texel_mm: float
 
     @classmethod
-    def of(cls, seed: int, planes: tuple[Plane, ...], finest_period_mm: float) -> Bench:
+    def of(cls, seed: int, planes: tuple[TexturedPlane, ...], finest_period_mm: float) -> Bench:
         """Boards with a texture from a seed, nothing in it finer than `finest_period_mm` on the sensor."""
         texel = finest_period_mm / 5
         rng = np.random.default_rng([seed, 20])
@@ -83,7 +83,7 @@ class Bench:
             depth = np.where(_cover(plane, rays, z, side) > 0.5, z, depth)
         return Rendering(radiance, depth.astype(np.float32))
 
-    def _lay(self, view: Floats, plane: Plane, number: int, rays: Rays, theta: NDArray[np.float64]) -> None:
+    def _lay(self, view: Floats, plane: TexturedPlane, number: int, rays: Rays, theta: NDArray[np.float64]) -> None:
         rays, where = _window(plane, rays, theta)
         view = view[:, *where]
         z, side = _meet(plane, rays, theta)
@@ -104,7 +104,7 @@ class Bench:
 
 
 def _meet(
-    plane: Plane, rays: Rays, theta: NDArray[np.float64]
+    plane: TexturedPlane, rays: Rays, theta: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Depth (m) where each ray meets the board, and its place there (y, x) in metres.
 
@@ -120,7 +120,7 @@ def _meet(
     return z, (slope_y * z - metres[0], slope_x * z - metres[1])
 
 
-def _window(plane: Plane, rays: Rays, theta: NDArray[np.float64]) -> tuple[Rays, tuple[slice, slice]]:
+def _window(plane: TexturedPlane, rays: Rays, theta: NDArray[np.float64]) -> tuple[Rays, tuple[slice, slice]]:
     """The samples that may see a board: its extent, wider by the aperture's own offset seen at half the distance."""
     if plane.extent_mm is None:
         return rays, (slice(None), slice(None))
@@ -132,7 +132,7 @@ def _window(plane: Plane, rays: Rays, theta: NDArray[np.float64]) -> tuple[Rays,
 
 
 def _cover(
-    plane: Plane, rays: Rays, z: NDArray[np.float64], side: tuple[NDArray[np.float64], NDArray[np.float64]]
+    plane: TexturedPlane, rays: Rays, z: NDArray[np.float64], side: tuple[NDArray[np.float64], NDArray[np.float64]]
 ) -> Floats | float:
     """How far each sample is covered, 0 to 1, with an edge one sample wide."""
     if plane.extent_mm is None:
@@ -157,9 +157,11 @@ def boards(seed: int, optics: Optics, size_mm: tuple[float, float], pitch_mm: fl
     return Bench.of(
         seed,
         (
-            Plane(at(3.0)),
-            Plane(at(4.0), (0.47, 0.42, 0.36), extent_mm=(-0.30 * height, 0.34 * height, -0.40 * width, -0.08 * width)),
-            Plane(
+            TexturedPlane(at(3.0)),
+            TexturedPlane(
+                at(4.0), (0.47, 0.42, 0.36), extent_mm=(-0.30 * height, 0.34 * height, -0.40 * width, -0.08 * width)
+            ),
+            TexturedPlane(
                 at(4.4),
                 (0.36, 0.39, 0.41),
                 tilt=(0.0, lean),

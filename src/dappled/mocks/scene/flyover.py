@@ -12,9 +12,9 @@ from scipy import ndimage
 
 from dappled.decode.geometry.pose import Quaternion
 from dappled.mocks.autopilot.path import TruePose
-from dappled.mocks.scene import terrain
+from dappled.mocks.scene import landscape
+from dappled.mocks.scene.landscape import DETAIL_TEXEL_M, TEXEL_M, Landscape
 from dappled.mocks.scene.lens import Floats, Rays, Rendering
-from dappled.mocks.scene.terrain import DETAIL_TEXEL_M, TEXEL_M, Ground
 
 MARCH_STEP_M = 0.3
 THREADS = 2
@@ -32,27 +32,16 @@ def rotation(attitude: Quaternion) -> NDArray[np.float64]:
     )
 
 
-def project(pose: TruePose, point_ned_m: tuple[float, float, float], v_mm: float) -> tuple[float, float]:
-    """(y, x) in mm on the sensor where the aperture's centre sees a point.
-
-    Raises ValueError for a point that is not in front of the camera.
-    """
-    forward, right, down = rotation(pose.attitude).T @ (np.array(point_ned_m) - np.array(pose.position_ned_m))
-    if down <= 0:
-        raise ValueError("the point is not below the camera")
-    return float(-forward / down * v_mm), float(right / down * v_mm)
-
-
 @dataclass(frozen=True, slots=True)
-class Terrain:
+class TerrainScene:
     """The landscape as a scene."""
 
-    ground: Ground
+    ground: Landscape
 
     @classmethod
-    def of(cls, seed: int, finest_period_m: float = 0.037) -> Terrain:
+    def of(cls, seed: int, finest_period_m: float = 0.037) -> TerrainScene:
         """The landscape of a seed; nothing in its fine texture is finer than `finest_period_m` (metres a cycle)."""
-        return cls(terrain.build(seed, finest_period_m))
+        return cls(landscape.build(seed, finest_period_m))
 
     @property
     def mean_radiance(self) -> float:
@@ -62,7 +51,7 @@ class Terrain:
     @property
     def headroom(self) -> float:
         """Brightest surface over the mean."""
-        return terrain.HEADROOM
+        return landscape.HEADROOM
 
     def render(self, rays: Rays, pose: TruePose | None) -> Rendering:
         """The ground along the rays.
@@ -100,7 +89,7 @@ class _Surface:
     corner: tuple[int, int]
 
     @classmethod
-    def under(cls, ground: Ground, hits: _Hits) -> _Surface:
+    def under(cls, ground: Landscape, hits: _Hits) -> _Surface:
         finer = round(TEXEL_M / DETAIL_TEXEL_M)
         corner, indices = [], []
         for place in (hits.row, hits.column):
@@ -131,7 +120,7 @@ class _Hits:
     column_per_m: tuple[Floats, Floats]
 
 
-def _centre_hits(ground: Ground, rays: Rays, pose: TruePose) -> _Hits:
+def _centre_hits(ground: Landscape, rays: Rays, pose: TruePose) -> _Hits:
     turn = rotation(pose.attitude)
     north0, east0, down0 = pose.position_ned_m
     y, x = (rays.y_mm / rays.v_mm)[:, None], (rays.x_mm / rays.v_mm)[None, :]
@@ -196,7 +185,7 @@ def _centre_hits(ground: Ground, rays: Rays, pose: TruePose) -> _Hits:
     )
 
 
-def _relief_range(ground: Ground, pose: TruePose, north: Floats, east: Floats, down: Floats) -> tuple[float, float]:
+def _relief_range(ground: Landscape, pose: TruePose, north: Floats, east: Floats, down: Floats) -> tuple[float, float]:
     """(lowest, highest) ground that the picture may show, with 5 cm to spare."""
     n = len(ground.relief)
     spans = []

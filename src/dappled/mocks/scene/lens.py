@@ -163,13 +163,6 @@ def pattern_range(mask: Mask) -> tuple[float, float]:
     return float(values.min()), float(values.max())
 
 
-def mask_values(mask: Mask, y_mm: NDArray[np.float64], x_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Transmission 0 to 1 of the printed mask at places on it."""
-    low, high = pattern_range(mask)
-    f = mask.frequency_per_mm
-    return (transmission(mask, y_mm * f, x_mm * f) - low) / (high - low)
-
-
 def modulation(mask: Mask) -> dict[Order, float]:
     """Each carrier's Fourier coefficient over that of DC, for the half of the carriers from DC upwards."""
     low, _ = pattern_range(mask)

@@ -6,7 +6,6 @@ is for tests and pictures only.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,10 +17,9 @@ from numpy.typing import NDArray
 from dappled.decode.optics.carriers import Lattice, Sensor
 from dappled.decode.optics.masks import Mask
 from dappled.mocks.autopilot.path import FlightPath, TruePose
-from dappled.mocks.body import dng
-from dappled.mocks.scene import lens, synthesis
+from dappled.mocks.scene import dng, lens, synthesis
 from dappled.mocks.scene.bench import RealViews, WhiteCard, boards
-from dappled.mocks.scene.flyover import Terrain, finest_period_m
+from dappled.mocks.scene.flyover import TerrainScene, finest_period_m
 from dappled.mocks.scene.lens import Floats, Installation, Optics, Rays, Rendering, Scene
 from dappled.mocks.scene.synthesis import PASS, Grid
 
@@ -34,7 +32,7 @@ LATENCY_S, LATENCY_SPREAD_S = 0.060, 0.015
 
 
 @dataclass(frozen=True, slots=True)
-class Exposure:
+class SimulatedExposure:
     """One shot's outcome. `latency_s` is from the trigger to the opening of the shutter."""
 
     file: bytes
@@ -99,7 +97,7 @@ class MaskedCamera:
         *,
         f_number: float | None = None,
         exposure_s: float | None = None,
-    ) -> Exposure:
+    ) -> SimulatedExposure:
         """Take a picture: triggered at `trigger_t_s` (seconds on the path's clock).
 
         Without `f_number` the lens is open, without `exposure_s` the exposure is metered. Raises ValueError for an
@@ -134,7 +132,7 @@ class MaskedCamera:
             iso=ISO,
             taken_utc_ns=round((self.epoch_utc_s + middle_t_s) * 1e9),
         )
-        return Exposure(
+        return SimulatedExposure(
             file=dng.encode(raw, black=self.sensor.black, white=self.sensor.white, exif=exif, mono=self.sensor.mono),
             mid_exposure_t_s=middle_t_s,
             latency_s=latency_s,
@@ -142,7 +140,7 @@ class MaskedCamera:
             _truth=partial(self._truth, rendering, grid=grid, points_mm=points, pose=pose, middle_t_s=middle_t_s),
         )
 
-    def bench_frame(self, *, f_number: float | None = None, shot_number: int = 0) -> Exposure:
+    def bench_frame(self, *, f_number: float | None = None, shot_number: int = 0) -> SimulatedExposure:
         """A white card through the stopped-down lens, for calibration: 1/8 of the aperture unless told otherwise."""
         bench = replace(self, scene=WhiteCard(), path=None)
         return bench.expose(0.0, shot_number, f_number=8 * self.optics.f_number if f_number is None else f_number)
@@ -237,7 +235,7 @@ def reference_camera(
     if scene == "terrain":
         flown = path or FlightPath(seed)
         period_m = finest_period_m(flown.height_m, sensor.pitch_mm, optics.focal_length_mm, finest)
-        return replace(camera, scene=Terrain.of(seed, period_m), path=flown)
+        return replace(camera, scene=TerrainScene.of(seed, period_m), path=flown)
     views = RealViews.read(Path(scene), size_mm)
     return replace(camera, scene=views, optics=replace(optics, aperture_samples=len(views.views)))
 
@@ -301,34 +299,6 @@ class Truth:
     angular_frequency_per_mm: float
     lattice: Lattice
     grid: NDArray[np.float64]
-
-    def view_points_mm(self, n: int) -> NDArray[np.float64]:
-        """(n, n, 2): centres of n × n cells over the mask's own aperture 1/(f_m·α), turned as the mask is."""
-        axis = (np.arange(n) - (n - 1) / 2) / n / self.angular_frequency_per_mm
-        points = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
-        c, s = math.cos(self.mask_rotation_rad), math.sin(self.mask_rotation_rad)
-        return np.asarray(points @ np.array([[c, s], [-s, c]]))  # Rᵀ applied to each point
-
-    def project(self, points_mm: NDArray[np.float64]) -> Floats:
-        """(..., h, w, 3): the light field at aperture points (..., 2), as far as the mask's carriers can tell.
-
-        The views' angular spectrum is taken at the carriers' orders and summed back: what a perfect decoder gets that
-        transforms slices to views. Where κ is not 1 an aperture of one brightness does not give views of one
-        brightness: beyond 1 its rim is seen twice, below 1 the outer views see past it.
-        """
-        orders = np.array(self.mask.orders(), dtype=np.float64)
-        c, s = math.cos(self.mask_rotation_rad), math.sin(self.mask_rotation_rad)
-        k = orders @ np.array([[c, s], [-s, c]]) * self.angular_frequency_per_mm
-        here = np.exp(2j * np.pi * self.aperture_points_mm.reshape(-1, 2) @ k.T)  # (J, K)
-        there = np.exp(-2j * np.pi * np.asarray(points_mm).reshape(-1, 2) @ k.T)  # (U, K)
-        weights = (there @ here.T).real.astype(np.float32) / len(here)
-        n = self.views.shape[0]
-        flat = weights @ self.views.reshape(n * n, -1)
-        return np.asarray(flat.reshape(*np.shape(points_mm)[:-1], *self.views.shape[2:]))
-
-    def band_views(self, n: int) -> Floats:
-        """(n, n, h, w, 3): `project` at `view_points_mm`. With n = 2p+1, as many samples, and κ = 1, the views."""
-        return self.project(self.view_points_mm(n))
 
     def save(self, path: Path) -> None:
         """All of it as an .npz file; what is None is left out."""

@@ -35,7 +35,7 @@ CARS: tuple[Colour, ...] = ((0.300, 0.300, 0.300), (0.190, 0.095, 0.085), (0.085
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class GroundTarget:
     """A painted survey target under the usual flight path: its centre, metres north and east of home and above it."""
 
     north_m: float
@@ -44,7 +44,7 @@ class Target:
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class Landscape:
     """The landscape as maps.
 
     `albedo` (3, n, n) with sunlight and shadow in it, `relief` (n, n) heights, `roughness` (n, n): how much of the fine
@@ -55,11 +55,11 @@ class Ground:
     relief: Floats
     roughness: Floats
     detail: Floats
-    targets: tuple[Target, ...]
+    targets: tuple[GroundTarget, ...]
     mean_radiance: float
 
 
-def build(seed: int, finest_period_m: float) -> Ground:
+def build(seed: int, finest_period_m: float) -> Landscape:
     """The landscape of a seed. The fine texture has nothing finer than `finest_period_m` (metres a cycle)."""
     rng = np.random.default_rng([seed, 10])
     n = round(EXTENT_M / TEXEL_M)
@@ -84,7 +84,7 @@ def build(seed: int, finest_period_m: float) -> Ground:
 
     lit = canvas.albedo * _sunlight(canvas.relief)
     mean = float(lit.mean())
-    return Ground(
+    return Landscape(
         albedo=np.minimum(lit, HEADROOM / 1.15 * mean).astype(np.float32),
         relief=canvas.relief,
         roughness=canvas.rough,
@@ -237,8 +237,8 @@ def _trees(canvas: _Canvas, rng: np.random.Generator, axis: Floats) -> None:
         ground += height * radius * crown * (1 + 0.1 * bumps) * (crown > 0)
 
 
-def _targets(canvas: _Canvas, rng: np.random.Generator, axis: Floats) -> tuple[Target, ...]:
-    found: list[Target] = []
+def _targets(canvas: _Canvas, rng: np.random.Generator, axis: Floats) -> tuple[GroundTarget, ...]:
+    found: list[GroundTarget] = []
     for number in range(40):
         angle, radius = 2 * np.pi * number / 40, rng.uniform(22.5, 27.5)
         north, east = float(radius * math.cos(angle)), float(radius * math.sin(angle))
@@ -253,7 +253,7 @@ def _targets(canvas: _Canvas, rng: np.random.Generator, axis: Floats) -> tuple[T
         canvas.stamp(patch.where, _step(0.6 - distance, 0.03), (0.045, 0.045, 0.045), 0.03)
         canvas.stamp(patch.where, _step(0.52 - distance, 0.03) * quarter, PAINT, 0.03)
         row, column = (s.start + (s.stop - s.start) // 2 for s in patch.where)
-        found.append(Target(north, east, float(canvas.relief[row, column])))
+        found.append(GroundTarget(north, east, float(canvas.relief[row, column])))
     return tuple(found)
 
 

@@ -12,7 +12,7 @@ import rawpy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.mocks.body import dng
+from dappled.mocks.scene import dng
 
 EXIF = dng.Exif("dappled", "Simulated Masked Camera", "SIM7", 50.0, 7.4, 1 / 1000, 100, 1_781_517_600_900_000_000)
 
