@@ -51,7 +51,7 @@ def test_a_test_shot_that_is_no_picture_is_no_go(tmp_path: Path, capfd: pytest.C
     assert main(["doctor", "--config", str(path), "--test-shot", "--keep", str(tmp_path / "kept")]) == 1
     out = capfd.readouterr().out
     assert out.splitlines()[-1] == "NO GO"
-    assert "it is no picture" in out
+    assert "it can't be read as a picture" in out
     assert len(list((tmp_path / "kept").rglob("frames/*.dng"))) == 1
 
 

@@ -195,7 +195,7 @@ def test_fired_by_the_autopilot_s_relay_and_the_ground_station_is_told(here: Pat
         with flying(settings) as daemon:
             daemon.until_ready()
             link = daemon.service.health
-            eventually(lambda: "nobody was heard" not in str(link()["problems"]), "the autopilot is heard")
+            eventually(lambda: "nothing was heard" not in str(link()["problems"]), "the autopilot is heard")
             pending = daemon.shoot()
             while "autopilot" in pending.problem:  # its heartbeat was not there yet
                 pending = daemon.shoot()

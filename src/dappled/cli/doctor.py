@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +21,16 @@ from dappled.cli.arguments import whole
 from dappled.cli.status import is_listening, stream_endpoint
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.daemon.health import frame_checks, go_no_go, host_checks, test_shot
-from dappled.daemon.health.host_checks import Finding
-from dappled.daemon.health.test_shot import Latency
+from dappled.daemon import test_shot
+from dappled.daemon.health import frame_checks, go_no_go, host_checks
+from dappled.daemon.health.go_no_go import Check
 from dappled.daemon.pipeline import recipes
+from dappled.daemon.test_shot import Latency
 from dappled.drivers import usb_bus
 from dappled.errors import DappledError
 
-_WORDS = {"ok": "ok", "note": "note", "wrong": "WRONG", "go": "go", "caution": "caution", "no-go": "NO GO"}
+_WORDS = {"go": "go", "caution": "caution", "no-go": "NO GO"}
+_HOST_WORDS = {"go": "ok", "caution": "note", "no-go": "WRONG"}
 _VERDICTS = {"go": "GO", "caution": "GO, with the cautions above", "no-go": "NO GO"}
 HEAR_S = 5.0  # a daemon says how it is every second
 
@@ -63,18 +65,18 @@ def run(arguments: argparse.Namespace) -> int:
         truth = None
         if arguments.simulate:
             settings, truth = stack.enter_context(_simulated(settings, arguments.seed, folder))
-        findings = host_checks.checkup(settings)
-        told: dict[str, Any] = {"checks": [asdict(one) for one in findings]}
-        ready = all(one.state != "wrong" for one in findings if one.name in ("camera", "disk"))
-        good = not host_checks.next_step(findings)
-        lines = _findings(findings)
+        checked = host_checks.run(settings)
+        told: dict[str, Any] = {"checks": _host_facts(checked)}
+        ready = all(one.state != "no-go" for one in checked if one.name in ("camera", "disk"))
+        good = not go_no_go.next_step(checked)
+        lines = _host_lines(checked)
         if (arguments.test_shot or arguments.latency) and ready:
             more, shot = _shoot(settings, arguments, folder, truth)
             lines, told, good = [*lines, *more], {**told, **shot}, good and shot["verdict"] != "no-go"
         elif arguments.test_shot or arguments.latency:
             lines.append("no shot was fired: the camera or the disk is not ready")
-    lines.append(_last(findings, told.get("verdict")))
-    told["next"] = host_checks.next_step(findings)
+    lines.append(_last(checked, told.get("verdict")))
+    told["next"] = go_no_go.next_step(checked)
     print(json.dumps(told, indent=2) if arguments.json else "\n".join(lines))
     return 0 if good else 1
 
@@ -88,31 +90,42 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
         )
     told = status.health(endpoint, HEAR_S)
     checks = go_no_go.checks(told)
-    looked: list[Finding] = []
-    if told["camera"]["state"] not in ("ready", "busy", "starting"):  # then nobody but a stranger holds it
+    looked: list[Check] = []
+    if told["camera"]["state"] not in ("ready", "busy", "starting"):  # then another program may hold it
         looked = [
             one
             for check in (host_checks.bodies, host_checks.grabbers)
             for one in check(settings, host_checks.Machine())
         ]
     verdict = go_no_go.verdict(checks)
-    todo = host_checks.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
+    todo = go_no_go.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
     if arguments.json:
-        facts = [*map(asdict, checks), *map(asdict, looked)]
+        facts = [*({"name": one.name, "state": one.state, "text": one.text} for one in checks), *_host_facts(looked)]
         print(json.dumps({"flight": told["flight"], "checks": facts, "verdict": verdict, "next": todo}, indent=2))
     else:
         print(f"a daemon runs here, flight {told['flight']}; it says")
-        print("\n".join([f"{_WORDS[one.state]:8} {one.name:11} {one.text}" for one in checks] + _findings(looked)))
+        print("\n".join([*_lines(checks), *_host_lines(looked)]))
         print(f"{_VERDICTS[verdict]}{f'; next: {todo}' if todo else ''}")
     return 1 if verdict == "no-go" else 0
 
 
-def _findings(findings: Sequence[Finding]) -> list[str]:
-    return [f"{_WORDS[one.state]:8} {one.name:11} {one.text}" for one in findings]
+def _lines(checks: Sequence[Check]) -> list[str]:
+    return [f"{_WORDS[one.state]:8} {one.name:11} {one.text}" for one in checks]
 
 
-def _last(findings: Sequence[Finding], verdict: str | None) -> str:
-    todo = host_checks.next_step(findings)
+def _host_lines(checks: Sequence[Check]) -> list[str]:
+    return [f"{_HOST_WORDS[one.state]:8} {one.name:11} {one.text}" for one in checks]
+
+
+def _host_facts(checks: Sequence[Check]) -> list[dict[str, str]]:
+    return [
+        {"name": one.name, "state": _HOST_WORDS[one.state].lower(), "text": one.text, "todo": one.todo}
+        for one in checks
+    ]
+
+
+def _last(checks: Sequence[Check], verdict: str | None) -> str:
+    todo = go_no_go.next_step(checks)
     if todo:
         return f"next: {todo}"
     if verdict is not None:
@@ -147,8 +160,13 @@ def _shoot(
             facts["verdict"] = "no-go"
         elif arguments.test_shot and frame is not None:
             judged = _judged(frame, recipe)
-            facts |= {"test_shot": [asdict(one) for one in judged], "verdict": go_no_go.verdict(judged)}
-            lines += [f"{_WORDS[one.state]:8} {one.name:11} {one.text}" for one in judged]
+            facts |= {
+                "test_shot": [
+                    {"name": one.name, "state": one.state, "text": one.text, "measured": one.measured} for one in judged
+                ],
+                "verdict": go_no_go.verdict(judged),
+            }
+            lines += _lines(judged)
     if arguments.latency and latencies:
         timed = _timed(latencies, None if truth is None else _true_latencies(truth, len(latencies)))
         lines += timed.pop("lines")
@@ -156,11 +174,11 @@ def _shoot(
     return lines, facts
 
 
-def _judged(frame: Path, recipe: Any) -> list[frame_checks.Finding]:
+def _judged(frame: Path, recipe: Any) -> list[Check]:
     try:
-        return frame_checks.examine(frame, recipe)
+        return frame_checks.check_frame(frame, recipe)
     except DappledError as error:
-        return [frame_checks.Finding("picture", "no-go", f"it is no picture: {error}", {})]
+        return [Check("picture", "no-go", f"it can't be read as a picture: {error}")]
 
 
 _SPANS = {
@@ -180,9 +198,7 @@ def _timed(latencies: Sequence[Latency], truth_ms: list[float] | None) -> dict[s
         values = [value for one in latencies if (value := getattr(one, name)) is not None]
         if not values:
             facts[name] = None
-            lines.append(
-                f"         {title:26} nobody could see it: a hot shoe on the autopilot tells (docs/drivers.md)"
-            )
+            lines.append(f"         {title:26} not measured: connect a hot shoe to the autopilot (docs/drivers.md)")
             continue
         facts[name] = {
             "median": statistics.median(values),

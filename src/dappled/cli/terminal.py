@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import re
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -18,6 +17,7 @@ from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from dappled.daemon.health.log_format import JournalHandler
+from dappled.daemon.health.logbook import NewProblems
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.daemon.stream import wire
 from dappled.drivers.camera import StateChanged
@@ -25,7 +25,6 @@ from dappled.workers import Worker
 
 log = logging.getLogger("dappled.run")
 _PROBLEMS_EVERY_S = 1.0
-_NUMBER = re.compile(r"\d+")  # a problem whose numbers change is still the same
 
 
 class Say(Protocol):
@@ -113,7 +112,7 @@ class ProblemRemarks:
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._health, self._told, self._say, self._clock_s = health, told, say, clock_s
-        self._said: set[str] = set()
+        self._problems = NewProblems()
         self._due_s = clock_s() + _PROBLEMS_EVERY_S
 
     def tell(self, *, now: bool = False) -> None:
@@ -122,11 +121,8 @@ class ProblemRemarks:
             return
         self._due_s = self._clock_s() + _PROBLEMS_EVERY_S
         record = self._health()
-        problems = {_NUMBER.sub("#", text): text for text in record["problems"]}
-        for kind, text in sorted(problems.items()):
-            if kind not in self._said:
-                self._say(f"problem: {text}", logging.WARNING, problem=text)
-        self._said = set(problems)
+        for text in sorted(self._problems.among(record["problems"])):
+            self._say(f"problem: {text}", logging.WARNING, problem=text)
         self._told(record)
 
 

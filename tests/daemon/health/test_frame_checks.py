@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from dappled.daemon.health.frame_checks import Finding, examine, sharpness
-from dappled.daemon.health.go_no_go import verdict
+from dappled.daemon.health.frame_checks import check_frame, sharpness
+from dappled.daemon.health.go_no_go import Check, verdict
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.mocks.scene.masked_camera import reference_camera
@@ -25,12 +25,12 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def by_name(findings: list[Finding]) -> dict[str, Finding]:
+def by_name(findings: list[Check]) -> dict[str, Check]:
     return {one.name: one for one in findings}
 
 
 def test_a_good_frame_is_go(good: Path) -> None:
-    found = by_name(examine(good, RECIPE))
+    found = by_name(check_frame(good, RECIPE))
     assert {one.state for one in found.values()} == {"go"}
     assert set(found) == {"focal length", "exposure", "carriers", "focus", "motion"}
     assert found["focal length"].measured["focal_length_mm"] == 50.0
@@ -38,7 +38,7 @@ def test_a_good_frame_is_go(good: Path) -> None:
 
 
 def test_without_a_mask_configured_the_rest_is_looked_at(good: Path) -> None:
-    found = by_name(examine(good, None))
+    found = by_name(check_frame(good, None))
     assert found["carriers"].state == "caution"
     assert found["exposure"].state == "go"
 
@@ -48,7 +48,7 @@ def test_a_clipped_frame_is_no_go(tmp_path: Path) -> None:
     camera = reference_camera(1, scale=0.25)
     metered_s, _ = camera.metered(14.8)
     path.write_bytes(camera.expose(10.0, 1, f_number=14.8, exposure_s=8 * metered_s).file)
-    found = by_name(examine(path, None))
+    found = by_name(check_frame(path, None))
     assert found["exposure"].state == "no-go"
     assert "expose less" in found["exposure"].text
 
@@ -58,11 +58,11 @@ def test_a_frame_without_light_is_no_go(tmp_path: Path) -> None:
     camera = reference_camera(1, scale=0.25)
     metered_s, _ = camera.metered(14.8)
     path.write_bytes(camera.expose(10.0, 1, f_number=14.8, exposure_s=metered_s / 50).file)
-    assert "expose more" in by_name(examine(path, None))["exposure"].text
+    assert "expose more" in by_name(check_frame(path, None))["exposure"].text
 
 
 def test_the_wrong_mask_shows_no_carriers(good: Path) -> None:
-    found = by_name(examine(good, Recipe(camera="reference-36mm", mask="mask-5")))
+    found = by_name(check_frame(good, Recipe(camera="reference-36mm", mask="mask-5")))
     assert found["carriers"].state == "no-go"
     assert "mask" in found["carriers"].text
 
@@ -75,7 +75,9 @@ def test_a_mask_away_from_its_place_is_cautioned_of(tmp_path: Path) -> None:
         'law = "geometric"\nmask_distance_mm = 0.48\n[[raw]]\nname = "half"\n'
         f"shape = [{height}, {width}]\nrow_mm = [0.0092, 0.0]\ncolumn_mm = [0.0, 0.0092]\n"
     )
-    found = by_name(examine(tmp_path / "stopped.dng", Recipe(camera=str(tmp_path / "off.toml"), mask="reference-5x5")))
+    found = by_name(
+        check_frame(tmp_path / "stopped.dng", Recipe(camera=str(tmp_path / "off.toml"), mask="reference-5x5"))
+    )
     assert found["carriers"].state == "caution"
     assert "farther out than predicted" in found["carriers"].text
 
@@ -84,7 +86,7 @@ def test_a_file_that_is_no_picture_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "x.dng"
     path.write_bytes(b"nothing")
     with pytest.raises(DappledError, match=r"x\.dng"):
-        examine(path, None)
+        check_frame(path, None)
 
 
 def ground(seed: int) -> NDArray[np.float64]:

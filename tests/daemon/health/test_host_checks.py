@@ -12,7 +12,8 @@ import pytest
 
 from dappled.config.settings import CameraSettings, MavlinkSettings, RecordSettings, Settings
 from dappled.daemon.health import host_checks
-from dappled.daemon.health.host_checks import Finding, Machine, next_step
+from dappled.daemon.health.go_no_go import Check, next_step
+from dappled.daemon.health.host_checks import Machine
 from dappled.drivers.camera import CameraError
 from dappled.drivers.usb_bus import CANON, FUJIFILM, UsbBody, UsbError
 from tests.daemon.fakes import FakeCamera
@@ -31,7 +32,7 @@ def having(machine: Machine, *bodies: UsbBody) -> Machine:
     return replace(machine, bodies=lambda: list(bodies))
 
 
-def the_one(findings: list[Finding]) -> Finding:
+def the_one(findings: list[Check]) -> Check:
     (found,) = findings
     return found
 
@@ -42,26 +43,26 @@ def no_libusb() -> list[UsbBody]:
 
 def test_without_a_camera_it_says_what_to_do_next(machine: Machine) -> None:
     found = the_one(host_checks.bodies(Settings(), machine))
-    assert found.state == "wrong"
+    assert found.state == "no-go"
     assert "USB mode" in found.todo
     assert "--simulate" in found.todo
 
 
 def test_without_a_libusb_it_says_what_to_install(machine: Machine) -> None:
     found = host_checks.libraries(Settings(), replace(machine, bodies=no_libusb))
-    assert found[-1].state == "wrong"
+    assert found[-1].state == "no-go"
     assert "apt install" in found[-1].todo
     assert host_checks.bodies(Settings(), replace(machine, bodies=no_libusb)) == []
 
 
 def test_a_body_that_can_be_fired(machine: Machine) -> None:
     found = the_one(host_checks.bodies(Settings(), having(machine, EOS)))
-    assert (found.state, "can be fired" in found.text, "EOS 450D" in found.text) == ("ok", True, True)
+    assert (found.state, "can be fired" in found.text, "EOS 450D" in found.text) == ("go", True, True)
 
 
 def test_a_body_in_the_wrong_usb_mode(machine: Machine) -> None:
     found = the_one(host_checks.bodies(Settings(), having(machine, replace(EOS, mode="mass storage"))))
-    assert found.state == "wrong"
+    assert found.state == "no-go"
     assert "PTP" in found.todo
 
 
@@ -71,7 +72,7 @@ def test_a_body_that_this_user_may_not_open(machine: Machine, monkeypatch: pytes
     node.write_bytes(b"")
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != node)  # root may do everything
     found = the_one(host_checks.bodies(Settings(), having(machine, EOS)))
-    assert found.state == "wrong"
+    assert found.state == "no-go"
     assert "udev rule" in found.todo
 
 
@@ -90,10 +91,10 @@ def test_gvfs_is_named_as_the_culprit(machine: Machine) -> None:
     (machine.proc / "17").mkdir()
     (machine.proc / "17" / "comm").write_text("gvfs-gphoto2-vo\n")
     found = the_one(host_checks.grabbers(Settings(), machine))
-    assert found.state == "wrong"
+    assert found.state == "no-go"
     assert "mask --now" in found.todo
     elsewhere = Settings(camera=CameraSettings(port="ptpip:127.0.0.1:1:1"))
-    assert the_one(host_checks.grabbers(elsewhere, machine)).state == "note"
+    assert the_one(host_checks.grabbers(elsewhere, machine)).state == "caution"
 
 
 def test_a_fujifilm_is_told_to_need_a_wire(machine: Machine) -> None:
@@ -102,13 +103,13 @@ def test_a_fujifilm_is_told_to_need_a_wire(machine: Machine) -> None:
     assert "can't fire it" in found.text
     assert "camera.shutter" in found.todo
     right = Settings(camera=CameraSettings(driver="fujifilm", shutter="relay:0"))
-    assert the_one(host_checks.bodies(right, having(machine, finepix))).state == "ok"
+    assert the_one(host_checks.bodies(right, having(machine, finepix))).state == "go"
 
 
 def test_a_driver_that_opens_is_ready(machine: Machine) -> None:
     settings = Settings(camera=CameraSettings(driver="simulated", options={"picture": "pattern:1000:dng"}))
     found = the_one(host_checks.camera(settings, machine))
-    assert (found.state, "Simulated" in found.text) == ("ok", True)
+    assert (found.state, "Simulated" in found.text) == ("go", True)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +122,7 @@ def test_a_driver_that_opens_is_ready(machine: Machine) -> None:
 )
 def test_a_driver_that_can_t_be_opened_says_why(machine: Machine, camera: dict[str, Any], words: str) -> None:
     found = the_one(host_checks.camera(Settings(camera=CameraSettings(**camera)), replace(machine, open_s=0.3)))
-    assert found.state == "wrong"
+    assert found.state == "no-go"
     assert words in found.text
     assert found.todo
 
@@ -135,9 +136,9 @@ def test_a_driver_that_fails_as_it_begins_costs_no_other_finding(
 
     broken = Broken()
     monkeypatch.setattr(host_checks, "open_camera", lambda _: broken)
-    found = host_checks.checkup(Settings(), machine, [host_checks.camera, host_checks.mask])
+    found = host_checks.run(Settings(), machine, [host_checks.camera, host_checks.mask])
     assert [one.name for one in found] == ["camera", "mask"]
-    assert (found[0].state, "no such port" in found[0].text, broken.stopped) == ("wrong", True, True)
+    assert (found[0].state, "no such port" in found[0].text, broken.stopped) == ("no-go", True, True)
 
 
 def test_the_disk_behind_a_closed_door(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,15 +154,15 @@ def test_the_disk_behind_a_closed_door(machine: Machine, tmp_path: Path, monkeyp
     closed.mkdir()
     monkeypatch.setattr(os, "stat", stat)
     settings = Settings(record=RecordSettings(directory=str(closed / "flights")))
-    assert the_one(host_checks.disk(settings, machine)).state == "ok"
+    assert the_one(host_checks.disk(settings, machine)).state == "go"
 
 
 def test_the_disk(machine: Machine, tmp_path: Path) -> None:
     def at(folder: Path, least: int = 0) -> Settings:
         return Settings(record=RecordSettings(directory=str(folder), min_free_mb=least))
 
-    assert the_one(host_checks.disk(at(tmp_path / "not" / "yet"), machine)).state == "ok"
-    assert the_one(host_checks.disk(at(tmp_path, 10_000_000), machine)).state == "wrong"
+    assert the_one(host_checks.disk(at(tmp_path / "not" / "yet"), machine)).state == "go"
+    assert the_one(host_checks.disk(at(tmp_path, 10_000_000), machine)).state == "no-go"
 
 
 def test_the_disk_of_somebody_else(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,22 +174,22 @@ def test_the_disk_of_somebody_else(machine: Machine, tmp_path: Path, monkeypatch
 @pytest.mark.parametrize(
     ("check", "settings", "state"),
     [
-        (host_checks.link, Settings(), "note"),
-        (host_checks.link, Settings(mavlink=MavlinkSettings(url=("/dev/no-such-tty:57600",))), "wrong"),
-        (host_checks.link, Settings(mavlink=MavlinkSettings(url=("udpin:127.0.0.1:14550",))), "ok"),
-        (host_checks.mask, Settings(), "note"),
-        (host_checks.clock, Settings(), "ok"),
+        (host_checks.link, Settings(), "caution"),
+        (host_checks.link, Settings(mavlink=MavlinkSettings(url=("/dev/no-such-tty:57600",))), "no-go"),
+        (host_checks.link, Settings(mavlink=MavlinkSettings(url=("udpin:127.0.0.1:14550",))), "go"),
+        (host_checks.mask, Settings(), "caution"),
+        (host_checks.clock, Settings(), "go"),
     ],
 )
 def test_the_rest(
-    machine: Machine, check: Callable[[Settings, Machine], list[Finding]], settings: Settings, state: str
+    machine: Machine, check: Callable[[Settings, Machine], list[Check]], settings: Settings, state: str
 ) -> None:
     assert the_one(check(settings, machine)).state == state
 
 
 def test_a_clock_that_nobody_keeps_is_noted(machine: Machine) -> None:
     found = the_one(host_checks.clock(Settings(), replace(machine, unsynchronised=lambda: True)))
-    assert (found.state, "chrony" in found.todo) == ("note", True)
+    assert (found.state, "chrony" in found.todo) == ("caution", True)
 
 
 def test_this_machine_s_own_clock_can_be_asked() -> None:
@@ -196,6 +197,6 @@ def test_this_machine_s_own_clock_can_be_asked() -> None:
 
 
 def test_the_first_wrong_thing_is_the_next_step() -> None:
-    findings = [Finding("a", "ok", ""), Finding("b", "note", "", "later"), Finding("c", "wrong", "", "now")]
+    findings = [Check("a", "go", ""), Check("b", "caution", "", "later"), Check("c", "no-go", "", "now")]
     assert next_step(findings) == "now"
     assert next_step(findings[:2]) == ""

@@ -5,8 +5,11 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
-from dappled.daemon.health.logbook import Logbook, of_story
+import pytest
+
+from dappled.daemon.health.logbook import Logbook, NewProblems, battery_doubt, of_shot
 from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.drivers.camera import Setting
 from dappled.flight import Cause, Frame, Shot
 
 SHOT = Shot(7, Cause("console", "console", 1), 0, 0)
@@ -42,11 +45,33 @@ def test_warnings_of_the_loggers_are_kept_and_lesser_ones_not() -> None:
     assert "TypeError" in texts[1]
 
 
-def test_a_story_in_words() -> None:
+def test_a_shot_in_words() -> None:
     pending = PendingShot(SHOT, frame=FRAME)
-    assert of_story(pending) == ("frame 7 is safe, 5.1 MB", "info")
-    assert of_story(replace(pending, problem="not decoded: no carriers")) == (
+    assert of_shot(pending) == ("frame 7 is safe, 5.1 MB", "info")
+    assert of_shot(replace(pending, problem="not decoded: no carriers")) == (
         "frame 7: not decoded: no carriers",
         "warning",
     )
-    assert of_story(PendingShot(SHOT, problem="the mirror is stuck")) == ("shot 7: the mirror is stuck", "warning")
+    assert of_shot(PendingShot(SHOT, problem="the mirror is stuck")) == ("shot 7: the mirror is stuck", "warning")
+
+
+@pytest.mark.parametrize("word", ["Low", "25%", "0 %", " 10% ", "EMPTY", "critical"])
+def test_a_battery_that_will_not_last_is_told(word: str) -> None:
+    said = battery_doubt((Setting("iso", "100"), Setting("battery", word)))
+    assert said == f"the camera's battery is nearly empty: {word.strip()}"
+
+
+@pytest.mark.parametrize("word", ["100%", "50%", "26%", "Unknown value 0x0007", "", "normal"])
+def test_a_good_one_and_one_that_says_nothing_clear_are_not(word: str) -> None:
+    assert battery_doubt((Setting("battery", word),)) is None
+    assert battery_doubt(()) is None
+
+
+def test_a_problem_is_new_once_though_its_numbers_change() -> None:
+    new = NewProblems()
+    assert (new.among([]), bool(new)) == ([], False)
+    assert (new.among(["409 MB left"]), bool(new)) == (["409 MB left"], True)
+    assert new.among(["408 MB left", "no camera"]) == ["no camera"]
+    assert new.among(["407 MB left", "no camera"], again=True) == ["407 MB left", "no camera"]
+    assert (new.among([]), bool(new)) == ([], False)
+    assert new.among(["409 MB left"]) == ["409 MB left"]

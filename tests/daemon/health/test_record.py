@@ -66,8 +66,8 @@ def test_well(tmp_path: Path) -> None:
     [
         ({"state": "absent", "reason": "nothing on the bus"}, "the camera is absent: nothing on the bus"),
         ({"state": "faulted"}, "the camera is faulted"),
-        ({"link": replace(LINK, last_heard_monotonic_ns=95 * S)}, "nobody was heard for 5 s"),
-        ({"link": replace(LINK, last_heard_monotonic_ns=None)}, "nobody was heard for 5 s"),
+        ({"link": replace(LINK, last_heard_monotonic_ns=95 * S)}, "nothing was heard for 5 s"),
+        ({"link": replace(LINK, last_heard_monotonic_ns=None)}, "nothing was heard for 5 s"),
         ({"link": replace(LINK, error="link down")}, "link down"),
         (
             {"link": replace(LINK, last_heard_monotonic_ns=None, signing=SigningStatistics(0, 3, 1, 0, 7))},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dappled.daemon.health.status_text import AGAIN_NS, AWAY_NS, PIECE_BYTES, Alarms, Audience, PilotLines
+from dappled.daemon.health.status_text import AGAIN_NS, AWAY_NS, PIECE_BYTES, Alarms, GroundStations, PilotMessages
 from dappled.drivers.mavlink.links import Message, mavlink
 
 
@@ -20,7 +20,7 @@ def test_a_problem_is_told_once_though_its_numbers_change_and_its_end_too() -> N
 
 
 def test_a_sentence_goes_in_pieces_and_not_twice_in_ten_seconds() -> None:
-    lines = PilotLines()
+    lines = PilotMessages()
     text = "x" * (PIECE_BYTES + 5)
     assert len(lines.messages(text, 4, 0)) == 2
     assert lines.messages(text, 4, 9 * 10**9) == []
@@ -43,19 +43,19 @@ def heartbeat(system: int, kind: int = mavlink.MAV_TYPE_GCS) -> Message:
 
 
 def test_a_ground_station_that_comes_late_or_back_is_news_once() -> None:
-    audience, now_ns = Audience(), 0
-    audience.heard(heartbeat(1, mavlink.MAV_TYPE_QUADROTOR), now_ns)
-    assert not audience.has_grown(AGAIN_NS)
-    audience.heard(heartbeat(255), now_ns)
-    assert [audience.has_grown(AGAIN_NS - 1), audience.has_grown(AGAIN_NS), audience.has_grown(AGAIN_NS)] == [
+    stations, now_ns = GroundStations(), 0
+    stations.heard(heartbeat(1, mavlink.MAV_TYPE_QUADROTOR), now_ns)
+    assert not stations.new_one(AGAIN_NS)
+    stations.heard(heartbeat(255), now_ns)
+    assert [stations.new_one(AGAIN_NS - 1), stations.new_one(AGAIN_NS), stations.new_one(AGAIN_NS)] == [
         False,
         True,
         False,
     ]
-    audience.heard(heartbeat(255), AWAY_NS)
-    assert not audience.has_grown(AWAY_NS + AGAIN_NS)  # it was there all the time
-    audience.heard(heartbeat(255), 3 * AWAY_NS)
-    assert audience.has_grown(3 * AWAY_NS + AGAIN_NS)
+    stations.heard(heartbeat(255), AWAY_NS)
+    assert not stations.new_one(AWAY_NS + AGAIN_NS)  # it was there all the time
+    stations.heard(heartbeat(255), 3 * AWAY_NS)
+    assert stations.new_one(3 * AWAY_NS + AGAIN_NS)
     for system in range(1, 200):  # bounded, whoever invents stations
-        audience.heard(heartbeat(system), 4 * AWAY_NS)
-    assert audience.has_grown(4 * AWAY_NS + AGAIN_NS)
+        stations.heard(heartbeat(system), 4 * AWAY_NS)
+    assert stations.new_one(4 * AWAY_NS + AGAIN_NS)

@@ -24,7 +24,7 @@ from dappled.daemon.camera_protocol.message_intervals import MessageIntervals
 from dappled.daemon.camera_protocol.messages import CameraFacts, Captured, Storage
 from dappled.daemon.camera_protocol.packet_dedup import Copies
 from dappled.daemon.camera_protocol.parameters import Parameters, Reply
-from dappled.daemon.health.status_text import Audience, PilotLines
+from dappled.daemon.health.status_text import GroundStations, PilotMessages
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Message, Packet, mavlink
@@ -99,7 +99,7 @@ class Component:
         self._identity = Identity(links.system_id, clock.monotonic_ns())
         self._autopilot = OwnAutopilot(links, self._identity, clock)
         self._copies = Copies()
-        self._lines, self._audience = PilotLines(), Audience()
+        self._lines, self._stations = PilotMessages(), GroundStations()
         self._results: deque[tuple[Command, int]] = deque(maxlen=64)
         self._heartbeat_due_ns = self._status_due_ns = 0
         self._status_wanted = threading.Event()
@@ -135,7 +135,7 @@ class Component:
             if packet.trusted:  # else anybody could say whose camera this is, and where orders to its autopilot go
                 now_ns = self._clock.monotonic_ns()
                 self._identity.heard(message, packet.link, now_ns)
-                self._audience.heard(message, now_ns)
+                self._stations.heard(message, now_ns)
         elif message.get_srcSystem() == self._identity.system_id:
             self._autopilot.heard(message)
 
@@ -251,7 +251,7 @@ class Component:
 
     def audience_has_grown(self) -> bool:
         """Whether a ground station listens that missed what was said before; True once."""
-        return self._audience.has_grown(self._clock.monotonic_ns())
+        return self._stations.new_one(self._clock.monotonic_ns())
 
     def tick(self) -> None:
         """What is due by now: heartbeat, time requests, stream requests, status, periodic messages, old images."""

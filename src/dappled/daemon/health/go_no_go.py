@@ -1,42 +1,45 @@
-"""Go or no-go: what a health record says about each thing that a flight needs, in words for a person on the field."""
+"""Judge a health record: go, caution or no-go for each thing that a flight needs. All checks are a `Check`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 State = Literal["go", "caution", "no-go"]
 _SURE_M, _SLOW_CLOCK_MS, _FRESH_MS = 5.0, 50.0, 3000.0
 _FRAME_BYTES = 20e6  # until a flight has shown its own
-_EARLIEST_UTC_NS = 1_700_000_000 * 10**9  # a machine that thinks it is before 2023 has no clock
+_EARLIEST_UTC_NS = 1_700_000_000 * 10**9  # a machine with a date before 2023 has no clock
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One thing: "go" is ready, "caution" flies with a loss that the text names, "no-go" brings no good frame."""
+    """The result of one check. "go": ready; "caution": a flight is possible, with a loss that the text names;
+    "no-go": the flight brings no good frames.
+
+    `todo` says what to do about it, "" where nothing is to be done. `measured` holds the numbers behind the text.
+    """
 
     name: str
     state: State
     text: str
+    todo: str = ""
+    measured: Mapping[str, Any] = field(default_factory=dict)
 
 
-class Judged(Protocol):
-    """Whatever has been judged go, caution or no-go."""
-
-    @property
-    def state(self) -> State:
-        """Its own verdict."""
-
-
-def verdict(judged: Sequence[Judged]) -> State:
-    """The worst of them."""
-    states = {one.state for one in judged}
+def verdict(checks: Sequence[Check]) -> State:
+    """The worst state of the checks."""
+    states = {one.state for one in checks}
     return "no-go" if "no-go" in states else "caution" if "caution" in states else "go"
 
 
+def next_step(checks: Sequence[Check]) -> str:
+    """What to do first: the `todo` of the first no-go; "" where there is none."""
+    return next((one.todo for one in checks if one.state == "no-go" and one.todo), "")
+
+
 def checks(health: Mapping[str, Any], *, frame_bytes: float | None = None) -> list[Check]:
-    """The checks of one health record. `frame_bytes` is what a frame of this flight takes, None before the first."""
+    """The checks of one health record. `frame_bytes`: mean size of this flight's frames, None before the first."""
     return [
         _camera(health["camera"]),
         _disk(health, frame_bytes or _FRAME_BYTES, known=frame_bytes is not None),
@@ -79,12 +82,12 @@ def _link(health: Mapping[str, Any]) -> Check:
         return Check("Autopilot", "go", f"heard; {silent} of {link['urls']} links silent" if silent else "heard")
     if silent >= link["urls"]:
         return Check("Autopilot", "no-go", "silent for more than 5 s")
-    return Check("Autopilot", "caution", "heard, but tells no position")
+    return Check("Autopilot", "caution", "heard, but it sends no position")
 
 
 def _position(vehicle: Mapping[str, Any] | None) -> Check:
     if vehicle is None or vehicle["latitude_deg"] is None:
-        return Check("Position", "caution", "unknown: frames have no place")
+        return Check("Position", "caution", "unknown: frames have no position")
     sigma, yaw = vehicle["position_sigma_m"], vehicle["yaw_deg"]
     text = "accuracy unknown" if sigma is None else _about(sigma, "m")
     if yaw is None:
@@ -94,7 +97,7 @@ def _position(vehicle: Mapping[str, Any] | None) -> Check:
 
 def _clock(health: Mapping[str, Any]) -> Check:
     if not health.get("utc_known", True):
-        return Check("Clock", "caution", "UTC is not known yet: the autopilot will tell it")
+        return Check("Clock", "caution", "UTC is not known yet: it comes from the autopilot")
     if health["utc_ns"] < _EARLIEST_UTC_NS:
         return Check("Clock", "no-go", "this machine does not know the date")
     clock = health.get("clock")
@@ -108,23 +111,27 @@ def _clock(health: Mapping[str, Any]) -> Check:
 def _decoding(health: Mapping[str, Any]) -> Check:
     decode = health.get("decode") or {"mask": "", "calibration": "", "running": False}
     if not decode["mask"]:
-        return Check("Decoding", "caution", "no mask is named: frames are kept, not decoded")
+        return Check("Decoding", "caution", "no mask is configured: frames are kept, not decoded")
     if not decode["running"]:
         return Check("Decoding", "caution", "off: frames are kept, not decoded")
     left = sum(stage["dropped"] for stage in health["stages"] if stage["name"] == "decode")
     if left:
-        return Check("Decoding", "caution", f"fell behind: {left} frames are only in the record")
+        return Check(
+            "Decoding", "caution", f"fell behind: {left} frame{' is' if left == 1 else 's are'} only in the record"
+        )
     if not decode["calibration"]:
-        return Check("Decoding", "caution", f"{decode['mask']}, not calibrated: carriers by the law alone")
+        return Check(
+            "Decoding", "caution", f"{decode['mask']}, not calibrated: carriers are predicted by the law alone"
+        )
     return Check("Decoding", "go", f"{decode['mask']}, calibrated")
 
 
 def _service(dead: Sequence[str]) -> Check:
     if dead:
         return Check("Service", "no-go", f"{', '.join(dead)} ended: restart dappled")
-    return Check("Service", "go", "all parts at work")
+    return Check("Service", "go", "all threads are running")
 
 
 def _about(sigma: float, unit: str) -> str:
-    """One sigma with two figures: ±0.024 m, ±1.3 m, ±12 m."""
+    """One sigma with two significant figures: ±0.024 m, ±1.3 m, ±12 m."""
     return f"±{sigma:.{0 if sigma >= 10 else 1 if sigma >= 1 else 2 if sigma >= 0.095 else 3}f} {unit}"

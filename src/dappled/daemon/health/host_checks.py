@@ -1,6 +1,6 @@
-"""What is missing on this machine for a flight: each check is a function that returns findings, in the order of need.
+"""Check what this machine lacks for a flight: libraries, camera, disk, clock, link, mask. `dappled doctor` runs this.
 
-`dappled doctor` runs them. A check looks; it never fires, changes or keeps anything.
+A check only looks: it never fires the camera, and changes nothing.
 """
 
 from __future__ import annotations
@@ -12,36 +12,24 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import Literal
 
 from dappled.config.settings import Settings
 from dappled.daemon.cameras import open_camera
+from dappled.daemon.health.go_no_go import Check
 from dappled.daemon.navigation import utc
 from dappled.drivers import usb_bus
 from dappled.drivers.camera import CameraError, StateChanged
 from dappled.drivers.usb_bus import UsbBody
 from dappled.errors import DappledError
 
-State = Literal["ok", "note", "wrong"]
-
 OPEN_S = 12.0
-_GRABBERS = ("gvfs-gphoto2-vo", "gvfsd-gphoto2", "gvfs-gphoto2-volume-monitor")  # /proc cuts names at 15 letters
+_GRABBERS = ("gvfs-gphoto2-vo", "gvfsd-gphoto2", "gvfs-gphoto2-volume-monitor")  # /proc cuts names to 15 letters
 _FRAME_BYTES = 20e6
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
-    """What a check found. `todo` is what to do about it, "" where there is nothing to do."""
-
-    name: str
-    state: State
-    text: str
-    todo: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class Machine:
-    """Where the checks look; a test hands in others."""
+    """Where the checks look; tests pass their own."""
 
     bodies: Callable[[], list[UsbBody]] = usb_bus.bodies
     proc: Path = Path("/proc")
@@ -50,50 +38,45 @@ class Machine:
     unsynchronised: Callable[[], bool] = field(default=lambda: not utc.kernel_synchronised())
 
 
-Check = Callable[[Settings, Machine], list[Finding]]
+HostCheck = Callable[[Settings, Machine], list[Check]]
 
 
-def checkup(settings: Settings, machine: Machine | None = None, checks: Sequence[Check] | None = None) -> list[Finding]:
-    """All findings, in the order of the checks."""
+def run(settings: Settings, machine: Machine | None = None, checks: Sequence[HostCheck] | None = None) -> list[Check]:
+    """The results of all checks, in their order."""
     where = machine or Machine()
-    return [finding for check in checks or CHECKS for finding in check(settings, where)]
+    return [one for check in checks or CHECKS for one in check(settings, where)]
 
 
-def next_step(findings: Sequence[Finding]) -> str:
-    """What to do first; "" where nothing stands in the way."""
-    return next((finding.todo for finding in findings if finding.state == "wrong" and finding.todo), "")
-
-
-def libraries(settings: Settings, machine: Machine) -> list[Finding]:
+def libraries(settings: Settings, machine: Machine) -> list[Check]:
     """libusb for everything on USB, libgphoto2 for cameras."""
-    found = [Finding("libgphoto2", "ok", f"python-gphoto2 {metadata.version('gphoto2')}")]
+    found = [Check("libgphoto2", "go", f"python-gphoto2 {metadata.version('gphoto2')}")]
     try:
         machine.bodies()
     except CameraError as error:
         text = str(error)
         todo = "sudo apt install libusb-1.0-0 (or your distribution's libusb), then `dappled doctor` again"
-        return [*found, Finding("libusb", "wrong" if _wants_usb(settings) else "note", text, todo)]
-    return [*found, Finding("libusb", "ok", f"pyusb {metadata.version('pyusb')}")]
+        return [*found, Check("libusb", "no-go" if _wants_usb(settings) else "caution", text, todo)]
+    return [*found, Check("libusb", "go", f"pyusb {metadata.version('pyusb')}")]
 
 
-def bodies(settings: Settings, machine: Machine) -> list[Finding]:
-    """Cameras on the bus: whether each can be fired, and what is in the way."""
+def bodies(settings: Settings, machine: Machine) -> list[Check]:
+    """Cameras on the bus: whether each can be fired, and if not, why."""
     try:
         found = machine.bodies()
     except CameraError:
-        return []  # `libraries` says why
+        return []  # `libraries` reports it
     if found:
         return [_body(settings, machine, body) for body in found]
     if not _wants_usb(settings):
-        return [Finding("USB", "note", "no camera is on the bus; none is needed there")]
+        return [Check("USB", "caution", "no camera is on the bus; none is needed there")]
     todo = (
         "connect the camera, switch it on, and set its USB mode to PTP or PC connection; then `dappled doctor` again. "
         "Without a camera: `dappled run --simulate --frames 3`"
     )
-    return [Finding("USB", "wrong", "no camera is on the bus", todo)]
+    return [Check("USB", "no-go", "no camera is on the bus", todo)]
 
 
-def _body(settings: Settings, machine: Machine, body: UsbBody) -> Finding:
+def _body(settings: Settings, machine: Machine, body: UsbBody) -> Check:
     name = f"{body.maker} {body.name}".strip() + f" at {body.port} ({body.mode})"
     node = body.node(machine.dev / "bus" / "usb")
     if node.exists() and not os.access(node, os.R_OK | os.W_OK):
@@ -101,29 +84,29 @@ def _body(settings: Settings, machine: Machine, body: UsbBody) -> Finding:
             "install the udev rule (systemd/70-dappled-camera.rules to /etc/udev/rules.d/), join the group: "
             "sudo usermod -aG plugdev $USER; log in anew, and plug the camera in again"
         )
-        return Finding("USB", "wrong", f"{name}: you may not open {node}", todo)
+        return Check("USB", "no-go", f"{name}: you have no permission to open {node}", todo)
     if body.vendor == usb_bus.FUJIFILM:
         text = f"{name}: USB can't fire it; its files can be picked up"
         if settings.camera.driver == "fujifilm":
-            return Finding("USB", "ok", text)
-        return Finding("USB", "note", text, 'set camera.driver = "fujifilm" and camera.shutter')
+            return Check("USB", "go", text)
+        return Check("USB", "caution", text, 'set camera.driver = "fujifilm" and camera.shutter')
     if body.mode != "PTP":
         todo = "set the camera's USB mode to PTP or PC connection in its menu, and connect it again"
-        return Finding("USB", "wrong", f"{name}: as a disk it can't be fired", todo)
+        return Check("USB", "no-go", f"{name}: it can't be fired in this USB mode", todo)
     holders = usb_bus.holders(node, machine.proc)
     if holders:
         names = ", ".join(holders)
-        return Finding("USB", "wrong", f"{name}: held by {names}", _stop(names))
-    return Finding("USB", "ok", f"{name}: can be fired")
+        return Check("USB", "no-go", f"{name}: held by {names}", _stop(names))
+    return Check("USB", "go", f"{name}: can be fired")
 
 
-def grabbers(settings: Settings, machine: Machine) -> list[Finding]:
-    """Desktop programs that take every camera as soon as it is there."""
+def grabbers(settings: Settings, machine: Machine) -> list[Check]:
+    """Desktop programs that open every camera as soon as it is connected."""
     running = sorted({name for name in _names(machine.proc) if name in _GRABBERS})
     if not running:
         return []
-    text = f"{', '.join(running)} runs and takes cameras before anybody else can"
-    return [Finding("desktop", "wrong" if _wants_usb(settings) else "note", text, _stop(running[0]))]
+    text = f"{', '.join(running)} is running and opens cameras before dappled can"
+    return [Check("desktop", "no-go" if _wants_usb(settings) else "caution", text, _stop(running[0]))]
 
 
 def _stop(name: str) -> str:
@@ -135,12 +118,12 @@ def _stop(name: str) -> str:
     return f"end {name}, then `dappled doctor` again"
 
 
-def camera(settings: Settings, machine: Machine) -> list[Finding]:
+def camera(settings: Settings, machine: Machine) -> list[Check]:
     """The configured driver, opened as the daemon would open it."""
     try:
         driver = open_camera(settings.camera)
     except DappledError as error:
-        return [Finding("camera", "wrong", str(error), "correct [camera] in your settings")]
+        return [Check("camera", "no-go", str(error), "correct [camera] in your settings")]
     last: StateChanged | None = None
     try:
         driver.start()
@@ -158,64 +141,62 @@ def camera(settings: Settings, machine: Machine) -> list[Finding]:
     return [_opened(settings, last)]
 
 
-def _opened(settings: Settings, last: StateChanged | None) -> Finding:
+def _opened(settings: Settings, last: StateChanged | None) -> Check:
     if last is not None and last.state == "ready" and last.identity is not None:
         who = last.identity
         serial = f", serial number {who.serial}" if who.serial else ""
-        return Finding("camera", "ok", f"{who.make} {who.model}{serial} at {who.port}: ready to fire")
+        return Check("camera", "go", f"{who.make} {who.model}{serial} at {who.port}: ready to fire")
     reason = "it did not answer in time" if last is None or not last.reason else last.reason
     todo = f"{reason[0].upper()}{reason[1:]}; then `dappled doctor` again"
-    return Finding("camera", "wrong", f"driver {settings.camera.driver}: {reason}", todo)
+    return Check("camera", "no-go", f"driver {settings.camera.driver}: {reason}", todo)
 
 
-def disk(settings: Settings, machine: Machine) -> list[Finding]:
-    """Where flights are recorded."""
+def disk(settings: Settings, machine: Machine) -> list[Check]:
+    """The folder where flights are recorded."""
     folder = Path(settings.record.directory)
-    place = next(one for one in (folder, *folder.parents) if os.path.exists(one))  # False where one may not look
+    place = next(one for one in (folder, *folder.parents) if os.path.exists(one))  # False without permission to look
     if not os.access(place, os.W_OK):
-        return [
-            Finding("disk", "wrong", f"{place} can't be written to", f"make {folder} yours, or set record.directory")
-        ]
+        return [Check("disk", "no-go", f"{place} can't be written to", f"make {folder} yours, or set record.directory")]
     free = shutil.disk_usage(place).free
     text = f"{free / 1e9:.1f} GB free at {folder}, room for some {int(free / _FRAME_BYTES)} frames"
     if free < settings.record.min_free_mb * 1e6:
         mend = "`dappled flight offload`, then remove frames by hand"
-        return [Finding("disk", "wrong", f"{text}: below record.min_free_mb", mend)]
-    return [Finding("disk", "ok", text)]
+        return [Check("disk", "no-go", f"{text}: below record.min_free_mb", mend)]
+    return [Check("disk", "go", text)]
 
 
-def clock(settings: Settings, machine: Machine) -> list[Finding]:
-    """Poses go by time: this machine's clock should be kept by something."""
+def clock(settings: Settings, machine: Machine) -> list[Check]:
+    """Whether the kernel's clock is synchronised."""
     if machine.unsynchronised():
-        text = "this machine's clock is not synchronised: poses go by the autopilot's time, file dates may be wrong"
-        return [Finding("clock", "note", text, "sudo apt install chrony")]
-    return [Finding("clock", "ok", "synchronised")]
+        text = "this machine's clock is not synchronised: poses use the autopilot's time, file dates may be wrong"
+        return [Check("clock", "caution", text, "sudo apt install chrony")]
+    return [Check("clock", "go", "synchronised")]
 
 
-def link(settings: Settings, machine: Machine) -> list[Finding]:
-    """The way to the autopilot."""
+def link(settings: Settings, machine: Machine) -> list[Check]:
+    """The links to the autopilot."""
     urls = settings.mavlink.url
     if not urls:
-        return [Finding("MAVLink", "note", "no link is configured: frames will have no poses", "set mavlink.url")]
+        return [Check("MAVLink", "caution", "no link is configured: frames will have no poses", "set mavlink.url")]
     found = []
     for url in urls:
         device = url.split(":")[0].split(",")[0]
         if device.startswith("/dev/") and not os.access(device, os.R_OK | os.W_OK):
             todo = "connect it, or: sudo usermod -aG dialout $USER and log in anew"
-            found.append(Finding("MAVLink", "wrong", f"{url}: {device} can't be opened", todo))
+            found.append(Check("MAVLink", "no-go", f"{url}: {device} can't be opened", todo))
         else:
-            found.append(Finding("MAVLink", "ok", f"{url} (`dappled run` says whether anybody is heard there)"))
+            found.append(Check("MAVLink", "go", f"{url} (`dappled run` says whether the autopilot is heard)"))
     return found
 
 
-def mask(settings: Settings, machine: Machine) -> list[Finding]:
-    """Decoding in flight."""
+def mask(settings: Settings, machine: Machine) -> list[Check]:
+    """Whether frames are decoded in flight."""
     if settings.mask.profile:
-        return [Finding("mask", "ok", settings.mask.profile)]
-    return [Finding("mask", "note", "no mask is configured: frames are kept, not decoded", "set mask.profile")]
+        return [Check("mask", "go", settings.mask.profile)]
+    return [Check("mask", "caution", "no mask is configured: frames are kept, not decoded", "set mask.profile")]
 
 
-CHECKS: tuple[Check, ...] = (libraries, bodies, grabbers, camera, disk, clock, link, mask)
+CHECKS: tuple[HostCheck, ...] = (libraries, bodies, grabbers, camera, disk, clock, link, mask)
 
 
 def _wants_usb(settings: Settings) -> bool:

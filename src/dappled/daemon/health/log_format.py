@@ -1,4 +1,4 @@
-"""The log, one line an event in words: structured to the journal where stderr goes there, else plain to stderr."""
+"""Write the log: with fields to the journal where stderr is the journal, else as plain lines to stderr."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import sys
 from collections.abc import Mapping
 
 JOURNAL = "/run/systemd/journal/socket"
-_PATIENCE_S = 0.05  # with a journal that stands still: the shutter logs too
+_PATIENCE_S = 0.05  # a journal that hangs must not delay the shutter, which logs too
 _PRIORITY = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 
 
 class JournalHandler(logging.Handler):
-    """Sends each record with its fields to the journal (its native protocol, one datagram a record).
+    """Sends each record with its fields to the journal (native protocol, one datagram for each record).
 
-    What a caller gives as `extra={"dappled": {"frame": 42}}` becomes fields of their own: DAPPLED_FRAME=42.
+    `extra={"dappled": {"frame": 42}}` of a log call becomes a field of its own: DAPPLED_FRAME=42.
     """
 
     def __init__(self, address: str = JOURNAL) -> None:
@@ -34,7 +34,7 @@ class JournalHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         try:
             self._socket.send(entry(fields(record)))
-        except Exception:  # noqa: BLE001  # as every handler of `logging`: whoever logs is not to blame, and goes on
+        except Exception:  # noqa: BLE001  # like every handler of `logging`: the caller goes on
             self.handleError(record)
 
     def close(self) -> None:
@@ -44,7 +44,7 @@ class JournalHandler(logging.Handler):
 
 def fields(record: logging.LogRecord) -> dict[str, str]:
     """A record's journal fields."""
-    told = {
+    found = {
         "MESSAGE": record.getMessage(),
         "PRIORITY": str(_PRIORITY.get(record.levelno, 5)),
         "SYSLOG_IDENTIFIER": "dappled",
@@ -53,16 +53,16 @@ def fields(record: logging.LogRecord) -> dict[str, str]:
         "CODE_LINE": str(record.lineno),
     }
     if record.exc_info:
-        told["DAPPLED_TRACEBACK"] = logging.Formatter().formatException(record.exc_info)
+        found["DAPPLED_TRACEBACK"] = logging.Formatter().formatException(record.exc_info)
     for name, value in getattr(record, "dappled", {}).items():
-        told[f"DAPPLED_{re.sub('[^A-Z0-9]', '_', str(name).upper())}"] = str(value)
-    return told
+        found[f"DAPPLED_{re.sub('[^A-Z0-9]', '_', str(name).upper())}"] = str(value)
+    return found
 
 
-def entry(told: Mapping[str, str]) -> bytes:
-    """Fields as the journal's native protocol writes them: a value with line ends goes behind its length."""
+def entry(found: Mapping[str, str]) -> bytes:
+    """Fields in the journal's native protocol: a value with line ends follows its length."""
     parts = []
-    for name, value in told.items():
+    for name, value in found.items():
         data = value.encode("utf-8", "replace")
         head = name.encode("ascii")
         if b"\n" in data:
@@ -73,11 +73,11 @@ def entry(told: Mapping[str, str]) -> bytes:
 
 
 def handler(environment: Mapping[str, str] = os.environ, address: str = JOURNAL) -> logging.Handler:
-    """Where the log goes: the journal when systemd says that stderr is its stream, else stderr."""
+    """The journal's handler when systemd says that stderr is the journal, else one for stderr."""
     if _is_journal(environment.get("JOURNAL_STREAM", "")):
         try:
             return JournalHandler(address)
-        except OSError:  # no such socket here: plain lines reach the journal too
+        except OSError:  # no such socket: plain lines reach the journal too
             pass
     plain = logging.StreamHandler(sys.stderr)
     plain.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))

@@ -1,22 +1,27 @@
-"""The log's last lines in words, for whoever looks at the daemon from outside its terminal."""
+"""The last lines of the log, the sentences in it, and which problems of the health record are new."""
 
 from __future__ import annotations
 
 import logging
+import re
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.drivers.camera import Setting
 from dappled.errors import sentence
 
 Level = Literal["info", "warning"]
+LOW_PERCENT = 25
+_LOW_WORDS = ("low", "empty", "exhausted", "critical")
+_NUMBER = re.compile(r"\d+")
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class LogLine:
     """One line; numbers count from 1 without gaps."""
 
     number: int
@@ -26,22 +31,22 @@ class Line:
 
 
 class Logbook(logging.Handler):
-    """Keeps the last lines; also what this package's loggers warn of, while it hangs there as a handler."""
+    """Keeps the last lines, for the console; as a handler of a logger also its warnings."""
 
     def __init__(self, utc_ns: Callable[[], int], *, capacity: int = 200) -> None:
         super().__init__(logging.WARNING)
         self._utc_ns = utc_ns
-        self._lines: deque[Line] = deque(maxlen=capacity)
+        self._lines: deque[LogLine] = deque(maxlen=capacity)
         self._guard = threading.Lock()
         self._count = 0
 
     def add(self, text: str, level: Level = "info") -> None:
-        """One line more; the oldest goes where there is no room. A line said twice in a row stands once."""
+        """Add a line; the oldest is removed when the book is full. The same line twice in a row is kept once."""
         with self._guard:
             if self._lines and self._lines[-1].text == text:
                 return
             self._count += 1
-            self._lines.append(Line(self._count, self._utc_ns(), level, text))
+            self._lines.append(LogLine(self._count, self._utc_ns(), level, text))
 
     def after(self, number: int, limit: int = 50) -> list[dict[str, Any]]:
         """The newest lines with a higher number, oldest first, as JSON values; at most `limit`."""
@@ -49,16 +54,40 @@ class Logbook(logging.Handler):
             return [asdict(line) for line in self._lines if line.number > number][-limit:]
 
     def emit(self, record: logging.LogRecord) -> None:
-        """A warning of a logger."""
+        """Add a logger's warning."""
         try:
             text = record.getMessage()
-        except (TypeError, ValueError) as error:  # a message whose arguments don't fit it
+        except (TypeError, ValueError) as error:  # the message's arguments don't fit it
             text = sentence(error)
         self.add(text, "warning")
 
 
-def of_story(pending: PendingShot) -> tuple[str, Level]:
-    """What became of a shot, in words."""
+class NewProblems:
+    """Finds the problems that the last call did not have. One whose numbers have changed is still the same problem."""
+
+    def __init__(self) -> None:
+        self._known: set[str] = set()
+
+    def __bool__(self) -> bool:
+        """Whether there was any problem at the last call."""
+        return bool(self._known)
+
+    def among(self, problems: Sequence[str], *, again: bool = False) -> list[str]:
+        """The new ones; with `again` all. These are the known ones from now on."""
+        known, self._known = self._known, {_NUMBER.sub("#", text) for text in problems}
+        return [text for text in problems if again or _NUMBER.sub("#", text) not in known]
+
+
+def battery_doubt(settings: Iterable[Setting]) -> str | None:
+    """A sentence where the camera says that its battery is nearly empty, else None. Each body has its own words."""
+    word = next((one.value.strip() for one in settings if one.name == "battery"), "")
+    percent = re.fullmatch(r"(\d+)\s*%", word)
+    low = int(percent[1]) <= LOW_PERCENT if percent else word.lower() in _LOW_WORDS
+    return f"the camera's battery is nearly empty: {word}" if low else None
+
+
+def of_shot(pending: PendingShot) -> tuple[str, Level]:
+    """The line that says how a shot ended, and its level."""
     who = f"frame {pending.shot.index}" if pending.frame else f"shot {pending.shot.index}"
     if pending.problem:
         return f"{who}: {pending.problem}", "warning"

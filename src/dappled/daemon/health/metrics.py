@@ -1,4 +1,4 @@
-"""A health record as Prometheus text, for whoever scrapes the console's port."""
+"""Write a health record as Prometheus text, for `/metrics` of the console."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _STATES = ("absent", "starting", "ready", "busy", "faulted")
 
 
 def text(health: Mapping[str, Any]) -> bytes:
-    """All numbers of the record. What is not known has no line."""
+    """All numbers of the record. Unknown values have no line."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Record(health))
     return generate_latest(registry)
@@ -32,24 +32,24 @@ def families(health: Mapping[str, Any]) -> Iterator[Metric]:
     """The record's metric families."""
     shots, disk, link, state = health["shots"], health["disk"], health["link"], health["camera"]["state"]
     yield _gauge(
-        "camera_state", "1 for the state that the camera is in", {name: name == state for name in _STATES}, "state"
+        "camera_state", "1 for the camera's state, 0 for the others", {name: name == state for name in _STATES}, "state"
     )
     ended = {name: shots.get(name) for name in ("safe", "failed", "refused")}
     yield _counter("shots", "Shots of this flight, by how they ended", ended, "state")
-    yield _counter("wishes", "Wishes that became shots", {"": shots["wished"]})
+    yield _counter("wishes", "Capture requests that became shots", {"": shots["wished"]})
     yield _gauge("shots_pending", "Shots under way", {"": shots["pending"]})
     yield _gauge("disk_free_bytes", "Free space where flights are recorded", {"": disk["free_bytes"]})
     yield _counter("mavlink_packets", "Packets heard and sent", {"": link["packets"]})
     yield _counter("positions", "Positions heard", {"": link["positions"]})
     stages = {stage["name"]: stage for stage in health["stages"] if "waiting" in stage}
     yield _gauge(
-        "stage_waiting", "Items that wait or are in hand", {n: s["waiting"] for n, s in stages.items()}, "stage"
+        "stage_waiting", "Items that wait or are being worked on", {n: s["waiting"] for n, s in stages.items()}, "stage"
     )
     for key, what in (("done", "Items done"), ("failed", "Items that failed"), ("dropped", "Items that did not fit")):
         yield _counter(f"stage_{key}", what, {name: stage[key] for name, stage in stages.items()}, "stage")
     sent = {topic: count for stage in health["stages"] for topic, count in stage.get("sent", {}).items()}
     yield _counter("published", "Messages published", sent, "topic")
-    yield _gauge("problems", "Problems that a person should read", {"": len(health["problems"])})
+    yield _gauge("problems", "Problems in the health record", {"": len(health["problems"])})
 
 
 def _gauge(name: str, what: str, samples: Mapping[str, float | None], label: str = "") -> Metric:

@@ -1,4 +1,4 @@
-"""What systemd is told: ready, still working, reloading, stopping, and one line of how it is (sd_notify(3))."""
+"""Notify systemd: ready, watchdog, reloading, stopping, and a status line (sd_notify(3))."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ log = logging.getLogger(__name__)
 
 
 class Notifier:
-    """Tells the service manager, where there is one; without one every call does nothing.
+    """Sends notifications to the service manager. Without one, every call does nothing.
 
-    `working` is for the working loop, each turn: it feeds the watchdog when half of its time has passed. A loop that
-    hangs doesn't get there, and systemd restarts the daemon.
+    The main loop calls `working` each turn; it feeds the watchdog when half of the watchdog's time has passed. When the
+    loop hangs, systemd restarts the daemon.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
@@ -25,42 +25,42 @@ class Notifier:
         self._status = ""
 
     def ready(self, monotonic_ns: int) -> None:
-        """Everything is open: wishes are answered from now on. Also ends `reloading`."""
+        """The daemon answers capture requests from now on. Also ends `reloading`."""
         self._fed_ns = monotonic_ns
-        self._tell("READY=1")
+        self._send("READY=1")
 
     def reloading(self, monotonic_ns: int) -> None:
-        """Settings are being read again; `ready` ends it."""
-        self._tell(f"RELOADING=1\nMONOTONIC_USEC={monotonic_ns // 1000}")
+        """Settings are being read again, until `ready`."""
+        self._send(f"RELOADING=1\nMONOTONIC_USEC={monotonic_ns // 1000}")
 
     def stopping(self) -> None:
         """The daemon is ending."""
-        self._tell("STOPPING=1")
+        self._send("STOPPING=1")
 
     def working(self, monotonic_ns: int, *, now: bool = False) -> None:
-        """The loop has turned once more. `now`: feed in any case, as something longer follows."""
+        """The loop has turned once more. `now`: feed the watchdog in any case, because something longer follows."""
         if self._watchdog_ns and (now or monotonic_ns - self._fed_ns >= self._watchdog_ns // 2):
             self._fed_ns = monotonic_ns
-            self._tell("WATCHDOG=1")
+            self._send("WATCHDOG=1")
 
     def status(self, text: str) -> None:
-        """One line for `systemctl status`; told when it changes."""
+        """The line of `systemctl status`; sent when it changes."""
         if text != self._status:
             self._status = text
-            self._tell("STATUS=" + text.replace("\n", " "))
+            self._send("STATUS=" + text.replace("\n", " "))
 
-    def _tell(self, message: str) -> None:
+    def _send(self, message: str) -> None:
         if not self._address:
             return
         try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as tell:
-                tell.sendto(message.encode(), self._address)
-        except OSError as error:  # a manager that does not listen must not stop a flight
-            log.debug("systemd was not told %r: %s", message, error)
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as one:
+                one.sendto(message.encode(), self._address)
+        except OSError as error:  # a missing manager must not stop a flight
+            log.debug("systemd was not notified of %r: %s", message, error)
 
 
 def _watchdog_ns(environment: Mapping[str, str]) -> int:
-    """The watchdog's time, when it is meant for this process; 0: there is none."""
+    """The watchdog's time if it is meant for this process; 0 without a watchdog."""
     if environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return 0
     usec = environment.get("WATCHDOG_USEC", "")

@@ -1,4 +1,4 @@
-"""One record that says how everything is: for the stream, the log and whoever looks."""
+"""Make the health record: the state of camera, links, disk, shots and queues, with a sentence for each problem."""
 
 from __future__ import annotations
 
@@ -42,8 +42,10 @@ def record(
     dead_threads: Sequence[str] = (),
     doubts: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """The facts of a `health` message; `problems` are sentences, none when all is well. `doubts`: more of them,
-    of what is contradictory in the vehicle. `dead_threads`: threads that have ended without being asked to."""
+    """The header of a `health` message. Its `problems` are sentences, none when all is well.
+
+    `doubts` are further problems, found by other parts. `dead_threads` have ended without being asked to.
+    """
     problems = [f"the {name} thread has ended: restart dappled" for name in dead_threads]
     if pipeline.camera_state not in ("starting", "ready", "busy"):
         problems.append(camera_sentence(pipeline))
@@ -60,7 +62,7 @@ def record(
     problems += doubts
     if not utc_known:
         problems.append(
-            "UTC is not known yet: the autopilot's satellites will tell it, and all stamps are put right then"
+            "UTC is not known yet: all time stamps are corrected when the autopilot has it from its satellites"
         )
     free = _free(folder)
     if free is not None and free < settings.record.min_free_mb * 1_000_000:
@@ -74,7 +76,10 @@ def record(
     stages = [asdict(stage.statistics()) for stage in pipeline.stages]
     for stage in stages:
         if stage["dropped"]:
-            problems.append(f"{stage['name']} fell behind: {stage['dropped']} frames are only in the record")
+            lost = stage["dropped"]
+            problems.append(
+                f"{stage['name']} fell behind: {lost} frame{' is' if lost == 1 else 's are'} only in the record"
+            )
     return {
         "utc_ns": utc_ns,
         "camera": {"state": pipeline.camera_state, "reason": pipeline.camera_reason},
@@ -110,18 +115,18 @@ def record(
 
 
 def _silence(link: LinkStatistics) -> str:
-    """Why a link is of no use, as far as can be told from here."""
+    """Why a link is not usable, as far as this end knows."""
     signing = link.signing
     if signing is None or signing.refused == 0:
-        return "nobody was heard for 5 s"
+        return "nothing was heard for 5 s"
     return (
-        f"nobody was heard for 5 s whose signature counts ({signing.unsigned_refused} packets were unsigned, "
-        f"{signing.forged} forged, {signing.replayed} too old); give both sides the same key"
+        f"nothing with a valid signature was heard for 5 s ({signing.unsigned_refused} packets were unsigned, "
+        f"{signing.forged} forged, {signing.replayed} too old); give both ends the same key"
     )
 
 
 def _counters(link: LinkStatistics) -> dict[str, Any]:
-    """What went over a link."""
+    """The counters of a link."""
     return {
         "url": link.url,
         "in": link.packets_in,
@@ -145,7 +150,7 @@ def _publish(publisher: PublisherStatistics) -> dict[str, Any]:
 
 
 def _place(pose: Pose) -> dict[str, float | None]:
-    """Where the vehicle is, for a map."""
+    """The vehicle's position, for a map."""
     speed = pose.velocity_ned_m_s
     return {
         "latitude_deg": wire.degrees(pose.latitude_rad),
@@ -159,21 +164,21 @@ def _place(pose: Pose) -> dict[str, float | None]:
     }
 
 
-def line(told: Mapping[str, Any]) -> str:
-    """A health record in one line, for a status display."""
-    shots, problems = told["shots"], told["problems"]
-    counts = f"camera {told['camera']['state']}, {shots['safe']} of {shots['wished']} frames safe"
+def line(health: Mapping[str, Any]) -> str:
+    """A health record in one line, for `systemctl status`."""
+    shots, problems = health["shots"], health["problems"]
+    counts = f"camera {health['camera']['state']}, {shots['safe']} of {shots['wished']} frames safe"
     return f"{counts}; {'; '.join(problems)}" if problems else f"{counts}; all is well"
 
 
 def camera_sentence(pipeline: Pipeline) -> str:
-    """Why there is no camera to fire: "the camera is absent: …"."""
+    """The camera's state and its reason: "the camera is absent: …"."""
     reason = f": {pipeline.camera_reason}" if pipeline.camera_reason else ""
     return f"the camera is {pipeline.camera_state}{reason}"
 
 
 def obstacle(pipeline: Pipeline, folder: Path, min_free_mb: int) -> str | None:
-    """Why no shot can be taken now; None where one can."""
+    """Why no shot can be taken now; None if one can."""
     if pipeline.camera_state not in ("ready", "busy"):
         return camera_sentence(pipeline)
     try:
@@ -181,7 +186,7 @@ def obstacle(pipeline: Pipeline, folder: Path, min_free_mb: int) -> str | None:
     except DappledError as error:
         return str(error)
     if free < min_free_mb * 1_000_000:
-        return f"the disk is nearly full: {free // 1_000_000} MB left, record.min_free_mb asks for more"
+        return f"the disk is nearly full: {free // 1_000_000} MB left, record.min_free_mb is more"
     return None
 
 

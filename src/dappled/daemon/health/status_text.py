@@ -1,13 +1,13 @@
-"""Lines for the pilot: STATUSTEXT, in pieces where a sentence is longer, and not the same one again and again."""
+"""Make STATUSTEXT messages for the pilot: sentences in pieces, none repeated at once, new problems and their end."""
 
 from __future__ import annotations
 
 import itertools
-import re
 import threading
 from collections import deque
 from collections.abc import Sequence
 
+from dappled.daemon.health.logbook import NewProblems
 from dappled.drivers.mavlink.links import Message, mavlink
 
 PIECE_BYTES = 50
@@ -15,49 +15,48 @@ LONGEST_BYTES = 4 * PIECE_BYTES
 AGAIN_NS = 10 * 10**9
 AWAY_NS = 60 * 10**9
 _REMEMBERED = 32
-_NUMBER = re.compile(r"\d+")  # a problem whose numbers change is still the same
 
 
-class PilotLines:
-    """Sentences to messages. The same sentence is said at most once in ten seconds."""
+class PilotMessages:
+    """Turns sentences into messages. The same sentence is sent at most once in ten seconds."""
 
     def __init__(self) -> None:
         self._numbers = itertools.cycle(range(1, 65536))
-        self._said: deque[tuple[str, int]] = deque(maxlen=_REMEMBERED)
+        self._sent: deque[tuple[str, int]] = deque(maxlen=_REMEMBERED)
 
     def messages(self, text: str, severity: int, now_ns: int) -> list[Message]:
-        """The messages that say it; none where it was just said. Time is monotonic."""
-        if any(said == text and now_ns - at_ns < AGAIN_NS for said, at_ns in list(self._said)):
+        """The messages of a sentence; none where it was sent just before. Time is monotonic."""
+        if any(sent == text and now_ns - at_ns < AGAIN_NS for sent, at_ns in list(self._sent)):
             return []
-        self._said.append((text, now_ns))
+        self._sent.append((text, now_ns))
         return list(_pieces(text, severity, next(self._numbers)))
 
 
 class Alarms:
-    """Tells each problem once, when it comes up; and when the last has gone."""
+    """Warns of each problem once, when it comes up, and says when the last one has gone."""
 
     def __init__(self) -> None:
-        self._known: set[str] = set()
+        self._problems = NewProblems()
 
     @property
     def troubled(self) -> bool:
-        """Whether there is any, as told last."""
-        return bool(self._known)
+        """Whether there was a problem at the last call of `lines`."""
+        return bool(self._problems)
 
     def lines(self, problems: Sequence[str], *, again: bool = False) -> list[tuple[str, int]]:
-        """What is to be said now, and how severe it is. `again`: also what was said before, as long as it lasts."""
-        now = {_NUMBER.sub("#", text) for text in problems}
-        told = set() if again else self._known
-        said = [(text, mavlink.MAV_SEVERITY_WARNING) for text in problems if _NUMBER.sub("#", text) not in told]
-        if self._known and not now:
-            said.append(("all is well again", mavlink.MAV_SEVERITY_INFO))
-        self._known = now
-        return said
+        """The sentences to send now, each with its severity. `again` repeats the problems that last."""
+        before = bool(self._problems)
+        lines = [(text, mavlink.MAV_SEVERITY_WARNING) for text in self._problems.among(problems, again=again)]
+        if before and not problems:
+            lines.append(("all is well again", mavlink.MAV_SEVERITY_INFO))
+        return lines
 
 
-class Audience:
-    """The ground stations that read the lines. A daemon starts with the machine, long before anybody listens: who comes
-    later, or back after a minute, has missed what still lasts. Times are monotonic."""
+class GroundStations:
+    """Notices ground stations that are new, or back after a minute: they have not received the problems that last.
+
+    The daemon starts with the machine, often long before a ground station listens. Times are monotonic.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -65,20 +64,20 @@ class Audience:
         self._due_ns: int | None = None
 
     def heard(self, message: Message, now_ns: int) -> None:
-        """A heartbeat."""
+        """Take note of a heartbeat."""
         if message.type != mavlink.MAV_TYPE_GCS:
             return
         station = (message.get_srcSystem(), message.get_srcComponent())
-        with self._lock:  # each link has a thread
+        with self._lock:  # each link has its own thread
             before_ns = self._heard_ns.pop(station, None)
             self._heard_ns[station] = now_ns
             if len(self._heard_ns) > _REMEMBERED:
                 del self._heard_ns[next(iter(self._heard_ns))]
         if before_ns is None or now_ns - before_ns > AWAY_NS:
-            self._due_ns = now_ns + AGAIN_NS  # what was said a moment ago would not be said again
+            self._due_ns = now_ns + AGAIN_NS  # `PilotMessages` would leave out what was sent a moment ago
 
-    def has_grown(self, now_ns: int) -> bool:
-        """Whether somebody new listens; True once."""
+    def new_one(self, now_ns: int) -> bool:
+        """Whether a new one listens since a while; True once for each."""
         due_ns = self._due_ns
         if due_ns is None or now_ns < due_ns:
             return False
@@ -87,8 +86,8 @@ class Audience:
 
 
 def _pieces(text: str, severity: int, number: int) -> list[Message]:
-    """One message up to 50 bytes; more carry a number and count up, and the last one is not full."""
-    raw = text.encode("ascii", "replace")  # what ground stations can be trusted to show
+    """One message up to 50 bytes; else several with one number, of which the last is not full."""
+    raw = text.encode("ascii", "replace")  # all ground stations show ASCII
     if len(raw) <= PIECE_BYTES:
         return [mavlink.MAVLink_statustext_message(severity, raw)]
     if len(raw) >= LONGEST_BYTES:

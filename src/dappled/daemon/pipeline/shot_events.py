@@ -8,8 +8,7 @@ from collections.abc import Callable
 from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol import ground_facts
 from dappled.daemon.camera_protocol.component import CameraFacts, Component
-from dappled.daemon.health import battery
-from dappled.daemon.health.logbook import Logbook, of_story
+from dappled.daemon.health.logbook import Logbook, battery_doubt, of_shot
 from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.pipeline.shutter import Shutter
@@ -76,7 +75,7 @@ class ShotEvents:
         self._outside.tagged(pending)
 
     def _finished(self, pending: PendingShot) -> None:
-        self._logbook.add(*of_story(pending))
+        self._logbook.add(*of_shot(pending))
         if self._depth is not None:
             self._depth.offer(pending)
         self._outside.finished(pending)
@@ -103,6 +102,6 @@ class ShotEvents:
             report(log, "camera", error)
 
     def _settings_changed(self, change: SettingsChanged) -> None:
-        self._battery_doubt = battery.doubt(change.settings)
+        self._battery_doubt = battery_doubt(change.settings)
         self._component.settings_changed(change.refused)
         self._outside.settings(change)

@@ -1,6 +1,6 @@
-"""A few shots through the whole daemon, to be looked at: what `dappled doctor --test-shot` and `--latency` fly.
+"""Take test shots with a whole daemon of its own, for `dappled doctor --test-shot` and `--latency`.
 
-A daemon that runs meanwhile is not disturbed, but two can't hold one camera.
+A daemon that runs at the same time is not disturbed, but only one of them can hold the camera.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ END_S = 60.0
 _LOOK_S = 0.02
 
 
-class TrialError(DappledError):
+class TestShotError(DappledError):
     """No shot can be taken; one sentence."""
 
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """One shot's times in milliseconds from the wish's way to the camera, None where nobody could see it.
+    """One shot's times in milliseconds; None where a time could not be measured.
 
-    `to_exposure` is from the trigger call to the opening of the shutter, by the hot shoe; `to_file` from the trigger
-    call to the whole file in memory; `recorded` from there to safe on disk.
+    `wish_to_trigger` is from the capture request to the trigger call, `to_exposure` from the trigger call to the
+    opening of the shutter (by the hot shoe), `to_file` from the trigger call to the whole file in memory, `recorded`
+    from there to safe on disk.
     """
 
     wish_to_trigger: float | None
@@ -44,8 +45,8 @@ class Latency:
 
 
 @contextmanager
-def daemon(settings: Settings, sockets: Path, record: Path) -> Iterator[Trial]:
-    """A daemon of these settings at work: its sockets in one folder, its flight in another. Raises DappledError."""
+def daemon(settings: Settings, sockets: Path, record: Path) -> Iterator[TestShot]:
+    """Run a daemon with these settings: its sockets in one folder, its flight in another. Raises DappledError."""
     ours = replace(
         settings,
         record=replace(settings.record, directory=str(record / "flights"), min_free_mb=0),
@@ -62,17 +63,17 @@ def daemon(settings: Settings, sockets: Path, record: Path) -> Iterator[Trial]:
 
     service = Service(ours, observer=Observer(finished=finished))
     service.start()
-    loop = threading.Thread(target=service.run, name="trial")
+    loop = threading.Thread(target=service.run, name="test shot")
     loop.start()
     try:
-        yield Trial(service, shots, ended)
+        yield TestShot(service, shots, ended)
     finally:
         service.ask_to_stop()
         loop.join(5)
         service.stop()
 
 
-class Trial:
+class TestShot:
     """A running daemon to take shots with."""
 
     def __init__(self, service: Service, shots: list[PendingShot], ended: threading.Condition) -> None:
@@ -81,34 +82,36 @@ class Trial:
 
     @property
     def flight(self) -> Path:
-        """Where it is recorded."""
+        """The flight's folder."""
         return self._service.folder
 
     def until_ready(self, timeout_s: float = READY_S) -> None:
-        """Wait for the camera. Raises TrialError with the camera's own reason."""
+        """Wait for the camera. Raises TestShotError with the camera's own reason."""
         until = time.monotonic() + timeout_s
         while (state := self._service.health()["camera"])["state"] != "ready":
             if time.monotonic() >= until:
-                raise TrialError(f"the camera is not ready after {timeout_s:g} s: {state['state']} {state['reason']}")
+                raise TestShotError(
+                    f"the camera is not ready after {timeout_s:g} s: {state['state']} {state['reason']}"
+                )
             time.sleep(_LOOK_S)
 
     def shoot(self, timeout_s: float = END_S) -> PendingShot:
-        """One shot to its end. Raises TrialError where it is refused, or does not end."""
+        """Take one shot and wait for its end. Raises TestShotError where it is refused, or does not end."""
         self.until_ready()
         self._requests += 1
         decision = self._service.request(CaptureRequest("doctor", "test shot", self._requests, acknowledged=False))
         if decision.index is None or not decision.accepted:
-            raise TrialError(f"the shot was refused: {decision.reason}")
+            raise TestShotError(f"the shot was refused: {decision.reason}")
         until = time.monotonic() + timeout_s
         with self._ended:
             while not (found := [one for one in self._shots if one.shot.index == decision.index]):
                 if not self._ended.wait(until - time.monotonic()):
-                    raise TrialError(f"the shot did not come to an end within {timeout_s:g} s")
+                    raise TestShotError(f"the shot did not end within {timeout_s:g} s")
         return found[0]
 
 
 def latency(pending: PendingShot) -> Latency:
-    """What one shot took."""
+    """The times of one shot."""
     to_exposure = to_file = None
     if pending.fired is not None and pending.tag is not None and pending.tag.time_source.startswith("hot shoe"):
         called_utc_ns = clocks.called_utc_ns(pending.shot, pending.fired.called_monotonic_ns)
