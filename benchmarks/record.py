@@ -1,4 +1,4 @@
-"""What recording costs: a durable frame against plain write + fsync, a note in the wish journal, a ledger row.
+"""What recording costs: a durable frame against plain write + fsync, a note in the shot journal, a ledger row.
 
 python benchmarks/record.py [--json] [--directory DIR] [--megabytes 17] [--rounds 15]
 python benchmarks/record.py --sustained 300 [--json] [--directory DIR]      4 frames/s of 11 MB: see sustained.py

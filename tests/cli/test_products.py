@@ -18,7 +18,7 @@ from dappled.flight import recording
 from dappled.products import opened
 from dappled.products.exports import light_files
 from dappled.products.maps.earth import Projection
-from tests.flight.makers import deliver, pose, tag, wish
+from tests.flight.makers import deliver, pose, request, tag
 from tests.products.fields import DISPARITY, light_field
 
 
@@ -124,7 +124,7 @@ def test_points_lie_where_the_flights_own_mount_looks(
     facts = {"settings": {"pose": {"mount": mount.ravel().tolist(), "lever_arm_m": [0.0, 0.0, 2.0]}}}
     level = replace(pose(), latitude_rad=0.72, longitude_rad=-1.6, altitude_msl_m=215.0, attitude=(1.0, 0.0, 0.0, 0.0))
     begun = recording.begin(tmp_path / "flights", lambda: 1_795_256_103_000_000_000, facts)
-    wish(begun, 0)
+    request(begun, 0)
     begun.ledger.add_tag(replace(tag(deliver(begun, 0, b"a frame")), pose=level))
     begun.close()
     given = ["--focus", "inf", "--flight", str(begun.folder.path), "--frame", "0"]

@@ -35,8 +35,8 @@ def shot(index: int = 0, source: str = "mavlink:255/190", sequence: int | None =
     return Shot(index, Cause(source, "IMAGE_START_CAPTURE", sequence), 1_000 + index, 2_000 + index)
 
 
-def wish(flight: Recording, index: int) -> None:
-    """One wish, all the way to a fired shot."""
+def request(flight: Recording, index: int) -> None:
+    """One capture request, up to a fired shot."""
     flight.journal.note(shot(index))
     flight.ledger.add_shot(shot(index))
     flight.ledger.fired(index, 10, 20)

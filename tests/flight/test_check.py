@@ -9,14 +9,14 @@ import pytest
 
 from dappled.flight import FlightError, FlightFolder, LedgerReader, Recording, Result, durable, flight_report
 from dappled.flight.check import check
-from tests.flight.makers import deliver, flip, mavlink_2, shot, tag, wish
+from tests.flight.makers import deliver, flip, mavlink_2, request, shot, tag
 
 
 @pytest.fixture
 def recorded(flight: Recording) -> FlightFolder:
     """A closed flight: shots 0 and 1 safe, tagged and (0) decoded, shot 2 failed."""
     for index in range(3):
-        wish(flight, index)
+        request(flight, index)
     for index in range(2):
         frame = deliver(flight, index, bytes(1000))
         flight.ledger.add_tag(tag(frame))
@@ -67,9 +67,9 @@ FAULTS = [
         "a line of the journal", lambda f: drop_line(f.journal, 1), "shot 1 is in the ledger, but not in shots.jsonl"
     ),
     Fault(
-        "another wish",
+        "another shot",
         lambda f: f.journal.write_bytes(f.journal.read_bytes().replace(b"mavlink:255/190", b"mavlink:255/191")),
-        "told differently",
+        "differs between shots.jsonl",
     ),
     Fault("a letter of flight.toml", lambda f: flip(f.settings, 2), "flight.toml was changed"),
     Fault("a byte of the white frame", lambda f: flip(f.path / "inputs/white.npy", 9), "inputs/white.npy was changed"),
@@ -108,7 +108,7 @@ def test_one_fault_is_found(recorded: FlightFolder, fault: Fault) -> None:
 
 
 def test_a_flight_that_is_being_recorded_is_no_fault(flight: Recording) -> None:
-    wish(flight, 0)
+    request(flight, 0)
     report = check(flight.folder.path)
     assert report.intact
     assert "still recorded" in report.notes[0]

@@ -19,7 +19,7 @@ import pytest
 from dappled.flight import FlightError, Frame, Recording, durable, layout, recording
 from dappled.flight.check import check
 from tests.flight.conftest import START_UTC_NS
-from tests.flight.makers import deliver, flip, shot, tag, wish
+from tests.flight.makers import deliver, flip, request, shot, tag
 
 LATER_UTC_NS = START_UTC_NS + 10**9
 MB = 1_000_000
@@ -48,14 +48,14 @@ from pathlib import Path
 from dappled.flight import recording
 from dappled.flight.check import check
 from dappled.flight.errors import FlightError
-from tests.flight.makers import deliver, wish
+from tests.flight.makers import deliver, request
 mount = lambda *words: subprocess.run(["mount", *words], check=True)
 disk = Path(sys.argv[1])
 mount("-t", "tmpfs", "-o", "size=8m", "dappled", str(disk))
 flight = recording.begin(disk / "flights", lambda: 1795256103000000000)
 told, safe = [], []
 def shoot(index, size=2_500_000):
-    wish(flight, index)
+    request(flight, index)
     try:
         safe.append(deliver(flight, index, os.urandom(size)).index)
     except FlightError as error:
@@ -179,9 +179,9 @@ def test_a_disk_that_the_kernel_makes_read_only(ext4: Image) -> None:
     """The journal, the ledger and the frames are refused, each in a sentence; what was safe is there after a repair."""
     flights = ext4.mounted / "flights"
     flight = recording.begin(flights, lambda: START_UTC_NS)
-    wish(flight, 0)
+    request(flight, 0)
     safe = {0: deliver(flight, 0, os.urandom(MB)).sha256}
-    wish(flight, 1)
+    request(flight, 1)
     ext4.break_down()
     with pytest.raises(FlightError, match=r"cannot record IMG_0001.CR2 .* read-only"):
         deliver(flight, 1, os.urandom(MB))
@@ -216,7 +216,7 @@ def test_a_power_cut_on_a_real_file_system(ext4: Image, tmp_path: Path, monkeypa
         monkeypatch.setattr(os, name, partial(watched, getattr(os, name)))
     flight = recording.begin(ext4.mounted / "flights", lambda: START_UTC_NS)
     for index in range(2):
-        wish(flight, index)
+        request(flight, index)
         cut()
         safe[index] = deliver(flight, index, os.urandom(300_000)).sha256
         cut()
@@ -241,7 +241,7 @@ def flown(flights: Path) -> Recording:
     """A closed flight of six frames."""
     flight = recording.begin(flights, lambda: START_UTC_NS)
     for index in range(6):
-        wish(flight, index)
+        request(flight, index)
         flight.ledger.add_tag(tag(deliver(flight, index, b"raw %d" % index)))
     flight.close()
     return flight
@@ -281,7 +281,7 @@ def test_a_corrupted_ledger_of_a_crashed_flight_is_made_anew(flights: Path) -> N
     flight = recording.begin(flights, lambda: START_UTC_NS)
     frames: list[Frame] = []
     for index in range(6):
-        wish(flight, index)
+        request(flight, index)
         if index != 4:
             frames.append(deliver(flight, index, b"raw %d" % index))
     flight.close()
@@ -307,7 +307,7 @@ def test_a_corrupted_ledger_of_a_crashed_flight_is_made_anew(flights: Path) -> N
 
 def test_a_flipped_bit_in_the_journal_of_a_crashed_flight(flights: Path, flight: Recording) -> None:
     for index in range(3):
-        wish(flight, index)
+        request(flight, index)
     sha256 = deliver(flight, 0, b"raw").sha256
     flight.close()
     flip(flight.folder.journal, 40)

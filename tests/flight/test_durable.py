@@ -3,17 +3,13 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from dappled.flight import durable
-from dappled.flight.durable import Flusher
 from tests.flight.makers import held
-
-DEADLINE_S = 20.0
 
 
 def test_bytes_come_in_with_their_hash(tmp_path: Path) -> None:
@@ -73,45 +69,3 @@ def test_temporary_names_are_told_apart(tmp_path: Path) -> None:
     assert durable.is_temporary(durable.temporary(tmp_path / "000001.dng").name)
     assert not durable.is_temporary("000001.part")
     assert not durable.is_temporary(".lock")
-
-
-def test_bytes_written_while_the_disk_was_busy_are_synced_at_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The disk is slow: before its first sync is done more is written, and the flusher is told to end."""
-    sizes: list[int] = []
-    begun, go_on = threading.Event(), threading.Event()
-
-    def slow(fd: int) -> None:
-        sizes.append(os.fstat(fd).st_size)
-        begun.set()
-        assert go_on.wait(DEADLINE_S)
-
-    monkeypatch.setattr(os, "fdatasync", slow)
-    with (tmp_path / "log").open("ab", buffering=0) as file:
-        flusher = Flusher(file.fileno(), interval_s=0.0)
-        file.write(b"0123456789")
-        flusher.poke()
-        assert begun.wait(DEADLINE_S)
-        file.write(b"0123456789")
-        flusher.poke()
-        end = threading.Thread(target=flusher.close)
-        end.start()
-        assert flusher._closing.wait(DEADLINE_S)  # from here on `close` only waits
-        go_on.set()
-        end.join(DEADLINE_S)
-        assert not end.is_alive()
-    assert sizes[-1] == 20
-    assert flusher.error is None
-
-
-def test_a_refused_sync_stays_readable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(fd: int) -> None:
-        raise OSError(5, "Input/output error")
-
-    monkeypatch.setattr(os, "fdatasync", refuse)
-    with (tmp_path / "log").open("ab", buffering=0) as file:
-        flusher = Flusher(file.fileno())
-        flusher.poke()
-        flusher.close()
-    assert flusher.error is not None

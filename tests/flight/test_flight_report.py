@@ -1,4 +1,4 @@
-"""The books by source: every wish in one column, and the columns add up."""
+"""The report by source: every request in one column, and the columns add up."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import pytest
 from dappled.cli import main
 from dappled.flight import FlightFolder, Recording, Result, flight_report
 from dappled.flight.flight_report import SourceReport, by_source
-from tests.flight.makers import deliver, tag, wish
+from tests.flight.makers import deliver, request, tag
 
 
 @pytest.fixture
 def recorded(flight: Recording) -> FlightFolder:
     """A closed flight: shots 0 and 1 safe and tagged, 0 decoded, shot 2 failed."""
     for index in range(3):
-        wish(flight, index)
+        request(flight, index)
     for index in range(2):
         flight.ledger.add_tag(tag(deliver(flight, index, bytes(1000))))
     flight.ledger.add_result(Result(0, "ab", 12, 13, "geometric", "predicted"))
@@ -27,8 +27,8 @@ def test_a_flights_books_by_source(recorded: FlightFolder) -> None:
     assert by_source(recorded.path) == (SourceReport("mavlink:255/190", 3, 0, 3, 2, 1, 0, 2, 1),)
 
 
-def test_refused_wishes_stand_with_who_made_them(flight: Recording) -> None:
-    wish(flight, 0)
+def test_refused_requests_are_counted_at_their_source(flight: Recording) -> None:
+    request(flight, 0)
     for text in ("IMAGE_START_CAPTURE from mavlink:7/1: no camera", "console from console: no camera", "gibberish"):
         flight.ledger.add_event("refused", text)
     books = {one.source: one for one in by_source(flight.folder.path)}

@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 
 from dappled.flight import Cause, FlightError, Shot
 from dappled.flight import journal as journals
+from dappled.flight.journal import Flusher
 from tests.flight.makers import shot
 
+DEADLINE_S = 20.0
 SHOTS = st.builds(
     Shot,
     st.integers(0, 2**31),
@@ -25,7 +27,7 @@ SHOTS = st.builds(
 
 
 @given(st.lists(SHOTS, max_size=5, unique_by=lambda shot: shot.index), st.binary(max_size=40))
-def test_wishes_come_back_and_a_torn_end_is_told(
+def test_shots_come_back_and_a_torn_end_is_reported(
     tmp_path_factory: pytest.TempPathFactory, shots: list[Shot], torn: bytes
 ) -> None:
     path = tmp_path_factory.mktemp("journal") / "shots.jsonl"
@@ -69,10 +71,10 @@ def test_any_bytes_are_read_without_a_crash(tmp_path_factory: pytest.TempPathFac
         b"[" * 100_000,
     ],
 )
-def test_a_line_that_is_no_wish_is_told(tmp_path: Path, line: bytes) -> None:
+def test_a_line_that_is_not_a_shot_is_reported(tmp_path: Path, line: bytes) -> None:
     path = tmp_path / "shots.jsonl"
     path.write_bytes(line + b"\n")
-    assert journals.read(path) == journals.JournalContents((), (f"line 1 of {path} is not a wish",))
+    assert journals.read(path) == journals.JournalContents((), (f"line 1 of {path} is not a shot",))
 
 
 def test_a_shot_noted_twice_is_told(tmp_path: Path) -> None:
@@ -165,3 +167,45 @@ def test_a_note_survives_the_process(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=False, timeout=60)
     assert done.returncode == -9
     assert journals.read(path).shots == (shot(5),)
+
+
+def test_bytes_written_while_the_disk_was_busy_are_synced_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk is slow: before its first sync is done more is written, and the flusher is told to end."""
+    sizes: list[int] = []
+    begun, go_on = threading.Event(), threading.Event()
+
+    def slow(fd: int) -> None:
+        sizes.append(os.fstat(fd).st_size)
+        begun.set()
+        assert go_on.wait(DEADLINE_S)
+
+    monkeypatch.setattr(os, "fdatasync", slow)
+    with (tmp_path / "log").open("ab", buffering=0) as file:
+        flusher = Flusher(file.fileno(), interval_s=0.0)
+        file.write(b"0123456789")
+        flusher.poke()
+        assert begun.wait(DEADLINE_S)
+        file.write(b"0123456789")
+        flusher.poke()
+        end = threading.Thread(target=flusher.close)
+        end.start()
+        assert flusher._closing.wait(DEADLINE_S)  # from here on `close` only waits
+        go_on.set()
+        end.join(DEADLINE_S)
+        assert not end.is_alive()
+    assert sizes[-1] == 20
+    assert flusher.error is None
+
+
+def test_a_refused_sync_stays_readable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(fd: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(os, "fdatasync", refuse)
+    with (tmp_path / "log").open("ab", buffering=0) as file:
+        flusher = Flusher(file.fileno())
+        flusher.poke()
+        flusher.close()
+    assert flusher.error is not None

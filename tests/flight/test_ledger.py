@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Result, ShotRow, ShotState, Stray
-from dappled.flight.records import TRANSITIONS, IllegalTransitionError, advance
+from dappled.flight.ledger import TRANSITIONS, IllegalTransitionError, advance
 from tests.flight.makers import shot, tag
 
 
@@ -111,7 +111,7 @@ def test_two_frames_or_rows_for_one_shot_are_refused(tmp_path: Path) -> None:
         ledger.safe(frame(1))
         with pytest.raises(IllegalTransitionError, match="shot 1 is safe: it can't become safe"):
             ledger.safe(frame(1))
-        with pytest.raises(FlightError, match="never wished for"):
+        with pytest.raises(FlightError, match="never requested"):
             ledger.safe(frame(2))
         with pytest.raises(FlightError, match="contradicts"):
             ledger.add_tag(tag(frame(2)))

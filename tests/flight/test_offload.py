@@ -11,13 +11,13 @@ from dappled.cli import main
 from dappled.flight import FlightError, Ledger, Recording, durable, layout, offload
 from dappled.flight.check import check
 from tests.flight.conftest import START_UTC_NS
-from tests.flight.makers import deliver, flip, mavlink_2, wish
+from tests.flight.makers import deliver, flip, mavlink_2, request
 
 
 @pytest.fixture
 def closed(flight: Recording) -> Path:
     for index in range(2):
-        wish(flight, index)
+        request(flight, index)
         deliver(flight, index, b"raw %d" % index * 1000)
     flight.telemetry.append(1, mavlink_2(b"a"))
     flight.close()

@@ -109,7 +109,7 @@ def put_in_order(flights: Path, told: Told) -> None:
     try:
         assert after.next_index > max(told.noted, default=-1)
         for index in told.noted:
-            assert after.index.lookup(index) is not None, f"wish {index} is lost"
+            assert after.index.lookup(index) is not None, f"shot {index} is lost"
         for index, sha256 in told.safe.items():
             entry = after.index.lookup(index)
             assert entry is not None, f"frame {index} is lost"

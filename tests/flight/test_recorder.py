@@ -16,7 +16,7 @@ import pytest
 from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Recording, Stray, durable
 from dappled.flight.check import check
 from dappled.flight.recording import StrayFileError
-from tests.flight.makers import deliver, held, wish
+from tests.flight.makers import deliver, held, request
 
 DATA = b"raw bytes" * 1000
 
@@ -26,7 +26,7 @@ def files(flight: Recording) -> list[str]:
 
 
 def test_a_frame_is_safe_when_record_returns(flight: Recording) -> None:
-    wish(flight, 0)
+    request(flight, 0)
     frame = deliver(flight, 0, DATA)
     assert frame.name == "frames/000000.cr2"
     assert (frame.camera_name, frame.size, frame.arrived_utc_ns) == ("IMG_0001.CR2", len(DATA), 5)
@@ -50,13 +50,13 @@ def test_the_row_comes_after_the_file(flight: Recording, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(durable, "sync_folder", watched_sync)
     monkeypatch.setattr(Ledger, "safe", watched_safe)
-    wish(flight, 0)
+    request(flight, 0)
     deliver(flight, 0, DATA)
     assert order == ["sync frames", "row"]
 
 
 def test_the_same_file_twice_is_one_frame(flight: Recording) -> None:
-    wish(flight, 0)
+    request(flight, 0)
     first = deliver(flight, 0, DATA)
     assert deliver(flight, 0, DATA) == first
     assert files(flight) == ["000000.cr2"]
@@ -64,7 +64,7 @@ def test_the_same_file_twice_is_one_frame(flight: Recording) -> None:
 
 
 def test_a_second_file_for_a_shot_is_kept_as_a_stray(flight: Recording) -> None:
-    wish(flight, 0)
+    request(flight, 0)
     first = deliver(flight, 0, DATA)
     with pytest.raises(StrayFileError, match=r"IMG_0001.JPG is a second file for shot 0") as told:
         deliver(flight, 0, b"jpeg", "IMG_0001.JPG")
@@ -91,7 +91,7 @@ def test_a_stray_that_lost_its_row_does_not_keep_the_next_one_out(
 
 
 def test_a_file_for_an_unknown_shot_is_kept_as_a_stray(flight: Recording) -> None:
-    with pytest.raises(StrayFileError, match="never wished for"):
+    with pytest.raises(StrayFileError, match="never requested"):
         deliver(flight, 9, DATA, "../../IMG.CR2")
     assert files(flight) == ["stray-000000.cr2"]
     assert flight.ledger.shot(9) is None
@@ -105,7 +105,7 @@ def test_a_disk_fault_fails_the_shot_and_leaves_no_file(
     def refuse(*_: object, **__: object) -> None:
         raise OSError(number, os.strerror(number))
 
-    wish(flight, 0)
+    request(flight, 0)
     with held(DATA) as blob:
         monkeypatch.setattr(os, call, refuse)
         with pytest.raises(FlightError, match=r"cannot record A.CR2 as .*000000\.cr2: the disk") as told:
@@ -120,7 +120,7 @@ def test_a_disk_fault_fails_the_shot_and_leaves_no_file(
 
 def test_a_full_disk_in_the_middle_of_a_frame(flight: Recording) -> None:
     """The kernel itself refuses, after some bytes: a file size limit stands for the full disk."""
-    wish(flight, 0)
+    request(flight, 0)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
@@ -141,7 +141,7 @@ def test_a_disk_that_takes_no_note_either_is_told(flight: Recording, monkeypatch
     def refuse(*_: object) -> None:
         raise FlightError("cannot use the ledger")
 
-    wish(flight, 0)
+    request(flight, 0)
     monkeypatch.setattr(type(flight.ledger), "failed", refuse)
     with held(b"abc", size=5) as blob, pytest.raises(FlightError, match=r"ended early .* nor can that be noted"):
         flight.recorder.record(0, "A.CR2", blob, arrived_utc_ns=5)
@@ -149,7 +149,7 @@ def test_a_disk_that_takes_no_note_either_is_told(flight: Recording, monkeypatch
 
 @pytest.mark.parametrize(("data", "size", "words"), [(b"", 0, "is empty"), (b"abc", 5, "only 3 of 5 bytes")])
 def test_a_file_without_its_bytes_fails_the_shot(flight: Recording, data: bytes, size: int, words: str) -> None:
-    wish(flight, 0)
+    request(flight, 0)
     with held(data, size) as blob, pytest.raises(FlightError, match=words):
         flight.recorder.record(0, "A.CR2", blob, arrived_utc_ns=5)
     assert files(flight) == []
@@ -159,7 +159,7 @@ def test_a_file_without_its_bytes_fails_the_shot(flight: Recording, data: bytes,
 
 
 def test_nothing_is_written_over(flight: Recording) -> None:
-    wish(flight, 0)
+    request(flight, 0)
     (flight.folder.frames / "000000.cr2").write_bytes(b"older")
     with pytest.raises(FlightError, match="stands there already"):
         deliver(flight, 0, DATA)
@@ -167,7 +167,7 @@ def test_nothing_is_written_over(flight: Recording) -> None:
 
 
 def test_the_blob_stays_open_and_its_offset_stays(flight: Recording) -> None:
-    wish(flight, 0)
+    request(flight, 0)
     with held(DATA) as blob:
         place = os.lseek(blob.fd, 7, os.SEEK_SET)
         flight.recorder.record(0, "A.CR2", blob, arrived_utc_ns=5)

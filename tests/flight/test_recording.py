@@ -27,7 +27,7 @@ from dappled.flight import journal as journals
 from dappled.flight.check import check
 from dappled.flight.index import IndexEntry, in_order
 from tests.flight.conftest import START_UTC_NS
-from tests.flight.makers import deliver, held, logged, mavlink_1, mavlink_2, shot, wish
+from tests.flight.makers import deliver, held, logged, mavlink_1, mavlink_2, request, shot
 
 LATER_UTC_NS = START_UTC_NS + 60_000_000_000
 
@@ -48,10 +48,10 @@ def begin_later(flights: Path) -> Recording:
 
 def test_a_flight_from_first_to_last(flights: Path, flight: Recording) -> None:
     assert (flight.next_index, flight.recovered) == (0, ())
-    wish(flight, 0)
+    request(flight, 0)
     frame = deliver(flight, 0, b"raw")
     flight.note_image(0)
-    flight.note_image(99)  # a shot that nobody wished for has no entry
+    flight.note_image(99)  # a shot that was never requested has no entry
     assert flight.index.lookup(0) == IndexEntry(0, flight.folder.name, frame.name, "safe")
     assert flight.index.lookup(99) is None
     flight.telemetry.append(1, mavlink_1(b"a"))
@@ -79,7 +79,7 @@ def test_a_flight_from_first_to_last(flights: Path, flight: Recording) -> None:
 
 
 def test_closing_fails_what_is_open(flight: Recording) -> None:
-    wish(flight, 0)
+    request(flight, 0)
     flight.journal.note(shot(1))
     assert flight.close() == [
         "shot 1 was noted in the journal only; it is in the ledger now",
@@ -91,7 +91,7 @@ def test_closing_fails_what_is_open(flight: Recording) -> None:
 
 def test_a_crash_is_put_in_order_before_the_next_flight(flights: Path, flight: Recording) -> None:
     for index in range(3):
-        wish(flight, index)
+        request(flight, index)
     deliver(flight, 0, b"safe")
     frames = flight.folder.frames
     (frames / "000001.cr2").write_bytes(b"whole, but the row was never written")
@@ -116,7 +116,7 @@ def test_a_crash_is_put_in_order_before_the_next_flight(flights: Path, flight: R
         "frames/000007.cr2 belongs to no shot",
         "shot 2 was fired, and is lost",
         "shot 3 was wished, and is lost",
-        "18 bytes at the end are no telemetry",
+        "18 bytes at the end are not telemetry",
         "it was not closed; it is now",
     ):
         assert words in told
@@ -135,8 +135,8 @@ def test_a_crash_is_put_in_order_before_the_next_flight(flights: Path, flight: R
     third.close()
 
 
-def test_a_wish_that_only_the_ledger_kept_is_noted_again(flights: Path, flight: Recording) -> None:
-    wish(flight, 0)
+def test_a_shot_that_only_the_ledger_kept_is_noted_again(flights: Path, flight: Recording) -> None:
+    request(flight, 0)
     crash(flight)
     flight.folder.journal.write_bytes(b'{"torn')  # a power cut took what was not flushed
     begin_later(flights).close()
@@ -153,7 +153,7 @@ def test_a_flight_that_died_while_it_was_made(flights: Path) -> None:
 
 
 def test_a_damaged_ledger_does_not_keep_the_next_flight_down(flights: Path, flight: Recording) -> None:
-    wish(flight, 4)
+    request(flight, 4)
     deliver(flight, 4, b"raw")
     flight.close()
     (flights / "index.sqlite").unlink()
@@ -169,7 +169,7 @@ def test_a_damaged_ledger_does_not_keep_the_next_flight_down(flights: Path, flig
 def test_a_ledger_made_anew_tells_raw_frames_from_the_jpegs_beside_them(
     flights: Path, flight: Recording, raw: str
 ) -> None:
-    wish(flight, 4)
+    request(flight, 4)
     frame = deliver(flight, 4, b"raw", raw)
     with held(b"jpeg") as blob:
         flight.recorder.record_companion(4, "DSCF0001.JPG", blob, arrived_utc_ns=6)
@@ -185,7 +185,7 @@ def test_a_ledger_made_anew_tells_raw_frames_from_the_jpegs_beside_them(
 
 @pytest.mark.parametrize("harm", ["garbage", "foreign", "gone"])
 def test_the_index_is_made_anew_from_the_flights(flights: Path, flight: Recording, harm: str) -> None:
-    wish(flight, 0)
+    request(flight, 0)
     frame = deliver(flight, 0, b"raw")
     flight.close()
     path = flights / "index.sqlite"
@@ -285,7 +285,7 @@ def test_a_flight_without_utc_is_named_by_boot_and_put_right_later(flights: Path
     flight = recording.begin(flights, lambda: uptime_ns, utc_known=False)
     name = flight.folder.name
     assert name.startswith("boot")
-    wish(flight, 0)
+    request(flight, 0)
     frame = deliver(flight, 0, b"raw")
     flight.note_image(0)
     assert flight.index.flights() == {name: None}
@@ -322,7 +322,7 @@ def test_flights_stand_in_the_order_they_were_flown_when_the_clock_was_stepped(f
     names = []
     for number in range(3):
         begun = recording.begin(flights, lambda step=number: START_UTC_NS + step * step_s * 10**9)  # type: ignore[misc]  # bound now
-        wish(begun, begun.next_index)
+        request(begun, begun.next_index)
         deliver(begun, begun.next_index, b"raw")
         begun.close()
         names.append(begun.folder.name)

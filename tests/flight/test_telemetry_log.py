@@ -178,6 +178,6 @@ def test_a_real_flight_reads_but_for_its_torn_end(shared_data: Path) -> None:
     problems: list[str] = []
     path = shared_data / "telemetry" / "dronekit-flight.tlog"
     stamps = [stamp for _, stamp, _ in telemetry_log.read(path, problems.append)]
-    assert problems == [f"{path}: 19 bytes at the end are no telemetry and were skipped"]
+    assert problems == [f"{path}: 19 bytes at the end are not telemetry and were skipped"]
     assert len(stamps) > 10_000
     assert round((stamps[-1] - stamps[0]) / 1e6) == 1377

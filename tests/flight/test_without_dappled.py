@@ -16,7 +16,7 @@ from dappled.decode.geometry.pose import Pose
 from dappled.flight import LedgerReader, Tag, recording
 from dappled.flight.ledger import SCHEMA
 from tests.flight.conftest import START_UTC_NS
-from tests.flight.makers import deliver, flip, pose, tag, wish
+from tests.flight.makers import deliver, flip, pose, request, tag
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "flight-data.md"
 
@@ -26,7 +26,7 @@ def flight(flights: Path) -> Path:
     """Two frames, of which one has a position; and a failed shot."""
     begun = recording.begin(flights, lambda: START_UTC_NS)
     for index in range(3):
-        wish(begun, index)
+        request(begun, index)
     known = tag(deliver(begun, 0, b"raw 0"))
     begun.ledger.add_tag(replace(known, utc_ns=START_UTC_NS, pose=replace(pose(), position_sigma_m=0.8)))
     deliver(begun, 1, b"raw 1")

@@ -25,7 +25,7 @@ from dappled.mocks.scene.flyover import TerrainScene
 from dappled.mocks.scene.landscape import DETAIL_TEXEL_M, EXTENT_M, TEXEL_M
 from dappled.mocks.scene.masked_camera import MaskedCamera, Truth, reference_camera
 from dappled.mocks.simulation import CAMERA, MASK
-from tests.flight.makers import deliver, wish
+from tests.flight.makers import deliver, request
 
 START_NS = 1_795_256_103_000_000_000
 F_NUMBER = 14.8
@@ -85,7 +85,7 @@ def fly(
         truth = exposure.truth
         assert truth.pose is not None
         truths.append(truth)
-        wish(begun, index)
+        request(begun, index)
         frame = deliver(begun, index, exposure.file, f"IMG_{index:04d}.DNG")
         pose = as_recorded(told(index, truth.pose))
         begun.ledger.add_tag(

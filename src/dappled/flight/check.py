@@ -1,4 +1,4 @@
-"""Is every byte of a flight intact, and do files, ledger, journal and telemetry agree?"""
+"""Check that every byte of a flight is intact, and that files, ledger, journal and telemetry agree."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.flight import durable, layout, provenance, telemetry_log
-from dappled.flight import journal as wishes
+from dappled.flight import journal as journals
 from dappled.flight.errors import FlightError
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
@@ -18,7 +18,7 @@ from dappled.flight.recovery import SIDECAR
 
 @dataclass(frozen=True, slots=True)
 class CheckReport:
-    """What was looked at and what is wrong, in sentences. `notes` are no faults."""
+    """What was checked and what is wrong, in sentences. `notes` are not faults."""
 
     flight: str
     files: int
@@ -33,7 +33,7 @@ class CheckReport:
 
 
 def check(path: Path) -> CheckReport:
-    """Read a whole flight and compare everything with everything. Raises FlightError when it is no flight."""
+    """Read a whole flight and compare its parts. Raises FlightError when it is not a flight."""
     folder = layout.open_folder(path)
     problems: list[str] = []
     notes: list[str] = []
@@ -103,7 +103,7 @@ def _names(folder: FlightFolder, ledger: LedgerReader, closed: bool) -> Iterator
 
 
 def _shots(folder: FlightFolder, ledger: LedgerReader, notes: list[str]) -> Iterator[str]:
-    journal = wishes.read(folder.journal)
+    journal = journals.read(folder.journal)
     notes.extend(journal.problems)  # a torn line; where it hid a shot, that is a problem below
     rows = {row.shot.index: row for row in ledger.shots()}
     noted = {shot.index: shot for shot in journal.shots}
@@ -115,7 +115,7 @@ def _shots(folder: FlightFolder, ledger: LedgerReader, notes: list[str]) -> Iter
         elif index not in noted:
             yield f"shot {index} is in the ledger, but not in shots.jsonl"
         elif noted[index] != row.shot:
-            yield f"shot {index} is told differently in shots.jsonl and in the ledger"
+            yield f"shot {index} differs between shots.jsonl and the ledger"
         if row is not None and (row.state == "safe") != (index in framed):
             yield f"shot {index} is {row.state}, but the ledger has {'a' if index in framed else 'no'} frame for it"
 
@@ -153,5 +153,5 @@ def _telemetry(folder: FlightFolder, ledger: LedgerReader, problems: list[str], 
         problems.append("telemetry.tlog was changed: its SHA-256 is not the ledger's")
         problems.extend(gaps)
     else:
-        notes.extend(gaps)  # so it was when the flight was closed
+        notes.extend(gaps)  # they were there when the flight was closed
     return found.packets

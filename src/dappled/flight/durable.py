@@ -1,8 +1,6 @@
-"""Files that survive a power cut: whole files that replace what was there, and files that are only appended to.
+"""Write files so that they survive a power cut: temporary name, fsync, rename, fsync of the folder.
 
-A whole file: temporary name, fsync, rename, fsync of the folder. In tests that cut the power, every shorter order lost
-acknowledged files or left torn ones under their final name. An appended file: one write(2) each time, which survives
-the death of the process at once, and an fdatasync by a thread within a set time; the writer never waits for it.
+In tests that cut the power, every shorter order lost acknowledged files or left torn ones under their final name.
 """
 
 from __future__ import annotations
@@ -10,28 +8,25 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-
-from dappled.flight.errors import FlightError, disk_error
 
 _PART = ".part"
 
 
 def temporary(path: Path) -> Path:
-    """The name that `path` is written under until it is whole: hidden, in the same folder."""
+    """The name that `path` has while it is being written: hidden, in the same folder."""
     return path.with_name(f".{path.name}{_PART}")
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a file's name is that of a file not wholly written."""
+    """Whether this is the name of a file that was still being written."""
     return name.startswith(".") and name.endswith(_PART)
 
 
 def sync_folder(path: Path) -> None:
-    """fsync of a folder: its names are durable afterwards. Raises OSError."""
+    """fsync a folder: its names are durable afterwards. Raises OSError."""
     fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(fd)
@@ -66,9 +61,9 @@ def write_file(path: Path, data: bytes) -> None:
 def copy_in(source_fd: int, size: int, path: Path) -> str:
     """Put the first `size` bytes of a file or memfd under `path`, durably; return their SHA-256 (hex).
 
-    The bytes go from file to file inside the kernel, and the hash is taken beside that in another thread. (Writing
-    from a map of a memfd costs more: a page fault for every 4 KiB.) Raises OSError, and EOFError when the source is
-    shorter; what stands under `path` then, if anything, is whole.
+    The kernel copies from file to file (sendfile) while another thread hashes. Writing from a memory map of a memfd
+    would cost a page fault for every 4 KiB. Raises OSError, and EOFError when the source is shorter; `path` is then
+    missing or complete, never torn.
     """
 
     def fill(fd: int) -> None:
@@ -92,7 +87,7 @@ def hash_file(path: Path) -> str:
 
 
 def hash_descriptor(fd: int, size: int) -> str:
-    """SHA-256 (hex) of the first `size` bytes of a file or memfd, whose offset stays. Raises OSError, EOFError."""
+    """SHA-256 (hex) of the first `size` bytes of a file or memfd; its offset stays. Raises OSError, EOFError."""
     sha256 = hashlib.sha256()
     buffer = memoryview(bytearray(1 << 20))
     done = 0
@@ -120,107 +115,3 @@ def _put(path: Path, fill: Callable[[int], None]) -> None:
         with contextlib.suppress(OSError):
             os.unlink(part)
         raise
-
-
-class AppendedFile:
-    """Owns its descriptor and its flusher. Its owner lets one thread at a time in. What comes after `shut` is refused:
-    it must not get into another file, opened since, that was given the same descriptor."""
-
-    def __init__(self, path: Path, what: str, flush_interval_s: float, *, new: bool) -> None:
-        """Open or make the file; `new`: there must be none. `what` it is called in sentences. Raises FlightError."""
-        self.path, self._what = path, what
-        doing = f"{'make' if new else 'open'} {what}"
-        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | (os.O_EXCL if new else 0)
-        try:
-            self._fd = os.open(path, flags, 0o644)
-        except OSError as error:
-            raise disk_error(doing, path, error) from error
-        try:
-            size = os.fstat(self._fd).st_size
-            self.last = os.pread(self._fd, 1, size - 1) if size else b""  # byte, when it was opened
-        except OSError as error:
-            os.close(self._fd)
-            raise disk_error(doing, path, error) from error
-        self._flusher = Flusher(self._fd, flush_interval_s)
-        self._closed = False
-
-    def append(self, data: bytes, doing: str) -> int:
-        """One write; how many bytes the disk took. Raises FlightError, "cannot `doing` …", when it took none."""
-        self._open_for(doing)
-        try:
-            written = os.write(self._fd, data)
-        except OSError as error:
-            raise disk_error(doing, self.path, error) from error
-        self._flusher.poke()
-        return written
-
-    def cut(self, size: int, doing: str) -> None:
-        """Take away what stands beyond `size`. Raises FlightError as `append` does."""
-        self._open_for(doing)
-        try:
-            os.ftruncate(self._fd, size)
-        except OSError as error:
-            raise disk_error(doing, self.path, error) from error
-
-    @property
-    def problem(self) -> str | None:
-        """Why what was written may not survive a power cut, if so."""
-        error = self._flusher.error
-        return None if error is None else str(disk_error(f"flush {self._what}", self.path, error))
-
-    def shut(self) -> bool:
-        """From now on nothing is written. False where that had been said before."""
-        was, self._closed = self._closed, True
-        return not was
-
-    def close(self) -> None:
-        """Flush and close, once, after `shut`; the owner need not keep others out meanwhile."""
-        self._flusher.close()
-        os.close(self._fd)
-
-    def _open_for(self, doing: str) -> None:
-        if self._closed:
-            raise FlightError(f"cannot {doing} {self.path}: the flight is closed")
-
-
-class Flusher:
-    """fdatasync of one descriptor, at most `interval_s` after the first write that it was told of.
-
-    Owns a thread, not the descriptor. A failed fdatasync stays readable in `error`: what was written before it may
-    not survive a power cut.
-    """
-
-    def __init__(self, fd: int, interval_s: float = 0.5) -> None:
-        self._fd = fd
-        self._interval_s = interval_s
-        self._dirty = threading.Event()
-        self._closing = threading.Event()
-        self.error: OSError | None = None
-        self._thread = threading.Thread(target=self._run, name="dappled-flusher", daemon=True)
-        self._thread.start()
-
-    def poke(self) -> None:
-        """Something was written."""
-        if not self._dirty.is_set():
-            self._dirty.set()
-
-    def close(self) -> None:
-        """Flush what is left and end the thread; the descriptor may be closed afterwards."""
-        self._closing.set()
-        self._dirty.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while not self._closing.is_set():
-            self._dirty.wait()
-            self._closing.wait(self._interval_s)
-            self._sync()
-        if self._dirty.is_set():
-            self._sync()  # written, then closed, while the last one ran
-
-    def _sync(self) -> None:
-        self._dirty.clear()  # before the sync: a write during it is told of again
-        try:
-            os.fdatasync(self._fd)
-        except OSError as error:
-            self.error = error

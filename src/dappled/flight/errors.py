@@ -1,4 +1,4 @@
-"""What can go wrong with a flight folder, in one clear sentence each."""
+"""The error of a flight folder, and the sentence for each error of the operating system."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dappled.errors import DappledError
 
 
 class FlightError(DappledError):
-    """A flight folder can't be written or read as it should be: what, where, what to do."""
+    """A flight folder can't be written or read."""
 
 
 _REMEDIES = {

@@ -17,9 +17,11 @@ from dappled.flight.records import Frame, LedgerEvent, Result, ShotRow, Stray, T
 
 @dataclass(frozen=True, slots=True)
 class Balance:
-    """The books of a flight: every wish that became a shot is safe, failed or still open; `refused` ones became none.
-    `by_source` counts shots, `following` those of the failed whose files are still at the camera, `companions` files
-    beside frames. `began_utc_ns` is None where nobody ever knew UTC."""
+    """The numbers of a flight. Every shot (`wishes`) is safe, failed or open; `refused` requests became no shot.
+
+    `by_source` counts shots, `following` the failed ones whose files are still on the camera, `companions` files beside
+    frames. `began_utc_ns` is None where UTC was never known.
+    """
 
     flight: str
     wishes: int
@@ -58,8 +60,8 @@ class ShotLine:
 
 @dataclass(frozen=True, slots=True)
 class FlightContents:
-    """A flight, whole: settings, facts, a line for every shot, strays and events. `utc_correction_ns` is to be added to
-    every `utc_ns`; None where nobody ever knew UTC. `runs` counts the results of each."""
+    """Everything in a flight: settings, facts, a line for every shot, strays and events. `utc_correction_ns` is to be
+    added to every `utc_ns`; None where UTC was never known. `runs` counts the results of each run."""
 
     name: str
     settings: Mapping[str, Any]
@@ -73,7 +75,7 @@ class FlightContents:
 
 @dataclass(frozen=True, slots=True)
 class ListedFlight:
-    """One flight of a list: its balance, or the sentence why there is none."""
+    """One flight of a list: its balance, or a sentence that says why it can't be read."""
 
     name: str
     path: Path
@@ -111,7 +113,7 @@ def balance(path: Path) -> Balance:
 
 
 def show(path: Path) -> FlightContents:
-    """Everything that a flight's ledger says. Raises FlightError."""
+    """Everything in a flight's ledger. Raises FlightError."""
     folder = layout.open_folder(path)
     with LedgerReader.open(folder.ledger) as ledger:
         frames = {frame.index: frame for frame in ledger.frames()}
@@ -150,7 +152,10 @@ _REFUSED = re.compile(r"\S+ from (?P<source>\S+): ")  # as the daemon notes it: 
 
 @dataclass(frozen=True, slots=True)
 class SourceReport:
-    """One source's wishes ("mavlink:1/1", "console" …). wishes = refused + shots; shots = safe + failed + open."""
+    """What became of one source's capture requests ("mavlink:1/1", "console" …).
+
+    wishes (requests) = refused + shots; shots = safe + failed + open.
+    """
 
     source: str
     wishes: int
@@ -164,7 +169,7 @@ class SourceReport:
 
 
 def by_source(path: Path) -> tuple[SourceReport, ...]:
-    """The books of a flight, a line for each source in the order of their names. Raises FlightError."""
+    """A report for each source, by name. Raises FlightError."""
     with LedgerReader.open(layout.open_folder(path).ledger) as ledger:
         rows, tags, results = ledger.shots(), ledger.tags(), ledger.results()
         refused = _refused(ledger.events())
@@ -183,7 +188,7 @@ def by_source(path: Path) -> tuple[SourceReport, ...]:
 
 
 def _refused(events: Iterable[LedgerEvent]) -> Counter[str]:
-    """Refused wishes by source; one whose note says no source stands under "unknown"."""
+    """Refused requests by source; "unknown" where the event names none."""
     found: Counter[str] = Counter()
     for event in events:
         if event.kind == "refused":

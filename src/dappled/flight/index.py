@@ -1,7 +1,7 @@
-"""The index over all flights: which flight and frame an image index stands for.
+"""The index over all flights: the flight and the frame of each image index.
 
-The camera's image index goes on over restarts. The index is made from the flights' own ledgers and can be made anew
-from them at any time.
+The camera's image index goes on over restarts. The index is made from the flights' own ledgers and can be rebuilt from
+them at any time.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import cast
 
 from dappled.flight import journal, layout
-from dappled.flight.database import Database
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
-from dappled.flight.ledger import LedgerReader
+from dappled.flight.ledger import Database, LedgerReader
 from dappled.flight.records import ShotState
 
 FILE_NAME = "index.sqlite"
@@ -41,7 +40,7 @@ COMMIT;
 
 @dataclass(frozen=True, slots=True)
 class IndexEntry:
-    """Where an image index leads: the flight's name, the frame's name in it (None without one), the shot's state."""
+    """The flight of an image index, the frame's name in it (None without a frame), and the shot's state."""
 
     index: int
     flight: str
@@ -73,8 +72,8 @@ class ImageIndex(Database):
         return FlightError(f"cannot use the index {self.path}: {error}; move it away, it is made anew")
 
     def add_flight(self, name: str, start_utc_ns: int | None, utc_correction_ns: int | None = 0) -> None:
-        """A flight begins, at this UTC. Where that is not known (None), it is told later by calling this again, with
-        what must be added to the flight's own stamps."""
+        """Add a flight that starts at this UTC. Where UTC is not known yet (None), call this again later with the start
+        and with what must be added to the flight's own stamps."""
         self._rows(
             "INSERT INTO flights (name, start_utc_ns, utc_correction_ns) VALUES (?, ?, ?) ON CONFLICT (name) DO UPDATE "
             "SET start_utc_ns = coalesce(excluded.start_utc_ns, start_utc_ns), "
@@ -85,7 +84,7 @@ class ImageIndex(Database):
         )
 
     def put(self, entry: IndexEntry) -> None:
-        """What an image index leads to now. Raises FlightError when it belongs to another flight."""
+        """Set the entry of an image index. Raises FlightError when the index belongs to another flight."""
         held = self.lookup(entry.index)
         if held is not None and held.flight != entry.flight:
             raise FlightError(
@@ -95,30 +94,30 @@ class ImageIndex(Database):
         self._rows("INSERT OR REPLACE INTO images VALUES (?, ?, ?, ?)", *values)
 
     def lookup(self, index: int) -> IndexEntry | None:
-        """Where an image index leads; None when no flight has it."""
+        """The entry of an image index; None when no flight has it."""
         rows = self._rows("SELECT idx, flight, frame, state FROM images WHERE idx = ?", index)
         return None if not rows else IndexEntry(rows[0][0], rows[0][1], rows[0][2], cast(ShotState, rows[0][3]))
 
     def highest(self) -> int | None:
-        """The highest image index that is indexed, or that a sealed flight mentions."""
+        """The highest image index in the index, or mentioned by a sealed flight."""
         rows = self._rows("SELECT max(idx) FROM images UNION ALL SELECT max(highest) FROM flights")
         return max((row[0] for row in rows if row[0] is not None), default=None)
 
     def flights(self) -> dict[str, int | None]:
-        """The flights in the order they were flown, with their start in UTC nanoseconds where known."""
+        """The flights in the order they were flown, with their starts (UTC, ns) where known."""
         return dict(self._rows("SELECT name, start_utc_ns FROM flights ORDER BY number"))
 
     def utc_correction_ns(self, name: str) -> int | None:
-        """What to add to a flight's stamps to have UTC: 0 where its machine knew; None where nobody did."""
+        """What to add to a flight's stamps to get UTC: 0 where its machine knew UTC, None where it never learnt it."""
         rows = self._rows("SELECT utc_correction_ns FROM flights WHERE name = ?", name)
         return rows[0][0] if rows else None
 
     def sealed(self) -> set[str]:
-        """Flights that are closed and wholly indexed."""
+        """The flights that are closed and fully indexed."""
         return {row[0] for row in self._rows("SELECT name FROM flights WHERE sealed")}
 
     def take_in(self, folder: FlightFolder, *, seal: bool) -> list[str]:
-        """Index all shots of a flight from its ledger; `seal` says that no more will come. Returns problems."""
+        """Index all shots of a flight from its ledger. `seal`: no more shots will come. Returns sentences."""
         problems: list[str] = []
         with LedgerReader.open(folder.ledger) as ledger:
             correction_ns, began_utc_ns = ledger.utc_correction_ns(), ledger.facts().get("began_utc_ns")
@@ -137,8 +136,8 @@ class ImageIndex(Database):
         return problems
 
     def next_index(self) -> int:
-        """The image index for the next shot, from 0: beyond everything indexed, and beyond every ledger, journal and
-        frame of a flight that is not sealed."""
+        """The image index of the next shot, from 0: above everything in the index, and above what the ledger, journal
+        and frames of each unsealed flight mention."""
         sealed = self.sealed()
         open_flights = [folder for folder in layout.flights(self.root) if folder.name not in sealed]
         known = [self.highest(), *(highest_in(folder) for folder in open_flights)]
@@ -146,9 +145,9 @@ class ImageIndex(Database):
 
 
 def open_or_rebuild(root: Path) -> tuple[ImageIndex, list[str]]:
-    """The index; a damaged one is moved aside and an empty one made, to be filled from the ledgers. With a report.
+    """Open the index; a damaged one is moved aside and replaced by an empty one, to be filled from the ledgers.
 
-    Raises FlightError when there can be none.
+    Returns the index and a report in sentences. Raises FlightError when no index can be opened or made.
     """
     try:
         return ImageIndex(root), []
@@ -167,21 +166,21 @@ def open_or_rebuild(root: Path) -> tuple[ImageIndex, list[str]]:
 
 
 def in_order(root: Path) -> list[FlightFolder]:
-    """All flights under `root` in the order they were flown, which their names needn't tell: the clock may have been
-    set back, or not known. Those that no index knows come first, by name. Raises FlightError."""
+    """All flights under `root` in the order they were flown. Names need not show that order: the clock may have been
+    set back, or unknown. Flights that are not in the index come first, by name. Raises FlightError."""
     known: list[str] = []
     if (root / FILE_NAME).is_file():
         try:
             with closing(sqlite3.connect(f"{(root / FILE_NAME).absolute().as_uri()}?mode=rw", uri=True)) as index:
                 known = [row[0] for row in index.execute("SELECT name FROM flights ORDER BY number")]
-        except sqlite3.Error:  # damaged, or not to be written: the names have to do
+        except sqlite3.Error:  # damaged, or not writable: order by name
             known = []
     place = {name: number for number, name in enumerate(known)}
     return sorted(layout.flights(root), key=lambda folder: place.get(folder.name, -1))
 
 
 def highest_in(folder: FlightFolder) -> int | None:
-    """The highest image index that a flight's journal, ledger or frames mention; a damaged ledger is passed over."""
+    """The highest image index that a flight's journal, ledger or frames mention; a damaged ledger is skipped."""
     found = [shot.index for shot in journal.read(folder.journal).shots]
     try:
         with LedgerReader.open(folder.ledger) as ledger:

@@ -1,37 +1,142 @@
-"""The wish journal: every wish to shoot is on file before the camera is touched.
+"""Note every shot in shots.jsonl before the camera is touched, in a file that is only appended to.
 
-One JSON line a wish, appended by one write(2): it survives the death of the process at once. A flusher brings it to
-the disk within a second, which a power cut can't undo. Firing never waits for a frame's fsync or a database.
+One JSON line a shot, appended by one write(2): it survives the death of the process at once. A thread brings it to the
+disk within a second; after that it survives a power cut. Firing never waits for a frame's fsync or for a database.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import threading
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from dappled.flight.durable import AppendedFile
 from dappled.flight.errors import FlightError, disk_error
-from dappled.flight.records import Cause, Shot, canonical
+from dappled.flight.records import Cause, Shot
+
+
+class AppendedFile:
+    """A file that is only appended to. Owns its descriptor and its flusher; its owner serialises the calls.
+
+    Writes after `shut` are refused: they could reach another file that was opened since with the same descriptor.
+    """
+
+    def __init__(self, path: Path, what: str, flush_interval_s: float, *, new: bool) -> None:
+        """Open or make the file. `new`: it must not exist yet. `what` is its name in sentences. Raises FlightError."""
+        self.path, self._what = path, what
+        doing = f"{'make' if new else 'open'} {what}"
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | (os.O_EXCL if new else 0)
+        try:
+            self._fd = os.open(path, flags, 0o644)
+        except OSError as error:
+            raise disk_error(doing, path, error) from error
+        try:
+            size = os.fstat(self._fd).st_size
+            self.last = os.pread(self._fd, 1, size - 1) if size else b""  # byte, when it was opened
+        except OSError as error:
+            os.close(self._fd)
+            raise disk_error(doing, path, error) from error
+        self._flusher = Flusher(self._fd, flush_interval_s)
+        self._closed = False
+
+    def append(self, data: bytes, doing: str) -> int:
+        """Write once; returns the number of bytes written. Raises FlightError, "cannot `doing` …", when it is 0."""
+        self._open_for(doing)
+        try:
+            written = os.write(self._fd, data)
+        except OSError as error:
+            raise disk_error(doing, self.path, error) from error
+        self._flusher.poke()
+        return written
+
+    def cut(self, size: int, doing: str) -> None:
+        """Truncate the file to `size`. Raises FlightError as `append` does."""
+        self._open_for(doing)
+        try:
+            os.ftruncate(self._fd, size)
+        except OSError as error:
+            raise disk_error(doing, self.path, error) from error
+
+    @property
+    def problem(self) -> str | None:
+        """Why written bytes may not survive a power cut; None where they do."""
+        error = self._flusher.error
+        return None if error is None else str(disk_error(f"flush {self._what}", self.path, error))
+
+    def shut(self) -> bool:
+        """Refuse writes from now on. False when they were refused already."""
+        was, self._closed = self._closed, True
+        return not was
+
+    def close(self) -> None:
+        """Flush and close, once, after `shut`. The owner need not hold its lock meanwhile."""
+        self._flusher.close()
+        os.close(self._fd)
+
+    def _open_for(self, doing: str) -> None:
+        if self._closed:
+            raise FlightError(f"cannot {doing} {self.path}: the flight is closed")
+
+
+class Flusher:
+    """fdatasync one descriptor, at most `interval_s` after the first `poke`.
+
+    Owns a thread, not the descriptor. A failed fdatasync stays in `error`: what was written before it may not survive
+    a power cut.
+    """
+
+    def __init__(self, fd: int, interval_s: float = 0.5) -> None:
+        self._fd = fd
+        self._interval_s = interval_s
+        self._dirty = threading.Event()
+        self._closing = threading.Event()
+        self.error: OSError | None = None
+        self._thread = threading.Thread(target=self._run, name="dappled-flusher", daemon=True)
+        self._thread.start()
+
+    def poke(self) -> None:
+        """Say that something was written."""
+        if not self._dirty.is_set():
+            self._dirty.set()
+
+    def close(self) -> None:
+        """Flush what is left and end the thread; the descriptor may be closed afterwards."""
+        self._closing.set()
+        self._dirty.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            self._dirty.wait()
+            self._closing.wait(self._interval_s)
+            self._sync()
+        if self._dirty.is_set():
+            self._sync()  # written, then closed, while the last one ran
+
+    def _sync(self) -> None:
+        self._dirty.clear()  # before the sync: a write during the sync needs another one
+        try:
+            os.fdatasync(self._fd)
+        except OSError as error:
+            self.error = error
 
 
 class ShotJournal:
     """The open journal of one flight; owns its descriptor and its flusher. `note` may be called by any thread."""
 
     def __init__(self, path: Path, flush_interval_s: float = 0.5) -> None:
-        """Open or make the journal. A torn last line of an earlier life is closed off before the next. Raises
-        FlightError."""
+        """Open or make the journal. After a torn last line the next note begins on a new line. Raises FlightError."""
         self.path = path
-        self._file = AppendedFile(path, "the wish journal", flush_interval_s, new=False)
+        self._file = AppendedFile(path, "the shot journal", flush_interval_s, new=False)
         self._lock = threading.Lock()
         self._torn = self._file.last not in (b"", b"\n")  # the last write ended within a line
 
     def note(self, shot: Shot) -> None:
-        """Append one wish. Raises FlightError when it could not be written whole, or the journal is closed: then don't
-        fire."""
-        line = canonical(asdict(shot)) + b"\n"
+        """Append one shot. Raises FlightError when it could not be written whole, or the journal is closed: then the
+        camera must not be fired."""
+        line = json.dumps(asdict(shot), sort_keys=True, separators=(",", ":")).encode() + b"\n"
         with self._lock:
             line = b"\n" + line if self._torn else line
             written = self._file.append(line, f"note shot {shot.index} in")
@@ -44,7 +149,7 @@ class ShotJournal:
 
     @property
     def problem(self) -> str | None:
-        """Why noted wishes may not survive a power cut, if so."""
+        """Why noted shots may not survive a power cut; None where they do."""
         return self._file.problem
 
     def close(self) -> None:
@@ -57,14 +162,14 @@ class ShotJournal:
 
 @dataclass(frozen=True, slots=True)
 class JournalContents:
-    """What a journal says: shots in the order of their notes, and a sentence for each line that is no wish."""
+    """The shots of a journal in the order of its lines, and a sentence for each line that is not a shot."""
 
     shots: tuple[Shot, ...]
     problems: tuple[str, ...]
 
 
 def read(path: Path) -> JournalContents:
-    """Read a journal; none at all is an empty one. A torn or damaged line is reported, the others are kept.
+    """Read a journal; a missing file counts as empty. A torn or damaged line is reported, the others are kept.
 
     Raises FlightError when the file can't be read.
     """
@@ -73,7 +178,7 @@ def read(path: Path) -> JournalContents:
     except FileNotFoundError:
         return JournalContents((), ())
     except OSError as error:
-        raise disk_error("read the wish journal", path, error) from error
+        raise disk_error("read the shot journal", path, error) from error
     lines = data.split(b"\n")
     tail = lines.pop()
     shots: dict[int, Shot] = {}
@@ -81,7 +186,7 @@ def read(path: Path) -> JournalContents:
     for number, line in enumerate(lines, 1):
         shot = _parse(line)
         if shot is None:
-            problems.append(f"line {number} of {path} is not a wish")
+            problems.append(f"line {number} of {path} is not a shot")
         elif shot.index in shots:
             problems.append(f"line {number} of {path} notes shot {shot.index} again")
         else:

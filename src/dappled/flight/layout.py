@@ -1,4 +1,4 @@
-"""The flight folder: what stands where, how a new one is made, and who records into it.
+"""The layout of a flights folder: the names in it, making and finding flights, and the lock of the recording daemon.
 
 `<flights>/<UTC start as 20261121T101503Z>-<8 hex>/` holds flight.toml, flight.sqlite, shots.jsonl, telemetry.tlog,
 frames/ and, where asked for, lightfields/. A machine that does not know UTC yet names its flight by boot.
@@ -31,7 +31,7 @@ _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 @dataclass(frozen=True, slots=True)
 class FlightFolder:
-    """A recorded flight on disk, by its path. Names are relative to it where they are kept."""
+    """The paths of one flight on disk. The ledger keeps names relative to `path`."""
 
     path: Path
 
@@ -50,7 +50,7 @@ class FlightFolder:
 
     @property
     def journal(self) -> Path:
-        """shots.jsonl: every wish, noted before the camera is touched."""
+        """shots.jsonl: every shot, noted before the camera is touched."""
         return self.path / "shots.jsonl"
 
     @property
@@ -67,7 +67,7 @@ class FlightFolder:
 
 
 def extension(camera_name: str) -> str:
-    """The extension to store a camera's file under: its own, lower case, letters and digits only, else "raw".
+    """The extension to store a camera's file with: its own in lower case if it is letters and digits, else "raw".
 
     >>> extension("IMG_0042.CR2"), extension("../../etc/passwd"), extension("a.j/../p g")
     ('cr2', 'raw', 'raw')
@@ -78,20 +78,20 @@ def extension(camera_name: str) -> str:
 
 
 def frame_name(index: int, camera_name: str) -> str:
-    """Where the frame of an image index stands, relative to the flight: "frames/000042.cr2"."""
+    """The name of a frame relative to its flight: "frames/000042.cr2"."""
     if index < 0:
         raise ValueError(f"an image index is 0 or more, not {index}")
     return f"frames/{index:06d}.{extension(camera_name)}"
 
 
 def index_of(file_name: str) -> int | None:
-    """The image index that a file's name in frames/ says, or None when it is not a frame's name."""
+    """The image index in the name of a file in frames/; None when it is not a frame's name."""
     match = _FRAME_NAME.fullmatch(file_name)
     return int(match[1]) if match else None
 
 
 def _boot() -> str:
-    """Eight hex digits of this boot's id; random ones where /proc is hidden: a flight needs a name."""
+    """Eight hex digits of this boot's id, or random ones where /proc can't be read."""
     try:
         return _BOOT_ID.read_text(encoding="ascii").strip().replace("-", "")[:8]
     except OSError:
@@ -99,7 +99,7 @@ def _boot() -> str:
 
 
 def create(root: Path, utc_ns: int | None, facts: Mapping[str, Any] | None = None) -> FlightFolder:
-    """A new, empty flight under `root` (made if missing), durable with its flight.toml when this returns.
+    """Make a new, empty flight under `root` (made if missing). It and its flight.toml are durable on return.
 
     `utc_ns` is the start, or None when UTC is not known. `facts` goes to flight.toml. Raises FlightError.
     """
@@ -124,7 +124,7 @@ def create(root: Path, utc_ns: int | None, facts: Mapping[str, Any] | None = Non
 
 
 def open_folder(path: Path) -> FlightFolder:
-    """A recorded flight. Raises FlightError when `path` is not one."""
+    """Open a recorded flight. Raises FlightError when `path` is not one."""
     folder = FlightFolder(path)
     try:
         found = path.is_dir() and (folder.ledger.is_file() or folder.settings.is_file())
@@ -137,12 +137,13 @@ def open_folder(path: Path) -> FlightFolder:
 
 
 def unmade(root: Path) -> list[Path]:
-    """Flight folders under `root` that were never wholly made: their temporary names. Raises FlightError."""
+    """Flight folders under `root` that still have their temporary names: making them was interrupted. Raises
+    FlightError."""
     return [root / name for name in _folders(root) if durable.is_temporary(name)]
 
 
 def flights(root: Path) -> list[FlightFolder]:
-    """All flights under `root`, by name; an empty list when there is no such folder. Raises FlightError."""
+    """All flights under `root`, by name; empty when the folder is missing. Raises FlightError."""
     return [FlightFolder(root / name) for name in _folders(root) if _FLIGHT_NAME.fullmatch(name)]
 
 
@@ -156,7 +157,7 @@ def _folders(root: Path) -> list[str]:
 
 
 def free_bytes(path: Path) -> int:
-    """What this user may still write on the disk of `path`, in bytes. Raises FlightError."""
+    """Free space for this user on the disk of `path`, in bytes. Raises FlightError."""
     try:
         stat = os.statvfs(path)
     except OSError as error:
@@ -165,7 +166,7 @@ def free_bytes(path: Path) -> int:
 
 
 def write_facts(folder: FlightFolder, facts: Mapping[str, Any]) -> None:
-    """Write flight.toml anew, whole or not at all. TOML has no null: unknown (None) values are left out.
+    """Replace flight.toml, whole or not at all. TOML has no null: None values are left out.
 
     Raises OSError, and TypeError for a value that TOML can't hold.
     """
@@ -173,12 +174,12 @@ def write_facts(folder: FlightFolder, facts: Mapping[str, Any]) -> None:
 
 
 def facts_as_toml(facts: Mapping[str, Any]) -> bytes:
-    """What flight.toml holds of these facts. Raises TypeError for a value that TOML can't hold."""
+    """Encode facts as flight.toml holds them. Raises TypeError for a value that TOML can't hold."""
     return tomli_w.dumps(_plain(facts)).encode()
 
 
 def read_facts(folder: FlightFolder) -> dict[str, Any]:
-    """What flight.toml says. Raises FlightError."""
+    """Read flight.toml. Raises FlightError."""
     try:
         return tomllib.loads(folder.settings.read_text("utf-8"))
     except OSError as error:
@@ -196,10 +197,13 @@ def _plain(value: Any) -> Any:
 
 
 class FlightsLock:
-    """Held from creation to `close`, or to the end of the process however it ends."""
+    """The lock (flock) of the one daemon that records into a flights folder.
+
+    Held from creation to `close`, or until the process ends in any way.
+    """
 
     def __init__(self, root: Path) -> None:
-        """Take the lock of `root`, which is made if missing. Raises FlightError when another process has it."""
+        """Take the lock of `root`, which is made if missing. Raises FlightError when another process holds it."""
         path = root / _LOCK
         try:
             durable.make_folder(root)
@@ -232,7 +236,7 @@ class FlightsLock:
 
 
 def is_locked(root: Path) -> bool:
-    """Whether some process records into `root` now. Raises FlightError when that can't be told."""
+    """Whether some process records into `root` now. Raises FlightError when the lock can't be read."""
     path = root / _LOCK
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)

@@ -1,13 +1,15 @@
 """The ledger: one SQLite file that says what became of every shot. A row in it is the acknowledgement.
 
 WAL with synchronous=FULL: a committed row survives a power cut. Poses, tags and results are kept as the canonical JSON
-that was hashed, so that anybody can check `sha256(record)` with SQLite and sha256sum alone.
+that was hashed, so that `sha256(record)` can be checked with SQLite and sha256sum alone.
 """
 
 from __future__ import annotations
 
 import json
 import sqlite3
+import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -15,7 +17,6 @@ from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
 from dappled.decode.geometry.pose import Gnss, Pose
-from dappled.flight.database import Database
 from dappled.flight.errors import FlightError
 from dappled.flight.records import (
     Cause,
@@ -27,7 +28,6 @@ from dappled.flight.records import (
     ShotState,
     Stray,
     Tag,
-    advance,
     canonical,
     digest,
 )
@@ -70,6 +70,15 @@ CREATE TABLE events (
 ) STRICT;
 CREATE TABLE facts (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
 """
+_BUSY_S = 10.0
+# The life of a shot: wished → fired → safe | failed. A file is proof of an exposure: it makes a shot safe even when the
+# trigger call was not seen to return, and even when the shot had been given up. What is safe stays safe.
+TRANSITIONS: dict[ShotState, frozenset[ShotState]] = {
+    "wished": frozenset({"fired", "safe", "failed"}),
+    "fired": frozenset({"safe", "failed"}),
+    "failed": frozenset({"safe"}),
+    "safe": frozenset(),
+}
 _Record = TypeVar("_Record")
 _REASONS = {
     "SQLITE_NOTADB": "it is damaged, or no SQLite file; move it away, the frames and shots.jsonl beside it are intact",
@@ -82,24 +91,90 @@ _REASONS = {
 }
 
 
+class IllegalTransitionError(FlightError):
+    """A shot can't go from its state to the one asked for."""
+
+
+def advance(index: int, old: ShotState, new: ShotState) -> ShotState:
+    """`new`, when a shot may go there from `old`. Raises IllegalTransitionError."""
+    if new not in TRANSITIONS[old]:
+        raise IllegalTransitionError(f"shot {index} is {old}: it can't become {new}")
+    return new
+
+
+class Database(ABC):
+    """One SQLite connection behind a lock, so that threads may share it. `_sentence` words SQLite's errors."""
+
+    def __init__(self, path: Path, uri: str) -> None:
+        """Connect to `uri` and check with `_identify` that the file is ours. Raises FlightError."""
+        self.path = path
+        self._lock = threading.RLock()
+        try:
+            self._db = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+        except sqlite3.Error as error:
+            raise self._sentence(error) from error
+        try:
+            with self._speaking():
+                self._identify()
+        except BaseException:
+            self._db.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection; the last one to close folds the WAL into the file."""
+        with self._lock:
+            self._db.close()
+
+    @abstractmethod
+    def _identify(self) -> None:
+        """Check that the file is ours; set up a new one. Raises FlightError and sqlite3.Error."""
+
+    @abstractmethod
+    def _sentence(self, error: sqlite3.Error) -> FlightError:
+        """The error for a person: what can't be done, why, and what to do."""
+
+    def _identity(self) -> tuple[bool, int, int]:
+        """(whether the file is empty, application id, version)."""
+        empty = self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+        application = self._db.execute("PRAGMA application_id").fetchone()[0]
+        return empty, application, self._db.execute("PRAGMA user_version").fetchone()[0]
+
+    def _rows(self, sql: str, *values: object) -> list[Any]:
+        with self._lock, self._speaking():
+            return self._db.execute(sql, values).fetchall()
+
+    @contextmanager
+    def _speaking(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise self._sentence(error) from error
+
+
 class LedgerReader(Database):
-    """Everything that a ledger says, as records. One connection, behind a lock: threads may share it."""
+    """Read a ledger's rows as records, also while it is written, also on a read-only disk."""
 
     def __init__(self, path: Path, *, uri: str, create: bool = False) -> None:
-        """Open a ledger; `create`: an empty file will do. Raises FlightError."""
+        """Open a ledger. `create`: an empty file is accepted. Raises FlightError."""
         self._create = create
         super().__init__(path, uri)
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """A ledger to read only, also while it is written, also on a read-only disk. Raises FlightError."""
+        """Open a ledger for reading. Raises FlightError."""
         if not path.is_file():
             raise FlightError(f"there is no ledger at {path}; give a flight folder that dappled recorded")
         try:
-            # Not mode=ro: such a connection, when it is the last, would leave -wal and -shm behind. Nothing is changed.
+            # Not mode=ro: when such a connection is the last one, it leaves -wal and -shm behind. We change nothing.
             reader = cls(path, uri=f"{path.absolute().as_uri()}?mode=rw")
         except FlightError:
-            # In a folder that can't be written a WAL database opens only as immutable, and only when closed well.
+            # In a read-only folder a WAL database opens only as immutable, and only if it was closed properly.
             wal = path.with_name(path.name + "-wal")
             if wal.exists() and wal.stat().st_size > 0:
                 raise
@@ -126,7 +201,7 @@ class LedgerReader(Database):
     def companions(self) -> list[Frame]:
         """Files beside frames, such as the JPEG of a raw frame; each has the index of its frame."""
         if not self._rows("SELECT 1 FROM sqlite_master WHERE name = 'companions'"):
-            return []  # recorded before there were any
+            return []  # recorded by a version without companions
         columns = "idx, name, camera_name, size, sha256, arrived_utc_ns"
         return [Frame(*row) for row in self._rows(f"SELECT {columns} FROM companions ORDER BY name")]  # noqa: S608  constant
 
@@ -135,9 +210,9 @@ class LedgerReader(Database):
         return [*self.frames(), *self.companions(), *self.strays()]
 
     def following(self) -> frozenset[int]:
-        """Shots that were fired and whose files stayed at the camera: failed for now, until they are picked up."""
-        told = "SELECT idx FROM events WHERE kind = 'follows'"
-        rows = self._rows(f"SELECT idx FROM shots WHERE state = 'failed' AND idx IN ({told})")  # noqa: S608  constant
+        """Shots that were fired and whose files are still on the camera. They count as failed until picked up."""
+        noted = "SELECT idx FROM events WHERE kind = 'follows'"
+        rows = self._rows(f"SELECT idx FROM shots WHERE state = 'failed' AND idx IN ({noted})")  # noqa: S608  constant
         return frozenset(row[0] for row in rows)
 
     def strays(self) -> list[Stray]:
@@ -158,7 +233,7 @@ class LedgerReader(Database):
         return self._load(_tag, rows[0][0]) if rows else None
 
     def results(self, run: str = "live") -> dict[int, Result]:
-        """What decoding made of each frame in one run."""
+        """The decoding results of one run, by index."""
         rows = self._rows("SELECT record FROM results WHERE run = ? ORDER BY idx", run)
         return {result.index: result for result in (self._load(_result, row[0]) for row in rows)}
 
@@ -167,7 +242,7 @@ class LedgerReader(Database):
         return self._load(_result, rows[0][0]) if rows else None
 
     def contradictions(self) -> list[str]:
-        """Results whose record and column say different hashes, in sentences."""
+        """A sentence for each result whose record and column hold different hashes."""
         rows = self._rows("SELECT idx, run, slices_sha256, record FROM results ORDER BY idx, run")
         return [
             f"the result of frame {index} in run {run} contradicts itself"
@@ -176,11 +251,11 @@ class LedgerReader(Database):
         ]
 
     def runs(self) -> dict[str, int]:
-        """How many results each run has; "live" is the flight itself."""
+        """The number of results of each run; "live" is the flight itself."""
         return dict(self._rows("SELECT run, count(*) FROM results GROUP BY run ORDER BY min(rowid)"))
 
     def digests(self, table: str) -> dict[int, tuple[str, str]]:
-        """(sha256 as noted, record text) by index, of "poses" or "tags"."""
+        """(stored sha256, record text) by index, of "poses" or "tags"."""
         if table not in ("poses", "tags"):
             raise ValueError(f"no digests are kept of {table}")
         rows = self._rows(f"SELECT idx, sha256, record FROM {table} ORDER BY idx")  # noqa: S608  one of two words
@@ -190,19 +265,19 @@ class LedgerReader(Database):
         return [LedgerEvent(*row) for row in self._rows("SELECT * FROM events ORDER BY number")]
 
     def facts(self) -> dict[str, Any]:
-        """What holds for the whole flight: telemetry_sha256, closed_utc_ns …"""
+        """Values that hold for the whole flight: telemetry_sha256, closed_utc_ns …"""
         return {key: json.loads(value) for key, value in self._rows("SELECT key, value FROM facts")}
 
     def utc_correction_ns(self) -> int | None:
-        """What to add to every `utc_ns` of this flight to have UTC: 0 where the machine knew it, None where nobody ever
-        told."""
+        """What to add to every `utc_ns` of this flight to get UTC: 0 where the machine knew UTC, None where it never
+        learnt it."""
         facts = self.facts()
         if "utc_correction" in facts:
             return int(facts["utc_correction"]["correction_ns"])
         return 0 if facts.get("utc_known", True) else None
 
     def damage(self) -> list[str]:
-        """What SQLite finds wrong with the file; empty when it is whole."""
+        """What SQLite's integrity check finds wrong; empty when the file is intact."""
         try:
             found = [str(row[0]) for row in self._rows("PRAGMA integrity_check(10)")]
             return [] if found == ["ok"] else found
@@ -240,7 +315,7 @@ class LedgerReader(Database):
 
 
 def ledger_damage(path: Path) -> str | None:
-    """What SQLite finds wrong with the content of a ledger; None where it is whole, missing, or can't be looked at."""
+    """What SQLite finds wrong with the content of a ledger; None where it is intact, missing, or can't be read."""
     if not path.is_file():
         return None
     try:
@@ -252,10 +327,7 @@ def ledger_damage(path: Path) -> str | None:
 
 
 class Ledger(LedgerReader):
-    """The ledger's one writer. Every method is one short transaction, durable when it returns.
-
-    All raise FlightError with a sentence when the ledger can't take it.
-    """
+    """Write a ledger. Every method is one short transaction, durable when it returns, and may raise FlightError."""
 
     def __init__(self, path: Path, utc_ns: Callable[[], int]) -> None:
         """Open a flight's ledger, or make it. `utc_ns` stamps the events."""
@@ -276,7 +348,7 @@ class Ledger(LedgerReader):
             raise
 
     def add_shot(self, shot: Shot) -> None:
-        """A wish, from the journal."""
+        """Add a shot that is in the journal."""
         with self._transaction():
             if self.shot(shot.index) is not None:
                 raise FlightError(f"shot {shot.index} is in the ledger {self.path} already")
@@ -287,7 +359,7 @@ class Ledger(LedgerReader):
             )
 
     def fired(self, index: int, called_monotonic_ns: int, returned_monotonic_ns: int) -> None:
-        """The trigger call was made, between these times."""
+        """Note that the trigger call was made between these times."""
         with self._transaction():
             self._advance(index, "fired")
             self._db.execute(
@@ -296,13 +368,13 @@ class Ledger(LedgerReader):
             )
 
     def failed(self, index: int, reason: str) -> None:
-        """The shot brings no frame. `reason` is a sentence."""
+        """Note that the shot gives no frame. `reason` is a sentence."""
         with self._transaction():
             self._advance(index, "failed", reason)
             self._event("failed", reason, index)
 
     def safe(self, frame: Frame) -> None:
-        """The frame's bytes and name are durable: this row acknowledges them."""
+        """Acknowledge a frame whose bytes and name are durable."""
         with self._transaction():
             before = self._advance(frame.index, "safe")
             values = (frame.index, frame.name, frame.camera_name, frame.size, frame.sha256, frame.arrived_utc_ns)
@@ -311,27 +383,27 @@ class Ledger(LedgerReader):
                 self._event("late", f"the file {frame.camera_name} came after the shot had been given up", frame.index)
 
     def follows(self, index: int, reason: str) -> None:
-        """The shot was fired and its file stays at the camera: it has failed until the file is picked up."""
+        """Note that the shot was fired and its file is still on the camera: it counts as failed until picked up."""
         with self._transaction():
             self._advance(index, "failed", reason)
             self._event("follows", reason, index)
 
     def add_companion(self, companion: Frame) -> None:
-        """A file beside a frame, durable under its name."""
+        """Add a file beside a frame; it is durable under its name."""
         with self._transaction():
             one = companion
             values = (one.name, one.index, one.camera_name, one.size, one.sha256, one.arrived_utc_ns)
             self._db.execute("INSERT INTO companions VALUES (?, ?, ?, ?, ?, ?)", values)
 
     def add_stray(self, stray: Stray) -> None:
-        """A file that belongs to no shot, or is one too many, durable under its name."""
+        """Add a file that belongs to no shot, or is a second one; it is durable under its name."""
         with self._transaction():
             values = (stray.name, stray.camera_name, stray.size, stray.sha256, stray.arrived_utc_ns, stray.reason)
             self._db.execute("INSERT INTO strays VALUES (?, ?, ?, ?, ?, ?)", values)
             self._event("stray", stray.reason, None)
 
     def add_tag(self, tag: Tag) -> None:
-        """A frame's tag and, with a digest of its own, the pose in it."""
+        """Add a frame's tag and, with a digest of its own, the pose in it."""
         with self._transaction():
             for table, record in (("poses", tag.pose), ("tags", tag)):
                 self._db.execute(
@@ -340,7 +412,7 @@ class Ledger(LedgerReader):
                 )
 
     def add_result(self, result: Result) -> None:
-        """What decoding made of a frame; once for each run."""
+        """Add the result of decoding a frame; once for each run."""
         with self._transaction():
             values = (result.index, result.run, result.slices_sha256, canonical(asdict(result)).decode())
             self._db.execute("INSERT INTO results VALUES (?, ?, ?, ?)", values)
@@ -350,7 +422,7 @@ class Ledger(LedgerReader):
             self._event(kind, text, index)
 
     def set_fact(self, key: str, value: object) -> None:
-        """Something that holds for the whole flight; replaces what was noted before."""
+        """Store a value that holds for the whole flight; replaces an earlier one."""
         with self._transaction():
             self._db.execute("INSERT OR REPLACE INTO facts VALUES (?, ?)", (key, canonical(value).decode()))
 
@@ -361,7 +433,7 @@ class Ledger(LedgerReader):
     def _advance(self, index: int, new: ShotState, reason: str | None = None) -> ShotState:
         row = self.shot(index)
         if row is None:
-            raise FlightError(f"no shot {index} is in the ledger {self.path}: it was never wished for")
+            raise FlightError(f"no shot {index} is in the ledger {self.path}: it was never requested")
         advance(index, row.state, new)
         self._db.execute("UPDATE shots SET state = ?, reason = ? WHERE idx = ?", (new, reason, index))
         return row.state
@@ -387,7 +459,7 @@ def _shot_row(row: Sequence[Any]) -> ShotRow:
 
 
 def _pose(value: dict[str, Any]) -> Pose:
-    """A record of `poses`. Raises TypeError for what is none."""
+    """A record of `poses`. Raises TypeError for anything else."""
     made: dict[str, Any] = {key: tuple(item) for key, item in value.items() if isinstance(item, list)}
     if value.get("gnss") is not None:
         made["gnss"] = Gnss(**value["gnss"])
@@ -395,10 +467,10 @@ def _pose(value: dict[str, Any]) -> Pose:
 
 
 def _tag(value: dict[str, Any]) -> Tag:
-    """A record of `tags`. Raises TypeError or KeyError for what is none."""
+    """A record of `tags`. Raises TypeError or KeyError for anything else."""
     return Tag(**{**value, "pose": _pose(value["pose"])})
 
 
 def _result(value: dict[str, Any]) -> Result:
-    """A record of `results`. Raises TypeError for what is none."""
+    """A record of `results`. Raises TypeError for anything else."""
     return Result(**value)

@@ -18,7 +18,7 @@ _SHARED_MEMORY = "-shm"
 
 @dataclass(frozen=True, slots=True)
 class Offloaded:
-    """What was done. `copied` and `there_already` count files; `size` is that of all of them, in bytes."""
+    """What was done. `copied` and `there_already` count files; `size` is their total in bytes."""
 
     flight: str
     destination: Path
@@ -34,12 +34,12 @@ def offload(
     prune: bool,
     progress: Callable[[int], object] = lambda size: None,
 ) -> Offloaded:
-    """Copy a closed flight to `destination/<its name>`; every file is read back from there and compared by SHA-256
-    with its source, and the copy is checked whole against its own ledger. Doing so again finishes what was left.
+    """Copy a closed flight to `destination/<its name>`. Every file is read back from there and compared by SHA-256 with
+    its source, and the copy is checked against its own ledger. A second call finishes what the first one left undone.
 
     Nothing is ever removed: `prune` is refused, because a destination that is the same disk under another name would
     pass every comparison and hold the only copy. Raises FlightError: `prune` asked for, flight open or not intact, copy
-    different, disk refuses. `progress` is told the bytes done.
+    different, disk refuses. `progress` gets the bytes done.
     """
     if prune:
         raise FlightError(
@@ -81,7 +81,7 @@ def _offloaded_before(folder: FlightFolder) -> str | None:
 
 
 def _files(flight: Path) -> Iterator[Path]:
-    """All files but SQLite's shared memory; the reader that was just closed has folded the WAL into the ledger."""
+    """All files except SQLite's shared memory. The reader that was just closed has folded the WAL into the ledger."""
     for root, folders, names in os.walk(flight):
         folders.sort()
         for name in sorted(names):
@@ -91,7 +91,7 @@ def _files(flight: Path) -> Iterator[Path]:
 
 
 def _bring(source: Path, goal: Path) -> tuple[bool, int]:
-    """(copied or not, size). A file that is there with the same bytes stays; another one is refused."""
+    """Copy a file; returns (whether it was copied, size). An equal file stays; a different one raises FlightError."""
     try:
         with source.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
@@ -111,7 +111,7 @@ def _bring(source: Path, goal: Path) -> tuple[bool, int]:
 
 
 def _hash_on_disk(path: Path) -> str:
-    """SHA-256 of a file, its pages dropped from memory first, so that the disk is asked."""
+    """SHA-256 of a file as it is on the disk: its pages are dropped from memory first."""
     with path.open("rb") as file:
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
         return durable.hash_descriptor(file.fileno(), os.fstat(file.fileno()).st_size)

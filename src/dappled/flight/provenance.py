@@ -1,4 +1,4 @@
-"""flight.toml and inputs/: what a flight was flown and decoded with. The ledger keeps their hashes for the check."""
+"""Keep the hashes of flight.toml and inputs/, which say what a flight was flown and decoded with, in the ledger."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FACT = "sha256:"  # and the name relative to the flight; the value lists every 
 
 
 def note(folder: FlightFolder, ledger: Ledger, under: str) -> None:
-    """Note the hash of a file, or of every file below a folder, as it now is. Raises FlightError."""
+    """Store the current hash of a file, or of every file below a folder. Raises FlightError."""
     place = folder.path / under
     try:
         for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
@@ -27,8 +27,8 @@ def note(folder: FlightFolder, ledger: Ledger, under: str) -> None:
 
 
 def write_facts(folder: FlightFolder, ledger: Ledger, facts: Mapping[str, Any]) -> None:
-    """Write flight.toml anew. The old and the new hash are both right until it is done: a crash in between is no
-    damage. Raises FlightError."""
+    """Replace flight.toml. The ledger accepts the old and the new hash until the file is in place, so that a crash in
+    between does not look like damage. Raises FlightError."""
     key = _FACT + folder.settings.name
     data = layout.facts_as_toml(facts)
     sha256 = hashlib.sha256(data).hexdigest()
@@ -42,7 +42,7 @@ def write_facts(folder: FlightFolder, ledger: Ledger, facts: Mapping[str, Any]) 
 
 
 def problems(folder: FlightFolder, ledger: LedgerReader) -> Iterator[str]:
-    """A sentence for each file that isn't as it was noted. That flight.toml is there is seen where it is read."""
+    """A sentence for each file that differs from its stored hash. `read_facts` reports a missing flight.toml."""
     for key, hashes in sorted(ledger.facts().items()):
         if not key.startswith(_FACT):
             continue

@@ -25,7 +25,7 @@ from dappled.flight.telemetry_log import TelemetryLog
 
 
 class FileBytes(Protocol):
-    """A file's bytes behind a descriptor; read by position, never closed here."""
+    """A file's bytes behind a descriptor; they are read by position, and the descriptor is never closed here."""
 
     @property
     def fd(self) -> int: ...
@@ -35,7 +35,7 @@ class FileBytes(Protocol):
 
 
 class StrayFileError(FlightError):
-    """The file was made safe, but it is not the frame of a shot: it stands beside the frames as `stray`."""
+    """The file was made safe, but it is not the frame of a shot: it is kept among the frames as `stray`."""
 
     def __init__(self, stray: Stray) -> None:
         super().__init__(stray.reason)
@@ -50,15 +50,15 @@ class Recorder:
         self._ledger = ledger
 
     def record(self, index: int, camera_name: str, blob: FileBytes, *, arrived_utc_ns: int) -> Frame:
-        """Make the file of shot `index` safe: when this returns, bytes, name and ledger row are durable.
+        """Make the file of shot `index` safe: on return its bytes, its name and its ledger row are durable.
 
-        The same bytes a second time give the same Frame. Raises StrayFileError (bytes kept, under another name) for a
-        second file of a shot or an unknown shot, and FlightError when the disk or the blob fails: no torn file is left
-        under a final name, and the shot is noted as failed where that can still be noted.
+        The same bytes a second time give the same Frame. Raises StrayFileError (the bytes are kept under another name)
+        for a second file of a shot or an unknown shot, and FlightError when the disk or the blob fails: then no torn
+        file is left under a final name, and the shot is noted as failed if the ledger can still be written.
         """
         row = self._ledger.shot(index)
         if row is None:
-            reason = f"{camera_name} came for shot {index}, which was never wished for: kept as a stray"
+            reason = f"{camera_name} came for shot {index}, which was never requested: kept as a stray"
             raise StrayFileError(self.record_stray(camera_name, blob, reason, arrived_utc_ns=arrived_utc_ns))
         first = self._ledger.frame(index)
         if first is not None:
@@ -74,8 +74,8 @@ class Recorder:
         return frame
 
     def record_companion(self, index: int, camera_name: str, blob: FileBytes, *, arrived_utc_ns: int) -> Frame:
-        """Make a file safe that stands beside the frame of a shot, under the same number. Raises FlightError where the
-        shot has no frame, or has such a file."""
+        """Make a companion safe: a file of the same number beside the frame of a shot. Raises FlightError where the
+        shot has no frame, or has such a file already."""
         if self._ledger.frame(index) is None:
             raise FlightError(f"{camera_name} goes with shot {index}, which has no frame: it was not recorded")
         name = layout.frame_name(index, camera_name)
@@ -126,9 +126,9 @@ class Recorder:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """The open parts of a flight. Each has one owner; `close` ends them all.
+    """A flight that is being recorded, with its open parts; `close` ends them all.
 
-    `next_index` is the image index of the first shot. `recovered` says what was put in order in earlier flights.
+    `next_index` is the image index of the first shot. `recovered` says what was repaired in earlier flights.
     """
 
     folder: FlightFolder
@@ -149,24 +149,24 @@ class Recording:
         return self._ended.is_set()
 
     def note_image(self, index: int) -> None:
-        """Bring the index over flights up to date for one shot. Raises FlightError."""
+        """Update the index over all flights for one shot. Raises FlightError."""
         row = self.ledger.shot(index)
         if row is not None:
             frame = self.ledger.frame(index)
             self.index.put(IndexEntry(index, self.folder.name, None if frame is None else frame.name, row.state))
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
-        """Add to flight.toml what was learnt since the start, such as the camera's identity. Raises FlightError."""
+        """Add to flight.toml what became known since the start, such as the camera's identity. Raises FlightError."""
         provenance.write_facts(self.folder, self.ledger, {**layout.read_facts(self.folder), **facts})
 
     def note_inputs(self, folder: str) -> None:
-        """What stands in this folder of the flight is what frames are decoded with: `flight check` compares it from
-        now on. Raises FlightError."""
+        """Store the hashes of the files in this folder of the flight, which frames are decoded with: `flight check`
+        compares them. Raises FlightError."""
         provenance.note(self.folder, self.ledger, folder)
 
     def learn_utc(self, correction_ns: int, sigma_ns: int, source: str) -> None:
-        """UTC is known now: this is to be added to every stamp of this flight, those before it too. Nothing is renamed
-        or stamped anew; ledger and index say it. Raises FlightError."""
+        """Store what is to be added to every stamp of this flight, earlier ones too, now that UTC is known. Stamps and
+        names stay as they are; ledger and index hold the correction. Raises FlightError."""
         fact = {"correction_ns": correction_ns, "sigma_ns": sigma_ns, "source": source}
         self.ledger.set_fact("utc_correction", fact)
         self.ledger.add_event("utc", f"UTC is {correction_ns / 1e9:+.3f} s from this machine's, by {source}")
@@ -174,9 +174,9 @@ class Recording:
         self.index.add_flight(self.folder.name, began_utc_ns + correction_ns, correction_ns)
 
     def close(self) -> list[str]:
-        """End the flight: nobody notes, records or logs any more. Shots still open are failed; returns sentences.
+        """End the flight. Shots still open become failed. Returns sentences.
 
-        Raises FlightError when the ledger can't be closed properly; the next flight's recovery does it then.
+        Raises FlightError when the ledger can't be closed properly; the recovery of the next flight closes it then.
         """
         self._ended.set()
         with ExitStack() as stack:
@@ -195,10 +195,11 @@ class Recording:
 def begin(
     root: Path, utc_ns: Callable[[], int], facts: Mapping[str, Any] | None = None, *, utc_known: bool = True
 ) -> Recording:
-    """Lock the flights folder, put earlier flights in order, and begin a new one.
+    """Lock the flights folder, repair earlier flights, and begin a new one.
 
-    `facts` goes to flight.toml. `utc_known` False: `utc_ns` counts from somewhere, the flight is named by boot, and
-    `learn_utc` may tell later what to add. Raises FlightError when another daemon records there, or the disk refuses.
+    `utc_ns` stamps the events. `facts` goes to flight.toml. With `utc_known` False, `utc_ns` counts from an arbitrary
+    time, the flight is named by boot, and `learn_utc` may give the correction later. Raises FlightError when another
+    daemon records there, or the disk refuses.
     """
     with ExitStack() as stack:
         lock = FlightsLock(root)
@@ -221,7 +222,7 @@ def begin(
         stack.callback(journal.close)
         telemetry = TelemetryLog(folder.telemetry)
         stack.callback(telemetry.close)
-        _make_names_sure(folder)
+        _sync_names(folder)
         for text in recovered:
             ledger.add_event("recovery", text)
         recorder = Recorder(folder, ledger)
@@ -232,7 +233,7 @@ def begin(
     return opened
 
 
-def _make_names_sure(folder: FlightFolder) -> None:
+def _sync_names(folder: FlightFolder) -> None:
     try:
         durable.sync_folder(folder.path)
     except OSError as error:

@@ -13,14 +13,13 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from dappled.decode.geometry.pose import Pose
-from dappled.flight.errors import FlightError
 
 ShotState = Literal["wished", "fired", "safe", "failed"]
 
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Who wanted the shot. `source` is "mavlink:255/190", "console", "replay" …; `kind` the message or act."""
+    """Who requested a shot. `source` is "mavlink:255/190", "console", "replay" …; `kind` the message or action."""
 
     source: str
     kind: str
@@ -29,7 +28,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One wish to expose, with its cause. Times are the daemon's own clocks at the wish."""
+    """One capture request, with its cause. The times are those of the daemon's clocks when the request came."""
 
     index: int
     cause: Cause
@@ -39,7 +38,7 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What the camera delivered for a shot, safe on disk: `name` is relative to the flight folder."""
+    """The file that the camera delivered for a shot, safe on disk. `name` is relative to the flight folder."""
 
     index: int
     name: str
@@ -51,7 +50,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Tag:
-    """What is known of a frame apart from its pixels. Times are mid-exposure, UTC; sigma one standard deviation."""
+    """What is known of a frame apart from its pixels. `utc_ns` is mid-exposure; sigmas are one standard deviation."""
 
     index: int
     utc_ns: int
@@ -68,7 +67,10 @@ class Tag:
 
 
 def canonical(value: Any) -> bytes:
-    """One byte string for equal values: JSON with sorted keys, no spaces, shortest round-trip floats, no NaN."""
+    """Encode a value so that equal values give equal bytes: JSON, sorted keys, no spaces, shortest round-trip floats.
+
+    Raises ValueError for NaN and infinities.
+    """
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
@@ -80,7 +82,7 @@ def digest(record: Pose | Tag | Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ShotRow:
-    """A shot and how far it came. The fired times bracket the trigger call; None where it was not seen to fire.
+    """A shot and its state. The fired times are those before and after the trigger call; None where there was none.
 
     `reason` is a sentence, for a failed shot.
     """
@@ -94,9 +96,9 @@ class ShotRow:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What decoding made of a frame. `run` is "live" for the flight itself; other runs stand beside it.
+    """The result of decoding a frame. `run` is "live" for the flight itself; later runs have names of their own.
 
-    `slices_sha256` is that of the published body. `decode_ms` is None where nobody measured it.
+    `slices_sha256` is the hash of the published body. `decode_ms` is None where it was not measured.
     """
 
     index: int
@@ -112,7 +114,7 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class Stray:
-    """A file that belongs to no shot or is one too many: kept, with the reason."""
+    """A file that belongs to no shot, or is a second file of one. It is kept, with the reason."""
 
     name: str
     camera_name: str
@@ -124,29 +126,10 @@ class Stray:
 
 @dataclass(frozen=True, slots=True)
 class LedgerEvent:
-    """Something that happened, in words. `index` is the shot's, where there is one."""
+    """Something that happened, as a sentence. `index` is the shot's, where there is one."""
 
     number: int
     utc_ns: int
     kind: str
     index: int | None
     text: str
-
-
-TRANSITIONS: dict[ShotState, frozenset[ShotState]] = {
-    "wished": frozenset({"fired", "safe", "failed"}),
-    "fired": frozenset({"safe", "failed"}),
-    "failed": frozenset({"safe"}),
-    "safe": frozenset(),
-}
-
-
-class IllegalTransitionError(FlightError):
-    """A shot was asked to go where it can't."""
-
-
-def advance(index: int, old: ShotState, new: ShotState) -> ShotState:
-    """`new`, when a shot may go there from `old`. Raises IllegalTransitionError."""
-    if new not in TRANSITIONS[old]:
-        raise IllegalTransitionError(f"shot {index} is {old}: it can't become {new}")
-    return new

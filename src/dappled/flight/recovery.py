@@ -1,7 +1,8 @@
-"""What a flight that ended without a goodbye left behind is put in order before the next one begins.
+"""Repair flights that were not closed, before the next flight begins.
 
-Half-written files go, whole files without a row are adopted, noted wishes without a row are entered, and whatever was
-still open is failed with a reason. Nothing that was acknowledged is touched. All of it is reported.
+Half-written files are removed, complete files without a row are adopted, shots that only the journal has are added to
+the ledger, and shots that were still open become failed, with a reason. Nothing that was acknowledged is touched.
+Everything done is reported.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from dappled.flight import durable, layout, telemetry_log
-from dappled.flight import journal as wishes
+from dappled.flight import journal as journals
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.index import ImageIndex
 from dappled.flight.journal import ShotJournal
@@ -26,10 +27,10 @@ LOST = "the recording ended before its file came"
 
 
 def recover(root: Path, index: ImageIndex, utc_ns: Callable[[], int]) -> list[str]:
-    """Put all flights that were not closed in order, and index them. The caller holds the flights' lock.
+    """Repair all flights that were not closed, and index them. The caller holds the flights' lock.
 
-    A flight that can't be put in order is reported and left as it is; the next flight can begin all the same.
-    Returns sentences.
+    A flight that can't be repaired is reported and left as it is; the next flight can begin all the same. Returns
+    sentences.
     """
     report: list[str] = []
     for path in layout.unmade(root):
@@ -48,13 +49,13 @@ def recover(root: Path, index: ImageIndex, utc_ns: Callable[[], int]) -> list[st
 
 
 def recover_flight(folder: FlightFolder, utc_ns: Callable[[], int]) -> list[str]:
-    """Put one flight in order and close it; doing so again finds nothing to do. Returns sentences.
+    """Repair one flight and close it; a second call finds nothing to do. Returns sentences.
 
     Raises FlightError or OSError when ledger or disk don't allow it.
     """
     report = _remove_parts(folder) + _move_damaged_ledger(folder)
     with Ledger(folder.ledger, utc_ns) as ledger:
-        report += _enter_wishes(folder, ledger)
+        report += _add_noted_shots(folder, ledger)
         report += _adopt(folder, ledger)
         for row in ledger.shots():
             if row.state in ("wished", "fired"):
@@ -75,7 +76,7 @@ def close_ledger(
     telemetry: telemetry_log.TelemetrySummary | None,
     report: list[str],
 ) -> None:
-    """Note in the ledger what the telemetry is (read from the file when not given) and that the flight is over."""
+    """Store in the ledger the telemetry's summary (read from the file when not given) and the flight's end."""
     if telemetry is None and folder.telemetry.exists():
         telemetry = telemetry_log.summarise(folder.telemetry, report.append)
     if telemetry is not None:
@@ -86,7 +87,7 @@ def close_ledger(
 
 
 def _move_damaged_ledger(folder: FlightFolder) -> list[str]:
-    """A ledger that SQLite finds damaged makes room for a new one, which journal and frames will fill."""
+    """Move a damaged ledger aside; journal and frames will fill a new one."""
     damage = ledger_damage(folder.ledger)
     if damage is None:
         return []
@@ -111,8 +112,8 @@ def _remove_parts(folder: FlightFolder) -> list[str]:
     return report
 
 
-def _enter_wishes(folder: FlightFolder, ledger: Ledger) -> list[str]:
-    journal = wishes.read(folder.journal)
+def _add_noted_shots(folder: FlightFolder, ledger: Ledger) -> list[str]:
+    journal = journals.read(folder.journal)
     report = [*journal.problems]
     for shot in journal.shots:
         if ledger.shot(shot.index) is None:
@@ -132,12 +133,12 @@ def _enter_wishes(folder: FlightFolder, ledger: Ledger) -> list[str]:
 
 
 def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
-    """Files under a final name are whole: the rename came after their fsync."""
+    """Adopt files without a row. A file under a final name is complete: the rename came after its fsync."""
     if not folder.frames.is_dir():
         return []
     known = {row.name for row in ledger.files()}
     report = []
-    # JPEGs last: beside a raw frame they go with it
+    # JPEGs last: beside a raw frame they are companions
     for file_name in sorted(os.listdir(folder.frames), key=lambda one: (one.endswith(_JPEG), one)):
         name = f"frames/{file_name}"
         if name in known or file_name.endswith(SIDECAR):

@@ -1,7 +1,7 @@
-"""telemetry.tlog: every MAVLink packet received and sent, in the common format of ground stations.
+"""Write and read telemetry.tlog: every MAVLink packet received and sent, in the ground stations' common format.
 
 A record is an 8-byte big-endian count of microseconds UTC and the packet. Packets are split by MAVLink's own framing
-(MAVLink 1: 0xFE, 8 bytes around the payload; MAVLink 2: 0xFD, 12 bytes, 13 more with a signature); no dialect needed.
+(MAVLink 1: 0xFE, 8 bytes around the payload; MAVLink 2: 0xFD, 12 bytes, 13 more with a signature) without a dialect.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.flight.durable import AppendedFile
 from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.journal import AppendedFile
 
 _MAVLINK_1, _MAVLINK_2 = 0xFE, 0xFD
 _SIGNED = 0x01
@@ -26,7 +26,7 @@ _Bytes = bytes | mmap.mmap | memoryview
 
 @dataclass(frozen=True, slots=True)
 class TelemetrySummary:
-    """What a closed telemetry log is."""
+    """The size and content of a closed telemetry log."""
 
     packets: int
     size: int
@@ -34,7 +34,7 @@ class TelemetrySummary:
 
 
 def packet_length(data: _Bytes, at: int = 0) -> int | None:
-    """Bytes of the MAVLink packet that begins at `at`, or None where none begins or it isn't all there."""
+    """Length of the MAVLink packet that begins at `at`; None where none begins or the packet is cut off."""
     left = len(data) - at
     if left >= 8 and data[at] == _MAVLINK_1:
         length = data[at + 1] + 8
@@ -46,10 +46,10 @@ def packet_length(data: _Bytes, at: int = 0) -> int | None:
 
 
 class TelemetryLog:
-    """The open log of one flight; owns its descriptor and its flusher. `append` may be called by any thread."""
+    """The open log of one flight; owns its descriptor and its flusher. Any thread may call `append`."""
 
     def __init__(self, path: Path, flush_interval_s: float = 0.5) -> None:
-        """Make the log. Raises FlightError, also when there is one already."""
+        """Make the log. Raises FlightError, also when the file exists."""
         self.path = path
         self._lock = threading.Lock()
         self._sha = hashlib.sha256()
@@ -82,11 +82,11 @@ class TelemetryLog:
 
     @property
     def problem(self) -> str | None:
-        """Why logged packets may not survive a power cut, if so."""
+        """Why logged packets may not survive a power cut; None where they do."""
         return self._file.problem
 
     def close(self) -> TelemetrySummary:
-        """Flush and close; says what the file now is."""
+        """Flush and close; returns the size and content of the file."""
         with self._lock:
             first = self._file.shut()
         if first:
@@ -94,7 +94,7 @@ class TelemetryLog:
         return TelemetrySummary(self._packets, self._size, self._sha.hexdigest())
 
     def _cut(self) -> None:
-        """Take away what there is of a record that was not taken whole; tried again before the next one."""
+        """Remove a record that was written in part; tried again before the next record."""
         self._file.cut(self._size, _LOGGING)
         self._torn = False
 
@@ -102,8 +102,8 @@ class TelemetryLog:
 def read(path: Path, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, int, bytes]]:
     """(running number, stamp in µs UTC, packet) of a .tlog, in the file's order.
 
-    Bytes that are no packet are skipped up to the next place where two records follow each other (or one ends the
-    file); `report` gets a sentence for each such gap. Raises FlightError when the file can't be read.
+    Bytes that are not a packet are skipped up to the next place where two records follow each other, or one ends the
+    file. `report` gets a sentence for each such gap. Raises FlightError when the file can't be read.
     """
     try:
         with path.open("rb") as file:
@@ -126,7 +126,7 @@ def split(data: bytes | mmap.mmap, report: Callable[[str], object] = lambda _: N
             found = _resynchronise(data, at + 1)
             skipped = (size if found is None else found) - at
             where = "at the end" if found is None else f"before byte {found}"
-            report(f"{skipped} bytes {where} are no telemetry and were skipped")
+            report(f"{skipped} bytes {where} are not telemetry and were skipped")
             if found is None:
                 return
             at = found
@@ -136,7 +136,7 @@ def split(data: bytes | mmap.mmap, report: Callable[[str], object] = lambda _: N
 
 
 def summarise(path: Path, report: Callable[[str], object] = lambda _: None) -> TelemetrySummary:
-    """Read a whole log and say what it is. Raises FlightError."""
+    """Read a whole log and summarise it. Raises FlightError."""
     packets = sum(1 for _ in read(path, report))
     try:
         with path.open("rb") as file:
@@ -155,7 +155,7 @@ def _record_end(data: bytes | mmap.mmap, at: int) -> int | None:
 
 
 def _resynchronise(data: bytes | mmap.mmap, start: int) -> int | None:
-    """The first offset from which two whole records follow each other, or one that ends the file."""
+    """The first offset at which two complete records follow each other, or one ends the file."""
     for at in range(start, len(data) - 15):
         if data[at + 8] in (_MAVLINK_1, _MAVLINK_2):
             end = _record_end(data, at)

@@ -11,7 +11,7 @@ import pytest
 
 from dappled.cli import main
 from dappled.flight import Recording, Result, recording
-from tests.flight.makers import deliver, flip, tag, wish
+from tests.flight.makers import deliver, flip, request, tag
 
 START_UTC_NS = 1_795_256_103_000_000_000  # 2026-11-21T10:15:03Z
 
@@ -20,7 +20,7 @@ def fly(flights: Path) -> Recording:
     """Shot 0 safe, tagged and decoded, shot 1 failed."""
     begun = recording.begin(flights, lambda: START_UTC_NS, {"camera": {"driver": "none"}})
     for index in range(2):
-        wish(begun, index)
+        request(begun, index)
     begun.ledger.add_tag(tag(deliver(begun, 0, bytes(2_000_000))))
     begun.ledger.add_result(Result(0, "ab", 12, 13, "geometric", "predicted"))
     begun.ledger.failed(1, "no file came")

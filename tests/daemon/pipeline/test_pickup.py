@@ -12,13 +12,13 @@ from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
 from dappled.flight import recording
 from tests.flight.conftest import START_UTC_NS
-from tests.flight.makers import shot, wish
+from tests.flight.makers import request, shot
 
 
 def test_a_file_is_no_frame_of_a_shot_that_never_fired(tmp_path: Path) -> None:
     """Shot 0 was fired and its file stayed at the camera; shot 1 found no camera."""
     flight = recording.begin(tmp_path / "flights", lambda: START_UTC_NS)
-    wish(flight, 0)
+    request(flight, 0)
     flight.journal.note(shot(1))
     flight.ledger.add_shot(shot(1))
     flight.ledger.follows(0, "its file stays at the camera")

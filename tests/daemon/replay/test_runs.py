@@ -16,7 +16,7 @@ from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import LedgerReader, Recording, Result, recording
 from dappled.flight.check import check
-from tests.flight.makers import deliver, tag, wish
+from tests.flight.makers import deliver, request, tag
 
 RESULT = Result(0, "a" * 64, 12, 13, "geometric", "calibrated")
 NAMES = Names("reference-36mm", "reference-5x5", "geometric")
@@ -26,7 +26,7 @@ NAMES = Names("reference-36mm", "reference-5x5", "geometric")
 def flight(tmp_path: Path) -> Iterator[Recording]:
     """One decoded frame."""
     begun = recording.begin(tmp_path / "flights", lambda: 10**18)
-    wish(begun, 0)
+    request(begun, 0)
     begun.ledger.add_tag(tag(deliver(begun, 0, b"raw")))
     begun.ledger.add_result(RESULT)
     yield begun

@@ -33,7 +33,7 @@ from dappled.products.geotags import exif_gps, geotags, sidecars
 from dappled.products.geotags.exif_gps import ExifError
 from dappled.products.geotags.geotags import Mounting
 from dappled.products.maps.earth import Geoid
-from tests.flight.makers import deliver, pose, tag, wish
+from tests.flight.makers import deliver, pose, request, tag
 
 START_NS = 1_795_256_103_000_000_000
 
@@ -43,7 +43,7 @@ def flight(tmp_path: Path) -> Path:
     """Three frames: one with a pose, one without a position, one without a tag."""
     begun = recording.begin(tmp_path / "flights", lambda: START_NS)
     for index in range(3):
-        wish(begun, index)
+        request(begun, index)
         frame = deliver(begun, index, b"raw %d" % index)
         nowhere = replace(pose(), source="none", latitude_rad=None, longitude_rad=None, altitude_msl_m=None)
         if index < 2:
@@ -135,7 +135,7 @@ def rtk(**changed: Any) -> Pose:
 
 def one_frame(root: Path, frame: bytes, name: str, where: Pose, *, utc_known: bool = True) -> Path:
     begun = recording.begin(root / "flights", lambda: START_NS, utc_known=utc_known)
-    wish(begun, 0)
+    request(begun, 0)
     begun.ledger.add_tag(replace(tag(deliver(begun, 0, frame, name)), pose=where, utc_ns=START_NS + 123_456_789))
     if not utc_known:
         begun.learn_utc(86_400 * 10**9, 1, "test")

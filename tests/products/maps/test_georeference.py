@@ -32,7 +32,7 @@ from dappled.products.maps.georeference import Options, Survey
 from dappled.products.maps.ground import Flat
 from dappled.products.maps.photographs import Mounting, Photograph, PhotographError, Station
 from tests import globe
-from tests.flight.makers import deliver, pose, wish
+from tests.flight.makers import deliver, pose, request
 from tests.products import flown
 from tests.products.flown import Flown
 from tests.products.maps.test_eye import eye_at
@@ -165,7 +165,7 @@ def later_flight(short_flight: Flown, tmp_path: Path) -> Path:
     """The first frame alone, as frame 7 of another flight: numbers go on over flights."""
     begun = recording.begin(tmp_path / "later", lambda: flown.START_NS)
     raw = sorted((short_flight.folder / "frames").iterdir())[0].read_bytes()
-    wish(begun, 7)
+    request(begun, 7)
     frame = deliver(begun, 7, raw, "IMG_7.DNG")
     pose_of_it = flown.as_recorded(true_pose(short_flight))
     begun.ledger.add_tag(replace(tagged(frame.sha256, 7), pose=pose_of_it))
@@ -255,7 +255,7 @@ def test_frames_that_cant_be_placed_are_named_and_the_flight_goes_on(tmp_path: P
     poses = [None, replace(good, latitude_rad=None), replace(good, attitude=level), replace(good, attitude=None), good]
     begun = recording.begin(tmp_path / "flights", lambda: flown.START_NS)
     for index, one in enumerate(poses):
-        wish(begun, index)
+        request(begun, index)
         frame = deliver(begun, index, raw, f"IMG_{index}.DNG")
         if one is not None:
             begun.ledger.add_tag(replace(tagged(frame.sha256, index), pose=one))

@@ -19,7 +19,7 @@ _LATER = 1000
 
 
 class LedgerWriter:
-    """Writes one flight. A wish's row is written with the first event of its shot: until then the wish journal holds
+    """Writes one flight. A wish's row is written with the first event of its shot: until then the shot journal holds
     it, so that firing never waits for the database."""
 
     def __init__(self, recording: Recording, clock: Clock) -> None:
