@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from dappled.drivers.camera import CameraError
-from dappled.drivers.child_process import end_child, start_child
+from dappled.drivers.child_process import RestartBudget, end_child, start_child
 from dappled.drivers.process_channel import ChannelError, ProcessChannel
 from dappled.drivers.wired.ptp_source import PtpSource
 
@@ -98,3 +98,15 @@ def test_one_that_can_not_be_started_leaves_nothing_open(monkeypatch: pytest.Mon
         assert far.fileno() == -1
         with pytest.raises(ChannelError):
             near.send({})
+
+
+def test_budget_allows_its_number_in_any_window() -> None:
+    budget = RestartBudget(limit=2, window_s=60.0)
+    second = 1_000_000_000
+    for at in (0, 10):
+        assert budget.wait_ns(at * second) == 0
+        budget.spend(at * second)
+    assert budget.wait_ns(20 * second) == 40 * second
+    assert budget.wait_ns(60 * second) == 0
+    budget.spend(60 * second)
+    assert budget.wait_ns(61 * second) == 9 * second

@@ -150,7 +150,7 @@ def _play(
         publisher.publish("start", header)
     identity = Identity("dappled", "recording", "", str(arguments.flight))
     pipeline = Pipeline(
-        camera=ReplayCamera(recording.files, identity, clock.monotonic_ns),
+        camera=ReplayCamera(recording.files, identity, clock),
         writer=writer,
         poses=telemetry.pose,
         decoder=decoder,

@@ -1,22 +1,22 @@
-"""A camera that is a recording: each shot brings again the file that it brought, byte for byte."""
+"""Replay a recorded camera: each shot brings the recorded file again, byte for byte."""
 
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from dappled.clock import Clock, SystemClock
 from dappled.drivers.camera import Arrival, Blob, Fired, Identity, PlainCamera, ShotFailed, StateChanged
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
-    """One recorded shot: its file and the camera's name for it, or the reason why there is none.
+class RecordedShot:
+    """One recorded shot: its file and the camera's name for it, or the reason why there is no file.
 
-    The fired times bracket the recorded trigger call; None where it was never seen, as is the file's arrival. `facts`
-    are those that came with the file (see `Arrival`).
+    The fired times bracket the recorded trigger call. They and the file's arrival are None where none was recorded.
+    `facts` came with the file (see `Arrival`).
     """
 
     shot: int
@@ -29,28 +29,23 @@ class Recorded:
 
 
 class ReplayCamera(PlainCamera):
-    """A Camera (see `drivers.camera`) that plays recorded shots. Files are only ever opened for reading."""
+    """The driver (`drivers.camera.Camera`). Files are only opened for reading."""
 
-    def __init__(
-        self,
-        shots: Iterable[Recorded],
-        identity: Identity,
-        monotonic_ns: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
-        """`monotonic_ns` stamps what the recording has no stamp for: the recording's own clock, in a replay."""
+    def __init__(self, shots: Iterable[RecordedShot], identity: Identity, clock: Clock | None = None) -> None:
+        """`clock` stamps what the recording has no stamp for; in a replay it is the recording's own clock."""
         super().__init__()
         self._shots = {recorded.shot: recorded for recorded in shots}
-        self._identity, self._now_ns = identity, monotonic_ns
+        self._identity, self._clock = identity, clock or SystemClock()
         self._playing = False
 
     def start(self) -> None:
         """See Camera."""
         self._playing = True
-        self._events.put(StateChanged("ready", "", self._now_ns(), self._identity))
+        self._events.put(StateChanged("ready", "", self._clock.monotonic_ns(), self._identity))
 
     def fire(self, shot: int) -> None:
-        """See Camera: the recorded events of this shot follow at once."""
-        now_ns = self._now_ns()
+        """See Camera. The recorded events of this shot follow at once."""
+        now_ns = self._clock.monotonic_ns()
         if not self._playing:
             self._events.put(ShotFailed(shot, "the recording is not playing", now_ns))
             return

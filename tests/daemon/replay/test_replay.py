@@ -101,7 +101,7 @@ def test_the_street_hears_the_recordings_clock(tmp_path: Path) -> None:
     clock = replay.clock(recording)
     first, last = recording.shots[0], recording.shots[-1]
     assert (clock.utc_ns(), clock.monotonic_ns()) == (first.wished_utc_ns, first.wished_monotonic_ns)
-    camera = ReplayCamera(recording.files, Identity("dappled", "recording", "", ""), clock.monotonic_ns)
+    camera = ReplayCamera(recording.files, Identity("dappled", "recording", "", ""), clock)
     camera.start()
     ready = camera.next_event(1)
     assert isinstance(ready, StateChanged)

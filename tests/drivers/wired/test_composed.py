@@ -14,7 +14,7 @@ import pytest
 from dappled.clock import RecordedClock, SystemClock
 from dappled.drivers.camera import Arrival, CameraError, Companion, Deferred, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.raw.raw_file import read_exif
-from dappled.drivers.replay import Recorded, ReplayCamera
+from dappled.drivers.replay import RecordedShot, ReplayCamera
 from dappled.drivers.wired import composed, folder, fujifilm, matching
 from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.shutter_line import GpioLine, OutsideLine
@@ -118,7 +118,7 @@ class TestContractOfReplay(CameraContract):
             path = tmp_path / f"{shot:06d}.dng"
             place = {7: 1, 3: 1, 4: 2, 5: 3, 1: 1}.get(shot, number)
             path.write_bytes(pattern(place, 50_000))
-            shots.append(Recorded(shot, path, f"IMG_{number:04d}.DNG", (10, 20), 30))
+            shots.append(RecordedShot(shot, path, f"IMG_{number:04d}.DNG", (10, 20), 30))
         camera = ReplayCamera(shots, Identity("dappled", "recording", "", ""))
         yield Rig(camera, lambda number: pattern(number, 50_000), recorded=True)
         camera.stop()

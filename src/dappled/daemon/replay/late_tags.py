@@ -80,7 +80,7 @@ def add_missing(flight: Path, utc_ns: Callable[[], int]) -> list[int]:
         ledger = stack.enter_context(Ledger(folder.ledger, utc_ns))
         writer = MissingTagWriter(recording, ledger)
         pipeline = Pipeline(
-            camera=ReplayCamera(recording.files, Identity("dappled", "recording", "", str(flight)), time.monotonic_ns),
+            camera=ReplayCamera(recording.files, Identity("dappled", "recording", "", str(flight)), time),
             writer=writer,
             poses=RecordedTelemetry.flown(settings, recording.telemetry, recording.horizons, recording.vehicles).pose,
             decoder=None,

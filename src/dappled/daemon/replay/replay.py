@@ -20,7 +20,7 @@ from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.mavlink.links import Message, PacketParser
-from dappled.drivers.replay import Recorded
+from dappled.drivers.replay import RecordedShot
 from dappled.errors import DappledError
 from dappled.flight import LIVE, Cause, Frame, LedgerReader, Result, Shot, ShotRow, durable, layout, telemetry_log
 
@@ -39,7 +39,7 @@ class RecordedFlight:
 
     root: Path
     shots: Sequence[Shot]
-    files: Sequence[Recorded]
+    files: Sequence[RecordedShot]
     expected: Sequence[Expected]
     telemetry: Path | None
     horizons: dict[int, int]
@@ -106,7 +106,7 @@ def of_folder(
         except OSError as error:
             raise ReplayError(f"{path} can't be read: {error.strerror}") from None
         shots.append(shot)
-        files.append(Recorded(index, path, path.name, (utc_ns, utc_ns), utc_ns))
+        files.append(RecordedShot(index, path, path.name, (utc_ns, utc_ns), utc_ns))
         expected.append(Expected(ShotRow(shot, "safe", None, utc_ns, utc_ns), frame))
     return RecordedFlight(folder, shots, files, expected, telemetry, {})
 
@@ -238,14 +238,14 @@ def writer(recording: RecordedFlight, keep: Callable[[Result], object] | None = 
     return ReplayVerifier(recording.root, recording.expected, keep)
 
 
-def _file(folder: Path, row: ShotRow, frame: Frame | None, doubt: str | None) -> Recorded:
+def _file(folder: Path, row: ShotRow, frame: Frame | None, doubt: str | None) -> RecordedShot:
     called, returned = row.fired_called_monotonic_ns, row.fired_returned_monotonic_ns
     fired = None if called is None or returned is None else (called, returned)
     if frame is None:
-        return Recorded(row.shot.index, None, "", fired, reason=row.reason or "no frame was recorded")
+        return RecordedShot(row.shot.index, None, "", fired, reason=row.reason or "no frame was recorded")
     arrived_ns = frame.arrived_utc_ns - row.shot.wished_utc_ns + row.shot.wished_monotonic_ns
     facts = {} if doubt is None else {"doubt": doubt}
-    return Recorded(row.shot.index, folder / frame.name, frame.camera_name, fired, arrived_ns, facts=facts)
+    return RecordedShot(row.shot.index, folder / frame.name, frame.camera_name, fired, arrived_ns, facts=facts)
 
 
 def _recorded(digests: dict[int, tuple[str, str]], index: int) -> str | None:

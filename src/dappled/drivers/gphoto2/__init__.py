@@ -1,1 +1,1 @@
-"""Cameras that libgphoto2 drives, in a process of their own, and the client of that process."""
+"""Drive cameras with libgphoto2: `client` is the driver, `process` the process of its own that loads the library."""

@@ -1,7 +1,7 @@
-"""A camera over USB or PTP/IP through libgphoto2, which lives in a process of its own.
+"""Drive a camera over USB or PTP/IP through libgphoto2, which runs in a process of its own.
 
-This side never blocks: it passes commands to the process, hands its events on, kills it when it stops answering and
-starts it again, at most five times a minute.
+This side never blocks: it passes commands to the process and events to the receiver, kills the process when it stops
+answering, and starts it again, at most five times a minute.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ import contextlib
 import json
 import subprocess
 import threading
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
+from dappled.clock import Clock, SystemClock
 from dappled.drivers import usb_bus
 from dappled.drivers.attribution import Claim
 from dappled.drivers.camera import (
@@ -33,7 +33,7 @@ from dappled.drivers.camera import (
     check_change,
 )
 from dappled.drivers.child_process import RestartBudget, end_child, start_child
-from dappled.drivers.gphoto2.messages import LATE, Before, message_event
+from dappled.drivers.gphoto2.messages import LATE_LIMIT, Carryover, message_event
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
 from dappled.drivers.process_channel import ChannelError, ProcessChannel
 
@@ -42,17 +42,19 @@ _STOP_S = 1.2
 _KILL_S = 0.6
 _SPAWN_S = 1.0
 
-Spawn = Callable[[GPhoto2Settings, Before], tuple["subprocess.Popen[bytes]", ProcessChannel]]
+Spawn = Callable[[GPhoto2Settings, Carryover], tuple["subprocess.Popen[bytes]", ProcessChannel]]
 
 
 def open_camera(settings: Mapping[str, Any]) -> GPhoto2Camera:
-    """The driver for these settings (see `GPhoto2Settings`); `start` it. Raises CameraError for a wrong setting."""
+    """Make the driver for these settings (see `GPhoto2Settings`). Raises CameraError for a wrong setting."""
     return GPhoto2Camera(parse_settings(settings))
 
 
-def spawn_process(settings: GPhoto2Settings, before: Before) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
+def spawn_process(settings: GPhoto2Settings, carryover: Carryover) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
     """Start the camera's process; it dies with the calling thread. Raises OSError."""
-    return start_child("dappled.drivers.gphoto2.process", json.dumps(settings.to_json()), json.dumps(before.to_json()))
+    return start_child(
+        "dappled.drivers.gphoto2.process", json.dumps(settings.to_json()), json.dumps(carryover.to_json())
+    )
 
 
 class GPhoto2Camera(QueuedCamera):
@@ -63,23 +65,21 @@ class GPhoto2Camera(QueuedCamera):
         settings: GPhoto2Settings,
         *,
         spawn: Spawn = spawn_process,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
+        clock: Clock | None = None,
         budget: RestartBudget | None = None,
-        reset: Callable[[str], None] = usb_bus.reset,
     ) -> None:
         super().__init__()
         self._settings = settings
         self._spawn = spawn
-        self._clock_ns = clock_ns
-        self._reset = reset
+        self._clock = clock or SystemClock()
         self._budget = budget or RestartBudget(limit=5, window_s=60.0)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._supervise, name="gphoto2", daemon=True)
-        self._lock = threading.Lock()  # guards the three below
+        self._lock = threading.Lock()  # guards the next three
         self._channel: ProcessChannel | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._pending: dict[int, int | None] = {}  # the shots that the process has, in order, and when it fired them
-        self._before = Before()  # the supervising thread's
+        self._pending: dict[int, int | None] = {}  # shots that the process has, in order: when it fired each
+        self._carryover = Carryover()  # used by the supervising thread alone
         self._identity: Identity | None = None
         self._known_settings: tuple[Setting, ...] = ()
 
@@ -90,7 +90,7 @@ class GPhoto2Camera(QueuedCamera):
         self._thread.start()
 
     def fire(self, shot: int) -> None:
-        """Pass the shot to the process; one socket write in the caller's own thread."""
+        """Send the shot to the process: one socket write in the caller's thread."""
         with self._lock:
             if shot in self._pending:
                 raise CameraError(f"shot {shot} was fired before and has not ended")
@@ -104,7 +104,7 @@ class GPhoto2Camera(QueuedCamera):
                     return
             else:
                 reason = "the camera's process is not running"
-        self._events.put(ShotFailed(shot, reason, self._clock_ns()))
+        self._events.put(ShotFailed(shot, reason, self._clock.monotonic_ns()))
 
     @property
     def identity(self) -> Identity | None:
@@ -112,11 +112,11 @@ class GPhoto2Camera(QueuedCamera):
         return self._identity
 
     def settings(self) -> tuple[Setting, ...]:
-        """As the process read them last."""
+        """See Camera."""
         return self._known_settings
 
     def change(self, name: SettingName, value: str) -> None:
-        """Pass the wish to the process."""
+        """Send the request to the process."""
         check_change(self._known_settings, name, value)
         with self._lock:
             if self._channel is None:
@@ -131,14 +131,14 @@ class GPhoto2Camera(QueuedCamera):
         folder = arrival.facts.get("folder")
         if not self._settings.delete_after_download or folder in (None, "/"):
             return
-        with self._lock, contextlib.suppress(ChannelError):  # the file then stays on the card, which harms nobody
+        with self._lock, contextlib.suppress(ChannelError):  # the file then stays on the card
             if self._channel is not None:
                 self._channel.send({"do": "delete", "folder": folder, "name": arrival.facts["name"]})
 
     def stop(self) -> None:
-        """End the process, politely for 1.2 s. What had not ended ends as failed."""
+        """Ask the process to end, and kill it after 1.2 s. Shots that had not ended fail."""
         self._stopping.set()
-        with self._lock, contextlib.suppress(ChannelError):  # then it is ended below
+        with self._lock, contextlib.suppress(ChannelError):  # it is killed below
             if self._channel is not None:
                 self._channel.send({"do": "stop"})
         if self._thread.ident is None:
@@ -154,10 +154,10 @@ class GPhoto2Camera(QueuedCamera):
     def _supervise(self) -> None:
         while not self._stopping.is_set():
             try:
-                process, channel = self._spawn(self._settings, self._before)
-            except OSError as error:  # no memory, no descriptors: that may pass
+                process, channel = self._spawn(self._settings, self._carryover)
+            except OSError as error:  # no memory, no descriptors: may pass
                 reason = f"the camera's process can't be started: {error.strerror}"
-                self._events.put(StateChanged("faulted", reason, self._clock_ns()))
+                self._events.put(StateChanged("faulted", reason, self._clock.monotonic_ns()))
                 self._stopping.wait(_SPAWN_S)
                 continue
             with self._lock:
@@ -167,27 +167,29 @@ class GPhoto2Camera(QueuedCamera):
                 self._process = self._channel = None
                 pending, self._pending = self._pending, {}
             fired = [Claim(shot, fired_ns) for shot, fired_ns in pending.items() if fired_ns is not None]
-            self._before = replace(self._before, late=(*self._before.late, *fired)[-LATE:])
+            self._carryover = replace(self._carryover, late=(*self._carryover.late, *fired)[-LATE_LIMIT:])
             channel.close()
             end_child(process)
             stopped = self._stopping.is_set()
             for shot in pending:
-                self._events.put(ShotFailed(shot, "the camera was stopped" if stopped else reason, self._clock_ns()))
+                self._events.put(
+                    ShotFailed(shot, "the camera was stopped" if stopped else reason, self._clock.monotonic_ns())
+                )
             if not stopped:
-                self._events.put(StateChanged("faulted", reason, self._clock_ns()))
+                self._events.put(StateChanged("faulted", reason, self._clock.monotonic_ns()))
                 self._await_budget()
-        self._events.put(StateChanged("absent", "the camera was stopped", self._clock_ns()))
+        self._events.put(StateChanged("absent", "the camera was stopped", self._clock.monotonic_ns()))
 
     def _serve(self, process: subprocess.Popen[bytes], channel: ProcessChannel) -> str:
-        """Hand events on until the process ends; returns why, as a sentence."""
-        heard_ns = asked_ns = self._clock_ns()
+        """Pass events on until the process ends; return why, as a sentence."""
+        heard_ns = asked_ns = self._clock.monotonic_ns()
         answer_s = self._settings.timeouts.answer_s
         try:
             while True:
                 if self._stopping.is_set():
-                    channel.send({"do": "stop"})  # again: the process may have begun after `stop` spoke
+                    channel.send({"do": "stop"})  # again: the process may have begun after `stop` sent it
                 message = channel.receive(_PING_S)
-                now_ns = self._clock_ns()
+                now_ns = self._clock.monotonic_ns()
                 if message is not None:
                     heard_ns = now_ns
                     if message.body.get("is") != "pong":
@@ -205,11 +207,11 @@ class GPhoto2Camera(QueuedCamera):
             return f"the camera's process ended unexpectedly ({error}); it starts again"
 
     def _reset_port(self) -> str:
-        """A body that went silent on USB is reset, as if its cable had been pulled; what is to be said of it."""
+        """Reset a silent body on USB, as if its cable had been pulled; return words on the result."""
         if self._identity is None or not self._identity.port.startswith("usb:"):
             return ""
         try:
-            self._reset(self._identity.port)
+            usb_bus.reset(self._identity.port)
         except CameraError as error:
             return f" ({error})"
         return ", the camera's USB port reset"
@@ -224,7 +226,7 @@ class GPhoto2Camera(QueuedCamera):
         elif isinstance(event, StateChanged):
             self._identity = event.identity or self._identity
             if event.identity is not None:
-                self._before = replace(self._before, serial=event.identity.serial)
+                self._carryover = replace(self._carryover, serial=event.identity.serial)
         elif isinstance(event, SettingsChanged):
             self._known_settings = event.settings
         if isinstance(event, Arrival | Companion):
@@ -232,18 +234,18 @@ class GPhoto2Camera(QueuedCamera):
         self._events.put(event)
 
     def _learn(self, event: Arrival | Companion) -> None:
-        """What the next process should know, should this one die."""
-        before, facts = self._before, event.facts
-        late = tuple(claim for claim in before.late if claim.shot != event.shot)
-        seen = (*before.seen, (str(facts.get("folder")), str(facts.get("name"))))[-2 * LATE :]
-        offsets_s = tuple(facts.get("body_offsets_s", before.offsets_s))
-        self._before = replace(before, late=late, offsets_s=offsets_s, seen=seen)
+        """Remember what the next process needs, in case this one dies."""
+        carryover, facts = self._carryover, event.facts
+        late = tuple(claim for claim in carryover.late if claim.shot != event.shot)
+        seen = (*carryover.seen, (str(facts.get("folder")), str(facts.get("name"))))[-2 * LATE_LIMIT :]
+        offsets_s = tuple(facts.get("body_offsets_s", carryover.offsets_s))
+        self._carryover = replace(carryover, late=late, offsets_s=offsets_s, seen=seen)
 
     def _await_budget(self) -> None:
-        now_ns = self._clock_ns()
+        now_ns = self._clock.monotonic_ns()
         wait_ns = self._budget.wait_ns(now_ns)
         if wait_ns:
             reason = f"the camera's process ended too often; the next attempt is in {wait_ns / 1e9:.0f} s"
             self._events.put(StateChanged("faulted", reason, now_ns))
             self._stopping.wait(wait_ns / 1e9)
-        self._budget.spend(self._clock_ns())
+        self._budget.spend(self._clock.monotonic_ns())

@@ -14,6 +14,7 @@ from dappled.drivers.attribution import Claim
 from dappled.drivers.camera import (
     Arrival,
     Blob,
+    BodyState,
     CameraEvent,
     Companion,
     Deferred,
@@ -24,13 +25,15 @@ from dappled.drivers.camera import (
     ShotFailed,
     StateChanged,
 )
-from dappled.drivers.process_channel import ChannelError, ChannelMessage
+from dappled.drivers.process_channel import ChannelError, ChannelMessage, ProcessChannel
 
-LATE = 16
+LATE_LIMIT = 16
+"""How many late shots and files are remembered."""
+_SEND_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Before:
+class Carryover:
     """What a process that died leaves to the next: the body's serial number, the shots that were fired and have no file
     yet, the offsets of the body's clock, and the (folder, name) of the files that came last."""
 
@@ -44,11 +47,38 @@ class Before:
         return asdict(self)
 
     @classmethod
-    def of_json(cls, value: Mapping[str, Any]) -> Before:
+    def of_json(cls, value: Mapping[str, Any]) -> Carryover:
         """Read what `to_json` made."""
         late = tuple(Claim(**each) for each in value["late"])
         seen = tuple((folder, name) for folder, name in value["seen"])
         return cls(value["serial"], late, tuple(value["offsets_s"]), seen)
+
+
+class EventSender:
+    """Send events to the driver, and each state once. All calls raise ChannelError when the driver is gone."""
+
+    def __init__(self, channel: ProcessChannel) -> None:
+        self._channel = channel
+        self.state: BodyState | None = None
+        self.reason = ""
+
+    def send(self, *events: CameraEvent) -> None:
+        """Send events in order and close their blobs; skip a state that was sent last."""
+        for event in events:
+            if isinstance(event, StateChanged):
+                if (event.state, event.reason) == (self.state, self.reason):
+                    continue
+                self.state, self.reason = event.state, event.reason
+            message = event_message(event)
+            try:
+                self._channel.send(message.body, message.fds, timeout_s=_SEND_S)
+            finally:
+                for fd in message.fds:
+                    os.close(fd)
+
+    def pong(self) -> None:
+        """Answer a ping."""
+        self._channel.send({"is": "pong"}, timeout_s=_SEND_S)
 
 
 def event_message(event: CameraEvent) -> ChannelMessage:

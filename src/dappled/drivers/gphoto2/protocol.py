@@ -1,4 +1,4 @@
-"""What the camera's process needs of an open camera, and how its calls fail. No libgphoto2 here."""
+"""The protocol of an open camera, and its errors. This module does not load libgphoto2."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ class LostError(SessionError):
 
 
 class BusyError(SessionError):
-    """The camera is at work; the same call may succeed later."""
+    """The camera is busy; the same call may succeed later."""
 
 
 class RefusedError(SessionError):
-    """The camera said no to this call; the session goes on."""
+    """The camera refused this call; the session goes on."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraFile:
-    """Where a file lies at the camera. Files in the camera's memory have the folder "/"."""
+    """A file's place on the camera. Files in the camera's memory have the folder "/"."""
 
     folder: str
     name: str
@@ -49,8 +49,8 @@ class CameraFile:
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """A file's bytes, and when the body's own clock says that it was made: seconds of a clock that may be wrong, None
-    where the body doesn't say."""
+    """A file's bytes, and when it was made by the body's own clock: seconds of a clock that may be wrong, or None where
+    the body doesn't report it."""
 
     blob: Blob
     taken_s: int | None = None
@@ -72,11 +72,11 @@ CameraNews = FileAdded | CaptureComplete
 
 
 class Session(Protocol):
-    """What the camera's process needs of an open camera."""
+    """An open camera."""
 
     @property
     def identity(self) -> Identity:
-        """Who the camera is."""
+        """What the camera says it is."""
 
     @property
     def keeps_files(self) -> bool:
@@ -86,28 +86,28 @@ class Session(Protocol):
         """Release the shutter. Raises BusyError, RefusedError, LostError."""
 
     def news(self) -> list[CameraNews]:
-        """All that happened since the last call. Raises LostError."""
+        """Return what happened since the last call. Raises LostError."""
 
     def fetch(self, file: CameraFile) -> Fetched:
-        """A file's bytes. Raises BusyError, RefusedError, LostError."""
+        """Fetch a file's bytes. Raises BusyError, RefusedError, LostError."""
 
     def taken_s(self, file: CameraFile) -> int | None:
-        """When a file on the card was made, by the body's clock. Raises LostError."""
+        """Return when a file on the card was made, by the body's clock. Raises LostError."""
 
     def about(self, file: CameraFile) -> tuple[int, int | None]:
-        """(size in bytes, when it was made by the body's clock) of a file on the card. Raises SessionError."""
+        """Return (size in bytes, when it was made by the body's clock) of a file on the card. Raises SessionError."""
 
     def delete(self, file: CameraFile) -> None:
         """Delete a file at the camera. Raises RefusedError, LostError."""
 
     def files(self) -> frozenset[CameraFile]:
-        """All files on the card, as they were when the session was opened or later. Raises LostError."""
+        """List all files on the card, as they were when the session was opened or later. Raises LostError."""
 
     def settings(self) -> tuple[Setting, ...]:
-        """What can be read of the camera. Raises LostError."""
+        """Read all settings that the camera has. Raises LostError."""
 
     def change(self, name: SettingName, value: str) -> None:
-        """Set one of them. Raises BusyError, RefusedError, LostError."""
+        """Change a setting. Raises BusyError, RefusedError, LostError."""
 
     def close(self) -> None:
         """End the session; never raises."""

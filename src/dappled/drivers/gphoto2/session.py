@@ -1,5 +1,6 @@
-"""libgphoto2's face: fire an open body, drain its events, read its files. Only the camera's own process imports this;
-every call may block for as long as libgphoto2 waits for a silent camera (up to 10 s), with the GIL held.
+"""Find, open and use a camera through libgphoto2. Only the camera's own processes import this.
+
+Every call may block for as long as libgphoto2 waits for a silent camera (up to 10 s), with the GIL held.
 """
 
 from __future__ import annotations
@@ -7,58 +8,166 @@ from __future__ import annotations
 import contextlib
 import mmap
 import os
+from collections.abc import Iterator
 from typing import Any
 
 import gphoto2 as gp
 
 from dappled.drivers.camera import Blob, Identity, Setting, SettingName
-from dappled.drivers.gphoto2 import widgets
-from dappled.drivers.gphoto2.errors import LOST, sentence, translated
 from dappled.drivers.gphoto2.protocol import (
+    AbsentError,
+    BusyError,
     CameraFile,
     CameraNews,
     CaptureComplete,
     Fetched,
     FileAdded,
+    HeldError,
     LostError,
     RefusedError,
     SessionError,
 )
-from dappled.drivers.gphoto2.settings import CaptureTarget
+from dappled.drivers.gphoto2.settings import CaptureTarget, GPhoto2Settings
 
 _CHUNK_BYTES = 1 << 20
 _FOLDERS = 256
-"""More folders than a card has; a bound for the walk."""
+"""More folders than a card has: bounds the walk."""
 _DRAIN = 64
-"""Events taken at one go, so that a chattering camera can't keep the process from its commands."""
+"""Events taken at once, so that a camera with many events can't keep the process from its commands."""
+_LOST = {gp.GP_ERROR_IO, gp.GP_ERROR_TIMEOUT, gp.GP_ERROR_IO_INIT, gp.GP_ERROR_IO_READ, gp.GP_ERROR_IO_WRITE} | {
+    gp.GP_ERROR_IO_USB_CLEAR_HALT,
+    gp.GP_ERROR_IO_USB_FIND,
+    gp.GP_ERROR_IO_USB_CLAIM,
+    gp.GP_ERROR_OS_FAILURE,
+    gp.GP_ERROR_LIBRARY,
+}
+"""Errors after which the session is unusable."""
+_HELD = {gp.GP_ERROR_IO_USB_CLAIM, gp.GP_ERROR_IO_LOCK, gp.GP_ERROR_CAMERA_BUSY, gp.GP_ERROR}
+_GONE = {gp.GP_ERROR_IO, gp.GP_ERROR_IO_USB_FIND, gp.GP_ERROR_MODEL_NOT_FOUND, gp.GP_ERROR_UNKNOWN_PORT}
+_WIDGETS: dict[SettingName, tuple[str, ...]] = {
+    "focal_length": ("focallength",),
+    "aperture": ("aperture", "f-number"),
+    "shutter_speed": ("shutterspeed", "shutterspeed2"),
+    "iso": ("iso",),
+    "image_format": ("imageformat", "imagequality"),
+    "capture_target": ("capturetarget",),
+    "battery": ("batterylevel",),
+    "free_shots": ("availableshots",),
+}
+"""libgphoto2's names of each setting; makers differ."""
+
+
+def open_session(settings: GPhoto2Settings, before: str | None = None) -> GPhoto2Session:
+    """Open the camera that the settings name; prefer the one with serial number `before`, which was open before. Raises
+    AbsentError, HeldError, LostError."""
+    trouble: list[SessionError] = []
+    spare: GPhoto2Session | None = None
+    others: list[str] = []
+    for model, port in _candidates(settings.port):
+        try:
+            session = _session(model, port, settings.capture_target)
+        except SessionError as error:
+            trouble.append(error)
+            continue
+        if before is None or session.identity.serial == before:
+            wanted = settings.serial is None or settings.serial in session.serials
+        else:
+            wanted = settings.serial is not None and settings.serial in session.serials
+        if wanted:
+            if spare is not None:
+                spare.close()
+            return session
+        if settings.serial is None and spare is None:
+            spare = session
+            continue
+        others.append(f"{session.identity.model} {session.identity.serial}")
+        session.close()
+    if spare is not None:
+        return spare
+    raise _none_found(settings, trouble, others)
+
+
+def _none_found(settings: GPhoto2Settings, trouble: list[SessionError], others: list[str]) -> SessionError:
+    for error in trouble:
+        if not isinstance(error, AbsentError):
+            return error
+    if others:
+        return AbsentError(f"no camera with serial number {settings.serial} is here, only {', '.join(others)}")
+    if trouble:
+        return trouble[0]
+    return AbsentError("no camera is on USB: connect it, switch it on, and set its USB mode to PTP or PC connection")
+
+
+def _session(model: str, port: str, target: CaptureTarget) -> GPhoto2Session:
+    camera = _opened(model, port)
+    try:
+        return GPhoto2Session(camera, port, target)
+    except gp.GPhoto2Error as error:
+        _close(camera)
+        raise _translated(error, "set up") from error
+
+
+def _candidates(ports: str | None) -> Iterator[tuple[str, str]]:
+    """Yield (model, port) of all cameras on the ports named: one, or several separated by commas; None: all on USB."""
+    for port in [None] if ports is None else [each.strip() for each in ports.split(",")]:
+        if port is not None and port.startswith("ptpip:"):
+            yield "PTP/IP Camera", port
+            continue
+        found = gp.Camera.autodetect()
+        for index in range(found.count()):
+            where = found.get_value(index)
+            if port in (None, "usb:", where):
+                yield found.get_name(index), where
+
+
+def _opened(model: str, port: str) -> Any:
+    ports = gp.PortInfoList()
+    ports.load()
+    abilities = gp.CameraAbilitiesList()
+    abilities.load()
+    camera = gp.Camera()
+    try:
+        camera.set_port_info(ports[ports.lookup_path(port)])
+        camera.set_abilities(abilities[abilities.lookup_model(model)])
+        camera.init()
+    except gp.GPhoto2Error as error:
+        if error.code in _HELD:
+            raise HeldError(
+                f"the camera at {port} can't be opened ({error.string}): another program holds it, often the desktop's "
+                "gvfs-gphoto2-volume-monitor; end that program"
+            ) from error
+        if error.code in _GONE:
+            raise AbsentError(f"no camera answers at {port} ({error.string}): connect it and switch it on") from error
+        raise HeldError(f"the camera at {port} can't be opened: {error.string}; switch it off and on") from error
+    return camera
 
 
 class GPhoto2Session:
-    """An open camera."""
+    """An open camera; see `protocol.Session`."""
 
     def __init__(self, camera: Any, port: str, target: CaptureTarget) -> None:
         self._camera = camera
-        printed = widgets.text(camera, "eosserialnumber")  # what stands on the body; the PTP number is another
-        reported = widgets.text(camera, "serialnumber")
+        printed = _text(camera, "eosserialnumber")  # as printed on the body; the PTP number is another
+        reported = _text(camera, "serialnumber")
         self.serials = {text for text in (printed, reported, reported.lstrip("0")) if text}
         self.identity = Identity(
-            make=widgets.text(camera, "manufacturer"),
-            model=widgets.text(camera, "cameramodel"),
+            make=_text(camera, "manufacturer"),
+            model=_text(camera, "cameramodel"),
             serial=printed or reported,
             port=port,
         )
         self._in_pieces = True
-        self.keeps_files = not (widgets.set_target(camera, target) and target == "ram")
+        self.keeps_files = not (_set_target(camera, target) and target == "ram")
 
     def trigger(self) -> None:
         """Release the shutter."""
         try:
             self._camera.trigger_capture()
         except gp.GPhoto2Error as error:
-            raise translated(error, "release the shutter") from error
+            raise _translated(error, "release the shutter") from error
 
     def news(self) -> list[CameraNews]:
-        """All that happened since the last call, at most 64 events of it."""
+        """Return what happened since the last call, at most 64 events."""
         news: list[CameraNews] = []
         try:
             for _ in range(_DRAIN):
@@ -71,17 +180,17 @@ class GPhoto2Session:
                     news.append(CaptureComplete())
         except gp.GPhoto2Error as error:
             if not news:
-                raise LostError(sentence(error, "report what happens")) from error
+                raise LostError(_sentence(error, "report what happens")) from error
         return news
 
     def fetch(self, file: CameraFile) -> Fetched:
-        """A file's bytes; from the card in pieces of 1 MiB straight into a memory file."""
-        fd = os.memfd_create("camera file", os.MFD_CLOEXEC)  # a name of the camera's own may be too long for one
+        """Fetch a file's bytes; from the card in pieces of 1 MiB straight into a memory file."""
+        fd = os.memfd_create("camera file", os.MFD_CLOEXEC)  # the camera's own name may be too long for one
         try:
             size, taken_s = self._fill(fd, file)
         except gp.GPhoto2Error as error:
             os.close(fd)
-            raise translated(error, f"send {file.name}") from error
+            raise _translated(error, f"send {file.name}") from error
         except SessionError:
             os.close(fd)
             raise
@@ -107,7 +216,7 @@ class GPhoto2Session:
         return got, taken_s
 
     def _pieces(self, fd: int, file: CameraFile, size: int) -> int | None:
-        """Read piece by piece; None where the body can't."""
+        """Read piece by piece; None where the body doesn't support that."""
         os.ftruncate(fd, size)
         offset = 0
         with mmap.mmap(fd, size) as whole, memoryview(whole) as view:
@@ -134,20 +243,20 @@ class GPhoto2Session:
             return len(view)
 
     def taken_s(self, file: CameraFile) -> int | None:
-        """When it was made, by the body's clock; None also for a file that is gone."""
+        """Return when a file was made, by the body's clock; None also for a file that is gone."""
         try:
             return _time(self._camera.file_get_info(file.folder, file.name).file)
         except gp.GPhoto2Error as error:
-            if error.code in LOST:
-                raise LostError(sentence(error, f"tell of {file.name}")) from error
+            if error.code in _LOST:
+                raise LostError(_sentence(error, f"tell of {file.name}")) from error
             return None
 
     def about(self, file: CameraFile) -> tuple[int, int | None]:
-        """(size in bytes, when it was made by the body's clock) of a file on the card. Raises SessionError."""
+        """Return (size in bytes, when it was made by the body's clock) of a file on the card. Raises SessionError."""
         try:
             info = self._camera.file_get_info(file.folder, file.name).file
         except gp.GPhoto2Error as error:
-            raise translated(error, f"tell of {file.name}") from error
+            raise _translated(error, f"tell of {file.name}") from error
         return info.size, _time(info)
 
     def delete(self, file: CameraFile) -> None:
@@ -155,10 +264,10 @@ class GPhoto2Session:
         try:
             self._camera.file_delete(file.folder, file.name)
         except gp.GPhoto2Error as error:
-            raise translated(error, f"delete {file.name}") from error
+            raise _translated(error, f"delete {file.name}") from error
 
     def files(self) -> frozenset[CameraFile]:
-        """All files on the card, from libgphoto2's memory where it has them."""
+        """List all files on the card, from libgphoto2's memory where it has them."""
         found: set[CameraFile] = set()
         folders = ["/"]
         try:
@@ -167,22 +276,22 @@ class GPhoto2Session:
                 inner = _names(self._camera.folder_list_folders(folder))
                 folders.extend(f"{folder.rstrip('/')}/{name}" for name in inner[: _FOLDERS - len(folders)])
         except gp.GPhoto2Error as error:
-            raise LostError(sentence(error, "list its card")) from error
+            raise LostError(_sentence(error, "list its card")) from error
         return frozenset(file for file in found if not file.in_memory)
 
     def settings(self) -> tuple[Setting, ...]:
-        """What can be read of the camera, by the first of its maker's names for each that the body knows."""
-        return widgets.read(self._camera)
+        """Read all settings that the camera has."""
+        return _read_settings(self._camera)
 
     def change(self, name: SettingName, value: str) -> None:
-        """Set one of them."""
-        widgets.change(self._camera, name, value)
+        """Change a setting."""
+        _change_setting(self._camera, name, value)
         if name == "capture_target":
             self.keeps_files = "ram" not in value.lower()
 
     def close(self) -> None:
         """End the session."""
-        let_go(self._camera)
+        _close(self._camera)
 
 
 def _time(info: Any) -> int | None:
@@ -193,7 +302,91 @@ def _names(found: Any) -> list[str]:
     return [found.get_name(index) for index in range(found.count())]
 
 
-def let_go(camera: Any) -> None:
+def _close(camera: Any) -> None:
     """End a session; never raises."""
-    with contextlib.suppress(gp.GPhoto2Error):  # it is being let go; a broken link can't be closed properly
+    with contextlib.suppress(gp.GPhoto2Error):  # a broken link can't be closed properly
         camera.exit()
+
+
+# --- settings
+
+
+def _read_settings(camera: Any) -> tuple[Setting, ...]:
+    """Read each setting by the first of its names that the body has. Raises LostError."""
+    try:
+        found = [_read_setting(camera, name, widgets) for name, widgets in _WIDGETS.items()]
+    except gp.GPhoto2Error as error:
+        raise LostError(_sentence(error, "tell its settings")) from error
+    return tuple(each for each in found if each is not None)
+
+
+def _change_setting(camera: Any, name: SettingName, value: str) -> None:
+    """Change a setting. Raises BusyError, RefusedError, LostError."""
+    try:
+        widget = _widget(camera, _WIDGETS[name])
+        if widget is None:
+            raise RefusedError(f"the camera has no setting {name}")
+        widget.set_value(value)
+        camera.set_single_config(widget.get_name(), widget)
+    except gp.GPhoto2Error as error:
+        raise _translated(error, f"set {name} to {value}") from error
+
+
+def _text(camera: Any, name: str) -> str:
+    """Read a widget as text, "" where the body has none of this name. Raises GPhoto2Error."""
+    widget = _widget(camera, (name,))
+    return "" if widget is None else str(widget.get_value() or "").strip()
+
+
+def _set_target(camera: Any, target: CaptureTarget) -> bool:
+    """Set where pictures go, which bodies forget between sessions. False where the body has no choice. Raises
+    GPhoto2Error."""
+    word = "ram" if target == "ram" else "card"
+    try:
+        widget = camera.get_single_config("capturetarget")
+        choice = next((each for each in widget.get_choices() if word in each.lower()), None)
+        if choice is None:
+            return False
+        widget.set_value(choice)
+        camera.set_single_config("capturetarget", widget)
+    except gp.GPhoto2Error as error:
+        if error.code in _LOST:
+            raise
+        return False
+    return True
+
+
+def _read_setting(camera: Any, name: SettingName, widgets: tuple[str, ...]) -> Setting | None:
+    widget = _widget(camera, widgets)
+    if widget is None:
+        return None
+    settable = widget.get_type() in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU) and not widget.get_readonly()
+    return Setting(name, str(widget.get_value()), tuple(widget.get_choices()) if settable else ())
+
+
+def _widget(camera: Any, names: tuple[str, ...]) -> Any:
+    """Return the first of these widgets that the body has; None without any."""
+    for name in names:
+        try:
+            return camera.get_single_config(name)
+        except gp.GPhoto2Error as error:
+            if error.code in _LOST:
+                raise
+    return None
+
+
+# --- errors
+
+
+def _sentence(error: gp.GPhoto2Error, what: str) -> str:
+    """Say what the camera could not do, and why in libgphoto2's words."""
+    return f"the camera could not {what}: {error.string} ({error.code})"
+
+
+def _translated(error: gp.GPhoto2Error, what: str) -> SessionError:
+    """Convert libgphoto2's error; `what` is what the camera could not do."""
+    if error.code == gp.GP_ERROR_CAMERA_BUSY:
+        return BusyError(f"the camera is too busy to {what}")
+    if error.code in _LOST:
+        return LostError(_sentence(error, what))
+    return RefusedError(_sentence(error, what))

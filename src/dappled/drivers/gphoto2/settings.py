@@ -1,4 +1,4 @@
-"""What can be set about a camera that libgphoto2 drives. Shared by the driver and its process."""
+"""The settings of a camera that libgphoto2 drives, for the driver and its process."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ CaptureTarget = Literal["card", "ram"]
 
 @dataclass(frozen=True, slots=True)
 class Timeouts:
-    """How long to wait for what, in seconds; all above 0.
+    """Waiting times in seconds; all above 0.
 
-    `busy_s`: for a busy camera to take the release. `complete_s`: for the file after the camera said that the capture
-    is complete, before its card is searched. `look_s`: the same where it said nothing. `file_s`: for the file, from
-    the release, before the shot has failed. `answer_s`: for the camera's process to answer, before it is killed
-    (libgphoto2 needs up to 10 s to give up on a silent camera). `retry_s`: between attempts to find the camera.
+    `busy_s`: for a busy camera to accept the release. `complete_s`: for the file after the camera has reported that the
+    capture is complete, before its card is searched. `look_s`: the same where it reported nothing. `file_s`: for the
+    file, from the release, before the shot has failed. `answer_s`: for the camera's process to answer, before it is
+    killed (libgphoto2 needs up to 10 s to give up on a silent camera). `retry_s`: between attempts to find the camera.
     """
 
     busy_s: float = 5.0
@@ -31,9 +31,12 @@ class Timeouts:
 
 @dataclass(frozen=True, slots=True)
 class GPhoto2Settings:
-    """`port`: a libgphoto2 port; None or "usb:" take the first camera on USB. `serial`: only the body with this
-    number; None takes any. `capture_target`: where the body puts its pictures; with "card" a file outlives a broken
-    link. `delete_after_download`: delete from the card what the receiver has released."""
+    """Which camera to open, and how to use it.
+
+    `port`: a libgphoto2 port; None or "usb:" is the first camera on USB. `serial`: only the body with this number; None
+    accepts any. `capture_target`: where the body stores its pictures; with "card" a file survives a broken link.
+    `delete_after_download`: delete from the card what the receiver has released.
+    """
 
     port: str | None = None
     serial: str | None = None
@@ -42,12 +45,12 @@ class GPhoto2Settings:
     timeouts: Timeouts = field(default_factory=Timeouts)
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values; `parse_settings` reads them back."""
+        """Convert to plain values; `parse_settings` reads them back."""
         return asdict(self)
 
 
 def parse_settings(settings: Mapping[str, Any]) -> GPhoto2Settings:
-    """Settings from a table of a configuration file. Raises CameraError naming the key and what it may be."""
+    """Parse a table of a configuration file. Raises CameraError naming the key and what it may be."""
     known = [each.name for each in fields(GPhoto2Settings)]
     check_options(settings, known)
     port, serial = settings.get("port"), settings.get("serial")

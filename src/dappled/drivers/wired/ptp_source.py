@@ -92,7 +92,7 @@ class _Files:
     """The files of the camera at a port. libgphoto2 is imported here, in the child, and nowhere else."""
 
     def __init__(self, port: str) -> None:
-        from dappled.drivers.gphoto2.finding import open_session  # noqa: PLC0415  # reason above
+        from dappled.drivers.gphoto2.session import open_session  # noqa: PLC0415  # reason above
 
         self._open = open_session
         self._settings = GPhoto2Settings(port=None if port == "usb:" else port)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.drivers.camera import (
     Arrival,
     Blob,
@@ -20,8 +21,8 @@ from dappled.drivers.camera import (
     ShotFailed,
     StateChanged,
 )
-from dappled.drivers.gphoto2.loop import CameraLoop
 from dappled.drivers.gphoto2.messages import message_event
+from dappled.drivers.gphoto2.process import CameraLoop
 from dappled.drivers.gphoto2.protocol import (
     AbsentError,
     BusyError,
@@ -118,11 +119,11 @@ class Harness:
     """The loop on one end of a channel, the test on the other."""
 
     def __init__(self) -> None:
-        self.now_ns = 1_000_000_000_000
+        self.clock = RecordedClock(1_000_000_000_000)
         self.camera = FakeCamera()
         self.channel, there = ProcessChannel.pair()
         self.loop_channel = ProcessChannel(there)
-        self.loop = CameraLoop(self.loop_channel, GPhoto2Settings(), self.camera.open, lambda: self.now_ns)
+        self.loop = CameraLoop(self.loop_channel, GPhoto2Settings(), self.camera.open, self.clock)
 
     def fire(self, *shots: int) -> None:
         for shot in shots:
@@ -130,7 +131,7 @@ class Harness:
 
     def turn(self, seconds: float = 0.0, steps: int = 3) -> list[CameraEvent]:
         """Let time pass, then let the loop step; what it said."""
-        self.now_ns += round(seconds * 1e9)
+        self.clock.advance(seconds)
         for _ in range(steps):
             self.channel.send({"do": "ping"})  # a waiting command: the loop need not wait for one
             assert self.loop.step()
@@ -342,7 +343,7 @@ def shot_on(harness: Harness, shot: int, taken_s: int | None, number: int) -> li
 @pytest.mark.parametrize("hours_wrong", [0, 1, -24])
 def test_a_late_file_is_told_from_the_next_shot_s_by_the_body_s_own_time(ready: Harness, hours_wrong: int) -> None:
     def body_s() -> int:
-        return ready.now_ns // 10**9 + 1_700_000_000 + hours_wrong * 3600
+        return ready.clock.monotonic_ns() // 10**9 + 1_700_000_000 + hours_wrong * 3600
 
     (first,) = arrivals(shot_on(ready, 1, body_s(), 1))
     first.blob.close()
