@@ -29,12 +29,10 @@ from dappled.decode.decoder import MaskDecoder
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield.views import Aperture, from_slices, transfer
 from dappled.decode.spectrum import plane as planes
-from dappled.decode.spectrum.colours import coloured, local_colours
-from dappled.decode.spectrum.developer import Developer, developer
-from dappled.decode.spectrum.noise import Noise
-from dappled.decode.spectrum.padded import padded_shape
-from dappled.decode.spectrum.plan import Plan
-from dappled.decode.spectrum.slices import Slices
+from dappled.decode.spectrum.lineariser import Lineariser, lineariser
+from dappled.decode.spectrum.plane import coloured, local_colours
+from dappled.decode.spectrum.slices import Slices, extract
+from dappled.decode.spectrum.transform import SpectrumBuffers, noise_rms, padded_shape, transform
 
 SHAPE = (2776, 3688)
 LENSLETS = (3280, 3280)
@@ -72,9 +70,9 @@ def main() -> None:
 def measure(rounds: int, workers: int) -> dict[str, float]:
     """All figures by name; ratios are of times in this run."""
     mosaic = noise(SHAPE)
-    develop = developer(SHAPE, black=BLACK, white=WHITE, cfa=BAYER, reference=[1])
+    linear = lineariser(SHAPE, black=BLACK, white=WHITE, cfa=BAYER, reference=[1])
     decoder = masked(workers)
-    frame = develop.expose(mosaic, workers=workers).plane(workers)
+    frame = linear.apply(mosaic).plane(workers)
     high, wide = padded_shape(SHAPE)
     padded = np.zeros((high, wide), dtype=np.float32)
     padded[: SHAPE[0], : SHAPE[1]] = frame
@@ -82,12 +80,12 @@ def measure(rounds: int, workers: int) -> dict[str, float]:
         "rfft2": lambda: fft.rfft2(padded, workers=workers),
         "rfft2_padding": lambda: fft.rfft2(frame, s=(high, wide), workers=workers),
     }
-    plan = Plan(SHAPE)
+    buffers = SpectrumBuffers()
     for length in LENGTHS_MM:
-        work[f"slices_{length}mm"] = lambda length=length: slices(plan, develop, decoder, mosaic, length)  # type: ignore[misc]  # a default binds the loop's value
+        work[f"slices_{length}mm"] = lambda length=length: slices(buffers, linear, decoder, mosaic, length)  # type: ignore[misc]  # a default binds the loop's value
         work[f"search_{length}mm"] = search(decoder, frame, length)
-        work[f"decode_{length}mm"] = lambda length=length: decode(develop, decoder, mosaic, length)  # type: ignore[misc]  # the same
-    work["views_13mm"] = views(plan, develop, decoder, mosaic)
+        work[f"decode_{length}mm"] = lambda length=length: decode(linear, decoder, mosaic, length)  # type: ignore[misc]  # the same
+    work["views_13mm"] = views(buffers, linear, decoder, mosaic)
     took = dict.fromkeys(work, np.inf)
     cpu = dict.fromkeys(work, np.inf)
     for _ in range(rounds):  # in turn, so that a busy moment falls on all
@@ -103,7 +101,7 @@ def measure(rounds: int, workers: int) -> dict[str, float]:
             figures[f"{name}_over_{whole}_cpu"] = cpu[name] / cpu[whole]
     figures["textbook_over_slices_13mm"] = took["textbook_13mm"] / took["slices_13mm"]
     figures["textbook_over_decode_13mm"] = took["textbook_13mm"] / took["decode_13mm"]
-    figures["peak_memory_over_float32_frame"] = peak_memory(decoder, develop, mosaic)
+    figures["peak_memory_over_float32_frame"] = peak_memory(decoder, linear, mosaic)
     figures["lenslet_colour_views_ms"] = lenslet_colour_views(rounds, workers)
     return figures
 
@@ -120,15 +118,14 @@ def masked(workers: int) -> MaskDecoder:
     return MaskDecoder(camera.sensor(SHAPE), mask, "fd", camera.mask_distance_mm, workers=workers)
 
 
-def slices(plan: Plan, develop: Developer, decoder: MaskDecoder, mosaic: Mosaic, length: float) -> Slices:
+def slices(buffers: SpectrumBuffers, linear: Lineariser, decoder: MaskDecoder, mosaic: Mosaic, length: float) -> Slices:
     """The mosaic to slices, at the predicted carriers."""
-    workers = decoder.workers
-    exposure = develop.expose(mosaic, workers=workers)
     lattice, carriers = decoder.lattice_at(length), decoder.predict(length)
-    spectrum = plan.spectrum(exposure, workers=workers, largest_fx=decoder.largest_fx(length))
-    looking = Noise(spectrum)
-    cut = plan.cut(spectrum, carriers, decoder.slice_size(lattice), workers=workers, beside=looking.work)
-    looking.rms()
+    with buffers.lend(SHAPE) as tiles:
+        rows, reach = linear.apply(mosaic), decoder.largest_fx(length)
+        spectrum = transform(rows, tiles=tiles, workers=decoder.workers, largest_fx=reach)
+        cut = extract(spectrum, carriers, decoder.slice_size(lattice), workers=decoder.workers)
+        noise_rms(spectrum)
     return cut
 
 
@@ -138,15 +135,15 @@ def search(decoder: MaskDecoder, frame: planes.Plane, length: float) -> Callable
     return lambda: decoder.locate(spectrum, length, predicted)
 
 
-def decode(develop: Developer, decoder: MaskDecoder, mosaic: Mosaic, length: float) -> Any:
+def decode(linear: Lineariser, decoder: MaskDecoder, mosaic: Mosaic, length: float) -> Any:
     """The mosaic to slices at the carriers that were searched for, as the daemon does it."""
-    exposure = develop.expose(mosaic, workers=decoder.workers)
-    return decoder.decode_reported(exposure, focal_length_mm=length, views=False)
+    rows = linear.apply(mosaic)
+    return decoder.decode_reported(rows, focal_length_mm=length, views=False)
 
 
-def views(plan: Plan, develop: Developer, decoder: MaskDecoder, mosaic: Mosaic) -> Callable[[], Any]:
+def views(buffers: SpectrumBuffers, linear: Lineariser, decoder: MaskDecoder, mosaic: Mosaic) -> Callable[[], Any]:
     """Slices to 5 × 5 views."""
-    cut = slices(plan, develop, decoder, mosaic, 13)
+    cut = slices(buffers, linear, decoder, mosaic, 13)
     orders = [(carrier.ky, carrier.kx) for carrier in cut.carriers]
     transfers = transfer(orders, np.where(np.arange(len(orders)) == 0, 1.0, 0.5), (0.1, 0.2))
     return lambda: from_slices(
@@ -172,12 +169,12 @@ def textbook(mosaic: Mosaic, decoder: MaskDecoder, length: float) -> list[NDArra
     return made
 
 
-def peak_memory(decoder: MaskDecoder, develop: Developer, mosaic: Mosaic) -> float:
+def peak_memory(decoder: MaskDecoder, linear: Lineariser, mosaic: Mosaic) -> float:
     """What a warm decoder holds at most, its own buffers included, over the frame as float32; the mosaic left out."""
     tracemalloc.start()
-    fresh = replace(decoder, plans=type(decoder.plans)())
+    fresh = replace(decoder, buffers=SpectrumBuffers())
     for _ in range(2):
-        decode(develop, fresh, mosaic, 13)
+        decode(linear, fresh, mosaic, 13)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return peak / (4 * mosaic.size)
@@ -196,14 +193,14 @@ def lenslet_colour_views(rounds: int, workers: int) -> float:
     balance = planes.estimate_balance(white, black=BLACK, cfa=BAYER)
 
     def plane(mosaic: Mosaic) -> planes.Plane:
-        return planes.to_plane(mosaic, black=BLACK, white=WHITE, cfa=BAYER, balance=balance, workers=workers)
+        return planes.to_plane(mosaic, black=BLACK, white=WHITE, cfa=BAYER, balance=balance)
 
-    develop = developer(LENSLETS, black=BLACK, white=WHITE, cfa=BAYER, balance=balance, reference=[0, 1, 2])
+    linear = lineariser(LENSLETS, black=BLACK, white=WHITE, cfa=BAYER, balance=balance, reference=[0, 1, 2])
     decoder = LensletDecoder.with_white(plane(white), workers=workers, rolloff=MOSAIC_ROLLOFF)
 
     def to_views() -> Any:
         chroma = local_colours(plane(frame), BAYER, [0, 1, 2], [0, 1, 2])
-        field = decoder.decode(develop.expose(frame, workers=workers))
+        field = decoder.decode(linear.apply(frame))
         return replace(field, views=coloured(field.views, field.grid, chroma, LENSLETS))
 
     return min(timed(to_views) for _ in range(min(rounds, 3)))

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.optics.carriers import Lattice, Sensor, geometric
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import Lattice, Mask, Sensor, geometric
 
 Plane = NDArray[np.float32]
 FULL_APERTURE_MM = 6.7

@@ -7,7 +7,7 @@ from dappled.decode.calibration.calibration import Calibration
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.errors import DecodeError
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import Mask
 from tests.decode.rays import (
     FOCAL_MM,
     FULL_F,

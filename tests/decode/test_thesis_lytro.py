@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.lenslets import carriers_within
 from dappled.decode.spectrum.lattice import find_lattice
-from dappled.decode.spectrum.padded import Spectrum
+from dappled.decode.spectrum.transform import transform
 from tests.decode.thesis_tables import LYTRO
 
 SIDE = 3280
@@ -62,7 +62,7 @@ def _frame(steps_bins: NDArray[np.float64], seed: int) -> NDArray[np.float32]:
 
 def test_every_carrier_of_the_list_is_found_on_a_frame_of_that_lattice() -> None:
     steps = _fitted()
-    found = find_lattice(Spectrum.of(_frame(steps, 1), workers=2))
+    found = find_lattice(transform(_frame(steps, 1), workers=2))
     places = [(0.0, 0.0)]
     for carrier in found.carriers:
         places += [(carrier.fy * SIDE, carrier.fx * SIDE), (-carrier.fy * SIDE, -carrier.fx * SIDE)]

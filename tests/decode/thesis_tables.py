@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dappled.decode.optics.carriers import Sensor
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import Mask, Sensor
 
 S5200 = Sensor((2776, 3688), (4.29 / 2776, 0.0), (0.0, 5.76 / 3688))
 MASK_1 = Mask(113.8 / 5, 2, "diagonal")

@@ -13,9 +13,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from dappled.config import profiles
-from dappled.decode.optics.carriers import Lattice, Sensor
-from dappled.decode.optics.masks import Mask
-from dappled.decode.spectrum.stagger import spread_sensor
+from dappled.decode.optics.carriers import Lattice, Mask, Sensor
 from dappled.mocks.scene import lens, synthesis
 from dappled.mocks.scene.bench import Bench, WhiteCard, boards
 from dappled.mocks.scene.dng import Exif
@@ -46,7 +44,7 @@ class MaskedFinePix:
     @property
     def chip(self) -> Sensor:
         """The whole file's samples, spread to where they stand."""
-        return spread_sensor(profiles.camera("fujifilm-s5200").sensor(SHAPE))
+        return profiles.camera("fujifilm-s5200").sensor(SHAPE).spread()
 
     @property
     def installed(self) -> Installation:

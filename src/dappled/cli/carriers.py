@@ -15,16 +15,14 @@ from PIL import Image
 from dappled.cli import decode_arguments
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
+from dappled.decode.decoder import CarriersFrom, doubt
 from dappled.decode.optics.carrier_tables import crossed_orders, lattice_rotation
-from dappled.decode.optics.carriers import Carrier, Lattice
-from dappled.decode.optics.masks import Mask, Order
-from dappled.decode.report import CarriersFrom, doubt
+from dappled.decode.optics.carriers import Carrier, Lattice, Mask, Order
 from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
-from dappled.decode.spectrum.padded import Spectrum, padded_shape
 from dappled.decode.spectrum.peaks import Measured, measure
+from dappled.decode.spectrum.pictures import LOOKS, Look, around, spectrum_boxes
 from dappled.decode.spectrum.plane import Plane
-from dappled.decode.spectrum.slices import default_size
-from dappled.decode.spectrum.spectrum_pictures import LOOKS, Look, around, spectrum_boxes
+from dappled.decode.spectrum.transform import padded_shape, transform
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, known_to
 
 
@@ -92,7 +90,7 @@ def picture(plane: Plane, table: Table, look: Look = "magnitude") -> Any:
     """The spectrum with a box a slice, uint8 RGB (Figs 36, 41, 42)."""
     half = [(c, m) for c, m in table.rows if (c.ky, c.kx) >= (0, 0) and c.on_sensor]
     high, wide = padded_shape(table.shape)
-    size = default_size(table.used, (high, wide))
+    size = table.used.slice_size((high, wide))
     return spectrum_boxes(
         plane,
         table.used.carriers([(c.ky, c.kx) for c, _ in half]),
@@ -134,7 +132,7 @@ def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
         plane = darkroom.plane(raw)
         shape = (plane.shape[0], plane.shape[1])
         if arguments.mask == profiles.LENSLET:
-            found = find_lattice(Spectrum.of(plane, workers=2))
+            found = find_lattice(transform(plane, workers=2))
             pairs = list(zip(found.carriers, found.measured, strict=True))
             rows = _both_halves([(Carrier(0, 0, 0.0, 0.0), measure_mean()), *pairs])
             main = frozenset(found.orders) | {(0, 0)}
@@ -147,7 +145,7 @@ def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
         length = arguments.focal_length or raw.focal_length_mm
         if length is None:
             raise DarkroomError(f"{arguments.frames} doesn't say its focal length: give --focal-length MM")
-        spectrum = Spectrum.of(plane, workers=2)
+        spectrum = transform(plane, workers=2)
         predicted = decoder.predict(length)
         used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
         known = {(c.ky, c.kx): m for c, m in zip(predicted, seen, strict=True)}

@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled.config.schema import ConfigError, Source, build, read_toml, setting
-from dappled.decode.optics.carriers import LAWS, Sensor
-from dappled.decode.optics.masks import Mask
-from dappled.decode.spectrum.stagger import spread_sensor
+from dappled.decode.optics.carriers import LAWS, Mask, Sensor
 
 LENSLET = "lenslet"  # not a profile: the lattice is found in the frame itself
 
@@ -67,8 +65,8 @@ class CameraProfile:
             if known.sensor.shape == shape:
                 return known.sensor
         for known in self.raw:
-            if known.staggered and spread_sensor(known.sensor).shape == shape:
-                return spread_sensor(known.sensor)
+            if known.staggered and known.sensor.spread().shape == shape:
+                return known.sensor.spread()
         sizes = ", ".join(f"{h} × {w}" for h, w in (known.sensor.shape for known in self.raw))
         raise ConfigError(
             f"camera profile {self.name} knows frames of {sizes} px, this one has {shape[0]} × {shape[1]}; "

@@ -1,6 +1,6 @@
-"""From a plane to slices and views, for a masked camera and for lenslets: what carriers were used, and why.
+"""Decode planes of a masked camera to slices and views, and report which carriers were used, and why.
 
-A decoder is a value: it holds what all frames of a camera share and no memory of the frames. The same plane gives the
+A decoder is a value: it holds what all frames of a camera share, and nothing of the frames. The same plane gives the
 same bytes.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,21 +21,92 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.aperture import used_aperture
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.views import Aperture, Views, angular_frequencies, from_slices, kappa, transfer
-from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Sensor
-from dappled.decode.optics.masks import Mask, Order
-from dappled.decode.report import CarriersFrom, DecodeReport, ViewsFrom, light_field, no_views
-from dappled.decode.spectrum.noise import Noise
-from dappled.decode.spectrum.own_lattice import STRONG, STRONGER, farther_lattice, own_lattice, turn_between
-from dappled.decode.spectrum.padded import Spectrum, padded_shape
-from dappled.decode.spectrum.peaks import Measured, measure
-from dappled.decode.spectrum.plan import Plans
-from dappled.decode.spectrum.slices import Slices, default_size, extract
-from dappled.decode.spectrum.transform import Source, Transform
-from dappled.decode.threads import each
+from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Order, Sensor
+from dappled.decode.spectrum.peaks import (
+    STRONG,
+    STRONGER,
+    Measured,
+    farther_lattice,
+    measure,
+    own_lattice,
+    stretch,
+    turn_between,
+)
+from dappled.decode.spectrum.slices import Slices, extract
+from dappled.decode.spectrum.transform import Source, Spectrum, SpectrumBuffers, noise_rms, padded_shape, transform
 
+CarriersFrom = Literal["measured", "calibrated", "predicted", "found"]
+ViewsFrom = Literal["calibration", "frame", "white", "none"]
+_DOUBTED = 0.04  # of a carrier's frequency: a mask at its stated place is never so far off
 _ROTATION = 0.04  # of a carrier's frequency: the search without a calibration allows for 2.3°
-_NOTHING_TOLD: Mapping[str, Any] = {"transfers": None, "aperture": None}
+_UNKNOWN: Mapping[str, Any] = {"transfers": None, "aperture": None}
 _LEAST_THROUGH = 0.1  # a carrier of which the aperture leaves less doesn't tell the mask's transfer
+
+
+@dataclass(frozen=True, slots=True)
+class DecodeReport:
+    """Which carriers a frame was decoded at, and why.
+
+    `predicted` are the half plane's carriers on the sensor as predicted, (0, 0) first, `measured` what was seen near
+    each (None: nothing there), `used` those that the slices were cut at. `carriers_from`: "measured" in this frame;
+    "calibrated": predicted by the calibration, as too little was to be seen; "predicted": by the law alone; "found":
+    a lattice that nobody had named. `views_from`: whose phases and transfer made the views. `noise_rms` is the
+    plane's white noise, 1.0 = sensor white.
+    """
+
+    predicted: tuple[Carrier, ...]
+    measured: tuple[Measured | None, ...]
+    used: tuple[Carrier, ...]
+    carriers_from: CarriersFrom
+    views_from: ViewsFrom
+    noise_rms: float
+
+    @property
+    def found(self) -> int:
+        """How many carriers were seen, the mean (0, 0) included; suspect ones don't count."""
+        return sum(m is not None and not m.suspect for m in self.measured)
+
+    @property
+    def doubt(self) -> str | None:
+        """What is strange about the carriers that were measured, in a sentence."""
+        return doubt(self.used, self.predicted) if self.carriers_from == "measured" else None
+
+
+def doubt(used: Sequence[Carrier], predicted: Sequence[Carrier]) -> str | None:
+    """Carriers of a mask that seems not to be where it is said to be, in a sentence; None for those near enough."""
+    off = stretch(used, predicted)
+    if abs(off) <= _DOUBTED:
+        return None
+    way = "farther out" if off > 0 else "farther in"
+    return f"they stand {abs(off):.1%} {way} than predicted: check mask distance and focal length, or calibrate"
+
+
+def no_views(slices: Slices) -> tuple[Views, NDArray[np.float64]]:
+    """The views (0, 0, h, w) and offsets (0, 0, 2) of slices alone."""
+    return np.zeros((0, 0, *slices.values.shape[1:]), dtype=np.float32), np.zeros((0, 0, 2))
+
+
+def light_field(
+    slices: Slices,
+    views: Views,
+    offsets: NDArray[np.float64],
+    *,
+    shape: tuple[int, ...],
+    report: DecodeReport,
+    facts: Mapping[str, Any],
+) -> LightField:
+    """The light field's value, its attributes the facts and what the report says in numbers and words."""
+    rows = np.array([(c.ky, c.kx, c.fy, c.fx) for c in slices.carriers], dtype=np.float64)
+    attributes = {
+        "shape": [int(side) for side in shape],
+        **facts,
+        "carriers_from": report.carriers_from,
+        "views_from": report.views_from,
+        "carriers_predicted": len(report.predicted),
+        "carriers_found": report.found,
+        "noise_rms": report.noise_rms,
+    }
+    return LightField(slices.values, rows, views, offsets, slices.grid, attributes)
 
 
 class Decoder(Protocol):
@@ -61,7 +132,7 @@ class MaskDecoder:
     known to (half of the EXIF rounding): it widens the search. `size` of the slices in bins of the padded transform;
     None: as large as the spacing allows. Views need a calibration, or a frame that shows its carriers; else only the
     slices are there, and `views` has the shape (0, 0, h, w). `colours` says that the planes are colour mosaics.
-    `taper` apodises the bands, see `slices.extract`. `plans` keep buffers from frame to frame.
+    `taper` apodises the bands, see `slices.extract`. `buffers` are reused from frame to frame.
     """
 
     sensor: Sensor
@@ -75,7 +146,7 @@ class MaskDecoder:
     workers: int = 1
     colours: bool = False
     taper: float = 0.0
-    plans: Plans = field(default_factory=Plans, repr=False)
+    buffers: SpectrumBuffers = field(default_factory=SpectrumBuffers, repr=False)
 
     def __post_init__(self) -> None:
         """Raises DecodeError for an unknown law, or another camera's calibration."""
@@ -118,24 +189,23 @@ class MaskDecoder:
             raise DecodeError(
                 f"all carriers but the mean fall off the sensor at {focal_length_mm} mm: wrong mask, law or length?"
             )
-        with self.plans.lend(self.sensor.shape) as plan:
+        with self.buffers.lend(self.sensor.shape) as tiles:
             reach = self.largest_fx(focal_length_mm)
-            spectrum = plan.spectrum(plane, workers=self.workers, largest_fx=reach)
+            spectrum = transform(plane, tiles=tiles, workers=self.workers, largest_fx=reach)
             lattice, measured, carriers_from = self.locate(spectrum, focal_length_mm, predicted)
             used = [c for c in lattice.carriers([(c.ky, c.kx) for c in predicted]) if c.on_sensor]
             size = self.slice_size(lattice)
             needed = max(abs(c.fx) for c in used) + (size[1] / 2 + 1) / spectrum.padded[1]
             if reach < min(0.5, needed):  # a lattice found at the edge of the search
-                spectrum = plan.spectrum(plane, workers=self.workers, largest_fx=min(0.5, needed))
-            looking = Noise(spectrum)
-            slices = plan.cut(spectrum, used, size, workers=self.workers, beside=looking.work, taper=self.taper)
-            noise = looking.rms()
+                spectrum = transform(plane, tiles=tiles, workers=self.workers, largest_fx=min(0.5, needed))
+            slices = extract(spectrum, used, size, taper=self.taper, workers=self.workers)
+            noise = noise_rms(spectrum)
         if views:
             made, offsets, views_from, told = self.views(
                 slices, lattice, carriers_from, focal_length_mm=focal_length_mm, f_number=f_number, noise_rms=noise
             )
         else:
-            made, offsets, views_from, told = *no_views(slices), "none", _NOTHING_TOLD
+            made, offsets, views_from, told = *no_views(slices), "none", _UNKNOWN
         report = DecodeReport(tuple(predicted), tuple(measured), tuple(used), carriers_from, views_from, noise)
         facts: dict[str, Any] = {
             "law": self.law,
@@ -149,8 +219,7 @@ class MaskDecoder:
 
     def transform(self, plane: Source, focal_length_mm: float) -> Spectrum:
         """The spectrum as far out as this focal length's slices and searches need it."""
-        largest = self.largest_fx(focal_length_mm)
-        return Transform(self.sensor.shape).apply(plane, workers=self.workers, largest_fx=largest)
+        return transform(plane, workers=self.workers, largest_fx=self.largest_fx(focal_length_mm))
 
     def largest_fx(self, focal_length_mm: float) -> float:
         """The largest frequency along columns that slices and searches ask for, in cycles/pixel."""
@@ -164,27 +233,21 @@ class MaskDecoder:
 
     def slice_size(self, lattice: Lattice) -> tuple[int, int]:
         """(height, width) of the bands in bins of the padded transform."""
-        return self.size or default_size(lattice, padded_shape(self.sensor.shape))
+        return self.size or lattice.slice_size(padded_shape(self.sensor.shape))
 
     def locate(
         self, spectrum: Spectrum, focal_length_mm: float, predicted: Sequence[Carrier]
     ) -> tuple[Lattice, list[Measured | None], CarriersFrom]:
         """The lattice to use, what was seen near each predicted carrier, and which of the two it came from."""
         lattice = self.lattice_at(focal_length_mm)
-        radii = self._radii(predicted, focal_length_mm)
-        measured: list[Measured | None] = [None] * len(predicted)
-
-        def look(k: int) -> None:
-            measured[k] = measure(spectrum, [predicted[k]], radii[k])[0]
-
-        each(look, range(len(predicted)), self.workers)
+        measured = measure(spectrum, predicted, self._radii(predicted, focal_length_mm))
         least = STRONGER if self.calibration is not None else STRONG
         own = own_lattice(spectrum, predicted, measured, least)
         if own is None and self.calibration is not None:
             return lattice, measured, "calibrated"
         own = own or farther_lattice(spectrum, predicted)
         if own is None:
-            # Wide searches find a fence's or a roof's own period, too: peaks on no common lattice are no carriers.
+            # Wide searches also find the period of a fence or a roof: peaks on no common lattice are no carriers.
             kept = [
                 m if m is not None and (m.suspect or (c.ky, c.kx) == (0, 0)) else None
                 for c, m in zip(predicted, measured, strict=True)
@@ -234,7 +297,7 @@ class MaskDecoder:
         it was taken through (see `Aperture.shape`)."""
         none = no_views(slices)
         if f_number is None:
-            return *none, "none", _NOTHING_TOLD
+            return *none, "none", _UNKNOWN
         orders = [(c.ky, c.kx) for c in slices.carriers]
         aperture = self.aperture or Aperture(self.mask.views_per_axis)
         cycles = kappa(self.mask.frequency_per_mm, self._distance(focal_length_mm), focal_length_mm, f_number)
@@ -255,11 +318,11 @@ class MaskDecoder:
             through = aperture.transform(angular_frequencies(orders, cycles, rotation)).real
             keep = np.abs(through) > _LEAST_THROUGH
             if np.linalg.matrix_rank([order for order, usable in zip(orders, keep, strict=True) if usable]) < 2:
-                return *none, "none", _NOTHING_TOLD
+                return *none, "none", _UNKNOWN
             transfers = _own_transfer(slices.values, orders, through, keep)
             views_from = "frame"
         else:
-            return *none, "none", _NOTHING_TOLD
+            return *none, "none", _UNKNOWN
         keep &= np.abs(transfers) > 1e-3  # a carrier that the mask doesn't make tells nothing
         views, offsets = from_slices(
             slices.values if keep.all() else slices.values[keep],

@@ -1,4 +1,4 @@
-"""Lenslet frames by the same method: carriers on a lattice that is found, all orders that the frame shows."""
+"""Decode lenslet frames by the same method: carriers on a lattice that is found, all orders that the frame shows."""
 
 from __future__ import annotations
 
@@ -12,18 +12,15 @@ from numpy.typing import NDArray
 
 from dappled.decode.calibration.calibration import at_centre, at_corner
 from dappled.decode.calibration.lattice_fit import relative_transfer
+from dappled.decode.decoder import DecodeReport, light_field, no_views
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.views import Aperture, Views, from_lenslet_slices
 from dappled.decode.optics.carriers import Carrier, Lattice
-from dappled.decode.report import DecodeReport, light_field, no_views
 from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
-from dappled.decode.spectrum.noise import noise_rms
-from dappled.decode.spectrum.padded import Spectrum
-from dappled.decode.spectrum.plan import Plan, Plans
 from dappled.decode.spectrum.plane import size_text
-from dappled.decode.spectrum.slices import Slices, default_size
-from dappled.decode.spectrum.transform import Source
+from dappled.decode.spectrum.slices import Slices, extract
+from dappled.decode.spectrum.transform import Source, Spectrum, SpectrumBuffers, noise_rms, transform
 
 _MOST_VIEWS = 15  # per axis
 MOSAIC_ROLLOFF = 0.3  # cycles/pixel: the chroma of a Bayer mosaic stands around 0.5, and what a pixel tells ends there
@@ -53,7 +50,7 @@ class LensletDecoder:
     views_per_axis: int | None = None
     workers: int = 1
     rolloff: float | None = None
-    plans: Plans = field(default_factory=Plans, repr=False)
+    buffers: SpectrumBuffers = field(default_factory=SpectrumBuffers, repr=False)
 
     @classmethod
     def with_white(
@@ -61,10 +58,9 @@ class LensletDecoder:
     ) -> LensletDecoder:
         """A decoder that knows a white frame (float32 (H, W)). Raises NoLattice where that shows no lenslets."""
         shape = (white_plane.shape[0], white_plane.shape[1])
-        plan = Plan(shape)
-        spectrum = plan.spectrum(white_plane, workers=workers)
+        spectrum = transform(white_plane, workers=workers)
         found = find_lattice(spectrum)
-        slices = _cut(plan, spectrum, found, workers)
+        slices = _cut(spectrum, found, workers)
         origin = lenslet_origin(slices)
         count = views_per_axis or views_carried(found)
         views = from_lenslet_slices(slices.values, slices.carriers, origin, offsets_px(found.lattice, count), rolloff)
@@ -88,11 +84,11 @@ class LensletDecoder:
             raise DecodeError(
                 f"the frame is {size_text(plane.shape)}, this decoder is made for {size_text(self.shape)}"
             )
-        with self.plans.lend(self.shape) as plan:
-            spectrum = plan.spectrum(plane, workers=self.workers)
+        with self.buffers.lend(self.shape) as tiles:
+            spectrum = transform(plane, tiles=tiles, workers=self.workers)
             found = self.white.found if self.white is not None else find_lattice(spectrum)
-            slices = _cut(plan, spectrum, found, self.workers)
-            noise = noise_rms(spectrum, workers=self.workers)
+            slices = _cut(spectrum, found, self.workers)
+            noise = noise_rms(spectrum)
         if self.white is not None:
             origin = at_corner(self.white.origin, found.lattice, self.shape)
         else:
@@ -178,11 +174,10 @@ def _reach(found: FoundLattice) -> float:
     return max(math.hypot(c.fy, c.fx) for c in found.carriers)
 
 
-def _cut(plan: Plan, spectrum: Spectrum, found: FoundLattice, workers: int) -> Slices:
+def _cut(spectrum: Spectrum, found: FoundLattice, workers: int) -> Slices:
     """Slices of all carriers of the half plane as far out as any was verified, bands going round at Nyquist."""
     carriers = carriers_within(found.lattice, 1.01 * _reach(found))
-    size = default_size(found.lattice, spectrum.padded, "cell")
-    return plan.cut(spectrum, carriers, size, lattice=found.lattice, window="cell", wrap=True, workers=workers)
+    return extract(spectrum, carriers, lattice=found.lattice, window="cell", wrap=True, workers=workers)
 
 
 def carriers_within(lattice: Lattice, reach: float) -> list[Carrier]:

@@ -11,8 +11,7 @@ from dappled.decode.calibration.calibration import Calibration, at_centre, at_co
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate, origin_of
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.views import transfer
-from dappled.decode.optics.carriers import Lattice
-from dappled.decode.optics.masks import Mask, Pattern
+from dappled.decode.optics.carriers import Lattice, Mask, Pattern
 from tests.decode.rays import FOCAL_MM, MASK, SENSOR, STATED_DISTANCE_MM, STOPPED_F, Camera, Texture
 
 

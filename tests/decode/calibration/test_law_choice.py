@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from dappled.decode.calibration.law_choice import Verdict, judge, steps_bins
-from dappled.decode.optics.carriers import LAWS, Lattice, Sensor
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Sensor
 from tests.decode.thesis_tables import MASK_2, S5200
 
 CHIP = Sensor((2776, 3688), (0.01, 0.0), (0.0, 0.01))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from dappled.decode.lightfield.aperture import used_aperture
 from dappled.decode.lightfield.views import Aperture, angular_frequencies, from_slices, transfer
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import Mask
 
 ORDERS = Mask(15.5, 2).half_orders()
 TRANSFERS = transfer(ORDERS, [1.0, *[0.36] * 6, *[0.18] * 6], (0.31, -0.12))

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from dappled.decode.lightfield.pictures import slice_mosaic, view_mosaic
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import Mask
 
 
 def test_slices_stand_at_their_orders_with_their_conjugates() -> None:

@@ -14,7 +14,7 @@ from dappled.decode.lightfield.views import (
     transfer,
     unmixing,
 )
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import Mask
 
 ORDERS = Mask(15.5, 2).half_orders()
 

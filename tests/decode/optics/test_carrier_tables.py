@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics import carrier_tables
-from dappled.decode.optics.carriers import Sensor
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import Mask, Sensor
 from tests.decode import thesis_tables as thesis
 
 SQUARE = Sensor((2776, 3688), (0.01, 0.0), (0.0, 0.01))

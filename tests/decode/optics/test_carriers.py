@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.decode.optics.carriers import Carrier, Lattice, Sensor, fd, geometric
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import Carrier, Lattice, Mask, Sensor, fd, geometric
 
 S5200 = Sensor((2776, 3688), (4.29 / 2776, 0.0), (0.0, 5.76 / 3688))
 

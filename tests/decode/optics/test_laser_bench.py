@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics import laser_bench
+from dappled.decode.optics.carriers import Mask
 from dappled.decode.optics.film import film_of
 from dappled.decode.optics.mask_image import MaskImage
-from dappled.decode.optics.masks import Mask
 from tests.decode import thesis_tables as thesis
 
 BENCH = (laser_bench.THESIS_WAVELENGTH_NM, laser_bench.THESIS_DISTANCE_M)

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.decode.errors import DecodeError
+from dappled.decode.optics.carriers import Harmonics, Mask, Pattern
 from dappled.decode.optics.film import FILMS, density_curve, film_of
 from dappled.decode.optics.mask_image import MaskImage, period_on
-from dappled.decode.optics.masks import Harmonics, Mask, Pattern
 
 ALL = slice(None)
 

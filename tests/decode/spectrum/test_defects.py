@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dappled.decode.spectrum.defects import find_defects, mended
+from dappled.decode.spectrum.plane import find_defects, mended
 
 
 def _dark() -> np.ndarray:

@@ -10,8 +10,8 @@ from PIL import Image
 
 from dappled.decode.errors import NoLattice
 from dappled.decode.spectrum.lattice import find_lattice, reduced
-from dappled.decode.spectrum.padded import Spectrum
 from dappled.decode.spectrum.plane import to_plane
+from dappled.decode.spectrum.transform import transform
 
 
 def _lenslets(steps: np.ndarray, shape: tuple[int, int], seed: int) -> np.ndarray:
@@ -42,7 +42,7 @@ def _turned(steps: np.ndarray, degrees: float) -> np.ndarray:
 @pytest.mark.parametrize("pitch", [9.3, 17.7])
 def test_square_lenslets_turned(pitch: float, degrees: float) -> None:
     frame = _lenslets(_turned(np.eye(2) * pitch, degrees), (420, 500), 1)
-    found = find_lattice(Spectrum.of(frame))
+    found = find_lattice(transform(frame))
     assert found.pitch_px == pytest.approx((pitch, pitch), abs=0.01)
     assert found.spacing_px == pytest.approx((pitch, pitch), abs=0.01)
     assert math.degrees(found.rotation_rad) == pytest.approx(degrees, abs=0.03)
@@ -53,7 +53,7 @@ def test_square_lenslets_turned(pitch: float, degrees: float) -> None:
 @pytest.mark.parametrize("degrees", [0.05, 1.5])
 def test_hexagonal_lenslets(degrees: float) -> None:
     steps = _turned(np.array([[10 * math.sqrt(3) / 2, 5.0], [0.0, 10.0]]), degrees)
-    found = find_lattice(Spectrum.of(_lenslets(steps, (420, 500), 2)))
+    found = find_lattice(transform(_lenslets(steps, (420, 500), 2)))
     assert found.spacing_px == pytest.approx((10, 10), abs=0.01)
     assert found.pitch_px == pytest.approx((8.660, 8.660), abs=0.01)
     area = abs(np.linalg.det(np.linalg.inv(found.lattice.matrix())))
@@ -77,17 +77,17 @@ def _photograph(seed: int) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(6))
 def test_no_carriers_on_a_photograph(seed: int) -> None:
     with pytest.raises(NoLattice, match="no carriers"):
-        find_lattice(Spectrum.of(_photograph(seed)))
+        find_lattice(transform(_photograph(seed)))
 
 
 def test_no_carriers_in_noise_or_jpeg_blocks() -> None:
     rng = np.random.default_rng(0)
     noise = rng.normal(0.5, 0.1, (300, 360)).astype(np.float32)
     with pytest.raises(NoLattice):
-        find_lattice(Spectrum.of(noise))
+        find_lattice(transform(noise))
     blocks = noise + 0.1 * (np.arange(360) % 8 == 0) + 0.1 * (np.arange(300) % 8 == 0)[:, None]
     with pytest.raises(NoLattice):
-        find_lattice(Spectrum.of(blocks.astype(np.float32)))
+        find_lattice(transform(blocks.astype(np.float32)))
 
 
 def test_reduction_finds_the_shortest_vectors() -> None:
@@ -98,14 +98,14 @@ def test_reduction_finds_the_shortest_vectors() -> None:
 
 def test_letters_photograph_alone(shared_data: Path) -> None:
     frame = np.asarray(Image.open(shared_data / "lenslet/ulf_letters/letters_ULF_M1.png"))
-    found = find_lattice(Spectrum.of(to_plane(frame, black=0, white=255)))
+    found = find_lattice(transform(to_plane(frame, black=0, white=255)))
     assert found.pitch_px == pytest.approx((48.23, 48.23), abs=0.02)
 
 
 @pytest.mark.parametrize("name", ["light_field.tif", "radiometry_frame.tif"])
 def test_sea_urchin_alone(shared_data: Path, name: str) -> None:
     frame = tifffile.imread(shared_data / "lenslet/lfm_seaurchin" / name)
-    found = find_lattice(Spectrum.of(to_plane(frame, black=0, white=255)))
+    found = find_lattice(transform(to_plane(frame, black=0, white=255)))
     assert found.pitch_px == pytest.approx((17.19, 17.19), abs=0.02)
     assert abs(math.degrees(found.rotation_rad)) == pytest.approx(0.18, abs=0.01)
 
@@ -113,7 +113,7 @@ def test_sea_urchin_alone(shared_data: Path, name: str) -> None:
 def test_hexagonal_bayer_raw_alone(shared_data: Path) -> None:
     frame = np.asarray(Image.open(shared_data / "lenslet/lytro_like/raw.png"))
     plane = to_plane(frame, black=168, white=4095, cfa=np.array([[2, 1], [1, 0]]))
-    found = find_lattice(Spectrum.of(plane))
+    found = find_lattice(transform(plane))
     assert found.spacing_px == pytest.approx((10, 10), abs=0.002)
     assert len(found.carriers) == found.predicted
 
@@ -122,4 +122,4 @@ def test_hexagonal_bayer_raw_alone(shared_data: Path) -> None:
 def test_no_carriers_on_real_photographs(shared_data: Path, name: str) -> None:
     frame = np.asarray(Image.open(shared_data / "raw" / name).convert("L"))
     with pytest.raises(NoLattice):
-        find_lattice(Spectrum.of(to_plane(frame, black=0, white=255)))
+        find_lattice(transform(to_plane(frame, black=0, white=255)))

@@ -8,10 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.spectrum import colours
 from dappled.decode.spectrum import plane as planes
-from dappled.decode.spectrum.developer import developer
-from dappled.decode.spectrum.linear_rows import Laid
+from dappled.decode.spectrum.lineariser import ArraySource, lineariser
+from tests.decode.spectrum.equations import even_colours
 
 BAYER = np.array([[0, 1], [1, 2]])
 SUPER_CCD = np.array([[0, 1, 2, 1], [1, 1, 1, 1], [2, 1, 0, 1], [1, 1, 1, 1]])
@@ -33,17 +32,17 @@ def _mosaic(shape: tuple[int, int], cfa: np.ndarray, seed: int = 2) -> np.ndarra
 @pytest.mark.parametrize("shape", [(201, 251), (47, 300), (16, 16), (96, 96)])
 @pytest.mark.parametrize("reference", [(1,), (0, 1, 2), ()])
 @pytest.mark.parametrize("balance", [None, (1.3, 1.0, 0.7)])
-def test_an_exposure_is_the_plane_with_its_colours_evened(
+def test_linear_rows_are_the_plane_with_its_colours_evened(
     cfa: np.ndarray, shape: tuple[int, int], reference: tuple[int, ...], balance: tuple[float, ...] | None
 ) -> None:
     mosaic = _mosaic(shape, cfa)
     levels: dict[str, Any] = {"black": (100, 90, 110), "white": 4095, "cfa": cfa, "balance": balance}
     expected = planes.to_plane(mosaic, **levels)
     if reference:
-        colours.even_colours(expected, cfa, reference)
-    exposure = developer(shape, **levels, reference=reference).expose(mosaic)
-    np.testing.assert_allclose(exposure.plane(), expected, rtol=2e-5, atol=1e-6)
-    assert exposure.level == pytest.approx(float(expected.mean()), rel=0.1)
+        even_colours(expected, cfa, reference)
+    linear = lineariser(shape, **levels, reference=reference).apply(mosaic)
+    np.testing.assert_allclose(linear.plane(), expected, rtol=2e-5, atol=1e-6)
+    assert linear.level == pytest.approx(float(expected.mean()), rel=0.1)
 
 
 def test_dark_and_white_frames_are_taken_off_while_it_is_read() -> None:
@@ -53,15 +52,15 @@ def test_dark_and_white_frames_are_taken_off_while_it_is_read() -> None:
     flat = rng.uniform(1, 2, mosaic.shape).astype(np.float32)
     levels: dict[str, Any] = {"black": 0, "white": 4095, "cfa": BAYER, "balance": (1.0, 1.0, 1.0)}
     expected = planes.to_plane(mosaic, dark=dark, **levels) * flat
-    found = developer(mosaic.shape, **levels).expose(mosaic, dark=dark, flat=flat).plane()
+    found = lineariser(mosaic.shape, **levels).apply(mosaic, dark=dark, flat=flat).plane()
     np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-6)
 
 
-def test_a_developer_serves_frame_after_frame() -> None:
-    made = developer((120, 150), black=100, white=4095, cfa=BAYER, reference=(1,))
-    first = made.expose(_mosaic((120, 150), BAYER, 1)).plane()
-    made.expose(_mosaic((120, 150), BAYER, 5))
-    again = made.expose(_mosaic((120, 150), BAYER, 1)).plane(workers=3)
+def test_a_lineariser_serves_frame_after_frame() -> None:
+    made = lineariser((120, 150), black=100, white=4095, cfa=BAYER, reference=(1,))
+    first = made.apply(_mosaic((120, 150), BAYER, 1)).plane()
+    made.apply(_mosaic((120, 150), BAYER, 5))
+    again = made.apply(_mosaic((120, 150), BAYER, 1)).plane(workers=3)
     assert first.tobytes() == again.tobytes()
 
 
@@ -69,16 +68,16 @@ def test_a_developer_serves_frame_after_frame() -> None:
 @given(first=st.integers(0, 9), count=st.integers(1, 60))
 def test_rows_can_be_read_from_any_period_on(first: int, count: int) -> None:
     mosaic = _mosaic((120, 90), BAYER)
-    exposure = developer((120, 90), black=100, white=4095, cfa=BAYER, reference=(1,)).expose(mosaic)
-    rows = slice(first * exposure.period, min(120, first * exposure.period + count))
+    linear = lineariser((120, 90), black=100, white=4095, cfa=BAYER, reference=(1,)).apply(mosaic)
+    rows = slice(first * linear.period, min(120, first * linear.period + count))
     out = np.empty((rows.stop - rows.start, 90), dtype=np.float32)
-    exposure.rows_into(out, rows)
-    np.testing.assert_allclose(out, exposure.plane()[rows], rtol=1e-6)
+    linear.rows_into(out, rows)
+    np.testing.assert_allclose(out, linear.plane()[rows], rtol=1e-6)
 
 
-def test_a_laid_plane_is_read_as_it_is() -> None:
+def test_a_plane_in_memory_is_read_as_it_is() -> None:
     plane = np.random.default_rng(4).random((70, 80)).astype(np.float32)
-    source = Laid(plane)
+    source = ArraySource(plane)
     out = np.empty((10, 80), dtype=np.float32)
     source.rows_into(out, slice(5, 15))
     assert np.array_equal(out, plane[5:15])
@@ -99,4 +98,4 @@ def test_a_laid_plane_is_read_as_it_is() -> None:
 )
 def test_a_frame_without_a_picture_is_refused_in_words(mosaic: np.ndarray, words: str) -> None:
     with pytest.raises(DecodeError, match=words):
-        developer((64, 64), black=0, white=4095, cfa=BAYER, reference=(1,)).expose(mosaic)
+        lineariser((64, 64), black=0, white=4095, cfa=BAYER, reference=(1,)).apply(mosaic)

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from dappled.decode.decoder import MaskDecoder
-from dappled.decode.optics.carriers import Carrier
-from dappled.decode.optics.masks import Mask
-from dappled.decode.spectrum.own_lattice import farther_lattice, stretch
-from dappled.decode.spectrum.padded import Spectrum
+from dappled.decode.optics.carriers import Carrier, Mask
+from dappled.decode.spectrum.peaks import farther_lattice, stretch
+from dappled.decode.spectrum.transform import transform
 from tests.decode.rays import FOCAL_MM, FULL_F, MASK, SENSOR, STATED_DISTANCE_MM, STOPPED_F, Camera, Plane, Texture
 
 DIAGONAL = Mask(15.5, 2, "diagonal")
@@ -74,7 +73,7 @@ def test_a_scene_without_a_mask_shows_no_lattice_however_regular_its_things_are(
             wave = np.cos(2 * np.pi * harmonic * (fy * rows + fx * columns))
             plane[top : top + 150, left : left + 200] += (0.1 / harmonic * wave)[top : top + 150, left : left + 200]
     noisy = (plane + rng.normal(0, 0.01, plane.shape)).astype(np.float32)
-    assert farther_lattice(Spectrum.of(noisy), predicted) is None
+    assert farther_lattice(transform(noisy), predicted) is None
 
 
 def test_a_stretch_is_counted_over_the_carriers_that_both_have() -> None:

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dappled.decode.optics.carriers import Carrier
-from dappled.decode.spectrum.padded import Spectrum
 from dappled.decode.spectrum.peaks import is_suspect, measure
+from dappled.decode.spectrum.transform import Spectrum, transform
 
 SHAPE = (150, 190)
 
@@ -16,7 +16,7 @@ def _wave(fy: float, fx: float, amplitude: float, phase: float, noise: float = 0
     y, x = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
     plane = 0.5 + 2 * amplitude * np.cos(2 * np.pi * (fy * y + fx * x) + phase)
     plane += np.random.default_rng(0).normal(0, noise, SHAPE)
-    return Spectrum.of(plane.astype(np.float32))
+    return transform(plane.astype(np.float32))
 
 
 @settings(max_examples=60, deadline=None)
@@ -39,7 +39,7 @@ def test_frequency_strength_and_phase_of_a_sinusoid(fy: float, fx: float, phase:
 
 
 def test_the_phase_pattern_knows_a_sinusoid_between_bins() -> None:
-    high, wide = Spectrum.of(np.random.default_rng(1).random(SHAPE).astype(np.float32)).padded
+    high, wide = transform(np.random.default_rng(1).random(SHAPE).astype(np.float32)).padded
     fy, fx = 30.4 / high, 41.5 / wide
     (found,) = measure(_wave(fy, fx, 0.1, 1.0), [Carrier(1, 1, fy, fx)], 2.0)
     assert found is not None
@@ -48,7 +48,7 @@ def test_the_phase_pattern_knows_a_sinusoid_between_bins() -> None:
 
 def test_noise_and_texture_without_a_carrier_are_not_there() -> None:
     rng = np.random.default_rng(2)
-    spectrum = Spectrum.of(rng.normal(0.5, 0.1, SHAPE).astype(np.float32))
+    spectrum = transform(rng.normal(0.5, 0.1, SHAPE).astype(np.float32))
     places = [Carrier(k, 1, *rng.uniform(0.05, 0.45, 2)) for k in range(100)]
     assert measure(spectrum, places, 4.0) == [None] * 100
 

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics.carriers import Carrier, Lattice
-from dappled.decode.spectrum.padded import Spectrum
-from dappled.decode.spectrum.slices import _cell_weights, default_size, extract, taper_weights
+from dappled.decode.spectrum.slices import _bands, _cell_weights, _taper_weights, extract
+from dappled.decode.spectrum.transform import SpectrumBuffers, transform
+from tests.decode.spectrum.equations import slice_at
 
 SHAPE = (200, 250)
 
@@ -26,7 +27,7 @@ def test_a_slice_is_the_picture_times_the_carriers_amplitude(fy: float, fx: floa
     factor = 0.3 * np.exp(1j * phase)
     picture, plane = _frame(fy, fx, factor)
     carriers = [Carrier(0, 0, 0.0, 0.0), Carrier(1, 0, fy, fx)]
-    found = extract(Spectrum.of(plane), carriers, (20, 24))
+    found = extract(transform(plane), carriers, (20, 24))
     rows = np.arange(found.values.shape[1]) * found.grid[0, 0]
     columns = np.arange(found.values.shape[2]) * found.grid[1, 1]
     assert rows[-1] <= SHAPE[0] - 1
@@ -40,25 +41,25 @@ def test_a_slice_is_the_picture_times_the_carriers_amplitude(fy: float, fx: floa
 
 def test_a_tapered_band_keeps_its_middle_and_rings_less() -> None:
     size = (40, 48)
-    weights = taper_weights(size, 0.5)
+    weights = _taper_weights(size, 0.5)
     assert weights[20, 24] == 1.0
     assert weights[0, 24] == pytest.approx(0.0, abs=1e-6)
     assert np.all(weights[11:30, 13:36] == 1.0)  # the middle half is left alone
     plane = np.zeros(SHAPE, dtype=np.float32)
     plane[:, SHAPE[1] // 2 :] = 1.0
     mean = [Carrier(0, 0, 0.0, 0.0)]
-    sharp, soft = (extract(Spectrum.of(plane), mean, size, taper=taper) for taper in (0.0, 1.0))
+    sharp, soft = (extract(transform(plane), mean, size, taper=taper) for taper in (0.0, 1.0))
     inner = (slice(8, -8), slice(8, -8))
     assert soft.values[0].real[inner].max() < sharp.values[0].real[inner].max() - 0.05  # Gibbs' overshoot is gone
-    assert soft.band == pytest.approx(sharp.band * float(np.mean(taper_weights(size, 1.0) ** 2)))
+    assert soft.band == pytest.approx(sharp.band * float(np.mean(_taper_weights(size, 1.0) ** 2)))
     with pytest.raises(DecodeError, match="share of the band"):
-        extract(Spectrum.of(plane), mean, size, taper=1.5)
+        extract(transform(plane), mean, size, taper=1.5)
 
 
 def test_the_largest_boxes_do_not_overlap() -> None:
     for angle in (0.0, 0.02, -0.035):
         lattice = Lattice((0.153, 0.0), (0.0, 0.1535)).rotated(angle)
-        height, width = default_size(lattice, (2800, 3750))
+        height, width = lattice.slice_size((2800, 3750))
         for ky in range(-2, 3):
             for kx in range(-2, 3):
                 dy, dx = np.array([ky, kx]) @ lattice.matrix() * (2800, 3750)
@@ -69,7 +70,7 @@ def test_the_largest_boxes_do_not_overlap() -> None:
 
 def test_cells_of_a_hexagonal_lattice_tile_the_plane() -> None:
     lattice = Lattice((0.1154, -0.0002), (0.0578, 0.0999))
-    size = default_size(lattice, (600, 750), "cell")
+    size = lattice.slice_size((600, 750), "cell")
     weights = _cell_weights(lattice, (600, 750), size)
     area = abs(np.linalg.det(lattice.matrix())) * 600 * 750
     assert weights.sum() == pytest.approx(area, rel=0.01)
@@ -79,13 +80,13 @@ def test_cells_of_a_hexagonal_lattice_tile_the_plane() -> None:
 
 def test_white_noise_fills_a_slice_by_its_band() -> None:
     plane = np.random.default_rng(0).normal(0.5, 0.1, SHAPE).astype(np.float32)
-    found = extract(Spectrum.of(plane), [Carrier(1, 1, 0.21, 0.13)], (40, 50))
+    found = extract(transform(plane), [Carrier(1, 1, 0.21, 0.13)], (40, 50))
     assert np.mean(np.abs(found.values) ** 2) == pytest.approx(0.1**2 * found.band, rel=0.1)
 
 
 def test_a_band_beyond_nyquist_is_cut_or_goes_round() -> None:
     plane = np.random.default_rng(0).normal(0.5, 0.1, SHAPE).astype(np.float32)
-    spectrum = Spectrum.of(plane)
+    spectrum = transform(plane)
     at_edge = [Carrier(1, 0, 0.49, 0.0)]
     cut, wrapped = (extract(spectrum, at_edge, (40, 40), wrap=wrap).values for wrap in (False, True))
     assert np.mean(np.abs(cut) ** 2) == pytest.approx(0.6 * np.mean(np.abs(wrapped) ** 2), rel=0.15)
@@ -94,13 +95,13 @@ def test_a_band_beyond_nyquist_is_cut_or_goes_round() -> None:
 def test_any_number_of_workers_gives_the_same_bytes() -> None:
     _, plane = _frame(0.2, 0.15, 0.3)
     carriers = Lattice((0.15, 0.001), (-0.001, 0.15)).carriers([(0, 0), (0, 1), (1, 0), (1, 1), (1, -1)])
-    spectrum = Spectrum.of(plane)
+    spectrum = transform(plane)
     one, three = (extract(spectrum, carriers, (30, 36), workers=w).values for w in (1, 3))
     assert one.tobytes() == three.tobytes()
 
 
 def test_bad_calls_are_refused_in_words() -> None:
-    spectrum = Spectrum.of(_frame(0.2, 0.2, 0.3)[1])
+    spectrum = transform(_frame(0.2, 0.2, 0.3)[1])
     with pytest.raises(DecodeError, match="no carriers"):
         extract(spectrum, [], (10, 10))
     with pytest.raises(DecodeError, match="size"):
@@ -108,4 +109,66 @@ def test_bad_calls_are_refused_in_words() -> None:
     with pytest.raises(DecodeError, match="fit"):
         extract(spectrum, [Carrier(0, 0, 0, 0)], (1000, 10))
     with pytest.raises(DecodeError, match="too close"):
-        default_size(Lattice((1e-6, 0.0), (0.0, 1e-6)), (600, 750))
+        Lattice((1e-6, 0.0), (0.0, 1e-6)).slice_size((600, 750))
+
+
+UNEVEN = np.random.default_rng(8).random((151, 203)).astype(np.float32)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    fy=st.floats(-0.49, 0.49),
+    fx=st.floats(-0.49, 0.49),
+    height=st.integers(2, 80),
+    width=st.integers(2, 90),
+    wrap=st.booleans(),
+    mean=st.booleans(),
+)
+def test_slices_are_those_of_the_equation(
+    *, fy: float, fx: float, height: int, width: int, wrap: bool, mean: bool
+) -> None:
+    spectrum = transform(UNEVEN)
+    carrier = Carrier(0, 0, 0.0, 0.0) if mean else Carrier(1, 2, fy, fx)
+    found = extract(spectrum, [carrier], (height, width), wrap=wrap).values[0]
+    expected = slice_at(UNEVEN, carrier, (height, width), level=spectrum.level, wrap=wrap)
+    expected = expected[: found.shape[0], : found.shape[1]]
+    assert np.abs(found - expected).max() < 1e-5 * max(np.abs(expected).max(), 1e-2)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+@pytest.mark.parametrize("workers", [2, 3])
+def test_any_number_of_workers_and_carriers_gives_the_same_bytes(count: int, workers: int) -> None:
+    spectrum = transform(UNEVEN)
+    carriers = [Carrier(1, k, 0.03 * k, 0.21 - 0.06 * k) for k in range(count)]
+    one, many = (extract(spectrum, carriers, (40, 60), workers=w).values for w in (1, workers))
+    assert one.tobytes() == many.tobytes()
+
+
+def test_columns_that_were_not_transformed_are_refused_before_anything_is_cut() -> None:
+    spectrum = transform(UNEVEN, largest_fx=0.2)
+    with pytest.raises(DecodeError, match="not computed"):
+        extract(spectrum, [Carrier(0, 0, 0.0, 0.0), Carrier(0, 1, 0.0, 0.3)], (20, 20))
+
+
+def test_bands_laid_out_before_give_the_same_slices_as_new_ones() -> None:
+    shape = (150, 210)
+    carriers = Lattice((0.15, 0.001), (-0.001, 0.15)).carriers([(0, 0), (0, 1), (1, -1), (1, 0), (1, 1)])
+    buffers = SpectrumBuffers()
+    for seed in (1, 2, 1):
+        frame = np.random.default_rng(seed).random(shape).astype(np.float32)
+        for size in ((20, 28), (24, 30)):
+            with buffers.lend(shape) as tiles:
+                found = extract(transform(frame, tiles=tiles), carriers, size, workers=2)
+            _bands.cache_clear()
+            fresh = extract(transform(frame), carriers, size)
+            assert found.values.tobytes() == fresh.values.tobytes()
+            assert np.array_equal(found.grid, fresh.grid)
+            assert found.carriers == fresh.carriers
+
+
+def test_slices_outlive_the_next_frame() -> None:
+    with SpectrumBuffers().lend(UNEVEN.shape) as tiles:
+        first = extract(transform(UNEVEN, tiles=tiles), [Carrier(0, 0, 0.0, 0.0)], (20, 28))
+        before = first.values.copy()
+        transform(UNEVEN * 3, tiles=tiles)
+    assert np.array_equal(first.values, before)

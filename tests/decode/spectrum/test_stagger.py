@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from dappled.decode.optics.carriers import Carrier, Sensor
-from dappled.decode.spectrum.padded import Spectrum
 from dappled.decode.spectrum.peaks import measure
-from dappled.decode.spectrum.stagger import spread, spread_sensor
+from dappled.decode.spectrum.plane import spread
+from dappled.decode.spectrum.transform import transform
 
 
 def _sampled(fy: float, fx: float, shape: tuple[int, int]) -> np.ndarray:
@@ -26,8 +26,8 @@ def test_samples_go_where_they_were_taken_and_the_mean_stays() -> None:
 
 def test_a_wave_has_one_peak_and_its_repetition_beyond_the_diamond() -> None:
     fy, fx, shape = 0.11, 0.153, (240, 150)
-    rough = Spectrum.of(_sampled(fy, fx, shape))
-    fine = Spectrum.of(spread(_sampled(fy, fx, shape)))
+    rough = transform(_sampled(fy, fx, shape))
+    fine = transform(spread(_sampled(fy, fx, shape)))
     near, mirrored = Carrier(1, 1, fy, fx), Carrier(1, 1, 0.5 - fy, 0.5 - fx)
     for carrier in (near, mirrored):
         (found,) = measure(fine, [Carrier(1, 1, carrier.fy, carrier.fx)], 2.0)
@@ -44,5 +44,5 @@ def test_a_wave_has_one_peak_and_its_repetition_beyond_the_diamond() -> None:
 
 
 def test_the_sensor_of_a_spread_plane_has_half_columns() -> None:
-    wide = spread_sensor(Sensor((2918, 1852), (0.0015, 0.0), (0.0, 0.003)))
+    wide = Sensor((2918, 1852), (0.0015, 0.0), (0.0, 0.003)).spread()
     assert wide == Sensor((2918, 3704), (0.0015, 0.0), (0.0, 0.0015))

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import Mask
 from dappled.mocks.autopilot.path import TruePose
 from dappled.mocks.scene import lens
 from dappled.mocks.scene.flyover import rotation

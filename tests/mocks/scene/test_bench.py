@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import Mask
 from dappled.mocks.scene.bench import Bench, RealViews, TexturedPlane, WhiteCard
 from dappled.mocks.scene.lens import Optics, Rays
 

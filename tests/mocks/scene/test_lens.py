@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.decode.optics.carriers import Sensor
-from dappled.decode.optics.masks import Harmonics, Mask, Pattern
+from dappled.decode.optics.carriers import Harmonics, Mask, Pattern, Sensor
 from dappled.mocks.scene import lens
 from dappled.mocks.scene.lens import Installation, Optics
 from tests.mocks.scene import oracles

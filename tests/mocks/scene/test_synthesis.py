@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dappled.decode.optics.carriers import Lattice
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import Lattice, Mask
 from dappled.mocks.autopilot.path import TruePose
 from dappled.mocks.scene import lens
 from dappled.mocks.scene.lens import Installation, Optics, Rays, Rendering

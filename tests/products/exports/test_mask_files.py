@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from dappled.decode.optics import laser_bench
+from dappled.decode.optics.carriers import Mask
 from dappled.decode.optics.film import film_of
 from dappled.decode.optics.mask_image import MaskImage
-from dappled.decode.optics.masks import Mask
 from dappled.products.exports import mask_files
 
 

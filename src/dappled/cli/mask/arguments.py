@@ -11,8 +11,7 @@ from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.config.schema import ConfigError
 from dappled.decode.optics import lenses
-from dappled.decode.optics.carriers import Sensor
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import Mask, Sensor
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from dappled.cli.mask import arguments as mask_arguments
 from dappled.decode.optics import carrier_tables
 from dappled.decode.optics.film import FILMS
 from dappled.decode.optics.mask_design import DESIGNS, Design, Wish
-from dappled.decode.spectrum import spectrum_pictures
+from dappled.decode.spectrum import pictures
 
 HELP = "mask, distance and film for an altitude"
 EXAMPLE = "dappled mask design --altitude 40 --camera fujifilm-s5200 --focal-length 13 --f-number 3.5 --film 16k"
@@ -90,7 +90,7 @@ def _picture(made: Design) -> Any:
     )
     carriers = [c for c in lattice.carriers(made.mask.half_orders()) if c.on_sensor]
     size = abs(lattice.ky[0]), abs(lattice.kx[1])
-    return spectrum_pictures.spectrum_boxes(np.zeros((height // shrink, width // shrink), np.float32), carriers, size)
+    return pictures.spectrum_boxes(np.zeros((height // shrink, width // shrink), np.float32), carriers, size)
 
 
 def _as_json(made: Design) -> dict[str, Any]:

@@ -20,8 +20,7 @@ from dappled.decode.calibration.law_choice import PLAUSIBLE, judge, steps_bins
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.views import Aperture, angular_frequencies, kappa, transfer
 from dappled.decode.optics.carrier_tables import lattice_rotation
-from dappled.decode.optics.carriers import LAWS, Lattice, Sensor
-from dappled.decode.optics.masks import Mask, Order
+from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Order, Sensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,13 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Sensor
-from dappled.decode.optics.masks import Mask, Order
-from dappled.decode.spectrum.lattice import candidates, find_lattice, fit, residual_bins
-from dappled.decode.spectrum.own_lattice import FARTHER
-from dappled.decode.spectrum.padded import Spectrum
-from dappled.decode.spectrum.peaks import Measured, measure
-from dappled.decode.spectrum.slices import default_size, extract
+from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Order, Sensor
+from dappled.decode.spectrum.lattice import candidates, find_lattice
+from dappled.decode.spectrum.peaks import FARTHER, Measured, fit, measure, residual_bins
+from dappled.decode.spectrum.slices import extract
+from dappled.decode.spectrum.transform import Spectrum, transform
 
 _ALIKE_BINS = 0.5  # rms from their lattice: what lies farther off are peaks of the scene
 _ENOUGH = 0.6  # of a mask's carriers: a prediction near which so many stand is the right one
@@ -54,7 +52,7 @@ def look(
     """Find the mask's carriers in a frame: near the law's prediction, near the other law's, or wherever they are."""
     if plane.shape != sensor.shape:
         raise DecodeError(f"the calibration frame is {plane.shape}, the camera's are {sensor.shape}")
-    spectrum = Spectrum.of(plane, workers=workers)
+    spectrum = transform(plane, workers=workers)
     lattice, found = _located(
         spectrum,
         sensor=sensor,
@@ -196,7 +194,7 @@ def relative_transfer(slices: NDArray[np.complex64]) -> NDArray[np.complex128]:
 
 def refine(spectrum: Spectrum, lattice: Lattice, orders: Sequence[Order], workers: int = 1) -> Lattice:
     """The lattice to a hundredth of a bin: what phase ramp is left in each slice against the DC slice is taken off."""
-    size = default_size(lattice, spectrum.padded)
+    size = lattice.slice_size(spectrum.padded)
     for _ in range(2):
         carriers = [c for c in lattice.carriers(orders) if c.on_sensor]
         values = extract(spectrum, carriers, size, workers=workers)

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from dappled.decode.optics.carriers import LAWS, Lattice, Sensor
-from dappled.decode.optics.masks import Mask
+from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Sensor
 
 EXPLAINED_BINS = 2.0  # rms: what a law may leave (the thesis' own readings scatter by 0 to 2)
 PLAUSIBLE = 0.35  # relative: a mask distance further from the stated one is not believed

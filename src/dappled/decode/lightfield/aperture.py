@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.lightfield.views import Aperture, Shape, angular_frequencies
-from dappled.decode.optics.masks import Order
+from dappled.decode.optics.carriers import Order
 
 ROUNDING = 0.05  # relative: f-numbers are off by no more (nominal f/22 is 22.6, f/3.5 is 3.56)
 _NOMINAL_SIGMA = 0.02  # relative: how far an f-number is believed

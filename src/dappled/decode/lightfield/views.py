@@ -29,8 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from dappled.decode.optics.carriers import Carrier
-from dappled.decode.optics.masks import Order
+from dappled.decode.optics.carriers import Carrier, Order
 
 Views = NDArray[np.float32]
 Shape = Literal["beams", "filled", "round"]

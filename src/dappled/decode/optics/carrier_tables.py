@@ -14,10 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.optics.carriers import LAWS, Lattice, Sensor
+from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Order, Sensor
 from dappled.decode.optics.lenses import focal_length, within
-from dappled.decode.optics.masks import Mask, Order
-from dappled.decode.spectrum.slices import default_size
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +138,7 @@ def table(
 def slice_size(lattice: Lattice, shape: tuple[int, int]) -> tuple[int, int] | None:
     """(height, width) in bins of the largest slice that overlaps no neighbour; None where there is no room for any."""
     try:
-        return default_size(lattice, shape)
+        return lattice.slice_size(shape)
     except DecodeError:
         return None
 

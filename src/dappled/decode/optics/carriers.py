@@ -1,21 +1,65 @@
-"""Where the carriers lie: sensors, lattices, and the two laws that predict a lattice from the lens.
+"""Masks, the carriers that they make, and where these lie: sensors, lattices, and the two laws that predict a lattice.
 
-A carrier of integer orders (ky, kx) stands at ky·a + kx·b cycles/pixel, where a and b are the two vectors of a
-`Lattice`. A law gives the lattice of a mask behind a lens; lenslet arrays have a lattice that is found, not predicted.
+A carrier of integer orders (ky, kx) lies at ky·a + kx·b cycles/pixel, where a and b are the two vectors of a
+`Lattice`. A law gives the lattice of a mask behind a lens. The lattice of a lenslet array is found, not predicted.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.optics.masks import Mask, Order
+from dappled.decode.errors import DecodeError
 
 Vector = tuple[float, float]
+Pattern = Literal["full", "diagonal"]
+Harmonics = Literal["linear", "octave"]
+Order = tuple[int, int]
+Window = Literal["box", "cell"]
+
+
+@dataclass(frozen=True, slots=True)
+class Mask:
+    """A mask of cosines.
+
+    `frequency_per_mm` is the fundamental at the mask's own plane. `p` counts harmonics: `linear` ones stand at
+    1, 2, 3 … p times the fundamental (Fig 14), `octave` ones at 1, 2, 4, 8 … (the thesis' text; the same for p = 2).
+    `full` is the product of Eq 11, (2p+1)² carriers; `diagonal` is Fig 14's sum of cos·cos, 4p+1 carriers.
+    """
+
+    frequency_per_mm: float
+    p: int
+    pattern: Pattern = "full"
+    harmonics: Harmonics = "linear"
+
+    @property
+    def multiples(self) -> tuple[int, ...]:
+        """The harmonics as integer multiples of the fundamental, rising."""
+        return tuple(2**q if self.harmonics == "octave" else q + 1 for q in range(self.p))
+
+    @property
+    def views_per_axis(self) -> int:
+        """N = 2p + 1, the views that the carriers of one axis can separate."""
+        return 2 * self.p + 1
+
+    def orders(self) -> list[Order]:
+        """All carriers (ky, kx): DC first, then the others in rising order. Integer multiples of the fundamental."""
+        axis = sorted({0, *self.multiples, *(-m for m in self.multiples)})
+        if self.pattern == "full":
+            found = set(itertools.product(axis, axis))
+        else:
+            found = {(sy * m, sx * m) for m in self.multiples for sy in (-1, 1) for sx in (-1, 1)}
+        return [(0, 0), *sorted(found - {(0, 0)})]
+
+    def half_orders(self) -> list[Order]:
+        """DC, then the orders lexicographically greater than (0, 0): a frame is real, the others are conjugates."""
+        return [order for order in self.orders() if order >= (0, 0)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +83,7 @@ class Carrier:
 
 @dataclass(frozen=True, slots=True)
 class Lattice:
-    """Two vectors (fy, fx) in cycles/pixel: what one step of ky and one step of kx mean."""
+    """Two vectors (fy, fx) in cycles/pixel: one step of ky and one step of kx."""
 
     ky: Vector
     kx: Vector
@@ -62,13 +106,81 @@ class Lattice:
         (ay, ax), (by, bx) = self.ky, self.kx
         return Lattice((c * ay - s * ax, s * ay + c * ax), (c * by - s * bx, s * by + c * bx))
 
+    def neighbours(self) -> NDArray[np.float64]:
+        """(8, 2) the eight shortest steps to other lattice points."""
+        orders = np.array([order for order in itertools.product(range(-2, 3), repeat=2) if order != (0, 0)])
+        vectors: NDArray[np.float64] = orders @ self.matrix()
+        lengths = np.hypot(vectors[:, 0], vectors[:, 1])
+        return vectors[np.argsort(lengths, kind="stable")][:8]
+
+    def slice_size(self, padded: tuple[int, int], window: Window = "box") -> tuple[int, int]:
+        """(height, width) of a slice in bins of a transform of shape `padded`, as large as the spacing allows.
+
+        For "box" the largest rectangle that overlaps none of its neighbours on the lattice, for "cell" the smallest
+        one around the lattice's own cell (the points nearer to one carrier than to any other). Both sides have small
+        prime factors, and those of the box are even. Raises DecodeError where the carriers lie too close together.
+        """
+        if window == "cell":
+            corners = self._cell_corners() * np.array(padded)
+            height, width = (2 * math.ceil(abs(corners[:, axis]).max()) + 1 for axis in (0, 1))
+            return min(_fast_up(height), padded[0]), min(_fast_up(width), padded[1])
+        orders = np.array([(a, b) for a, b in itertools.product(range(-3, 4), repeat=2) if (a, b) != (0, 0)])
+        steps = [(y * padded[0], x * padded[1]) for y, x in orders @ self.matrix()]
+        best = (0, 0)
+        for height in {abs(dy) for dy, _ in steps if abs(dy) > 1}:
+            width = min((abs(dx) for dy, dx in steps if abs(dy) < height * (1 - 1e-9)), default=float(padded[1]))
+            if height * width > best[0] * best[1]:
+                best = (math.floor(height + 1e-6), math.floor(width + 1e-6))
+        if min(best) < 2:
+            raise DecodeError(
+                "the carriers lie too close together to cut slices: is this the right mask and focal length?"
+            )
+        return _fast_down(min(best[0], padded[0])), _fast_down(min(best[1], padded[1]))
+
+    def _cell_corners(self) -> NDArray[np.float64]:
+        """The corners (fy, fx) of the lattice's cell around DC."""
+        vectors = self.neighbours()
+        corners = []
+        for a, b in itertools.combinations(vectors, 2):
+            matrix = np.array([a, b])
+            if abs(np.linalg.det(matrix)) < 1e-12:
+                continue
+            point = np.linalg.solve(matrix, np.array([a @ a, b @ b]) / 2)
+            if np.all(vectors @ point <= (vectors * vectors).sum(axis=1) / 2 + 1e-12):
+                corners.append(point)
+        return np.array(corners)
+
+
+def _fast_up(n: int) -> int:
+    """The next size that the FFT is fast for."""
+    size = n
+    while not _is_fast(size):
+        size += 1
+    return size
+
+
+def _fast_down(n: int) -> int:
+    """The next smaller even size that the FFT is fast for."""
+    size = n
+    while size > 2 and (size % 2 or not _is_fast(size)):
+        size -= 1
+    return size
+
+
+def _is_fast(n: int) -> bool:
+    """Whether n has no prime factor above 11, which is what `scipy.fft.next_fast_len` goes by."""
+    for factor in (2, 3, 5, 7, 11):
+        while n % factor == 0:
+            n //= factor
+    return n == 1
+
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """A raw shape and what one step of row and of column is in millimetres on the chip.
+    """A raw shape, and the step from row to row and from column to column in millimetres on the chip.
 
-    `row_mm` and `column_mm` are (y, x) vectors: (pitch, 0) and (0, pitch) on an ordinary chip. `picture` is the shape
-    on whose DFT the `fd` law counts bins, where that isn't this one but another sampling of the same chip.
+    `row_mm` and `column_mm` are (y, x) vectors: (pitch, 0) and (0, pitch) on an ordinary chip. `picture` is the
+    sampling of the same chip on whose DFT the `fd` law counts bins, where that is not this one.
     """
 
     shape: tuple[int, int]
@@ -87,6 +199,11 @@ class Sensor:
     def size_mm(self) -> Vector:
         """(height, width) of the chip in mm, for an axis-aligned one."""
         return self.shape[0] * math.hypot(*self.row_mm), self.shape[1] * math.hypot(*self.column_mm)
+
+    def spread(self) -> Sensor:
+        """The geometry of a staggered chip's plane once `plane.spread` has put it on twice as many columns."""
+        y, x = self.column_mm
+        return replace(self, shape=(self.shape[0], 2 * self.shape[1]), column_mm=(y / 2, x / 2))
 
 
 Law = Callable[[Mask, Sensor, float, float], Lattice]

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from dappled.decode.errors import DecodeError
+from dappled.decode.optics.carriers import Mask
 from dappled.decode.optics.lenses import within
-from dappled.decode.optics.masks import Mask
 
 THESIS_WAVELENGTH_NM = 532.0
 THESIS_DISTANCE_M = 0.5842

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics.carrier_tables import fresnel_number, lattice_of
-from dappled.decode.optics.carriers import Sensor
+from dappled.decode.optics.carriers import Mask, Sensor
 from dappled.decode.optics.film import FILMS, Film
 from dappled.decode.optics.lenses import depth_sigma_m, ground_sample_m, image_distance_mm, within
-from dappled.decode.optics.masks import Mask
 
 FRESNEL_LIMIT = 0.25
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
+from dappled.decode.optics.carriers import Mask, Order
 from dappled.decode.optics.film import DensityCurve, Film
 from dappled.decode.optics.lenses import within
-from dappled.decode.optics.masks import Mask, Order
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Finding an unknown lattice of carriers in a frame: printed masks and lenslet arrays, square or hexagonal, rotated."""
+"""Find an unknown lattice of carriers in a frame: printed masks and lenslet arrays, square or hexagonal, rotated."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from dappled.decode.errors import NoLattice
-from dappled.decode.optics.carriers import Carrier, Lattice
-from dappled.decode.optics.masks import Order
-from dappled.decode.spectrum.padded import Spectrum
-from dappled.decode.spectrum.peaks import Measured, is_suspect, measure
+from dappled.decode.optics.carriers import Carrier, Lattice, Order
+from dappled.decode.spectrum.peaks import Measured, fit, is_suspect, lattice_from, measure, residual_bins
+from dappled.decode.spectrum.transform import Spectrum
 
 _SMALLEST_VERIFIED = 6  # carriers in one half plane, DC left out
 _CANDIDATES = 30
@@ -136,31 +135,6 @@ def candidates(spectrum: Spectrum, *, prominence_nats: float = 2.0, spacing_bins
     return sorted(found, key=lambda c: -c.prominence)
 
 
-def fit(pairs: list[tuple[Carrier, Measured]]) -> Lattice:
-    """The lattice nearest to measured carriers: least squares, weighted by the logarithm of their strength."""
-    orders = np.array([(c.ky, c.kx) for c, _ in pairs], dtype=np.float64)
-    seen = np.array([(m.fy, m.fx) for _, m in pairs])
-    strength = np.array([m.strength for _, m in pairs])
-    weights = np.sqrt(1 + np.log(strength / strength.min()))[:, None]
-    matrix = np.linalg.lstsq(orders * weights, seen * weights, rcond=None)[0]
-    residual = np.hypot(*(orders @ matrix - seen).T)
-    keep = residual <= 3 * max(float(np.median(residual)), 1e-9)  # an outlier is another thing's peak
-    if keep.sum() >= _SMALLEST_VERIFIED and np.linalg.matrix_rank(orders[keep]) == 2:
-        matrix = np.linalg.lstsq((orders * weights)[keep], (seen * weights)[keep], rcond=None)[0]
-    return _from_matrix(matrix)
-
-
-def residual_bins(carriers: list[Carrier], measured: list[Measured], spectrum: Spectrum) -> float:
-    """The rms distance between carriers and what was measured of them, in bins of the padded transform."""
-    if not carriers:
-        return math.nan
-    squares = [
-        ((c.fy - m.fy) * spectrum.padded[0]) ** 2 + ((c.fx - m.fx) * spectrum.padded[1]) ** 2
-        for c, m in zip(carriers, measured, strict=True)
-    ]
-    return math.sqrt(sum(squares) / len(squares))
-
-
 def reduced(basis: NDArray[np.float64]) -> NDArray[np.float64]:
     """Gauss reduction of a (2, 2) basis (rows): the two shortest vectors of the same lattice, the shorter first."""
     a, b = basis
@@ -244,7 +218,7 @@ def _named(lattice: Lattice, verified: list[tuple[Carrier, Measured]]) -> tuple[
             renamed.append(((-ky, -kx), measured.twin()))
         else:
             renamed.append(((ky, kx), measured))
-    return _from_matrix(matrix), sorted(renamed, key=lambda pair: pair[0])
+    return lattice_from(matrix), sorted(renamed, key=lambda pair: pair[0])
 
 
 def _artefact(candidate: Candidate, spectrum: Spectrum) -> bool:
@@ -252,12 +226,7 @@ def _artefact(candidate: Candidate, spectrum: Spectrum) -> bool:
 
 
 def _lattice(basis_bins: NDArray[np.float64], spectrum: Spectrum) -> Lattice:
-    return _from_matrix(basis_bins / np.array(spectrum.padded))
-
-
-def _from_matrix(matrix: NDArray[np.float64]) -> Lattice:
-    (ay, ax), (by, bx) = matrix
-    return Lattice((float(ay), float(ax)), (float(by), float(bx)))
+    return lattice_from(basis_bins / np.array(spectrum.padded))
 
 
 def _parabola(below: float, centre: float, above: float) -> float:

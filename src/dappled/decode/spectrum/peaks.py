@@ -1,4 +1,4 @@
-"""Where carriers really are: peaks near predictions, to a fraction of a bin, or the word that nothing is there."""
+"""Measure carriers: peaks near predictions, to a fraction of a bin, and the lattice that a frame's own peaks show."""
 
 from __future__ import annotations
 
@@ -9,10 +9,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.optics.carriers import Carrier
-from dappled.decode.spectrum.padded import Complex, Spectrum, hann
+from dappled.decode.optics.carriers import Carrier, Lattice
+from dappled.decode.spectrum.transform import Complex, Spectrum, hann
 
 PROMINENCE_NATS = 2.5  # of log magnitude above the median around; the highest of 400 bins of noise reaches 1.1
+_FEWEST_WITHOUT_OUTLIERS = 6  # peaks that a fit needs once outliers are left out
+_ENOUGH = 4  # peaks of a half plane, in both directions, before a frame's own lattice is believed
+STRONG = 0.02  # of the mean; at the ideal aperture parallax alone leaves up to a thousandth
+STRONGER = 0.1  # what it takes against a calibration: weak peaks are pulled aside by parallax
+FARTHER = 0.12  # of a carrier's frequency: 2° of rotation and, under the fd law, 10 % of the mask's distance
+_ALIKE_BINS = 0.5  # rms from their lattice
+_STRICTLY_ALIKE_BINS = 0.1  # of a lattice that was searched for far and wide
 _FRACTIONS = (1 / 2, 1 / 3, 1 / 4, 1 / 6, 1 / 8, 3 / 8)  # colour patterns, interpolation, JPEG blocks
 
 
@@ -139,3 +146,100 @@ def is_suspect(fy: float, fx: float, shape: tuple[int, int]) -> bool:
 
     both_zero = abs(fy) * shape[0] < 0.6 and abs(fx) * shape[1] < 0.6
     return not both_zero and simple(fy, shape[0]) and simple(fx, shape[1])
+
+
+def fit(pairs: Sequence[tuple[Carrier, Measured]]) -> Lattice:
+    """The lattice nearest to measured carriers by least squares, weighted by the logarithm of their strength."""
+    orders = np.array([(c.ky, c.kx) for c, _ in pairs], dtype=np.float64)
+    seen = np.array([(m.fy, m.fx) for _, m in pairs])
+    strength = np.array([m.strength for _, m in pairs])
+    weights = np.sqrt(1 + np.log(strength / strength.min()))[:, None]
+    matrix = np.linalg.lstsq(orders * weights, seen * weights, rcond=None)[0]
+    residual = np.hypot(*(orders @ matrix - seen).T)
+    keep = residual <= 3 * max(float(np.median(residual)), 1e-9)  # an outlier is a peak of something else
+    if keep.sum() >= _FEWEST_WITHOUT_OUTLIERS and np.linalg.matrix_rank(orders[keep]) == 2:
+        matrix = np.linalg.lstsq((orders * weights)[keep], (seen * weights)[keep], rcond=None)[0]
+    return lattice_from(matrix)
+
+
+def residual_bins(carriers: Sequence[Carrier], measured: Sequence[Measured], spectrum: Spectrum) -> float:
+    """The rms distance between carriers and what was measured of them, in bins of the padded transform."""
+    if not carriers:
+        return math.nan
+    squares = [
+        ((c.fy - m.fy) * spectrum.padded[0]) ** 2 + ((c.fx - m.fx) * spectrum.padded[1]) ** 2
+        for c, m in zip(carriers, measured, strict=True)
+    ]
+    return math.sqrt(sum(squares) / len(squares))
+
+
+def lattice_from(matrix: NDArray[np.float64]) -> Lattice:
+    """The lattice of a (2, 2) matrix, the inverse of `Lattice.matrix`."""
+    (ay, ax), (by, bx) = matrix
+    return Lattice((float(ay), float(ax)), (float(by), float(bx)))
+
+
+def own_lattice(
+    spectrum: Spectrum, predicted: Sequence[Carrier], measured: Sequence[Measured | None], least: float
+) -> Lattice | None:
+    """The lattice that this frame's own peaks show, or None where they are too few, too weak or not on a lattice."""
+    pairs = _believed(predicted, measured, least)
+    for radius in (3.0, 2.0):
+        if len(pairs) < _ENOUGH or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in pairs]) < 2:
+            return None
+        lattice = fit(pairs)
+        looked = lattice.carriers([(c.ky, c.kx) for c in predicted])
+        pairs = _believed(looked, measure(spectrum, looked, radius), least)
+    if len(pairs) < _ENOUGH or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in pairs]) < 2:
+        return None
+    lattice = fit(pairs)
+    carriers = lattice.carriers([(c.ky, c.kx) for c, _ in pairs])
+    if residual_bins(carriers, [m for _, m in pairs], spectrum) > _ALIKE_BINS:
+        return None
+    return lattice
+
+
+def farther_lattice(spectrum: Spectrum, predicted: Sequence[Carrier]) -> Lattice | None:
+    """The lattice of a mask that doesn't stand where it was said to, or None.
+
+    The innermost carriers are looked for up to `FARTHER` from their prediction. As such wide searches meet more of the
+    scene, the lattice must explain two thirds of the mask's carriers, and these stand closely on it.
+    """
+    high, wide = spectrum.padded
+    others = [c for c in predicted if (c.ky, c.kx) != (0, 0)]
+    away = {c: math.hypot(c.fy * high, c.fx * wide) for c in others}
+    inner = sorted(others, key=away.__getitem__)[:_ENOUGH]
+    seen = dict(zip(inner, measure(spectrum, inner, [FARTHER * away[c] for c in inner]), strict=True))
+    lattice = own_lattice(spectrum, predicted, [seen.get(c) for c in predicted], STRONG)
+    if lattice is None:
+        return None
+    looked = lattice.carriers([(c.ky, c.kx) for c in others])
+    shown = _believed(looked, measure(spectrum, looked, 2.0), STRONG)
+    off = residual_bins([c for c, _ in shown], [m for _, m in shown], spectrum)
+    return lattice if 3 * len(shown) >= 2 * len(others) and off < _STRICTLY_ALIKE_BINS else None
+
+
+def _believed(
+    carriers: Sequence[Carrier], measured: Sequence[Measured | None], least: float
+) -> list[tuple[Carrier, Measured]]:
+    return [
+        (c, m)
+        for c, m in zip(carriers, measured, strict=True)
+        if m is not None and not m.suspect and m.strength >= least and (c.ky, c.kx) != (0, 0)
+    ]
+
+
+def stretch(used: Sequence[Carrier], predicted: Sequence[Carrier]) -> float:
+    """How much farther from the middle carriers stand than those of the same orders were predicted, as a share."""
+    said = {(c.ky, c.kx): math.hypot(c.fy, c.fx) for c in predicted}
+    both = [(math.hypot(c.fy, c.fx), said[c.ky, c.kx]) for c in used if (c.ky, c.kx) in said]
+    whole = sum(there for _, there in both)
+    return sum(here for here, _ in both) / whole - 1 if whole else 0.0
+
+
+def turn_between(lattice: Lattice, predicted: Lattice) -> float:
+    """The turn from one lattice to another, mean of both vectors', as `Lattice.rotated` counts."""
+    turns = []
+    for (ay, ax), (by, bx) in zip((lattice.ky, lattice.kx), (predicted.ky, predicted.kx), strict=True):
+        turns.append(math.atan2(by * ax - bx * ay, by * ay + bx * ax))
+    return sum(turns) / 2

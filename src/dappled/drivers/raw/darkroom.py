@@ -16,28 +16,20 @@ from numpy.typing import NDArray
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode.calibration.calibration import Calibration
-from dappled.decode.decoder import Decoder, MaskDecoder
+from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
 from dappled.decode.depth.ranging import RANGING
 from dappled.decode.errors import DecodeError
-from dappled.decode.latest import Latest
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.report import DecodeReport
 from dappled.decode.spectrum import plane as planes
-from dappled.decode.spectrum.colours import coloured, local_colours
-from dappled.decode.spectrum.defects import Places, find_defects, mended
-from dappled.decode.spectrum.developer import Developer, developer
-from dappled.decode.spectrum.linear_rows import Exposure
-from dappled.decode.spectrum.plane import Plane
-from dappled.decode.spectrum.stagger import spread
+from dappled.decode.spectrum.lineariser import LinearRows, lineariser
+from dappled.decode.spectrum.plane import Places, Plane, coloured, find_defects, local_colours, mended, spread
 from dappled.decode.spectrum.transform import Source
 from dappled.drivers.raw import calibration_files, reading
 from dappled.drivers.raw.reading import RawFile
 from dappled.drivers.raw.recipe import DarkroomError, Recipe, camera_name, camera_profile, naming, read, said
 
 __all__ = ["Darkroom", "DarkroomError", "DecodeResult", "Recipe", "camera_name", "known_to"]
-
-_KEPT = 4  # linearisers: some bodies report another black level with every frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,16 +203,15 @@ class FrameLineariser:
         self._defects: Places | None = None
         self._gains: dict[tuple[int, int], Plane] = {}
         self._balance: NDArray[np.float64] | None = None
-        self._developers: Latest[Developer] = Latest(_KEPT)
         self._staggered: dict[tuple[tuple[int, int], str], bool] = {}
 
     def plane(self, raw: RawFile) -> Plane:
         """The linear plane of a frame: black, white, dark frame; for masks also colours evened out, and white frame."""
         exposure = self.expose(raw, colour=False)[0]
         source = self.where_taken(exposure, raw)
-        return source.plane(self._recipe.workers) if isinstance(source, Exposure) else source
+        return source.plane(self._recipe.workers) if isinstance(source, LinearRows) else source
 
-    def where_taken(self, exposure: Exposure, raw: RawFile) -> Source:
+    def where_taken(self, exposure: LinearRows, raw: RawFile) -> Source:
         """The plane with each sample where it stands on the chip: a staggered one spread out."""
         if self._recipe.mask == profiles.LENSLET:
             return exposure
@@ -229,7 +220,7 @@ class FrameLineariser:
             self._staggered[key] = camera_profile(self._recipe, key[1]).staggered(key[0])
         return spread(exposure.plane(self._recipe.workers)) if self._staggered[key] else exposure
 
-    def expose(self, raw: RawFile, *, colour: bool) -> tuple[Exposure, NDArray[np.float32] | None]:
+    def expose(self, raw: RawFile, *, colour: bool) -> tuple[LinearRows, NDArray[np.float32] | None]:
         """The plane to be, and local colours (3, rows, columns) as shares of it where they are asked for."""
         raw = said(raw, self._recipe)
         lenslets = self._recipe.mask == profiles.LENSLET
@@ -242,7 +233,6 @@ class FrameLineariser:
                 self._defects = find_defects(dark, period)
                 self._dark = dark = mended(dark, self._defects, period)
             raw = replace(raw, mosaic=mended(raw.mosaic, self._defects, period))
-        workers = self._recipe.workers
         reference: list[int] = []
         chroma = None
         if cfa is not None:
@@ -250,20 +240,15 @@ class FrameLineariser:
             # Behind lenslets the grey view is the mean of the colours; a masked frame has most of its detail in green.
             reference = [names.index("G")] if "G" in names and not lenslets else sorted({int(c) for c in cfa.flat})
             if colour and all(name in names for name in "RGB"):
-                even = planes.to_plane(
-                    raw.mosaic, black=black, white=raw.white, cfa=cfa, balance=balance, dark=dark, workers=workers
-                )
+                even = planes.to_plane(raw.mosaic, black=black, white=raw.white, cfa=cfa, balance=balance, dark=dark)
                 chroma = local_colours(even, cfa, [names.index(name) for name in "RGB"], reference)
         elif colour:
             raise DecodeError("the frame has no colour pattern: decode it without --colour, or name it with --cfa")
         planes.check_shape(raw.mosaic)
         shape = raw.mosaic.shape[0], raw.mosaic.shape[1]
-        key = shape, None if cfa is None else (cfa.shape, cfa.tobytes()), black, raw.white
-        develop = self._developers.of(
-            key, lambda: developer(shape, black=black, white=raw.white, cfa=cfa, balance=balance, reference=reference)
-        )
+        linear = lineariser(shape, black=black, white=raw.white, cfa=cfa, balance=balance, reference=reference)
         flat = self._gain(shape) if self._recipe.white and not lenslets else None
-        return develop.expose(raw.mosaic, dark=dark, flat=flat, workers=workers), chroma
+        return linear.apply(raw.mosaic, dark=dark, flat=flat), chroma
 
     def _white_balance(self) -> NDArray[np.float64] | None:
         """The gains that make the white frame grey; None without one."""

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from dappled.decode.optics.carriers import Lattice
-from dappled.decode.spectrum.padded import Spectrum
 from dappled.decode.spectrum.peaks import measure
-from dappled.decode.spectrum.spectrum_pictures import LOOKS, Look, around, spectrum_boxes
+from dappled.decode.spectrum.pictures import LOOKS, Look, around, spectrum_boxes
+from dappled.decode.spectrum.transform import transform
 
 
 def _wave(shape: tuple[int, int], fy: float, fx: float, phase: float = 0.0) -> np.ndarray:
@@ -21,7 +21,7 @@ def test_boxes_and_markers_stand_on_the_carriers(shape: tuple[int, int]) -> None
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
     plane = (0.5 + 0.3 * np.cos(2 * np.pi * (0.2 * y + 0.1 * x))).astype(np.float32)
     carriers = Lattice((0.2, 0.1), (0.0, 0.2)).carriers([(1, 0)])
-    measured = measure(Spectrum.of(plane), carriers, 2.0)
+    measured = measure(transform(plane), carriers, 2.0)
     bare = spectrum_boxes(plane, [], (0.1, 0.1))
     row, column = round(0.7 * shape[0]), round(0.6 * shape[1])
     brightest = np.unravel_index(np.argmax(bare[shape[0] // 2 + 2 :, :, 0]), bare[shape[0] // 2 + 2 :, :, 0].shape)

@@ -12,8 +12,7 @@ import pytest
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.errors import DecodeError
 from dappled.decode.lenslets import LensletDecoder
-from dappled.decode.spectrum.developer import developer
-from dappled.decode.spectrum.linear_rows import Exposure
+from dappled.decode.spectrum.lineariser import LinearRows, lineariser
 from tests.decode.rays import FOCAL_MM, MASK, SENSOR, STATED_DISTANCE_MM
 
 BAYER = np.array([[0, 1], [1, 2]])
@@ -24,14 +23,14 @@ def _decoder(shape: tuple[int, int], workers: int = 1) -> MaskDecoder:
     return MaskDecoder(replace(SENSOR, shape=shape), MASK, "geometric", STATED_DISTANCE_MM, workers=workers)
 
 
-def _exposure(shape: tuple[int, int], seed: int = 0, workers: int = 1) -> Exposure:
+def _rows(shape: tuple[int, int], seed: int = 0) -> LinearRows:
     mosaic = np.random.default_rng(seed).integers(300, 3500, shape, dtype=np.uint16)
-    made = developer(shape, black=256, white=4095, cfa=BAYER, reference=(1,))
-    return made.expose(mosaic, workers=workers)
+    made = lineariser(shape, black=256, white=4095, cfa=BAYER, reference=(1,))
+    return made.apply(mosaic)
 
 
 def _slices(decoder: MaskDecoder, seed: int) -> bytes:
-    field, _ = decoder.decode_reported(_exposure(decoder.sensor.shape, seed), focal_length_mm=FOCAL_MM, views=False)
+    field, _ = decoder.decode_reported(_rows(decoder.sensor.shape, seed), focal_length_mm=FOCAL_MM, views=False)
     return field.slices.tobytes()
 
 
@@ -53,12 +52,12 @@ def test_one_decoder_serves_several_threads() -> None:
     "shape", [pytest.param((1200, 1600)), pytest.param((8192, 12288), marks=pytest.mark.slow, id="100 megapixels")]
 )
 def test_a_warm_decoder_holds_at_most_six_frames(shape: tuple[int, int]) -> None:
-    exposure = _exposure(shape, workers=2)
+    rows = _rows(shape)
     decoder = _decoder(shape, workers=2)
     tracemalloc.start()
     try:
         for _ in range(2):
-            decoder.decode_reported(exposure, focal_length_mm=FOCAL_MM, views=False)
+            decoder.decode_reported(rows, focal_length_mm=FOCAL_MM, views=False)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -68,7 +67,7 @@ def test_a_warm_decoder_holds_at_most_six_frames(shape: tuple[int, int]) -> None
 def test_more_than_can_be_decoded_is_refused_before_it_is_read() -> None:
     huge = np.lib.stride_tricks.as_strided(np.zeros(1, np.uint16), (12000, 12000), (0, 0))
     with pytest.raises(DecodeError, match="megapixels, cut it first"):
-        developer((12000, 12000), black=0, white=4095).expose(huge)
+        lineariser((12000, 12000), black=0, white=4095).apply(huge)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

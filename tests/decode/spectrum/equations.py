@@ -1,4 +1,4 @@
-"""The colours of a mosaic place by place: evened out before the decoder, given back to views after it."""
+"""Decoding as the equations say it, step by step in double precision: what the fast path is compared with."""
 
 from __future__ import annotations
 
@@ -7,9 +7,44 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
+from dappled.decode.optics.carriers import Carrier
 from dappled.decode.spectrum.plane import Plane
+from dappled.decode.spectrum.transform import padded_shape
+
+
+def padded_plane(plane: NDArray[np.floating], level: float) -> NDArray[np.float64]:
+    """The plane (H, W) less `level`, with zeros at its lower and right edge: float64 (Hp, Wp)."""
+    high, wide = padded_shape((plane.shape[0], plane.shape[1]))
+    padded = np.zeros((high, wide))
+    padded[: plane.shape[0], : plane.shape[1]] = plane.astype(np.float64) - level
+    return padded
+
+
+def slice_at(
+    plane: NDArray[np.floating], carrier: Carrier, size: tuple[int, int], *, level: float, wrap: bool = False
+) -> NDArray[np.complex128]:
+    """The slice of one carrier (Eq 12), complex128 (h, w) over the padded plane.
+
+    S[n] = 1/(Hp Wp) Σ_k F[c + k] e^{2πi k·n/size} · e^{−2πi (f − c)·n/size} for whole bins c + k around the carrier's
+    frequency f in bins, c = round(f), −size/2 ≤ k < size/2. F is the padded plane's DFT, 0 beyond Nyquist unless
+    `wrap`. The slice of (0, 0) gets the level back.
+    """
+    padded = padded_plane(plane, level)
+    spectrum = np.fft.fft2(padded)
+    band = np.zeros(size, dtype=np.complex128)
+    f = carrier.fy * padded.shape[0], carrier.fx * padded.shape[1]
+    k = [np.arange(side) - side // 2 for side in size]
+    rows, columns = (round(f[axis]) + k[axis] for axis in (0, 1))
+    band[...] = spectrum[np.ix_(rows % padded.shape[0], columns % padded.shape[1])]
+    if not wrap:
+        band[np.abs(rows) > padded.shape[0] // 2, :] = 0
+        band[:, np.abs(columns) > padded.shape[1] // 2] = 0
+    image = np.fft.ifft2(np.fft.ifftshift(band), norm="forward") / padded.size
+    n = [np.arange(side) / side for side in size]
+    image *= np.exp(-2j * np.pi * (f[0] - round(f[0])) * n[0])[:, None]
+    image *= np.exp(-2j * np.pi * (f[1] - round(f[1])) * n[1])[None, :]
+    return image + level if (carrier.ky, carrier.kx) == (0, 0) else image
 
 
 def even_colours(plane: Plane, cfa: NDArray[Any], reference: Sequence[int], *, cell_px: int = 48) -> Plane:
@@ -18,7 +53,7 @@ def even_colours(plane: Plane, cfa: NDArray[Any], reference: Sequence[int], *, c
     `cfa` (a, b) colour indices as in `to_plane`, `reference` the indices of green (of all colours for their plain
     mean). A colour cast that varies slowly modulates the mosaic at the colour pattern's own frequencies, and the mask
     repeats it around all its carriers: into other carriers' bands. Local means are taken over `cell_px`, several
-    periods of any mask or lenslet. `developer` does the same while the frame is read.
+    periods of any mask or lenslet.
     """
     pattern = np.asarray(cfa, dtype=np.intp)
     a, b = pattern.shape
@@ -61,44 +96,6 @@ def _cell_means(
             plane[first : first + down * a : a, :width].sum(axis=0, out=sums[place, row])
     cells = sums.reshape(a, rows, columns, across, b).sum(axis=3, dtype=np.float64) / (down * across)
     return {(row, column): cells[row, :, :, column] for row in range(a) for column in range(b)}
-
-
-def local_colours(
-    plane: Plane, cfa: NDArray[Any], colours: Sequence[int], reference: Sequence[int], *, cell_px: int = 12
-) -> NDArray[np.float32]:
-    """(len(colours), rows, columns): local means of colours, over the mean of the reference colours', 1 for grey.
-
-    The cells are `cell_px` on a side and stand for the whole frame: a lenslet, or half a mask period. Finer chroma is
-    not told apart from other carriers' bands.
-    """
-    pattern = np.asarray(cfa, dtype=np.intp)
-    a, b = pattern.shape
-    steps = min(plane.shape[0] // a, max(1, cell_px // a)), min(plane.shape[1] // b, max(1, cell_px // b))
-    cells = _cell_means(plane, (a, b), steps)
-    smooth = {place: ndimage.uniform_filter(mean, 3, mode="nearest") for place, mean in cells.items()}
-    means = {
-        int(colour): np.mean([smooth[at] for at, c in np.ndenumerate(pattern) if c == colour], axis=0)
-        for colour in np.unique(pattern)
-    }
-    grey = np.mean([means[colour] for colour in reference], axis=0)
-    grey = np.maximum(grey, 1e-3 * max(float(grey.mean()), 1e-12))
-    return np.stack([np.clip(means[colour] / grey, 0, 10) for colour in colours]).astype(np.float32)
-
-
-def coloured(
-    views: NDArray[np.float32], grid: NDArray[np.float64], colours: NDArray[np.float32], shape: tuple[int, ...]
-) -> NDArray[np.float32]:
-    """Views (V, U, h, w, 3): each of (V, U, h, w) times the frame's `local_colours` (3, rows, columns).
-
-    `grid` as in `LightField`, `shape` the frame's. All views share the colours of their place; parallax is in the grey.
-    """
-    height, width = views.shape[2:]
-    down = _between(np.arange(height) * grid[0, 0] / shape[0] * colours.shape[1], colours.shape[1])
-    along = _between(np.arange(width) * grid[1, 1] / shape[1] * colours.shape[2], colours.shape[2])
-    places = np.ascontiguousarray(np.moveaxis(down @ colours @ along.T, 0, -1))
-    made = np.empty((*views.shape, len(colours)), dtype=np.float32)
-    np.multiply(views[..., None], places, out=made)
-    return made
 
 
 def _between(places: NDArray[np.floating], blocks: int) -> NDArray[np.float32]:
