@@ -1,68 +1,83 @@
-"""The driver of docs/drivers.md does what the page says, as it stands there."""
+"""The driver of docs/drivers.md, in a package of its own: found by name, typed, and passing the tests of the page."""
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
 import sys
-import types
-from collections.abc import Iterator
-from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from dappled.config.settings import CameraSettings
 from dappled.daemon import cameras
-from dappled.mocks.body.body import pattern
-from tests.drivers.contract import CameraContract, Rig
+from dappled.testing import CameraContract
 
 PAGE = Path(__file__).parents[2] / "docs" / "drivers.md"
 
 
-def code() -> str:
-    (block,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    return str(block)
+def code() -> tuple[str, str]:
+    """The page's driver, and its tests."""
+    driver, tests = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    return driver, tests
 
 
 @pytest.fixture
-def driver(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The page's driver, installed as the page says."""
-    module = types.ModuleType("your_package.camera")
-    exec(compile(code(), str(PAGE), "exec"), module.__dict__)  # noqa: S102  # the page is ours
-    monkeypatch.setitem(sys.modules, "your_package", types.ModuleType("your_package"))
-    monkeypatch.setitem(sys.modules, "your_package.camera", module)
-
-    def found(**_: Any) -> list[EntryPoint]:
-        return [EntryPoint("command", "your_package.camera:open_camera", cameras.GROUP)]
-
-    monkeypatch.setattr(cameras, "entry_points", found)
-
-
-@pytest.fixture
-def command(tmp_path: Path) -> Path:
-    """A command that writes the n-th picture, whole."""
-    for number in range(1, 6):
-        (tmp_path / f"{number}.picture").write_bytes(pattern(number, 20_000))
-    script = tmp_path / "shoot"
-    script.write_text(
-        "#!/bin/sh\n"
-        'number=$(basename "$1" .dng | sed "s/shot_0*//")\n'
-        f'cp "{tmp_path}/$number.picture" "$1.part" && mv "$1.part" "$1"\n'
+def package(tmp_path: Path) -> Path:
+    """A folder with the package as pip installs it, its entry point as the page has it, and its tests."""
+    driver, tests = code()
+    (entry_points,) = re.findall(
+        r'\[project\.entry-points\."(dappled\.cameras)"\]\n(command) = "(.*)"', PAGE.read_text(encoding="utf-8")
     )
-    script.chmod(0o755)
-    return script
+    folder = tmp_path / "site"
+    facts = folder / "your_package-1.0.dist-info"
+    for made in (folder / "your_package", facts):
+        made.mkdir(parents=True)
+    (folder / "your_package" / "__init__.py").touch()
+    (folder / "your_package" / "py.typed").touch()
+    (folder / "your_package" / "camera.py").write_text(driver, encoding="utf-8")
+    (folder / "test_camera.py").write_text(tests, encoding="utf-8")
+    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: your-package\nVersion: 1.0\n")
+    group, name, target = entry_points
+    (facts / "entry_points.txt").write_text(f"[{group}]\n{name} = {target}\n")
+    return folder
 
 
-@pytest.mark.usefixtures("driver")
-class TestContractOfThePage(CameraContract):
-    @pytest.fixture
-    def rig(self, driver: None, command: Path) -> Iterator[Rig]:
-        camera = cameras.open_camera(CameraSettings(driver="command", options={"command": str(command)}))
-        yield Rig(camera, lambda number: pattern(number, 20_000), loose=True)
-        camera.stop()
+def run(package: Path, *words: str) -> str:
+    """What a Python module prints where the package is installed. Fails unless it exits with 0."""
+    paths = os.pathsep.join([str(package), *(path for path in sys.path if path)])
+    done = subprocess.run(
+        [sys.executable, "-m", *words],
+        cwd=package,
+        env={**os.environ, "PYTHONPATH": paths, "MYPYPATH": ""},
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_its_own_tests_pass_with_public_imports_alone(package: Path) -> None:
+    count = sum(name.startswith("test_") for name in dir(CameraContract))
+    printed = run(package, "pytest", "-q", "-p", "no:cacheprovider", "test_camera.py")
+    assert f"{count} passed" in printed
+
+
+@pytest.mark.slow
+def test_it_is_typed(package: Path) -> None:
+    printed = run(package, "mypy", "--strict", "--cache-dir", str(package / "cache"), "your_package", "test_camera.py")
+    assert "no issues found in 3 source files" in printed
+
+
+def test_it_is_found_by_name(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(package)
+    camera = cameras.open_camera(CameraSettings(driver="command", options={"command": "true"}))
+    assert type(camera).__name__ == "ComposedCamera"
 
 
 def test_it_is_short() -> None:
-    lines = [line for line in code().splitlines() if line.strip()]
+    lines = [line for line in code()[0].splitlines() if line.strip()]
     assert len(lines) <= 40

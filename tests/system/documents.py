@@ -198,7 +198,7 @@ def _files(folder: Path) -> None:
     for name in ("white.dng", "white-f22.dng", "bench.dng"):
         (folder / name).write_bytes(white)
     (folder / "DCIM").mkdir()
-    (folder / "examples").symlink_to(ROOT / "examples")
+    (folder / "tools").symlink_to(ROOT / "tools")
     _lenslets(folder)
     (folder / "density.csv").write_text(
         "level,density\n" + "".join(f"{i * 17},{i * 0.2:.2f}\n" for i in range(16)), encoding="utf-8"

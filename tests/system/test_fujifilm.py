@@ -19,7 +19,7 @@ from dappled.drivers.wired import shutter_line
 from dappled.flight import LedgerReader, check, flight_report
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from dappled.mocks.simulation import free_port
-from tests.drivers.contract import content, until_shot_ends, until_state
+from dappled.testing import content, until_shot_ends, until_state
 from tests.simulated.finepix import FinePix
 from tests.system.flying import Flying, eventually, flying, settings_of
 

@@ -24,8 +24,9 @@ from hypothesis import strategies as st
 
 from dappled.config.settings import PublishSettings
 from dappled.daemon.stream import publisher, sockets, wire
+from dappled.daemon.stream.curve import KeyFileError
 from dappled.daemon.stream.publisher import UNREAD_STACKS, Publisher, Reply
-from dappled.daemon.stream.subscriber import AsyncSubscriber, Subscriber, subscribe, subscribe_async
+from dappled.daemon.stream.subscriber import AsyncSubscriber, Subscriber, subscribe
 from dappled.daemon.stream.wire import Message, WireError
 
 STACK = np.arange(24, dtype=np.complex64).reshape(2, 3, 4)
@@ -444,7 +445,7 @@ def test_asyncio_recovers_what_was_lost(endpoint: str) -> None:
 def test_async_for_ends_after_end(started: Publisher, endpoint: str) -> None:
     async def topics() -> list[str]:
         got = []
-        async for message in subscribe_async(endpoint, topics=["frame", "end"]):
+        async for message in subscribe(endpoint, topics=["frame", "end"]):
             got.append(message.topic)
         return got
 
@@ -476,6 +477,42 @@ def test_subscribe_ends_after_end(started: Publisher, endpoint: str) -> None:
     reader.join(10)
     assert not reader.is_alive()
     assert got[-1] == "end"
+
+
+def test_a_subscription_asks_for_what_was_sent_before(endpoint: str) -> None:
+    def answer(request: Mapping[str, Any], reply: Reply) -> None:
+        reply(Message("slices", {"frame": request["frame"], "arrays": []}, b""))
+
+    one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer, capacity=100)
+    one.start()
+    one.publish("slices", {"frame": 40, "arrays": []}, b"")
+    eventually(lambda: one.statistics().sent["slices"] == 1, "it is out before anybody listens")
+    stream = subscribe(endpoint, from_start=True)
+    frames: list[int] = []
+    stop = threading.Event()
+
+    def send() -> None:
+        while not stop.wait(0.02):
+            one.publish("slices", {"frame": 41, "arrays": []}, b"")
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        for message in stream:
+            frames.append(message.header["frame"])
+            if 40 in frames:
+                break
+    finally:
+        stop.set()
+        sender.join()
+        one.stop(0.2)
+    assert (frames[0], frames[-1]) == (41, 40)
+    assert (stream.gaps >= 1, stream.recovered >= 1, stream.lost) == (True, True, 0)
+
+
+def test_a_subscription_needs_both_key_files() -> None:
+    with pytest.raises(KeyFileError, match="keys and server_key go together"):
+        subscribe("tcp://127.0.0.1:5555", keys="laptop.key_secret")
 
 
 def test_a_thread_that_ended_by_itself_is_told(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:

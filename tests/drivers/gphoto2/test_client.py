@@ -26,7 +26,7 @@ from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
 from dappled.drivers.process_channel import ProcessChannel
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from dappled.mocks.body.eos450d import thumbnail
-from tests.drivers.contract import (
+from dappled.testing import (
     CameraContract,
     Rig,
     arrived,

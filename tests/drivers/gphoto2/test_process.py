@@ -37,7 +37,7 @@ from dappled.drivers.gphoto2.protocol import (
 )
 from dappled.drivers.gphoto2.settings import GPhoto2Settings
 from dappled.drivers.process_channel import ChannelError, ProcessChannel
-from tests.drivers.contract import content, of_shots
+from dappled.testing import content, of_shots
 
 FOLDER = "/store/DCIM/100CANON"
 

@@ -14,7 +14,7 @@ from dappled.drivers.mavlink.links import MavlinkLinks, Packet, mavlink
 from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.shutter_line import parse_line
 from dappled.drivers.wired.sources import FolderSource
-from tests.drivers.contract import CameraContract, Rig
+from dappled.testing import CameraContract, Rig
 from tests.simulated.finepix import FinePix, picture
 
 T0 = 1_700_000_000.0

@@ -22,7 +22,7 @@ from dappled.drivers.wired.sources import FolderSource, FoundFile, StorageSource
 from dappled.mocks import simulated
 from dappled.mocks.body.body import pattern
 from dappled.mocks.body.eos450d import thumbnail
-from tests.drivers.contract import (
+from dappled.testing import (
     CameraContract,
     Rig,
     arrived,

@@ -13,7 +13,7 @@ from dappled.drivers.wired import composed
 from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
-from tests.drivers.contract import CameraContract, Rig
+from dappled.testing import CameraContract, Rig
 
 SIZE = 100_001
 _PATIENCE_S = 20.0

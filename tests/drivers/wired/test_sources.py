@@ -14,7 +14,7 @@ from dappled.drivers.gphoto2.client import open_camera
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import FileSource, FolderSource, FoundFile, StorageSource, groups, parse_source
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
-from tests.drivers.contract import content, until_shot_ends, until_state
+from dappled.testing import content, until_shot_ends, until_state
 from tests.simulated.finepix import FinePix, picture
 
 

@@ -6,6 +6,7 @@ import json
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Collection, Generator, Iterator, Mapping
+from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar
 
@@ -13,7 +14,7 @@ import zmq
 import zmq.asyncio
 
 from dappled.daemon.stream import wire
-from dappled.daemon.stream.curve import ClientKeys
+from dappled.daemon.stream.curve import ClientKeys, KeyFileError, load_own, load_public
 from dappled.daemon.stream.wire import Message, WireError
 
 MOST_MISSING = 2**16  # as many as a publisher remembers; a header that claims more is not believed
@@ -250,40 +251,100 @@ class AsyncSubscriber(_SubscriberCore):
             return message
 
 
+class Subscription:
+    """The messages of a stream, for `for` or `async for`: until the flight has ended and no answer is outstanding.
+
+    Each loop connects anew, and closes its sockets when it is left. `gaps`, `recovered` and `lost` count the slices of
+    the last loop.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        ask: str,
+        *,
+        topics: Collection[str],
+        from_start: bool,
+        idle_s: float | None,
+        keys: ClientKeys | None,
+    ) -> None:
+        self._endpoint, self._ask, self._idle_s = endpoint, ask, idle_s
+        self._topics, self._from_start, self._keys = topics, from_start, keys
+        self._core: _SubscriberCore | None = None
+
+    @property
+    def gaps(self) -> int:
+        """Slices that were missed."""
+        return 0 if self._core is None else self._core.gaps
+
+    @property
+    def recovered(self) -> int:
+        """Missed slices that came when they were asked for."""
+        return 0 if self._core is None else self._core.recovered
+
+    @property
+    def lost(self) -> int:
+        """Missed slices that were given up."""
+        return 0 if self._core is None else self._core.lost
+
+    def __iter__(self) -> Iterator[Message]:
+        with Subscriber(
+            self._endpoint, self._ask, topics=self._topics, from_start=self._from_start, keys=self._keys
+        ) as core:
+            self._core = core
+            while not core.finished:
+                message = core.receive(self._wait_s)
+                if message is not None:
+                    yield message
+                elif self._silent(core):
+                    return
+
+    async def __aiter__(self) -> AsyncIterator[Message]:
+        async with AsyncSubscriber(
+            self._endpoint, self._ask, topics=self._topics, from_start=self._from_start, keys=self._keys
+        ) as core:
+            self._core = core
+            while not core.finished:
+                message = await core.receive(self._wait_s)
+                if message is not None:
+                    yield message
+                elif self._silent(core):
+                    return
+
+    @property
+    def _wait_s(self) -> float:
+        return 1.0 if self._idle_s is None else self._idle_s
+
+    def _silent(self, core: _SubscriberCore) -> bool:
+        return self._idle_s is not None or core.ended
+
+
 def subscribe(
     endpoint: str,
-    ask: str = "",
+    ask: str | None = None,
     *,
     topics: Collection[str] = wire.TOPICS,
+    from_start: bool = False,
     idle_s: float | None = None,
-    keys: ClientKeys | None = None,
-) -> Iterator[Message]:
-    """Messages until the flight has ended and no answer is outstanding, or none came for `idle_s`."""
-    with Subscriber(endpoint, ask, topics=topics, keys=keys) as subscriber:
-        while not subscriber.finished:
-            message = subscriber.receive(1.0 if idle_s is None else idle_s)
-            if message is not None:
-                yield message
-            elif idle_s is not None or subscriber.ended:
-                return
+    keys: Path | str | None = None,
+    server_key: Path | str | None = None,
+) -> Subscription:
+    """Subscribe to a daemon's stream; iterate over the result with `for` or `async for`.
 
-
-async def subscribe_async(
-    endpoint: str,
-    ask: str = "",
-    *,
-    topics: Collection[str] = wire.TOPICS,
-    idle_s: float | None = None,
-    keys: ClientKeys | None = None,
-) -> AsyncIterator[Message]:
-    """As `subscribe`, for `async for`."""
-    async with AsyncSubscriber(endpoint, ask, topics=topics, keys=keys) as subscriber:
-        while not subscriber.finished:
-            message = await subscriber.receive(1.0 if idle_s is None else idle_s)
-            if message is not None:
-                yield message
-            elif idle_s is not None or subscriber.ended:
-                return
+    `ask` is the endpoint where lost slices are asked for again: by default the one beside an ipc endpoint, "" for none.
+    With `from_start` the slices that the flight sent before count as lost too. The loop ends after the flight, or when
+    no message came for `idle_s`. A tcp endpoint with CURVE needs both files: `keys`, your own NAME.key_secret, and
+    `server_key`, the vehicle's NAME.key. Raises KeyFileError for the files; the loop raises WireError for an endpoint
+    or a message that is none.
+    """
+    if (keys is None) != (server_key is None):
+        raise KeyFileError("keys and server_key go together: your own secret key, and the vehicle's public one")
+    pair = None
+    if keys is not None and server_key is not None:
+        pair = ClientKeys(load_own(Path(keys)), load_public(Path(server_key)))
+    if ask is None:
+        ask = f"{endpoint}.ask" if endpoint.startswith("ipc://") else ""
+    return Subscription(endpoint, ask, topics=topics, from_start=from_start, idle_s=idle_s, keys=pair)
 
 
 def _sent(header: Mapping[str, Any]) -> Any:

@@ -1,6 +1,6 @@
-"""What every camera driver must do. A driver's test module inherits `CameraContract` and gives it a `rig`.
+"""The contract of every camera driver as a test class: inherit `CameraContract` and define its fixture `rig`.
 
-The helpers look only at events and descriptors, so that they can't share a fault with the driver.
+The helpers use only events and descriptors, so that they can't share a fault with the driver.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 
-PATIENCE_S = 30.0
+_PATIENCE_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """A driver that was not started, and what its camera's n-th exposure (from 1) looks like as a file.
+    """A driver that was not started, and the file that its camera makes of its n-th exposure (from 1).
 
-    `follows`: its files come after their shots were deferred. `recorded`: its times are those of a recording. `loose`:
-    a camera that takes its pictures at any time, so that firing and arriving of several shots may be interleaved.
+    `follows`: files come after their shots were deferred. `recorded`: times are those of a recording. `loose`: a shot
+    may be fired before the file of the last one arrived, so that the events of several shots may be interleaved.
     """
 
     camera: Camera
@@ -43,8 +43,8 @@ class Rig:
     loose: bool = False
 
 
-def until(camera: Camera, wanted: Callable[[CameraEvent], bool], patience_s: float = PATIENCE_S) -> list[CameraEvent]:
-    """All events up to and with the first wanted one. Fails when it doesn't come."""
+def until(camera: Camera, wanted: Callable[[CameraEvent], bool], patience_s: float = _PATIENCE_S) -> list[CameraEvent]:
+    """Return all events up to and including the first wanted one. Fails when it doesn't come."""
     events: list[CameraEvent] = []
     deadline = time.monotonic() + patience_s
     while time.monotonic() < deadline:
@@ -53,61 +53,61 @@ def until(camera: Camera, wanted: Callable[[CameraEvent], bool], patience_s: flo
             events.append(event)
             if wanted(event):
                 return events
-    pytest.fail(f"what was waited for never came; there came {events}")
+    pytest.fail(f"the expected event never came; these came: {events}")
 
 
 def until_state(camera: Camera, state: str) -> StateChanged:
-    """The first change into this state."""
+    """Return the first change into this state."""
     found = until(camera, lambda event: isinstance(event, StateChanged) and event.state == state)[-1]
     assert isinstance(found, StateChanged)
     return found
 
 
 def until_shot_ends(camera: Camera, shot: int) -> list[CameraEvent]:
-    """All events up to and with the one that ends this shot."""
+    """Return all events up to and including the one that ends this shot."""
     return until(camera, lambda event: isinstance(event, Arrival | ShotFailed) and event.shot == shot)
 
 
 def arrived(camera: Camera, shot: int) -> Arrival:
-    """The file of this shot. Fails where it ends in another way."""
+    """Return the file of this shot. Fails where the shot ends in another way."""
     end = until_shot_ends(camera, shot)[-1]
     assert isinstance(end, Arrival), end
     return end
 
 
 def failed(camera: Camera, shot: int) -> str:
-    """Why this shot failed. Fails where it did not."""
+    """Return why this shot failed. Fails where it did not."""
     end = until_shot_ends(camera, shot)[-1]
     assert isinstance(end, ShotFailed), end
     return end.reason
 
 
 def until_quiet(camera: Camera) -> None:
-    """Until no event came for a while: a camera may tell its settings after it is ready."""
-    deadline = time.monotonic() + PATIENCE_S
+    """Wait until no event came for 0.3 s: a camera may report its settings after it is ready."""
+    deadline = time.monotonic() + _PATIENCE_S
     while camera.next_event(0.3) is not None:
         assert time.monotonic() < deadline, "events without end"
 
 
 def content(arrival: Arrival | Companion) -> bytes:
-    """The bytes behind an arrival's descriptor, read with pread; the descriptor is closed."""
+    """Return the bytes behind an arrival's descriptor, read with pread, and close the descriptor."""
     data = os.pread(arrival.blob.fd, arrival.blob.size + 1, 0)
     arrival.blob.close()
     return data
 
 
 def of_shots(events: list[CameraEvent], *, deferred: bool = True) -> list[tuple[type[CameraEvent], int | None]]:
-    """What the events say of shots: kind and shot."""
+    """Return kind and shot of the events that belong to shots."""
     others = (StateChanged, SettingsChanged) if deferred else (StateChanged, SettingsChanged, Deferred)
     return [(type(event), event.shot) for event in events if not isinstance(event, others)]  # type: ignore[union-attr]
 
 
 class CameraContract:
-    """Inherit, and give a `rig` fixture of the driver."""
+    """What every driver must do. Inherit it and define the fixture `rig` with your driver."""
 
     @pytest.fixture
     def rig(self) -> Iterator[Rig]:
-        """The driver under test; whoever inherits stops it."""
+        """The driver under test. The fixture that overrides this stops the driver after the test."""
         raise NotImplementedError
 
     def test_becomes_ready_and_says_who_it_is(self, rig: Rig) -> None:
@@ -142,11 +142,11 @@ class CameraContract:
         for shot in (3, 4, 5):
             rig.camera.fire(shot)
         events = until_shot_ends(rig.camera, 5)
-        told = of_shots(events, deferred=False)
+        reported = of_shots(events, deferred=False)
         in_order: list[tuple[type[CameraEvent], int | None]] = [
             (kind, shot) for shot in (3, 4, 5) for kind in (Fired, Arrival)
         ]
-        assert told == in_order or (rig.loose and sorted(told, key=in_order.index) == in_order)
+        assert reported == in_order or (rig.loose and sorted(reported, key=in_order.index) == in_order)
         arrivals = [event for event in events if isinstance(event, Arrival)]
         assert [content(each) for each in arrivals] == [rig.picture(number) for number in (1, 2, 3)]
         assert len({each.name for each in arrivals}) == 3
@@ -187,11 +187,11 @@ class CameraContract:
         until_quiet(rig.camera)
         for each in [one for one in rig.camera.settings() if one.choices]:
             rig.camera.change(each.name, each.choices[-1])
-            told = until(rig.camera, lambda event: isinstance(event, SettingsChanged))[-1]
-            assert isinstance(told, SettingsChanged)
-            assert not told.refused
-            assert told.settings == rig.camera.settings()
-            now = {one.name: one.value for one in told.settings}
+            reported = until(rig.camera, lambda event: isinstance(event, SettingsChanged))[-1]
+            assert isinstance(reported, SettingsChanged)
+            assert not reported.refused
+            assert reported.settings == rig.camera.settings()
+            now = {one.name: one.value for one in reported.settings}
             assert now[each.name] == each.choices[-1], each.name
 
     def test_a_shot_without_a_camera_fails_with_a_sentence(self, rig: Rig) -> None:

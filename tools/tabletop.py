@@ -1,4 +1,4 @@
-"""Frames of a simulated tabletop, for docs/products.md: python examples/tabletop.py FOLDER
+"""Frames of a simulated tabletop, for docs/products.md: python tools/tabletop.py FOLDER
 
 The reference camera, focused at 1.2 m, photographs five boards from 0.8 to 5 m, a stopped-down white card, and a
 board at 1 and at 4 m, to calibrate with.
