@@ -257,8 +257,8 @@ def latency(root: Path, frames: int) -> dict[str, float]:
     """A simulated flight: from "safe on disk" to "received by a subscriber", less the decode; and what a subscriber
     that was killed and started again has at the end."""
     from dappled.config import settings as configuration  # noqa: PLC0415  # the subscribers' processes load none of it
-    from dappled.daemon.pipeline.capture_requests import CaptureRequest  # noqa: PLC0415  # as above
     from dappled.daemon.pipeline.pending_shot import Observer  # noqa: PLC0415  # as above
+    from dappled.daemon.pipeline.repeats import CaptureRequest  # noqa: PLC0415  # as above
     from dappled.daemon.service import Service  # noqa: PLC0415  # as above
     from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # as above
 

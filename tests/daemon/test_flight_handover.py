@@ -11,7 +11,7 @@ import pytest
 from dappled.config import profiles
 from dappled.config.settings import CameraSettings, DecodeSettings, MaskSettings, Settings
 from dappled.daemon import flight_handover
-from dappled.daemon.camera_protocol.camera_settings import Knobs
+from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.flight_handover import BY_BODY, NONE, FlightHandover
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.pending_shot import Names
@@ -33,8 +33,8 @@ class NoBody:
         raise AssertionError(name)
 
 
-def knobs(settings: Settings, after: FlightHandover | None, ask: Callable[[Settings, str], None]) -> Knobs:
-    return Knobs(NoBody(), flight_handover.knobs(recipes.called(settings), after, lambda: settings, ask))
+def knobs(settings: Settings, after: FlightHandover | None, ask: Callable[[Settings, str], None]) -> Parameters:
+    return Parameters(NoBody(), flight_handover.parameters(recipes.called(settings), after, lambda: settings, ask))
 
 
 def test_each_shipped_mask_each_law_and_no_mask_can_be_chosen() -> None:
@@ -52,7 +52,7 @@ def test_lenslets_have_nothing_to_choose() -> None:
     assert (after.masks(), after.laws()) == ((), ())
     found = knobs(lenslets, after, lambda *_: None)
     with pytest.raises(CameraError, match="can't be changed"):
-        found.turn("LF_MASK", "mask-1")
+        found.change("LF_MASK", "mask-1")
 
 
 def test_a_calibration_counts_with_its_own_mask_and_law_alone() -> None:
@@ -77,8 +77,8 @@ def test_what_was_set_is_asked_for_and_a_second_setting_comes_on_top_of_the_firs
         after.next = following
 
     found = knobs(CONFIGURED, after, ask)
-    assert found.turn("LF_MASK", "mask-2")
-    assert found.turn("LF_LAW", "fd")
+    assert found.change("LF_MASK", "mask-2")
+    assert found.change("LF_LAW", "fd")
     assert asked == ["mask mask-2", "carrier law fd"]
     assert after.next is not None
     assert (after.next.mask.profile, after.next.decode.law) == ("mask-2", "fd")
@@ -92,12 +92,14 @@ def test_what_is_refused_is_not_shown() -> None:
     found = knobs(CONFIGURED, FlightHandover(CONFIGURED), ask)
     for name, word in (("LF_MASK", "mask-2"), ("LF_LAW", "fd")):
         with pytest.raises(CameraError, match="under way"):
-            found.turn(name, word)
+            found.change(name, word)
     assert [knob.value for knob in found.all()] == list(flight_handover.words(recipes.called(CONFIGURED)))
 
 
 def test_where_no_flight_can_follow_they_are_to_be_read() -> None:
-    found = Knobs(NoBody(), flight_handover.knobs(Names("auto", "", ""), None, lambda: CONFIGURED, lambda *_: None))
+    found = Parameters(
+        NoBody(), flight_handover.parameters(Names("auto", "", ""), None, lambda: CONFIGURED, lambda *_: None)
+    )
     assert [(knob.name, knob.value, knob.choices) for knob in found.all()] == [
         ("LF_MASK", NONE, ()),
         ("LF_LAW", BY_BODY, ()),

@@ -190,11 +190,11 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
     service = Service(settings, observer=Observer(finished=shots.append), after=after)
     service.start()
     eventually(lambda: service.health()["camera"]["state"] == "ready", "the camera is ready")
-    knobs = service._parts.component._parameters._knobs
+    parameters = service._parts.component._parameters._parameters
     camera.script = lambda _: []
     assert service.request(CaptureRequest("test", "console", 1)).index == 0
     with pytest.raises(CameraError, match="1 shots are under way"):
-        knobs.turn("LF_MASK", "mask-3")
+        parameters.change("LF_MASK", "mask-3")
     for event in good(0):
         assert not isinstance(event, Exception)
         camera.say(event)
@@ -202,13 +202,13 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
     service._parts.shutter.start_interval(CaptureRequest("test", "console", 2), 3600, 0)
     camera.script = good
     with pytest.raises(CameraError, match="stop the interval first"):
-        knobs.turn("LF_MASK", "mask-3")
+        parameters.change("LF_MASK", "mask-3")
     service._parts.shutter.stop_interval()
     for event in good(1):
         assert not isinstance(event, Exception)
         camera.say(event)
     eventually(lambda: service._parts.shutter.statistics().pending == 0, "the interval's shot's end")
-    assert knobs.turn("LF_MASK", "mask-3")
+    assert parameters.change("LF_MASK", "mask-3")
     assert "next flight begins" in str(service.request(CaptureRequest("test", "console", 3)).reason)
     service.run()  # ends by itself
     service.stop()

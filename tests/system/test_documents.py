@@ -10,9 +10,8 @@ import pytest
 
 from dappled.config.settings import CameraSettings, PublishSettings
 from dappled.daemon import reload
-from dappled.daemon.camera_protocol import packet_dedup
 from dappled.daemon.console import access, connection, hub
-from dappled.daemon.pipeline import capture_requests
+from dappled.daemon.pipeline import repeats
 from tests.system.documents import ROOT, Stage, commands, stage
 
 DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
@@ -53,15 +52,16 @@ NUMBERS = {
     ],
     "mavlink.md": [
         (
-            f"comes twice over one link within {packet_dedup.COPY_NS / 1e9:g} s, or over another link within "
-            f"{packet_dedup.OTHER_LINK_NS / 1e9:g} s"
+            f"comes twice over one link within {repeats.SAME_LINK_NS / 1e9:g} s, or over another link within "
+            f"{repeats.OTHER_LINK_NS / 1e9:g} s"
         ),
         (
-            f"within {capture_requests.RETRY_NS / 1e9:g} s of the last such message, and within "
-            f"{capture_requests.RETRY_LIMIT_NS / 1e9:g} s"
+            f"within {repeats.RETRY_NS / 1e9:g} s of the last such message, and within "
+            f"{repeats.RETRY_LIMIT_NS / 1e9:g} s"
         ),
-        f"where the sender itself says that it repeats, {capture_requests.CONFIRMED_RETRY_NS / 1e9:g} s",
-        f"within {capture_requests.TRIGGER_NS / 1e9:g} s of a shot's first message",
+        f"where the sender itself says that it repeats, {repeats.CONFIRMED_RETRY_NS / 1e9:g} s",
+        f"within {repeats.TRIGGER_NS / 1e9:g} s of a shot's first message",
+        f"within {repeats.ECHO_NS / 1e9:g} s of the",
     ],
     "operating.md": [
         f"a millisecond instead of {CameraSettings().latency_sigma_ms:g}",

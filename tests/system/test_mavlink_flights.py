@@ -11,7 +11,7 @@ import pytest
 
 from dappled.cli import main
 from dappled.config.schema import ConfigError
-from dappled.daemon.camera_protocol.camera_settings import code
+from dappled.daemon.camera_protocol.parameters import code
 from dappled.drivers.mavlink import signing as mavlink_signing
 from dappled.drivers.mavlink.links import mavlink
 from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from dappled.config import profiles
 from dappled.config.settings import Settings
-from dappled.daemon.camera_protocol.camera_settings import OwnKnob
+from dappled.daemon.camera_protocol.parameters import OwnParameter
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.pending_shot import Names
 from dappled.decode.optics.carriers import LAWS
@@ -71,9 +71,9 @@ def words(names: Names) -> tuple[str, str]:
     return names.mask or NONE, names.law or BY_BODY
 
 
-def knobs(
+def parameters(
     flown: Names, after: FlightHandover | None, now: Callable[[], Settings], ask: Callable[[Settings, str], None]
-) -> tuple[OwnKnob, OwnKnob]:
+) -> tuple[OwnParameter, OwnParameter]:
     """LF_MASK and LF_LAW of a flight, to be read only where nothing can come `after` it.
 
     `ask` takes the next flight's settings, made from those of `now`, and a sentence; a CameraError from it says why
@@ -81,21 +81,21 @@ def knobs(
     """
     mask, law = words(flown)
     if after is None:
-        return OwnKnob("LF_MASK", "Mask", lambda: mask), OwnKnob("LF_LAW", "Carrier law", lambda: law)
+        return OwnParameter("LF_MASK", "Mask", lambda: mask), OwnParameter("LF_LAW", "Carrier law", lambda: law)
 
-    def turn_mask(word: str) -> None:
+    def change_mask(word: str) -> None:
         nonlocal mask
         ask(after.with_mask(after.next or now(), word), f"mask {word}")
         mask = word
 
-    def turn_law(word: str) -> None:
+    def change_law(word: str) -> None:
         nonlocal law
         ask(after.with_law(after.next or now(), word), f"carrier law {word}")
         law = word
 
     return (
-        OwnKnob("LF_MASK", "Mask", lambda: mask, after.masks(), turn_mask),
-        OwnKnob("LF_LAW", "Carrier law", lambda: law, after.laws(), turn_law),
+        OwnParameter("LF_MASK", "Mask", lambda: mask, after.masks(), change_mask),
+        OwnParameter("LF_LAW", "Carrier law", lambda: law, after.laws(), change_law),
     )
 
 

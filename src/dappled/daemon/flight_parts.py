@@ -8,9 +8,10 @@ from typing import Protocol
 from dappled.clock import Clock
 from dappled.config.settings import Settings
 from dappled.daemon import flight_handover
-from dappled.daemon.camera_protocol import distance_sensor, ground_facts
-from dappled.daemon.camera_protocol.camera_settings import Knobs, OwnKnob
-from dappled.daemon.camera_protocol.component import CameraFacts, Captured, Component, Storage
+from dappled.daemon.camera_protocol import camera_status
+from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, Storage
+from dappled.daemon.camera_protocol.component import Component
+from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters
 from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.health import record
 from dappled.daemon.health.logbook import Logbook
@@ -77,7 +78,7 @@ class FlightParts:
             links,
             self.shutter,
             clock,
-            self._knobs(camera, names),
+            self._parameters(camera, names),
             self,
             feedback_is_shot=now.mavlink.feedback_is_shot,
         )
@@ -136,16 +137,18 @@ class FlightParts:
             tell=self._tell_distance if decode.depth_to_autopilot else lambda _: None,
         )
 
-    def _knobs(self, camera: Camera, names: Names) -> Knobs:
+    def _parameters(self, camera: Camera, names: Names) -> Parameters:
         """What a ground station may set: the body's settings, and here whether and by what frames are decoded."""
-        decoding = OwnKnob(
+        decoding = OwnParameter(
             "LF_DECODE",
             "Decode in flight",
             lambda: "on" if self.pipeline.decoding else "off",
             ("on", "off"),
             self._decode_in_flight if self.decoder else None,
         )
-        return Knobs(camera, (decoding, *flight_handover.knobs(names, self._after, self._settings, self._hand_over)))
+        return Parameters(
+            camera, (decoding, *flight_handover.parameters(names, self._after, self._settings, self._hand_over))
+        )
 
     # for the shutter (ShotSink)
 
@@ -182,13 +185,13 @@ class FlightParts:
 
     def storage(self) -> Storage | None:
         """See CameraModel."""
-        return ground_facts.storage(self._recording.folder.path)
+        return camera_status.disk_storage(self._recording.folder.path)
 
     def lookup(self, index: int) -> Captured | None:
         """See CameraModel."""
         if self.pipeline.in_hand(index):
             return None  # its own message will come
-        return ground_facts.of_record(index, self._recording.index)
+        return camera_status.captured_image(index, self._recording.index)
 
     def pose(self) -> Pose | None:
         """See CameraModel."""
@@ -219,6 +222,6 @@ class FlightParts:
 
     def _tell_distance(self, nearest_m: tuple[float, float]) -> None:
         boot_ms = (self._clock.monotonic_ns() // 10**6) % 2**32
-        told = distance_sensor.message(nearest_m, boot_ms, self._settings().pose.mount)
+        told = camera_status.distance_message(nearest_m, boot_ms, self._settings().pose.mount)
         if told is not None:
             self._links.send(told)

@@ -282,4 +282,4 @@ class Service:
         self._parts.on_packet(packet)
 
     def _order(self, number: int, parameters: Sequence[float]) -> str | None:
-        return self._parts.component.order(number, parameters)
+        return self._parts.component.command_autopilot(number, parameters)

@@ -10,9 +10,10 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 
 from dappled.clock import Clock, RecordedClock, SystemClock
-from dappled.daemon.camera_protocol.camera_settings import Knobs
-from dappled.daemon.camera_protocol.camera_status import DOWN
-from dappled.daemon.camera_protocol.component import CameraFacts, Captured, Component, Storage
+from dappled.config.settings import PoseSettings
+from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, Storage
+from dappled.daemon.camera_protocol.component import Component
+from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.navigation.navigation import Telemetry
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.drivers.camera import Setting, SettingName
@@ -57,7 +58,7 @@ class Camera:
             signing=signing,
         )
         self.shutter = Shutter(self, self.clock, next_index=first, capacity=capacity)
-        self.component = Component(self.links, self.shutter, self.clock, Knobs(self), self)
+        self.component = Component(self.links, self.shutter, self.clock, Parameters(self), self)
         self.component._identity.settled = settled
         self._worker = threading.Thread(target=self._work)
 
@@ -109,7 +110,7 @@ class Camera:
     def refused(self, request: CaptureRequest, reason: str) -> None:
         """Told to the sender alone."""
 
-    mount = DOWN
+    mount = PoseSettings().mount
 
     def facts(self) -> CameraFacts:
         return CameraFacts("dappled", "test", (0, 1, 0))

@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.clock import RecordedClock
-from dappled.daemon.camera_protocol.camera_settings import Knobs, OwnKnob, code
-from dappled.daemon.camera_protocol.camera_status import DOWN
-from dappled.daemon.camera_protocol.component import CameraFacts, Captured, Component, Storage
+from dappled.config.settings import PoseSettings
+from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, Storage
+from dappled.daemon.camera_protocol.component import Component
+from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters, code
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Setting, SettingName, check_change
 from dappled.drivers.mavlink.links import Message, Packet, mavlink, pack
@@ -47,7 +48,7 @@ class Rig:
     def __init__(self, *, feedback_is_shot: bool = False, capacity: int = 8) -> None:
         self.body = Body()
         self.decode = "on"
-        own = OwnKnob("LF_DECODE", "Decode in flight", lambda: self.decode, ("on", "off"), self._decode)
+        own = OwnParameter("LF_DECODE", "Decode in flight", lambda: self.decode, ("on", "off"), self._decode)
         self.system_id, self.component_id = 1, 100
         self.packer = mavlink.MAVLink(None)
         self.copies = 1
@@ -57,14 +58,14 @@ class Rig:
         self.clock = RecordedClock(10**18, 10**18 - 10**9)
         self.sink = FakeSink()
         self.shutter = Shutter(self.sink, self.clock, next_index=5, capacity=capacity)
-        knobs = Knobs(self.body, (own,))
+        knobs = Parameters(self.body, (own,))
         self.component = Component(self, self.shutter, self.clock, knobs, self, feedback_is_shot=feedback_is_shot)
 
     @property
     def fired(self) -> list[int]:
         return self.sink.fired
 
-    mount = DOWN
+    mount = PoseSettings().mount
 
     def facts(self) -> CameraFacts:
         return CameraFacts("Canon", "EOS 450D", (0, 1, 0), 50.0, 22.2, 14.8, 4272, 2848)
@@ -432,7 +433,7 @@ def test_an_unsigned_heartbeat_does_not_decide_whose_camera_this_is(late_s: floa
     autopilot_heartbeat(rig, 66)
     rig.tick(4)
     assert (rig.system_id, rig.component.vehicle) == (7, 7)
-    assert rig.component.order(2000, (0,)) is None
+    assert rig.component.command_autopilot(2000, (0,)) is None
     assert rig.of("COMMAND_LONG")[-1].target_system == 7
 
 
@@ -453,7 +454,7 @@ def test_the_echo_of_an_order_is_no_wish_and_the_next_trigger_is_one() -> None:
     fire = mavlink.MAVLink_command_long_message(0, 0, mavlink.MAV_CMD_DO_DIGICAM_CONTROL, 0, 0, 0, 0, 0, 1, 0, 0)
     feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
     for turn in range(2):
-        assert rig.component.order(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1)) is None
+        assert rig.component.command_autopilot(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1)) is None
         rig.clock.advance(0.05)
         for message in (mavlink.MAVLink_camera_trigger_message(1, turn), fire, feedback):
             rig.hear(message, AUTOPILOT)
@@ -461,7 +462,7 @@ def test_the_echo_of_an_order_is_no_wish_and_the_next_trigger_is_one() -> None:
     assert rig.fired == []
     rig.hear(mavlink.MAVLink_camera_trigger_message(9, 9), AUTOPILOT)
     assert rig.fired == [5]
-    rig.component.order(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1))
+    rig.component.command_autopilot(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1))
     rig.clock.advance(2.1)
     rig.hear(mavlink.MAVLink_camera_trigger_message(10, 10), AUTOPILOT)
     assert rig.fired == [5, 6]
@@ -557,10 +558,10 @@ def test_no_parameters_crash_it(command: int, parameters: list[float], confirmat
 
 def test_the_autopilot_is_given_orders_and_its_refusal_is_told() -> None:
     rig = Rig()
-    assert rig.component.order(181, (0, 1)) is not None  # nobody was heard yet
+    assert rig.component.command_autopilot(181, (0, 1)) is not None  # nobody was heard yet
     rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3), sender=(1, 1))
     rig.tick(4)
-    assert rig.component.order(181, (0, 1)) is None
+    assert rig.component.command_autopilot(181, (0, 1)) is None
     (order,) = rig.of("COMMAND_LONG")[-1:]
     assert (order.target_system, order.target_component, order.command) == (1, 1, 181)
     assert (order.param1, order.param2, order.param7) == (0, 1, 0)

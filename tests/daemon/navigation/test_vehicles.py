@@ -15,8 +15,8 @@ from dappled.clock import SystemClock
 from dappled.config import settings as configuration
 from dappled.config.settings import MavlinkSettings, PoseSettings, PublishSettings, RecordSettings, Settings
 from dappled.daemon import service as module
-from dappled.daemon.camera_protocol import identity
-from dappled.daemon.camera_protocol.identity import Identity
+from dappled.daemon.camera_protocol import autopilot
+from dappled.daemon.camera_protocol.autopilot import SystemIdentity
 from dappled.daemon.navigation.clocks import ExposureTime
 from dappled.daemon.navigation.navigation import Navigation, Telemetry, recorded_vehicles
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
@@ -108,7 +108,7 @@ def test_a_change_of_vehicle_that_could_not_be_recorded_is_recorded_later(
     ("heard", "vehicle"), [((), None), ((7,), 7), ((2, 1), 1), ((2, 3), 1)], ids=["none", "one", "ours too", "others"]
 )
 def test_whose_telemetry_counts(heard: tuple[int, ...], vehicle: int | None) -> None:
-    one = Identity(1, 0)
+    one = SystemIdentity(1, 0)
     for system in heard:
         message = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)
         message.pack(mavlink.MAVLink(None, srcSystem=system, srcComponent=1))
@@ -121,7 +121,7 @@ def test_whose_telemetry_counts(heard: tuple[int, ...], vehicle: int | None) -> 
 @pytest.fixture
 def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Settings]:
     monkeypatch.setattr(module, "open_camera", lambda _: FakeCamera())
-    monkeypatch.setattr(identity, "LISTEN_NS", 5 * 10**8)
+    monkeypatch.setattr(autopilot, "LISTEN_NS", 5 * 10**8)
     with tempfile.TemporaryDirectory(prefix="dpl-") as sockets:
         yield configuration.resolve(
             Settings(

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dappled.daemon.camera_protocol.camera_status import DOWN
+from dappled.config.settings import PoseSettings
 from dappled.decode.geometry.field_of_view import EARTH_RADIUS_M, angle_rad, look
 from tests.daemon.fakes import no_pose
 
@@ -23,6 +23,8 @@ LEVEL = replace(
     height_above_home_m=100.0,
     attitude=(1.0, 0.0, 0.0, 0.0),
 )
+
+DOWN = PoseSettings().mount
 
 
 def test_a_camera_that_looks_down_sees_what_is_below() -> None:

@@ -1,73 +1,162 @@
-"""The commands of the camera protocol, one function each: what is done, and what is answered."""
+"""The commands of the camera protocol: what each one does, and how it is answered."""
 
 from __future__ import annotations
 
 import math
+import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from dappled.clock import Clock
-from dappled.daemon.camera_protocol.camera_settings import Knobs
-from dappled.daemon.camera_protocol.camera_status import ZOOM, Telling
-from dappled.daemon.camera_protocol.command import ACCEPTED, DENIED, REJECTED, UNSUPPORTED, Answer, Command, judged
-from dappled.daemon.camera_protocol.message_intervals import MessageIntervals
-from dappled.daemon.pipeline.capture_requests import Recent
-from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
+from dappled.daemon.camera_protocol.camera_status import ZOOM, CameraStatus
+from dappled.daemon.camera_protocol.parameters import Parameters
+from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
+from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
 from dappled.drivers.camera import CameraError
-from dappled.drivers.mavlink.links import mavlink
+from dappled.drivers.mavlink.links import Message, mavlink
 
+ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
+DENIED = mavlink.MAV_RESULT_DENIED
+UNSUPPORTED = mavlink.MAV_RESULT_UNSUPPORTED
+REJECTED = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
 OLD_IMAGES = 256
-_WALKS = 16
+SHORTEST_NS = 100_000_000  # 10 Hz: nothing here changes faster
+LONGEST_US = 3.6e9
+_SEQUENCES = 16
 _ZOOM_STEP, _ZOOM_RANGE, _ZOOM_FOCAL_LENGTH, _ZOOM_WIDTH = 0, 2, 3, 4
 
 
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A COMMAND_LONG or COMMAND_INT. Parameters may be NaN. `broadcast`: to all components."""
+
+    name: int
+    parameters: tuple[float, ...]
+    confirmation: int
+    system: int
+    component: int
+    link: int
+    broadcast: bool
+
+    @classmethod
+    def of(cls, message: Message, link: int) -> Command:
+        """From a COMMAND_LONG or COMMAND_INT."""
+        is_long = message.get_type() == "COMMAND_LONG"
+        last = (message.param5, message.param6, message.param7) if is_long else (message.x, message.y, message.z)
+        return cls(
+            message.command,
+            (message.param1, message.param2, message.param3, message.param4, *map(float, last)),
+            message.confirmation if is_long else 0,
+            message.get_srcSystem(),
+            message.get_srcComponent(),
+            link,
+            message.target_component == 0,
+        )
+
+    def number(self, place: int, default: float = 0.0) -> float:
+        """Parameter 1 to 7; the default for NaN and infinities."""
+        value = self.parameters[place - 1]
+        return value if math.isfinite(value) else default
+
+    def integer(self, place: int, default: int = 0) -> int:
+        """Parameter 1 to 7 as an integer; the default where it is not finite."""
+        return round(self.number(place, float(default)))
+
+    @property
+    def source(self) -> str:
+        """The sender, as causes name it."""
+        return f"mavlink:{self.system}/{self.component}"
+
+
+@dataclass(frozen=True, slots=True)
+class CommandAnswer:
+    """The result of a command, messages that follow the acknowledgement, and text for the pilot."""
+
+    result: int
+    then: tuple[Message, ...] = ()
+    words: str | None = None
+
+
+class MessageIntervals:
+    """The messages that were asked for at an interval (MAV_CMD_SET_MESSAGE_INTERVAL).
+
+    One set for all links, as a link has no name of its own in the protocol.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._intervals: dict[int, tuple[int, int]] = {}  # message id: (interval_ns, due_ns)
+
+    def set(self, message_id: int, interval_us: float, now_ns: int) -> None:
+        """Send it every `interval_us` microseconds, at most at 10 Hz; 0 or less: stop."""
+        with self._lock:
+            self._intervals.pop(message_id, None)
+            if interval_us > 0:
+                interval_ns = max(SHORTEST_NS, round(min(interval_us, LONGEST_US) * 1e3))
+                self._intervals[message_id] = (interval_ns, now_ns + interval_ns)
+
+    def interval_us(self, message_id: int) -> int:
+        """The interval in microseconds; 0 where none is set."""
+        with self._lock:
+            return self._intervals.get(message_id, (0, 0))[0] // 1000
+
+    def due(self, now_ns: int) -> list[int]:
+        """The messages that are due by now; the next of each is due an interval later."""
+        with self._lock:
+            due = [number for number, (_, due_ns) in self._intervals.items() if now_ns >= due_ns]
+            for number in due:
+                interval_ns = self._intervals[number][0]
+                self._intervals[number] = (interval_ns, now_ns + interval_ns)
+        return due
+
+
 class CameraCommands:
-    """Answers commands from memory. `wanted_images` are the past images that were asked for, (index, link)."""
+    """Answers commands from memory. `wanted_images` are the past images asked for, (index, link)."""
 
     def __init__(
         self,
         shutter: Shutter,
         clock: Clock,
-        telling: Telling,
-        knobs: Knobs,
+        status: CameraStatus,
+        parameters: Parameters,
         intervals: MessageIntervals,
     ) -> None:
-        self._shutter, self._clock, self._telling, self._knobs = shutter, clock, telling, knobs
+        self._shutter, self._clock, self._status, self._parameters = shutter, clock, status, parameters
         self._intervals = intervals
-        self._steps = Recent()
-        self._walks: dict[str, int] = {}  # who asks without an index: the next image for it
+        self._steps = RecentRequests()
+        self._next_images: dict[str, int] = {}  # by source: the next image for a request without an index
         self.wanted_images: deque[tuple[int, int]] = deque()
 
-    def answer(self, command: Command) -> Answer:
+    def answer(self, command: Command) -> CommandAnswer:
         """Do it, or say why not. Never raises for what a command says."""
         handler = _COMMANDS.get(command.name)
-        return Answer(UNSUPPORTED) if handler is None else handler(self, command)
+        return CommandAnswer(UNSUPPORTED) if handler is None else handler(self, command)
 
     # photographs
 
     def fires(self, command: Command) -> bool:
         """Whether it asks for one photograph now."""
         if command.name == mavlink.MAV_CMD_IMAGE_START_CAPTURE:
-            return command.whole(3, 1) == 1
-        return command.name == mavlink.MAV_CMD_DO_DIGICAM_CONTROL and command.whole(5) == 1
+            return command.integer(3, 1) == 1
+        return command.name == mavlink.MAV_CMD_DO_DIGICAM_CONTROL and command.integer(5) == 1
 
-    def _start_capture(self, command: Command) -> Answer:
-        count = command.whole(3, 1)
+    def _start_capture(self, command: Command) -> CommandAnswer:
+        count = command.integer(3, 1)
         request = CaptureRequest(
-            command.source, "IMAGE_START_CAPTURE", command.whole(4), command.confirmation, command.link
+            command.source, "IMAGE_START_CAPTURE", command.integer(4), command.confirmation, command.link
         )
         if count == 1:
-            return judged(self._shutter.request(request))
-        return judged(self._shutter.start_interval(request, command.number(2), count))
+            return _decided(self._shutter.request(request))
+        return _decided(self._shutter.start_interval(request, command.number(2), count))
 
-    def _stop_capture(self, command: Command) -> Answer:
+    def _stop_capture(self, command: Command) -> CommandAnswer:
         self._shutter.stop_interval(command.source)
-        return Answer(ACCEPTED)
+        return CommandAnswer(ACCEPTED)
 
-    def _digicam_control(self, command: Command) -> Answer:
-        if command.whole(5) != 1:
-            return Answer(ACCEPTED if command.broadcast else UNSUPPORTED)
+    def _digicam_control(self, command: Command) -> CommandAnswer:
+        if command.integer(5) != 1:
+            return CommandAnswer(ACCEPTED if command.broadcast else UNSUPPORTED)
         request = CaptureRequest(
             command.source,
             "DO_DIGICAM_CONTROL",
@@ -76,111 +165,111 @@ class CameraCommands:
             command.link,
             acknowledged=not command.broadcast,
         )
-        return judged(self._shutter.request(request))
+        return _decided(self._shutter.request(request))
 
     # questions
 
-    def _request_message(self, command: Command) -> Answer:
-        number = command.whole(1, -1)
+    def _request_message(self, command: Command) -> CommandAnswer:
+        number = command.integer(1, -1)
         if number == mavlink.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED:
             return self._old_image(command, 2)
         if number == mavlink.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
             return self._get_interval(command, 2)
-        return self._tell(number)
+        return self._send_status(number)
 
-    def _tell(self, number: int) -> Answer:
-        message = self._telling.about(number)
-        return Answer(UNSUPPORTED) if message is None else Answer(ACCEPTED, (message,))
+    def _send_status(self, number: int) -> CommandAnswer:
+        message = self._status.about(number)
+        return CommandAnswer(UNSUPPORTED) if message is None else CommandAnswer(ACCEPTED, (message,))
 
-    def _request_image(self, command: Command) -> Answer:
+    def _request_image(self, command: Command) -> CommandAnswer:
         return self._old_image(command, 1)
 
-    def _old_image(self, command: Command, place: int) -> Answer:
-        """How a past shot ended. MAVSDK, which lists photographs from before it came, leaves the index out (NaN) each
-        time: it is told one after the other, from the first."""
+    def _old_image(self, command: Command, place: int) -> CommandAnswer:
+        """How a past shot ended. MAVSDK leaves the index out (NaN) when it lists photographs from before it connected:
+        each such request gets the next image, from the first on."""
         count = self._shutter.statistics().next_index
         if len(self.wanted_images) >= OLD_IMAGES:
-            return Answer(REJECTED, words=f"{OLD_IMAGES} past images are being looked up: ask again")
+            return CommandAnswer(REJECTED, words=f"{OLD_IMAGES} past images are being looked up: ask again")
         if math.isfinite(command.parameters[place - 1]):
-            index = command.whole(place)
+            index = command.integer(place)
         else:
-            index = self._walks.pop(command.source, 0) % max(count, 1)
-            self._walks[command.source] = index + 1
-            if len(self._walks) > _WALKS:
-                self._walks.pop(next(iter(self._walks)))
+            index = self._next_images.pop(command.source, 0) % max(count, 1)
+            self._next_images[command.source] = index + 1
+            if len(self._next_images) > _SEQUENCES:
+                self._next_images.pop(next(iter(self._next_images)))
         if not 0 <= index < count:
-            return Answer(DENIED, words=f"no image {index}: there are {count}")
+            return CommandAnswer(DENIED, words=f"no image {index}: there are {count}")
         self.wanted_images.append((index, command.link))
-        return Answer(ACCEPTED)
+        return CommandAnswer(ACCEPTED)
 
-    def _set_interval(self, command: Command) -> Answer:
+    def _set_interval(self, command: Command) -> CommandAnswer:
         """511 for one of our messages: microseconds, -1 off, 0 default (off)."""
-        number = command.whole(1, -1)
-        if not self._telling.knows(number):
-            return Answer(UNSUPPORTED)
+        number = command.integer(1, -1)
+        if not self._status.knows(number):
+            return CommandAnswer(UNSUPPORTED)
         self._intervals.set(number, command.number(2, -1.0), self._clock.monotonic_ns())
-        return Answer(ACCEPTED)
+        return CommandAnswer(ACCEPTED)
 
-    def _get_interval(self, command: Command, place: int = 1) -> Answer:
-        """510: the interval in microseconds, -1 for off, 0 for a message that there isn't."""
-        number = command.whole(place, -1)
+    def _get_interval(self, command: Command, place: int = 1) -> CommandAnswer:
+        """510: the interval in microseconds, -1 for off, 0 for an unknown message."""
+        number = command.integer(place, -1)
         if not 0 <= number < 65536:
-            return Answer(DENIED)
+            return CommandAnswer(DENIED)
         interval_us = self._intervals.interval_us(number) or -1
-        known = self._telling.knows(number)
-        return Answer(ACCEPTED, (mavlink.MAVLink_message_interval_message(number, interval_us if known else 0),))
+        known = self._status.knows(number)
+        return CommandAnswer(ACCEPTED, (mavlink.MAVLink_message_interval_message(number, interval_us if known else 0),))
 
     # settings
 
-    def _set_mode(self, command: Command) -> Answer:
-        mode = command.whole(2, -1)
+    def _set_mode(self, command: Command) -> CommandAnswer:
+        mode = command.integer(2, -1)
         if mode not in (mavlink.CAMERA_MODE_IMAGE, mavlink.CAMERA_MODE_IMAGE_SURVEY):
-            return Answer(DENIED, (self._telling.settings(),), "this camera takes photographs only")
-        self._telling.mode = mode
-        return Answer(ACCEPTED, (self._telling.settings(),))
+            return CommandAnswer(DENIED, (self._status.settings(),), "this camera takes photographs only")
+        self._status.mode = mode
+        return CommandAnswer(ACCEPTED, (self._status.settings(),))
 
-    def _reset_settings(self, command: Command) -> Answer:
-        """529: what this protocol has set, which is the mode; the body keeps what its dials say."""
-        self._telling.mode = mavlink.CAMERA_MODE_IMAGE
-        return Answer(ACCEPTED, (self._telling.settings(),))
+    def _reset_settings(self, command: Command) -> CommandAnswer:
+        """529: reset what this protocol has set, which is the mode; the body's dials keep their settings."""
+        self._status.mode = mavlink.CAMERA_MODE_IMAGE
+        return CommandAnswer(ACCEPTED, (self._status.settings(),))
 
-    def _zoom(self, command: Command) -> Answer:
+    def _zoom(self, command: Command) -> CommandAnswer:
         """531: to the nearest focal length that the body offers."""
-        lengths = self._telling.focal_lengths()
+        lengths = self._status.focal_lengths()
         if not lengths:
-            return Answer(DENIED, words="no zoom: this lens is zoomed by hand")
-        kind, value = command.whole(1, -1), command.number(2, math.nan)
+            return CommandAnswer(DENIED, words="no zoom: this lens is zoomed by hand")
+        kind, value = command.integer(1, -1), command.number(2, math.nan)
         step = CaptureRequest(
             command.source, "SET_CAMERA_ZOOM", None, command.confirmation, command.link, series=(kind, value)
         )
         now_ns = self._clock.monotonic_ns()
         if kind == _ZOOM_STEP and self._steps.same(step, now_ns) is not None:
-            return Answer(ACCEPTED)  # its sender missed the answer
+            return CommandAnswer(ACCEPTED)  # a retry: its sender missed the answer
         at = self._zoom_target(kind, value, [mm for mm, _ in lengths])
         if at is None:
-            return Answer(DENIED, words="zoom goes by step, range, focal length or field of view")
+            return CommandAnswer(DENIED, words="zoom goes by step, range, focal length or field of view")
         try:
-            self._knobs.turn(ZOOM, lengths[at][1])
+            self._parameters.change(ZOOM, lengths[at][1])
         except CameraError as error:
-            return Answer(DENIED, words=str(error))
+            return CommandAnswer(DENIED, words=str(error))
         self._steps.forget(replace(step, series=(kind, -value)))  # forth, back and forth again is three steps
         if kind == _ZOOM_STEP:
             self._steps.add(step, now_ns, at)
-        return Answer(ACCEPTED)
+        return CommandAnswer(ACCEPTED)
 
     def _zoom_target(self, kind: int, value: float, lengths_mm: list[float]) -> int | None:
         last = len(lengths_mm) - 1
         if not math.isfinite(value):
             return None
         if kind == _ZOOM_STEP:
-            percent = self._telling.zoom_percent()
+            percent = self._status.zoom_percent()
             now = 0 if math.isnan(percent) else round(percent * last / 100)
             return min(max(now + round(math.copysign(min(abs(value), 1), value)), 0), last)
         if kind == _ZOOM_RANGE and 0 <= value <= 100:
             return round(value / 100 * last)
         wanted_mm = value
         if kind == _ZOOM_WIDTH:
-            width_mm = self._telling.sensor_width_mm()
+            width_mm = self._status.sensor_width_mm()
             if not width_mm or not 0 < value < 180:
                 return None
             wanted_mm = width_mm / 2 / math.tan(math.radians(value) / 2)
@@ -188,19 +277,19 @@ class CameraCommands:
             return None
         return min(range(last + 1), key=lambda at: abs(lengths_mm[at] - wanted_mm))
 
-    def _focus(self, command: Command) -> Answer:
-        return Answer(DENIED, words="no focus: this lens is focused by hand")
+    def _focus(self, command: Command) -> CommandAnswer:
+        return CommandAnswer(DENIED, words="no focus: this lens is focused by hand")
 
-    def _format(self, command: Command) -> Answer:
-        return Answer(DENIED, (self._telling.disk(),), "flights are not erased over MAVLink")
+    def _format(self, command: Command) -> CommandAnswer:
+        return CommandAnswer(DENIED, (self._status.disk(),), "flights are not erased over MAVLink")
 
 
-def _requests(number: int) -> Callable[[CameraCommands, Command], Answer]:
+def _requests(number: int) -> Callable[[CameraCommands, Command], CommandAnswer]:
     """The old 52x commands: one message each, whatever parameter 1 says (Mission Planner sends 0)."""
-    return lambda commands, command: commands._tell(number)
+    return lambda commands, command: commands._send_status(number)
 
 
-_COMMANDS: dict[int, Callable[[CameraCommands, Command], Answer]] = {
+_COMMANDS: dict[int, Callable[[CameraCommands, Command], CommandAnswer]] = {
     mavlink.MAV_CMD_IMAGE_START_CAPTURE: CameraCommands._start_capture,
     mavlink.MAV_CMD_IMAGE_STOP_CAPTURE: CameraCommands._stop_capture,
     mavlink.MAV_CMD_DO_DIGICAM_CONTROL: CameraCommands._digicam_control,
@@ -218,3 +307,10 @@ _COMMANDS: dict[int, Callable[[CameraCommands, Command], Answer]] = {
     mavlink.MAV_CMD_SET_CAMERA_FOCUS: CameraCommands._focus,
     mavlink.MAV_CMD_STORAGE_FORMAT: CameraCommands._format,
 }
+
+
+def _decided(decision: ShotDecision) -> CommandAnswer:
+    """The answer to a capture request. ACCEPTED means that the shot will be attempted."""
+    if decision.accepted:
+        return CommandAnswer(ACCEPTED)
+    return CommandAnswer(REJECTED, words=f"no photo: {decision.reason}")

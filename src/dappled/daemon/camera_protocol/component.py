@@ -1,7 +1,7 @@
-"""The MAVLink camera (Camera Protocol v2): hears messages, answers at once, tells how shots ended.
+"""The MAVLink camera (Camera Protocol v2): answer messages at once, and report how shots ended.
 
-`on_packet` runs in a link's receiving thread and only answers from memory; what may touch a disk (an old image looked
-up by index) waits for `tick`, which the daemon's working loop calls: no working loop, no heartbeat.
+`on_packet` runs in a link's receiving thread and only answers from memory. What may read a disk (an old image looked up
+by index) waits for `tick`, which the daemon's working loop calls: without the loop there is no heartbeat.
 """
 
 from __future__ import annotations
@@ -9,59 +9,28 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 from dappled.clock import Clock
-from dappled.daemon.camera_protocol import messages
-from dappled.daemon.camera_protocol.autopilot import Links, OwnAutopilot
-from dappled.daemon.camera_protocol.camera_settings import Knobs
-from dappled.daemon.camera_protocol.camera_status import Telling
-from dappled.daemon.camera_protocol.command import ACCEPTED, UNSUPPORTED, Answer, Command
-from dappled.daemon.camera_protocol.commands import CameraCommands
+from dappled.daemon.camera_protocol.autopilot import Links, OwnAutopilot, SystemIdentity
+from dappled.daemon.camera_protocol.camera_status import CameraModel, CameraStatus, Captured, image_captured
+from dappled.daemon.camera_protocol.commands import (
+    ACCEPTED,
+    UNSUPPORTED,
+    CameraCommands,
+    Command,
+    CommandAnswer,
+    MessageIntervals,
+)
 from dappled.daemon.camera_protocol.ftp_server import FtpServer
-from dappled.daemon.camera_protocol.identity import Identity
-from dappled.daemon.camera_protocol.message_intervals import MessageIntervals
-from dappled.daemon.camera_protocol.messages import CameraFacts, Captured, Storage
-from dappled.daemon.camera_protocol.packet_dedup import Copies
-from dappled.daemon.camera_protocol.parameters import Parameters, Reply
+from dappled.daemon.camera_protocol.parameters import ParameterReply, Parameters, ParameterServer
 from dappled.daemon.health.status_text import GroundStations, PilotMessages
-from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
-from dappled.decode.geometry.pose import Pose
+from dappled.daemon.pipeline.repeats import CaptureRequest, PacketDedup
+from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.mavlink.links import Message, Packet, mavlink
-
-__all__ = ["CameraFacts", "CameraModel", "Captured", "Component", "Storage"]
 
 HEARTBEAT_NS = 10**9
 STATUS_NS = 100_000_000
 _OLD_IMAGES_A_TICK = 2
-
-
-class CameraModel(Protocol):
-    """What the component reports about the camera. Every method but `lookup` answers from memory.
-
-    `mount` turns camera axes to body axes (nine numbers, row by row).
-    """
-
-    @property
-    def mount(self) -> tuple[float, ...]: ...
-
-    def facts(self) -> CameraFacts:
-        """Make, model, lens and sensor, as far as they are known."""
-
-    def storage(self) -> Storage | None:
-        """The disk that frames go to; None while it can't be read."""
-
-    def lookup(self, index: int) -> Captured | None:
-        """How an old shot ended; None for one that never was. May read a disk."""
-
-    def pose(self) -> Pose | None:
-        """The vehicle's pose now; None while it is unknown."""
-
-    def healthy(self) -> bool:
-        """Whether a heartbeat is sent."""
-
-    def troubled(self) -> bool:
-        """Whether the heartbeat says MAV_STATE_CRITICAL."""
 
 
 class Component:
@@ -75,30 +44,21 @@ class Component:
         links: Links,
         shutter: Shutter,
         clock: Clock,
-        knobs: Knobs,
+        parameters: Parameters,
         model: CameraModel,
         *,
         feedback_is_shot: bool = False,
     ) -> None:
         self._links, self._shutter, self._clock = links, shutter, clock
         self._model, self._feedback_is_shot = model, feedback_is_shot
-        self._telling = Telling(
-            shutter,
-            clock,
-            knobs,
-            links.component_id,
-            facts=model.facts,
-            storage=model.storage,
-            pose=model.pose,
-            mount=model.mount,
-        )
+        self._status = CameraStatus(model, shutter, parameters, clock, component_id=links.component_id)
         self._intervals = MessageIntervals()
-        self._commands = CameraCommands(shutter, clock, self._telling, knobs, self._intervals)
-        self._parameters = Parameters(knobs)
-        self._files = FtpServer(self._telling.files)
-        self._identity = Identity(links.system_id, clock.monotonic_ns())
+        self._commands = CameraCommands(shutter, clock, self._status, parameters, self._intervals)
+        self._parameters = ParameterServer(parameters)
+        self._files = FtpServer(self._status.files)
+        self._identity = SystemIdentity(links.system_id, clock.monotonic_ns())
         self._autopilot = OwnAutopilot(links, self._identity, clock)
-        self._copies = Copies()
+        self._dedup = PacketDedup()
         self._lines, self._stations = PilotMessages(), GroundStations()
         self._results: deque[tuple[Command, int]] = deque(maxlen=64)
         self._heartbeat_due_ns = self._status_due_ns = 0
@@ -112,11 +72,11 @@ class Component:
 
     @property
     def vehicle(self) -> int | None:
-        """The system whose telemetry counts (see `Identity.vehicle`)."""
+        """The system whose telemetry counts (see `SystemIdentity.vehicle`)."""
         return self._identity.vehicle()
 
     def doubt(self) -> str | None:
-        """A sentence where the camera may belong to the wrong system (see `Identity.doubt`)."""
+        """A sentence where the camera may belong to the wrong system (see `SystemIdentity.doubt`)."""
         return self._identity.doubt()
 
     # what comes in
@@ -143,11 +103,11 @@ class Component:
         if not self._is_for_us(packet.message):
             return
         command = Command.of(packet.message, packet.link)
-        if self._is_copy(packet):
+        if self._is_duplicate(packet):
             self._acknowledge_again(command)
             return
         echo = self._commands.fires(command) and self._autopilot.is_echo(packet, str(command.name))
-        answer = Answer(ACCEPTED) if echo else self._commands.answer(command)
+        answer = CommandAnswer(ACCEPTED) if echo else self._commands.answer(command)
         if not command.broadcast or answer.result == ACCEPTED:  # a broadcast is for whoever can: never refused
             self._acknowledge(command, answer.result)
             self._results.append((command, answer.result))
@@ -176,7 +136,7 @@ class Component:
         """CAMERA_TRIGGER (112), and CAMERA_FEEDBACK (180) where the autopilot fires: nobody acknowledges these."""
         message = packet.message
         name = message.get_type()
-        if message.get_srcSystem() != self._identity.system_id or self._is_copy(packet):
+        if message.get_srcSystem() != self._identity.system_id or self._is_duplicate(packet):
             return
         if name == "CAMERA_FEEDBACK" and not self._feedback_is_shot:
             return  # the hot shoe's time of a shot that is known already: telemetry has it
@@ -191,7 +151,7 @@ class Component:
 
     def _parameter(self, packet: Packet) -> None:
         message = packet.message
-        if not self._is_for_us(message) or self._is_copy(packet):
+        if not self._is_for_us(message) or self._is_duplicate(packet):
             return
         name = message.get_type()
         if name == "PARAM_EXT_REQUEST_LIST":
@@ -199,10 +159,10 @@ class Component:
         elif name == "PARAM_EXT_REQUEST_READ":
             reply = self._parameters.read(message)
         else:
-            self._send_news()  # what changed before is told apart from what this changes
+            self._send_changed_parameters()  # what changed before is told apart from what this changes
             reply = self._parameters.set(message, packet.link, self._clock.monotonic_ns())
         self._send_reply(reply, packet.link)
-        self._send_news()
+        self._send_changed_parameters()
 
     def _file(self, packet: Packet) -> None:
         if packet.message.target_component == self._links.component_id and self._is_for_us(packet.message):
@@ -214,23 +174,23 @@ class Component:
         systems = (0, self._links.system_id, self._identity.system_id)
         return message.target_system in systems and message.target_component in (0, self._links.component_id)
 
-    def _is_copy(self, packet: Packet) -> bool:
-        return self._copies.is_copy(packet, self._clock.monotonic_ns())
+    def _is_duplicate(self, packet: Packet) -> bool:
+        return self._dedup.is_duplicate(packet, self._clock.monotonic_ns())
 
-    def _ordered_result(self, packet: Packet) -> None:
+    def _command_result(self, packet: Packet) -> None:
         refusal = self._autopilot.refusal(packet.message)
         if refusal is not None:
             self.say(refusal)
 
     # what goes out
 
-    def order(self, number: int, parameters: Sequence[float]) -> str | None:
-        """Give our autopilot a command (MAV_CMD, parameters from the first); a sentence where it can't be given."""
-        return self._autopilot.order(number, parameters)
+    def command_autopilot(self, number: int, parameters: Sequence[float]) -> str | None:
+        """Send our autopilot a command (MAV_CMD, parameters from the first); a sentence where it can't be sent."""
+        return self._autopilot.command(number, parameters)
 
     def announce(self, captured: Captured) -> None:
         """A shot ended, its frame safe or lost: tell everybody, once."""
-        self._links.send(messages.image_captured(captured, self._telling.boot_ms()))
+        self._links.send(image_captured(captured, self._status.boot_ms()))
         self.state_changed()
 
     def state_changed(self) -> None:
@@ -241,8 +201,8 @@ class Component:
         """The body told its settings, with its sentence where it would not have a change."""
         for link, reply in self._parameters.settled(self._clock.monotonic_ns(), refused):
             self._send_reply(reply, link)
-        self._send_news()
-        self._links.send(self._telling.settings())
+        self._send_changed_parameters()
+        self._links.send(self._status.settings())
 
     def say(self, text: str, severity: int = mavlink.MAV_SEVERITY_WARNING) -> None:
         """A line for the pilot (STATUSTEXT)."""
@@ -275,21 +235,21 @@ class Component:
         if self._status_wanted.is_set() and now_ns >= self._status_due_ns:
             self._status_wanted.clear()
             self._status_due_ns = now_ns + STATUS_NS
-            self._links.send(self._telling.status())
+            self._links.send(self._status.status())
         for number in self._intervals.due(now_ns):
-            self._links.send(self._telling.about(number))
+            self._links.send(self._status.about(number))
         for link, reply in self._parameters.settled(now_ns):
             self._send_reply(reply, link)
         self._send_old_images()
 
-    def _send_reply(self, reply: Reply, link: int) -> None:
+    def _send_reply(self, reply: ParameterReply, link: int) -> None:
         for message in reply.messages:
             self._links.send(message, link)
         if reply.words is not None:
             self.say(reply.words)
 
-    def _send_news(self) -> None:
-        for message in self._parameters.news():
+    def _send_changed_parameters(self) -> None:
+        for message in self._parameters.changed():
             self._links.send(message)
 
     def _send_old_images(self) -> None:
@@ -300,13 +260,13 @@ class Component:
             if captured is None:
                 self.say(f"image {index} is in none of the flights here, or has not ended yet")
             else:
-                self._links.send(messages.image_captured(captured, self._telling.boot_ms()), link)
+                self._links.send(image_captured(captured, self._status.boot_ms()), link)
 
 
 _HANDLERS: dict[str, Callable[[Component, Packet], None]] = {
     "COMMAND_LONG": Component._command,
     "COMMAND_INT": Component._command,
-    "COMMAND_ACK": Component._ordered_result,
+    "COMMAND_ACK": Component._command_result,
     "CAMERA_TRIGGER": Component._trigger,
     "CAMERA_FEEDBACK": Component._trigger,
     "PARAM_EXT_REQUEST_LIST": Component._parameter,

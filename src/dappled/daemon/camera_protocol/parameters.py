@@ -1,26 +1,113 @@
-"""The extended parameter protocol (PARAM_EXT, messages 320 to 324): the camera's settings read and set by name."""
+"""The camera's settings as MAVLink parameters: read and set by name (PARAM_EXT, messages 320 to 324), and described
+in the camera definition file, the XML that QGroundControl and MAVSDK read."""
 
 from __future__ import annotations
 
 import struct
 import threading
+import zlib
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
+from xml.sax.saxutils import escape, quoteattr
 
-from dappled.daemon.camera_protocol.camera_settings import Knob, Knobs, code
-from dappled.drivers.camera import CameraError
+from dappled.drivers.camera import CameraError, Setting, SettingName
 from dappled.drivers.mavlink.links import Message, mavlink
 
 TYPE = mavlink.MAV_PARAM_EXT_TYPE_UINT32
 WAIT_NS = 5 * 10**9
+DEFINITION_PATH = "camera.xml"
 _ACCEPTED = mavlink.PARAM_ACK_ACCEPTED
 _FAILED = mavlink.PARAM_ACK_FAILED
 _UNSUPPORTED = mavlink.PARAM_ACK_VALUE_UNSUPPORTED
 _IN_PROGRESS = mavlink.PARAM_ACK_IN_PROGRESS
+_WORDS_FROM = 2**30
+# The names that QGroundControl gives a place of their own in its camera panel, where it has one.
+_BODY: dict[SettingName, tuple[str, str]] = {
+    "iso": ("CAM_ISO", "ISO"),
+    "aperture": ("CAM_APERTURE", "Aperture"),
+    "shutter_speed": ("CAM_SHUTTERSPD", "Shutter speed"),
+    "image_format": ("CAM_FORMAT", "Image format"),
+    "focal_length": ("CAM_FOCALLEN", "Focal length"),
+    "battery": ("CAM_BATTERY", "Battery"),
+}
+_SETTINGS = {name: setting for setting, (name, _) in _BODY.items()}
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
-    """Messages for the link that asked, and words for the pilot."""
+class Parameter:
+    """One setting: PARAM_EXT name (at most 16 letters), title, value and choices as text. No choices: read-only."""
+
+    name: str
+    title: str
+    value: str
+    choices: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class OwnParameter:
+    """A setting of dappled itself. `change` takes effect at once; None: fixed for the flight."""
+
+    name: str
+    title: str
+    value: Callable[[], str]
+    choices: tuple[str, ...] = ()
+    change: Callable[[str], None] | None = None
+
+
+class BodyParameters(Protocol):
+    """The part of a camera driver that is needed here; see `drivers.camera.BodySettings`."""
+
+    def settings(self) -> tuple[Setting, ...]: ...
+
+    def change(self, name: SettingName, value: str) -> None: ...
+
+
+class Parameters:
+    """All settings of a camera, as known in memory: the body's and those of dappled itself."""
+
+    def __init__(self, body: BodyParameters, own: Sequence[OwnParameter] = ()) -> None:
+        self._body = body
+        self._own = {one.name: one for one in own}
+
+    def all(self) -> tuple[Parameter, ...]:
+        """The body's first."""
+        body = [
+            Parameter(*_BODY[each.name], each.value, each.choices)
+            for each in self._body.settings()
+            if each.name in _BODY
+        ]
+        own = [
+            Parameter(one.name, one.title, one.value(), one.choices if one.change else ()) for one in self._own.values()
+        ]
+        return (*body, *own)
+
+    def find(self, name: str) -> Parameter | None:
+        """A setting by its name."""
+        return next((one for one in self.all() if one.name == name), None)
+
+    def change(self, name: str, value: str) -> bool:
+        """Ask for another value and return at once. True: it is set; False: the body was asked, and will report it.
+
+        Raises CameraError, in one sentence, where it can't be set.
+        """
+        parameter = self.find(name)
+        if parameter is None:
+            raise CameraError(f"there is no setting {name}")
+        if value not in parameter.choices:
+            takes = f"it takes {', '.join(parameter.choices)}" if parameter.choices else "it can't be changed in flight"
+            raise CameraError(f"{name} can't be {value}: {takes}")
+        own = self._own.get(name)
+        if own is not None and own.change is not None:
+            own.change(value)
+            return True
+        self._body.change(_SETTINGS[name], value)
+        return False
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterReply:
+    """Messages for the link that asked, and text for the pilot."""
 
     messages: tuple[Message, ...]
     words: str | None = None
@@ -28,97 +115,103 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """A body was asked for a value, and whoever asked waits."""
+    """A change that the body was asked for, and that its sender waits for."""
 
     value: str
     link: int
     due_ns: int
 
 
-class Parameters:
-    """Answers from memory. What a body takes its time for is acknowledged twice: in progress, and how it ended."""
+class ParameterServer:
+    """Answers PARAM_EXT from memory. A change that the body needs time for is acknowledged twice: in progress, and how
+    it ended."""
 
-    def __init__(self, knobs: Knobs) -> None:
-        self._knobs = knobs
+    def __init__(self, parameters: Parameters) -> None:
+        self._parameters = parameters
         self._lock = threading.Lock()
         self._asked: dict[str, _Asked] = {}
-        self._told: dict[str, str] | None = None  # what each was when that was asked last; None: never yet
-
-    def listing(self) -> Reply:
-        """PARAM_EXT_REQUEST_LIST (321)."""
-        knobs = self._knobs.all()
-        return Reply(tuple(_value(knob, at, len(knobs)) for at, knob in enumerate(knobs)))
-
-    def read(self, message: Message) -> Reply:
-        """PARAM_EXT_REQUEST_READ (320): by index, or by name where that is -1. Silence for one that is not there."""
-        knobs = self._knobs.all()
-        name, index = str(message.param_id), int(message.param_index)
-        found = [
-            _value(knob, at, len(knobs))
-            for at, knob in enumerate(knobs)
-            if (at == index if index >= 0 else knob.name == name)
-        ]
-        return Reply(tuple(found))
-
-    def news(self) -> tuple[Message, ...]:
-        """PARAM_EXT_VALUE of each setting that is another than when this was last asked, whoever changed it: other
-        ground stations and other links show it too. Nothing the first time."""
-        knobs = self._knobs.all()
-        now = {knob.name: knob.value for knob in knobs}
-        with self._lock:
-            before, self._told = self._told or now, now
-        return tuple(
-            _value(knob, at, len(knobs))
-            for at, knob in enumerate(knobs)
-            if knob.value != before.get(knob.name, knob.value)
+        self._reported: dict[str, str] | None = (
+            None  # each value as of the last call of `changed`; None: not called yet
         )
 
-    def set(self, message: Message, link: int, now_ns: int) -> Reply:
+    def listing(self) -> ParameterReply:
+        """PARAM_EXT_REQUEST_LIST (321)."""
+        parameters = self._parameters.all()
+        return ParameterReply(tuple(_value(one, at, len(parameters)) for at, one in enumerate(parameters)))
+
+    def read(self, message: Message) -> ParameterReply:
+        """PARAM_EXT_REQUEST_READ (320): by index, or by name where that is -1. No answer for an unknown one."""
+        parameters = self._parameters.all()
+        name, index = str(message.param_id), int(message.param_index)
+        found = [
+            _value(one, at, len(parameters))
+            for at, one in enumerate(parameters)
+            if (at == index if index >= 0 else one.name == name)
+        ]
+        return ParameterReply(tuple(found))
+
+    def changed(self) -> tuple[Message, ...]:
+        """PARAM_EXT_VALUE of each setting that differs from the last call; nothing the first time. So every ground station
+        shows a change, on every link."""
+        parameters = self._parameters.all()
+        now = {one.name: one.value for one in parameters}
+        with self._lock:
+            before, self._reported = self._reported or now, now
+        return tuple(
+            _value(one, at, len(parameters))
+            for at, one in enumerate(parameters)
+            if one.value != before.get(one.name, one.value)
+        )
+
+    def set(self, message: Message, link: int, now_ns: int) -> ParameterReply:
         """PARAM_EXT_SET (323). Time is monotonic."""
         name = str(message.param_id)
-        knob = self._knobs.find(name)
+        parameter = self._parameters.find(name)
         wanted = _number(message)
-        if knob is None or wanted is None:
-            words = f"there is no setting {name}" if knob is None else f"{name} takes whole numbers"
-            now = (wanted or 0) if knob is None else code(knob.value)
-            return Reply((_ack(name, now, _UNSUPPORTED),), words)
-        value = next((one for one in (*knob.choices, knob.value) if code(one) == wanted), None)
+        if parameter is None or wanted is None:
+            words = f"there is no setting {name}" if parameter is None else f"{name} takes whole numbers"
+            now = (wanted or 0) if parameter is None else code(parameter.value)
+            return ParameterReply((_ack(name, now, _UNSUPPORTED),), words)
+        value = next((one for one in (*parameter.choices, parameter.value) if code(one) == wanted), None)
         if value is None:
-            return Reply((_ack(name, code(knob.value), _UNSUPPORTED),), f"{name} has no choice {wanted}")
+            return ParameterReply((_ack(name, code(parameter.value), _UNSUPPORTED),), f"{name} has no choice {wanted}")
         asked = self._asked.get(name)
         if asked is not None and asked.value == value:
-            return Reply((_ack(name, wanted, _IN_PROGRESS),))  # a retry: it is on its way
-        if asked is None and value == knob.value:
-            return Reply((_ack(name, wanted, _ACCEPTED),))
-        return self._turn(knob, value, _Asked(value, link, now_ns + WAIT_NS))
+            return ParameterReply((_ack(name, wanted, _IN_PROGRESS),))  # a retry: the change is under way
+        if asked is None and value == parameter.value:
+            return ParameterReply((_ack(name, wanted, _ACCEPTED),))
+        return self._change(parameter, value, _Asked(value, link, now_ns + WAIT_NS))
 
-    def _turn(self, knob: Knob, value: str, asked: _Asked) -> Reply:
+    def _change(self, parameter: Parameter, value: str, asked: _Asked) -> ParameterReply:
         with self._lock:
-            self._asked[knob.name] = asked
+            self._asked[parameter.name] = asked
         result, words = _IN_PROGRESS, None
         try:
-            if self._knobs.turn(knob.name, value):
+            if self._parameters.change(parameter.name, value):
                 result = _ACCEPTED
         except CameraError as error:
-            result, value, words = _FAILED, knob.value, str(error)
+            result, value, words = _FAILED, parameter.value, str(error)
         if result != _IN_PROGRESS:
-            self._done(knob.name, asked)
-        return Reply((_ack(knob.name, code(value), result),), words)
+            self._done(parameter.name, asked)
+        return ParameterReply((_ack(parameter.name, code(value), result),), words)
 
-    def settled(self, now_ns: int, refused: str | None = None) -> list[tuple[int, Reply]]:
-        """How those ended that a body was asked for: (link, reply) each. Call when the body told its settings (with
-        its sentence where it `refused`), and now and then: whatever took longer than five seconds has failed."""
+    def settled(self, now_ns: int, refused: str | None = None) -> list[tuple[int, ParameterReply]]:
+        """How changes ended that the body was asked for: (link, reply) each.
+
+        Call when the body reports its settings (with its sentence where it `refused`), and regularly: a change that
+        took longer than five seconds has failed.
+        """
         replies = []
         with self._lock:
             waiting = list(self._asked.items())
         for name, asked in waiting:
-            knob = self._knobs.find(name)
-            now = "" if knob is None else knob.value
+            parameter = self._parameters.find(name)
+            now = "" if parameter is None else parameter.value
             if now == asked.value:
-                reply = Reply((_ack(name, code(now), _ACCEPTED),))
-            elif refused or now_ns >= asked.due_ns or knob is None:
+                reply = ParameterReply((_ack(name, code(now), _ACCEPTED),))
+            elif refused or now_ns >= asked.due_ns or parameter is None:
                 why = refused or "the camera has not taken it for 5 s"
-                reply = Reply((_ack(name, code(now), _FAILED),), f"{name} stays {now or 'unknown'}: {why}")
+                reply = ParameterReply((_ack(name, code(now), _FAILED),), f"{name} stays {now or 'unknown'}: {why}")
             else:
                 continue
             if self._done(name, asked):
@@ -126,7 +219,7 @@ class Parameters:
         return replies
 
     def _done(self, name: str, asked: _Asked) -> bool:
-        """Whether this is still what was asked for: not another value meanwhile, and told by nobody else."""
+        """Whether this is still the change asked for: not replaced by another value, and not reported already."""
         with self._lock:
             ours = self._asked.get(name) is asked
             if ours:
@@ -134,8 +227,59 @@ class Parameters:
         return ours
 
 
-def _value(knob: Knob, index: int, count: int) -> Message:
-    return mavlink.MAVLink_param_ext_value_message(knob.name.encode(), _packed(code(knob.value)), TYPE, count, index)
+@dataclass(frozen=True, slots=True)
+class Definition:
+    """The file's bytes, and its version: ground stations cache it by vendor, model and version, so the version
+    changes with the content (1 to 65535, made from it: the same content has the same version after a restart)."""
+
+    version: int
+    xml: bytes
+
+    def uri(self, component_id: int) -> str:
+        """Where to fetch it: over MAVLink FTP, from our component."""
+        return f"mftp://[;comp={component_id}]/{DEFINITION_PATH}"
+
+
+def camera_definition(vendor: str, model: str, parameters: Iterable[Parameter]) -> Definition:
+    """The definition of a camera with these settings."""
+    described = "".join(_described(one) for one in parameters)
+    version = zlib.crc32((vendor + "\0" + model + "\0" + described).encode()) % 65535 + 1
+    text = (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<mavlinkcamera>\n'
+        f'  <definition version="{version}">\n'
+        f"    <model>{escape(model)}</model>\n    <vendor>{escape(vendor)}</vendor>\n  </definition>\n"
+        f"  <parameters>\n{described}  </parameters>\n</mavlinkcamera>\n"
+    )
+    return Definition(version, text.encode())
+
+
+def _described(parameter: Parameter) -> str:
+    """One setting: choices in the body's order; the current value as the only one where it is read-only."""
+    choices = parameter.choices or (parameter.value,)
+    readonly = "" if parameter.choices else ' readonly="1"'
+    options = "".join(f'        <option name={quoteattr(one)} value="{code(one)}"/>\n' for one in choices)
+    return (
+        f'    <parameter name="{parameter.name}" type="uint32" default="{code(choices[0])}"{readonly}>\n'
+        f"      <description>{escape(parameter.title)}</description>\n"
+        f"      <options>\n{options}      </options>\n    </parameter>\n"
+    )
+
+
+def code(value: str) -> int:
+    """The number that stands for a value on the wire.
+
+    A whole number below 2³⁰ ("400") stands for itself; anything else ("1/500") is 2³⁰ plus 30 bits of its CRC-32. So a
+    number means the same whatever the other choices are, and fits the signed 32-bit integer that MAVSDK reads.
+    """
+    if value.isascii() and value.isdigit() and int(value) < _WORDS_FROM:
+        return int(value)
+    return zlib.crc32(value.encode()) >> 2 | _WORDS_FROM
+
+
+def _value(parameter: Parameter, index: int, count: int) -> Message:
+    return mavlink.MAVLink_param_ext_value_message(
+        parameter.name.encode(), _packed(code(parameter.value)), TYPE, count, index
+    )
 
 
 def _ack(name: str, value: int, result: int) -> Message:
@@ -147,7 +291,7 @@ def _packed(value: int) -> bytes:
 
 
 def _number(message: Message) -> int | None:
-    """The value as a number: what our type holds; None for another type."""
+    """The value as a number: None for another type than ours."""
     if message.param_type != TYPE:
         return None
     data: bytes = message._param_value_raw  # pymavlink cuts `param_value` at the first zero byte, as if it were text

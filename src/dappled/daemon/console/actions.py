@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dappled.daemon.health.logbook import Logbook
-from dappled.daemon.pipeline.capture_requests import CaptureRequest
+from dappled.daemon.pipeline.repeats import CaptureRequest
 from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
 
 SOURCE = "console"

@@ -6,8 +6,9 @@ import logging
 from collections.abc import Callable
 
 from dappled.config.settings import Settings
-from dappled.daemon.camera_protocol import ground_facts
-from dappled.daemon.camera_protocol.component import CameraFacts, Component
+from dappled.daemon.camera_protocol import camera_status
+from dappled.daemon.camera_protocol.camera_status import CameraFacts
+from dappled.daemon.camera_protocol.component import Component
 from dappled.daemon.health.logbook import Logbook, battery_doubt, of_shot
 from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
@@ -42,7 +43,7 @@ class ShotEvents:
         self._logbook, self._utc_ns, self._outside, self._depth = logbook, utc_ns, outside, depth
         self._identity: Identity | None = None
         self._focal_length_mm: float | None = None
-        self._chip = ground_facts.chip(settings, "")
+        self._chip = camera_status.sensor_facts(settings, "")
         self._battery_doubt: str | None = None
 
     def observer(self) -> Observer:
@@ -51,7 +52,7 @@ class ShotEvents:
 
     def facts(self) -> CameraFacts:
         """The camera as it is known by now."""
-        return ground_facts.camera(self._identity, self._focal_length_mm, self._chip)
+        return camera_status.camera_facts(self._identity, self._focal_length_mm, self._chip)
 
     def doubt(self) -> str | None:
         """A sentence where the camera will soon be of no use."""
@@ -62,7 +63,7 @@ class ShotEvents:
         self._outside.settled(index, ok)
 
     def _tagged(self, pending: PendingShot) -> None:
-        captured = ground_facts.of_story(pending, self._utc_ns)
+        captured = camera_status.captured_shot(pending, self._utc_ns)
         self._component.announce(captured)
         if not captured.ok:
             self._component.say(f"image {pending.shot.index} failed: {pending.problem}", mavlink.MAV_SEVERITY_ERROR)
@@ -94,7 +95,7 @@ class ShotEvents:
     def _meet(self, who: Identity) -> None:
         """Another camera than before, or the first one."""
         self._identity = who
-        self._chip = ground_facts.chip(self._settings, who.model)
+        self._chip = camera_status.sensor_facts(self._settings, who.model)
         facts = {"make": who.make, "model": who.model, "serial": who.serial, "port": who.port}
         try:
             self._recording.add_facts({"camera": facts})

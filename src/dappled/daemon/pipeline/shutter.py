@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 from dappled.clock import Clock
-from dappled.daemon.pipeline.capture_requests import CaptureRequest, Recent
+from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
 from dappled.errors import report
 from dappled.flight import Cause, FlightError, Shot
 
@@ -91,7 +91,7 @@ class Shutter:
         self._next_index = next_index
         self._capacity = capacity
         self._lock = threading.Lock()
-        self._recent = Recent()
+        self._recent = RecentRequests()
         self._pending: set[int] = set()
         self._interval: _Interval | None = None
         self._requests = self._shots = self._duplicates = self._refused = self._succeeded = self._failed = 0

@@ -1,0 +1,199 @@
+"""Recognise the same message again: the rules, with their numbers. What none of them matches is new.
+
+1. Packet. A packet with the same sender, sequence number, message and payload within 0.5 s over the same link, or
+   within 2.5 s over another link, is one packet (`PacketDedup`).
+2. Retry. A capture request of the same source, kind and sequence within 1.2 s of the last such message, and within
+   2.4 s of the first, is a retry of it. With `confirmation` above 0 (the sender itself says that it repeats) 10 s
+   instead of both. Holds for messages that are acknowledged (their sender repeats when it misses the answer) or that
+   carry a sequence (`RecentRequests`).
+3. One trigger, several messages. PX4 sends CAMERA_TRIGGER, IMAGE_START_CAPTURE and DO_DIGICAM_CONTROL for one trigger,
+   and a vehicle on two links sends each of them twice. Within 0.3 s of a shot's first message, a message of the same
+   source belongs to that shot if the shot has none of this kind from this link yet, and none of this kind with another
+   sequence; the oldest such shot takes it (`RecentRequests`).
+4. Echo. An autopilot that we command to fire the camera (a servo, a relay, its own trigger) reports that:
+   CAMERA_TRIGGER, CAMERA_FEEDBACK, or the command for cameras. One message of each kind on each link within 2 s of our
+   command is its echo and not a request, else every shot would ask for the next (`AutopilotCommands`).
+
+A series (an interval, a step of the zoom) is a different request than a single shot and than a series with other
+numbers: only a retry with the same numbers is the same, and nothing else belongs to its first shot.
+
+So a second press with the same sequence (most ground stations: always 0) inside 1.2 s is lost; and triggers from one
+source less than 0.3 s apart may be joined if some of their messages were lost on the way.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+from dappled.drivers.mavlink.links import Packet, mavlink
+
+SAME_LINK_NS = 500_000_000
+OTHER_LINK_NS = 2_500_000_000  # a radio may be seconds behind a cable
+RETRY_NS = 1_200_000_000
+RETRY_LIMIT_NS = 2_400_000_000
+CONFIRMED_RETRY_NS = 10 * 10**9
+TRIGGER_NS = 300_000_000
+ECHO_NS = 2 * 10**9
+_PACKETS_KEPT = 1024
+_REQUESTS_KEPT = 256
+_COMMANDS_KEPT = 32
+_PacketKey = tuple[int, int, int, int, bytes]
+_RequestKey = tuple[str, str, int | None, tuple[float, ...] | None]
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureRequest:
+    """One message, or one act of a person, that asks for a shot.
+
+    `source` is "mavlink:255/190", "console" …; `kind` the message or command; `sequence` the sender's own number,
+    None where the kind has none; `acknowledged`: the sender gets an answer, and repeats when it misses it. `series`:
+    the numbers of what is more than one shot now (an interval's seconds and count).
+    """
+
+    source: str
+    kind: str
+    sequence: int | None = None
+    confirmation: int = 0
+    link: int | None = None
+    acknowledged: bool = True
+    series: tuple[float, ...] | None = None
+
+
+@dataclass(slots=True)
+class _Remembered:
+    index: int
+    source: str
+    kind: str
+    sequence: int | None
+    series: tuple[float, ...] | None
+    first_ns: int
+    last_ns: int
+    parts: dict[tuple[str, int | None], int | None]  # (kind, link): sequence; shared by all names of a shot
+
+    def key(self) -> _RequestKey:
+        return self.source, self.kind, self.sequence, self.series
+
+
+class RecentRequests:
+    """The capture requests of the last ten seconds (at most 256), and the image index that each one got."""
+
+    def __init__(self) -> None:
+        self._requests: list[_Remembered] = []
+
+    def same(self, request: CaptureRequest, now_ns: int) -> int | None:
+        """The image index of the shot that this request already has; None for a new one. Times are monotonic."""
+        self._requests = [one for one in self._requests if now_ns - one.last_ns <= CONFIRMED_RETRY_NS][-_REQUESTS_KEPT:]
+        found = self._retry(request, now_ns) or self._part(request, now_ns)
+        if found is None:
+            return None
+        found.parts[request.kind, request.link] = request.sequence
+        if (request.kind, request.sequence) == (found.kind, found.sequence):
+            found.last_ns = max(found.last_ns, now_ns)
+        else:  # a part that may itself be retried: remembered under its own name
+            self._requests.append(
+                _Remembered(
+                    found.index, request.source, request.kind, request.sequence, None, now_ns, now_ns, found.parts
+                )
+            )
+        return found.index
+
+    def add(self, request: CaptureRequest, now_ns: int, index: int) -> None:
+        """A new request became shot `index`."""
+        parts = {(request.kind, request.link): request.sequence}
+        self._requests.append(
+            _Remembered(index, request.source, request.kind, request.sequence, request.series, now_ns, now_ns, parts)
+        )
+
+    def forget(self, request: CaptureRequest) -> None:
+        """The next message like this is a new request."""
+        self._requests = [known for known in self._requests if known.key() != _request_key(request)]
+
+    def _retry(self, request: CaptureRequest, now_ns: int) -> _Remembered | None:
+        if not request.acknowledged and request.sequence is None:
+            return None
+        for known in reversed(self._requests):
+            if known.key() != _request_key(request):
+                continue
+            if request.confirmation > 0:
+                return known if now_ns - known.last_ns <= CONFIRMED_RETRY_NS else None
+            recent = now_ns - known.last_ns <= RETRY_NS and now_ns - known.first_ns <= RETRY_LIMIT_NS
+            return known if recent else None
+        return None
+
+    def _part(self, request: CaptureRequest, now_ns: int) -> _Remembered | None:
+        if request.series is not None:
+            return None
+        for known in self._requests:
+            if known.series is not None or known.source != request.source or now_ns - known.first_ns > TRIGGER_NS:
+                continue
+            if (request.kind, request.link) in known.parts:
+                continue
+            if all(sequence == request.sequence for (kind, _), sequence in known.parts.items() if kind == request.kind):
+                return known
+        return None
+
+
+class PacketDedup:
+    """Packets of the last seconds (at most 1024), by sender, sequence number, message and payload.
+
+    What a link adds (version, signature) doesn't count. The window of one link is short because the sequence number has
+    one byte: on a busy link it soon starts again.
+    """
+
+    def __init__(self) -> None:
+        self._seen: dict[_PacketKey, dict[int, int]] = {}  # when it last arrived on each link; the oldest packet first
+
+    def is_duplicate(self, packet: Packet, now_ns: int) -> bool:
+        """Whether this packet was received before; remembers it. Times are monotonic."""
+        while self._seen:
+            oldest = next(iter(self._seen))
+            if now_ns - max(self._seen[oldest].values()) <= OTHER_LINK_NS and len(self._seen) < _PACKETS_KEPT:
+                break
+            del self._seen[oldest]
+        key = _packet_key(packet)
+        arrived = self._seen.pop(key, {})
+        known = any(
+            now_ns - at_ns <= (SAME_LINK_NS if link == packet.link else OTHER_LINK_NS)
+            for link, at_ns in arrived.items()
+        )
+        self._seen[key] = arrived | {packet.link: now_ns}
+        return known
+
+
+@dataclass(slots=True)
+class _Sent:
+    at_ns: int
+    echoes: set[tuple[str, int]] = field(default_factory=set)
+
+
+class AutopilotCommands:
+    """Commands of ours to the autopilot in the last two seconds, and their echoes. Times are monotonic."""
+
+    def __init__(self) -> None:
+        self.numbers: set[int] = set()
+        self._sent: deque[_Sent] = deque(maxlen=_COMMANDS_KEPT)
+
+    def sent(self, command: int, now_ns: int) -> None:
+        """A command was sent to the autopilot."""
+        self.numbers.add(command)
+        self._sent.append(_Sent(now_ns))
+
+    def is_echo(self, kind: str, link: int, now_ns: int) -> bool:
+        """Whether a message of this kind from our autopilot is an echo: of the oldest command that has none yet."""
+        for command in list(self._sent):
+            if now_ns - command.at_ns <= ECHO_NS and (kind, link) not in command.echoes:
+                command.echoes.add((kind, link))
+                return True
+        return False
+
+
+def _packet_key(packet: Packet) -> _PacketKey:
+    message, raw = packet.message, packet.raw
+    start = 10 if raw[0] == mavlink.PROTOCOL_MARKER_V2 else 6
+    payload = raw[start : start + raw[1]].rstrip(b"\0")  # version 2 leaves trailing zeros out
+    return message.get_srcSystem(), message.get_srcComponent(), message.get_seq(), message.get_msgId(), payload
+
+
+def _request_key(request: CaptureRequest) -> _RequestKey:
+    return request.source, request.kind, request.sequence, request.series
