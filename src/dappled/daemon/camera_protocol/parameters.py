@@ -151,8 +151,8 @@ class ParameterServer:
         return ParameterReply(tuple(found))
 
     def changed(self) -> tuple[Message, ...]:
-        """PARAM_EXT_VALUE of each setting that differs from the last call; nothing the first time. So every ground station
-        shows a change, on every link."""
+        """PARAM_EXT_VALUE of each setting that differs from the last call, for all ground stations; nothing the first
+        time."""
         parameters = self._parameters.all()
         now = {one.name: one.value for one in parameters}
         with self._lock:
