@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from dappled.config.settings import CameraSettings
-from dappled.daemon import cameras
+from dappled.drivers import registry
 from dappled.testing import CameraContract
 
 PAGE = Path(__file__).parents[2] / "docs" / "drivers.md"
@@ -74,7 +74,7 @@ def test_it_is_typed(package: Path) -> None:
 
 def test_it_is_found_by_name(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(package)
-    camera = cameras.open_camera(CameraSettings(driver="command", options={"command": "true"}))
+    camera = registry.open_camera(CameraSettings(driver="command", options={"command": "true"}))
     assert type(camera).__name__ == "ComposedCamera"
 
 

@@ -12,7 +12,6 @@ from typing import Any
 from dappled.clock import Clock, SystemClock
 from dappled.config.settings import Settings
 from dappled.daemon import links, live_record
-from dappled.daemon.cameras import open_camera
 from dappled.daemon.console import actions
 from dappled.daemon.console import process as console_process
 from dappled.daemon.flight_handover import FlightHandover
@@ -30,6 +29,7 @@ from dappled.daemon.stream.publisher import Publisher, Reply
 from dappled.drivers.camera import Camera
 from dappled.drivers.mavlink.links import Packet
 from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot
 from dappled.errors import DappledError, report
 

@@ -14,11 +14,11 @@ from importlib import metadata
 from pathlib import Path
 
 from dappled.config.settings import Settings
-from dappled.daemon.cameras import open_camera
 from dappled.daemon.health.go_no_go import Check
 from dappled.daemon.navigation import utc
 from dappled.drivers import usb_bus
 from dappled.drivers.camera import CameraError, StateChanged
+from dappled.drivers.registry import open_camera
 from dappled.drivers.usb_bus import UsbBody
 from dappled.errors import DappledError
 

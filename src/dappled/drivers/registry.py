@@ -1,4 +1,4 @@
-"""Camera drivers are found by name, so that a third party's camera comes in by the same door as ours."""
+"""Find a camera driver by name among the entry points of all installed packages, and open it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ GROUP = "dappled.cameras"
 
 
 def open_camera(settings: CameraSettings) -> Camera:
-    """The configured driver, not started yet. Raises ConfigError where no package brings one of that name, and
-    CameraError where it can't be loaded."""
+    """Open the configured driver; `start` it afterwards. Raises ConfigError where no package provides one of that name,
+    and CameraError where it can't be loaded."""
     found = {entry.name: entry for entry in entry_points(group=GROUP)}
     entry = found.get(settings.driver)
     if entry is None:
@@ -29,8 +29,8 @@ def open_camera(settings: CameraSettings) -> Camera:
 
 
 def _options(settings: CameraSettings) -> dict[str, Any]:
-    """What a driver is handed: the file's time-out, and every other setting that was set. It refuses what it doesn't
-    know, so that nobody believes in a setting that does nothing."""
+    """Return the options for a driver: the file's time-out, and every other setting that was set. A driver
+    refuses options that it doesn't know, so that no setting is silently ignored."""
     common = {
         "port": settings.port,
         "serial": settings.serial,

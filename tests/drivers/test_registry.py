@@ -9,25 +9,25 @@ import pytest
 
 from dappled.config.schema import ConfigError
 from dappled.config.settings import CameraSettings
-from dappled.daemon import cameras
+from dappled.drivers import registry
 from dappled.drivers.camera import CameraError
 from dappled.drivers.gphoto2.client import GPhoto2Camera
 
 
 def test_the_shipped_driver_is_found() -> None:
-    assert isinstance(cameras.open_camera(CameraSettings()), GPhoto2Camera)
+    assert isinstance(registry.open_camera(CameraSettings()), GPhoto2Camera)
 
 
 def test_an_unknown_driver_is_named_with_the_known_ones() -> None:
     with pytest.raises(ConfigError, match=r"'canon'; installed: .*gphoto2"):
-        cameras.open_camera(CameraSettings(driver="canon"))
+        registry.open_camera(CameraSettings(driver="canon"))
 
 
 @pytest.mark.parametrize("value", ["no_such_module:open", "dappled.drivers.camera:no_such_name"])
 def test_a_driver_that_can_t_be_loaded(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     def found(**_: Any) -> list[EntryPoint]:
-        return [EntryPoint("broken", value, cameras.GROUP)]
+        return [EntryPoint("broken", value, registry.GROUP)]
 
-    monkeypatch.setattr(cameras, "entry_points", found)
+    monkeypatch.setattr(registry, "entry_points", found)
     with pytest.raises(CameraError, match="'broken' can't be loaded"):
-        cameras.open_camera(CameraSettings(driver="broken"))
+        registry.open_camera(CameraSettings(driver="broken"))
