@@ -10,7 +10,7 @@ import pytest
 
 from dappled.config.settings import CameraSettings, PublishSettings
 from dappled.daemon import reload
-from dappled.daemon.console import access, connection, hub
+from dappled.daemon.console import access, connection, feed
 from dappled.daemon.pipeline import repeats
 from tests.system.documents import ROOT, Stage, commands, stage
 
@@ -42,7 +42,7 @@ def test_the_documents_commands_run(document: Path, on_stage: Stage) -> None:
 
 NUMBERS = {
     "console.md": [
-        f"At most {hub.PAGES} pages; each has a queue of {hub.WAITING} events",
+        f"At most {feed.PAGES} pages; each has a queue of {feed.WAITING} events",
         f"One address has {connection.PER_ADDRESS} connections, all together {connection.CONNECTIONS}",
         (
             f"no whole request within {connection.REQUEST_S:.0f} seconds is closed, and one whose reader stands still "

@@ -12,7 +12,6 @@ from typing import Any
 from dappled.clock import Clock, SystemClock
 from dappled.config.settings import Settings
 from dappled.daemon import links, live_record
-from dappled.daemon.console import actions
 from dappled.daemon.console import process as console_process
 from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.flight_parts import FlightParts
@@ -75,14 +74,14 @@ class Service:
             camera = open_camera(self.settings.camera)
             if isinstance(camera, UsesAutopilot):
                 camera.use_autopilot(self._order)
-            door = console_process.open_door(self.settings, stack)
+            door = console_process.open_listener(self.settings, stack)
             self._open_sockets(door.private if door else "", stack)
             kept = self._begin_recording(camera, names, recipe, stack)
             self._begin_parts(names, stack)
             self._links.start(self)
             if door:
                 self.console_url = door.url
-                console_process.begin(door, self.settings, stack, recipe=kept, act=self._act, logbook=self._logbook)
+                console_process.start(door, self.settings, stack, recipe=kept, act=self._act, logbook=self._logbook)
             self._started = True
             self._stack = stack.pop_all()
         for text in self._recording.recovered:
@@ -268,7 +267,7 @@ class Service:
     # what comes in by the doors that are open before the parts are made; nothing is heard there until `start` has them
 
     def _act(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        return actions.act(request, self._parts.shutter, self._logbook)
+        return console_process.answer(request, self._parts.shutter, self._logbook)
 
     def _answer(self, request: Mapping[str, Any], reply: Reply) -> None:
         self._parts.answers.answer(request, reply)

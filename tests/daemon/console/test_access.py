@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.daemon.console import access
-from dappled.daemon.console.access import Access, Request
+from dappled.daemon.console.access import Access, ConsoleRequest
 
 TOKEN = "sesame-sesame-sesame"  # noqa: S105  # it opens nothing
 HOST = {"host": "10.0.0.7:8080"}
@@ -15,7 +15,7 @@ OURS = {**HOST, "origin": "http://10.0.0.7:8080", "content-type": "application/j
 
 
 def status(rules: Access, method: str, path: str, headers: dict[str, str], query: str = "") -> int:
-    refusal = rules.judge(Request(method, path, headers, query))
+    refusal = rules.judge(ConsoleRequest(method, path, headers, query))
     return 200 if refusal is None else refusal.status
 
 
@@ -117,7 +117,7 @@ def test_a_strangers_guesses_keep_nobody_else_out(stranger: str, operator: str, 
     rules = Access(TOKEN)
     for guess in range(access.GUESSES + 1):
         rules.try_token(f"guess {guess}", stranger)
-    refusal = rules.judge(Request("GET", "/metrics", {**HOST, "authorization": f"Bearer {TOKEN}"}, "", operator))
+    refusal = rules.judge(ConsoleRequest("GET", "/metrics", {**HOST, "authorization": f"Bearer {TOKEN}"}, "", operator))
     assert (200 if refusal is None else refusal.status) == code
 
 
@@ -154,5 +154,5 @@ def test_without_a_token_loopback_is_open() -> None:
 )
 def test_nothing_strange_gets_in(method: str, path: str, headers: dict[str, str], query: str) -> None:
     rules = Access(TOKEN)
-    refusal = rules.judge(Request(method, "/api/" + path, headers, query))
+    refusal = rules.judge(ConsoleRequest(method, "/api/" + path, headers, query))
     assert refusal is not None or path == "login"

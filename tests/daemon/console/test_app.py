@@ -17,12 +17,11 @@ import numpy as np
 import pytest
 import uvicorn
 
-from dappled.daemon.console import app, hub
+from dappled.daemon.console import feed as feeds
 from dappled.daemon.console.access import Access
-from dappled.daemon.console.control import Control
-from dappled.daemon.console.feed import Feed
-from dappled.daemon.console.hub import Hub
-from dappled.daemon.console.parts import Parts
+from dappled.daemon.console.app import ConsoleApp
+from dappled.daemon.console.feed import Feed, Hub
+from dappled.daemon.console.process import DaemonChannel
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher, Reply
@@ -68,7 +67,7 @@ class Rig:
 
     url: str
     publisher: Publisher
-    parts: Parts
+    feed: Feed
     asked: list[dict[str, Any]] = field(default_factory=list)
     answer: dict[str, Any] = field(default_factory=lambda: {"ok": True, "text": "shot 0", "lines": []})
 
@@ -100,22 +99,18 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     publisher = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer, capacity=1000)
     publisher.start()
     here, there = ProcessChannel.pair()
-    pages = Hub()
     studio = Studio(None, camera_pose.NADIR.ravel().tolist())
-    feed = Feed(
-        endpoint, endpoint + ".ask", tell=pages.tell, thumb=studio.thumb, corners=studio.corners,
-        watched=lambda: made.parts.watched(),  # noqa: PLW0108  # it is made after
-    )  # fmt: skip
-    parts = Parts(feed, pages, studio, Control(ProcessChannel(there)), Access(""), None)
+    feed = Feed(endpoint, endpoint + ".ask", Hub(), studio)
+    app = ConsoleApp(feed, studio, DaemonChannel(ProcessChannel(there)), Access(""), None)
     listener = socket.create_server(("127.0.0.1", 0))
-    made = Rig(f"http://127.0.0.1:{listener.getsockname()[1]}", publisher, parts)
+    made = Rig(f"http://127.0.0.1:{listener.getsockname()[1]}", publisher, feed)
     server = uvicorn.Server(
-        uvicorn.Config(app.make(parts), lifespan="off", ws="none", http="h11", log_config=None,
+        uvicorn.Config(app.asgi(), lifespan="off", ws="none", http="h11", log_config=None,
                        timeout_graceful_shutdown=1)
     )  # fmt: skip
 
     async def serve() -> None:
-        tasks = [asyncio.create_task(feed.run()), asyncio.create_task(app.follow_log(parts))]
+        tasks = [asyncio.create_task(feed.run()), asyncio.create_task(app.follow_log())]
         await server.serve(sockets=[listener])
         for task in tasks:
             task.cancel()
@@ -144,8 +139,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         there.close()
         threads[1].join(20)
         here.close()
-        parts.workers.shutdown()
-        parts.askers.shutdown()
+        app.close()
         publisher.stop(0.1)
         listener.close()
 
@@ -156,7 +150,7 @@ def seen(rig: Rig, index: int) -> None:
     def there() -> bool:
         rig.publisher.publish("frame", frame(index))
         threading.Event().wait(0.02)
-        return index in rig.parts.feed.frames
+        return index in rig.feed.frames
 
     eventually(there, f"frame {index} is there")
 
@@ -230,7 +224,7 @@ def test_a_frame_s_pictures(rig: Rig) -> None:
         for name, kind in kinds.items():
             answer = client.get(f"/api/frames/4/{name}")
             assert (answer.status_code, answer.headers["content-type"]) == (200, kind), name
-        assert "no mask is named" in client.get("/api/frames/4/views.json").json()["error"]
+        assert "no mask is configured" in client.get("/api/frames/4/views.json").json()["error"]
         assert "no depth" in client.get("/api/frames/4/depth.png").json()["error"]
         assert client.get("/api/frames/4/fish.jpg").status_code == 404
         assert client.get("/api/frames/5/mean.jpg").status_code == 404
@@ -252,10 +246,10 @@ def test_a_depth_message_becomes_a_picture(rig: Rig) -> None:
     arrays = [wire.describe_array("disparity", disparity, "px"), wire.describe_array("sigma", sigma, "px")]
 
     def told() -> bool:
-        rig.parts.globe_s = time.monotonic()  # somebody watches
+        rig.feed.hub.globe_asked()  # a viewer
         rig.publisher.publish("depth", {"frame": 4, "arrays": arrays}, disparity.tobytes() + sigma.tobytes())
         threading.Event().wait(0.02)
-        return rig.parts.feed.frames[4].depth is not None
+        return rig.feed.frames[4].depth is not None
 
     eventually(told, "the depth is there")
     with rig.client() as client:
@@ -299,10 +293,10 @@ def test_a_page_hears_state_frames_and_log(rig: Rig) -> None:
         while state["health"] is None:
             state = events(lines, "state")
         assert state["verdict"] == "caution"  # no attitude
-        assert list(rig.parts.feed.path) == [(2.0, 41.0)]
+        assert list(rig.feed.path) == [(2.0, 41.0)]
         assert {"name": "Camera", "state": "go", "text": "ready"} in state["checks"]
-        eventually(rig.parts.watched, "the page counts")
-    eventually(lambda: len(rig.parts.hub) == 0, "a page that went away is forgotten")
+        eventually(lambda: rig.feed.hub.watched, "the page counts")
+    eventually(lambda: len(rig.feed.hub) == 0, "a page that went away is forgotten")
 
 
 def test_metrics_for_whoever_scrapes(rig: Rig) -> None:
@@ -318,7 +312,7 @@ def test_metrics_for_whoever_scrapes(rig: Rig) -> None:
 
 
 def test_pages_are_not_without_number(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hub, "PAGES", 0)
+    monkeypatch.setattr(feeds, "PAGES", 0)
     with rig.client() as client:
         assert client.get("/api/events").status_code == 503
 
@@ -330,18 +324,18 @@ def test_a_page_that_stops_reading_costs_a_bounded_queue() -> None:
         await anext(reading)
         waiting: asyncio.Future[str] = asyncio.ensure_future(anext(reading))
         await asyncio.sleep(0)
-        pages.tell({"is": "n", "n": -1})
+        pages.send({"is": "n", "n": -1})
         await waiting
-        for n in range(hub.WAITING + 36):
-            pages.tell({"is": "n", "n": n})
-        got = [await anext(reading) for _ in range(hub.WAITING)]
+        for n in range(feeds.WAITING + 36):
+            pages.send({"is": "n", "n": n})
+        got = [await anext(reading) for _ in range(feeds.WAITING)]
         await reading.aclose()  # type: ignore[attr-defined]  # it is a generator
         return pages.dropped, got
 
     dropped, got = asyncio.run(flood())
     assert dropped == 36
     assert json.loads(got[0].removeprefix("data: "))["n"] == 36  # the oldest went
-    assert json.loads(got[-1].removeprefix("data: "))["n"] == hub.WAITING + 35
+    assert json.loads(got[-1].removeprefix("data: "))["n"] == feeds.WAITING + 35
 
 
 def test_messages_that_are_none_are_passed_over(rig: Rig) -> None:

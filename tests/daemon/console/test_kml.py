@@ -7,7 +7,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from dappled.daemon.console import kml
-from dappled.daemon.console.footprint import Rectified
+from dappled.decode.geometry.footprint import RectifiedFrame
 from tests import globe
 
 NS = {"k": kml.NAMESPACE}
@@ -26,7 +26,7 @@ def test_a_link_asks_again_and_again() -> None:
 
 
 def test_the_latest_frame_lies_in_its_box() -> None:
-    frame = Rectified(np.zeros((2, 2, 4), dtype=np.uint8), 1.5, 1.25, 10.5, -10.25)
+    frame = RectifiedFrame(np.zeros((2, 2, 4), dtype=np.uint8), 1.5, 1.25, 10.5, -10.25)
     root = parsed(kml.latest("frame 7", "http://h/kml/7.png", frame, [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]))
     box = root.find(".//k:GroundOverlay/k:LatLonBox", NS)
     assert box is not None

@@ -1,4 +1,4 @@
-"""The daemon's side of the console: its door, and a process that is kept running."""
+"""The daemon's side of the console: its socket, and a process that is kept running."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import pytest
 
 from dappled.clock import SystemClock
 from dappled.config.settings import ConsoleSettings, PublishSettings, Settings
-from dappled.daemon.console import actions, process
+from dappled.daemon.console import process
 from dappled.daemon.console.process import Console, ConsoleError
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.pipeline.shutter import Shutter
@@ -77,18 +77,18 @@ def test_loopback_of_ipv6_too() -> None:
         assert (token, process.url(listener)[:13]) == ("", "http://[::1]:")
 
 
-def test_without_a_bind_there_is_no_door() -> None:
+def test_without_a_bind_there_is_no_socket() -> None:
     with ExitStack() as stack:
-        assert process.open_door(Settings(), stack) is None
+        assert process.open_listener(Settings(), stack) is None
 
 
 @pytest.mark.parametrize(("slices", "private"), [("ipc:///x/s", False), ("tcp://127.0.0.1:5555", True)])
-def test_a_stream_over_tcp_gets_a_door_of_the_daemon_s_own(slices: str, private: bool) -> None:
+def test_a_stream_over_tcp_gets_an_endpoint_of_the_daemon_s_own(slices: str, private: bool) -> None:
     settings = replace(Settings(), publish=PublishSettings(slices=slices), console=ConsoleSettings(bind="127.0.0.1:0"))
     with ExitStack() as stack:
-        door = process.open_door(settings, stack)
-        assert door is not None
-        assert door.private.startswith("ipc://") is private
+        opened = process.open_listener(settings, stack)
+        assert opened is not None
+        assert opened.private.startswith("ipc://") is private
 
 
 def setup(folder: Path) -> dict[str, Any]:
@@ -169,7 +169,7 @@ def pipeline(tmp_path: Path) -> Any:
 
 
 def do(shutter: Shutter, **request: Any) -> dict[str, Any]:
-    return actions.act(request, shutter, Logbook(lambda: 0))
+    return process.answer(request, shutter, Logbook(lambda: 0))
 
 
 def test_a_number_that_comes_twice_is_one_wish(pipeline: Rig) -> None:
@@ -204,6 +204,6 @@ def test_the_log_is_told_from_a_number_on(pipeline: Rig) -> None:
     book = Logbook(lambda: 7)
     book.add("one")
     book.add("two", "warning")
-    told = actions.act({"do": "log", "after": 1}, pipeline.shutter, book)
+    told = process.answer({"do": "log", "after": 1}, pipeline.shutter, book)
     assert told["lines"] == [{"number": 2, "utc_ns": 7, "level": "warning", "text": "two"}]
-    assert actions.act({"do": "nothing"}, pipeline.shutter, book) == {"ok": True}
+    assert process.answer({"do": "nothing"}, pipeline.shutter, book) == {"ok": True}

@@ -1,4 +1,4 @@
-"""Who may speak to the console: this host, this origin, this token; and how much of it."""
+"""Decide which requests reach the console: by host, origin, token and size; and set strict headers on all answers."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs
+
+from starlette.responses import JSONResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 COOKIE = "dappled"
 GUESSES, GUESS_WINDOW_S = 10, 60.0  # from one address
@@ -27,26 +30,26 @@ HEADERS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
-    """What the rules look at. Header names are lower case."""
+class ConsoleRequest:
+    """The part of a request that the rules need. Header names are lower case."""
 
     method: str
     path: str
     headers: Mapping[str, str]
     query: str = ""
-    client: str = ""  # the address it comes from
+    client: str = ""  # its address
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why not: an HTTP status, and a sentence."""
+    """An HTTP status, and a sentence that says why."""
 
     status: int
     text: str
 
 
 class Access:
-    """The rules. `token` "" asks for none; `names` are host names besides addresses that browsers may come by."""
+    """The rules. With `token` "" none is needed; `names` are host names, besides addresses, that browsers may use."""
 
     def __init__(
         self,
@@ -64,18 +67,18 @@ class Access:
 
     @property
     def open(self) -> bool:
-        """Whether no token is asked for."""
+        """Whether no token is needed."""
         return not self._token
 
-    def judge(self, request: Request) -> Refusal | None:
-        """None where the request may go on."""
+    def judge(self, request: ConsoleRequest) -> Refusal | None:
+        """None for a request that is allowed."""
         refusal = self._host(request) or self._state_change(request) or self._known(request)
         if refusal is not None:
             self.refused += 1
         return refusal
 
     def try_token(self, token: str, client: str) -> Refusal | None:
-        """None for the right token; guesses are few from one address, and keep nobody out who comes from another."""
+        """None for the right token. Wrong ones are limited for each address; other addresses are not affected."""
         now, client = self._clock(), _network(client)
         guesses = self._guesses.get(client, deque())
         if len(guesses) == GUESSES and now - guesses[0] < GUESS_WINDOW_S:
@@ -90,8 +93,8 @@ class Access:
         self.refused += 1
         return Refusal(403, "this is not the token")
 
-    def _host(self, request: Request) -> Refusal | None:
-        """A page elsewhere whose name was made to lead here (DNS rebinding) comes under its own name."""
+    def _host(self, request: ConsoleRequest) -> Refusal | None:
+        """Refuse unknown host names, such as that of a hostile page which resolves to this address (DNS rebinding)."""
         host = request.headers.get("host", "")
         name = host.rpartition(":")[0] if not host.endswith("]") and ":" in host else host
         try:
@@ -101,7 +104,7 @@ class Access:
                 return Refusal(421, f"the console does not answer to {name!r}: add it to console.hosts")
         return None
 
-    def _state_change(self, request: Request) -> Refusal | None:
+    def _state_change(self, request: ConsoleRequest) -> Refusal | None:
         if request.method != "POST":
             return None if request.method in ("GET", "HEAD") else Refusal(405, "only GET and POST")
         origin, host = request.headers.get("origin"), request.headers.get("host", "")
@@ -114,7 +117,7 @@ class Access:
             return Refusal(411, "a request says how long its body is")
         return Refusal(413, f"a body is at most {BODY_BYTES} bytes") if int(length) > BODY_BYTES else None
 
-    def _known(self, request: Request) -> Refusal | None:
+    def _known(self, request: ConsoleRequest) -> Refusal | None:
         guarded = request.path.startswith(("/api/", "/kml", "/metrics")) and request.path != "/api/login"
         if not guarded or not self._token:
             return None
@@ -122,12 +125,45 @@ class Access:
             return None
         bearer = request.headers.get("authorization", "").partition(" ")
         given = bearer[2] if bearer[0].lower() == "bearer" else ""
-        if request.path.startswith("/kml") and not given:  # a virtual globe has no cookies of ours
+        if request.path.startswith("/kml") and not given:  # a virtual globe has no cookie
             given = (parse_qs(request.query).get("token") or [""])[0]
         return self.try_token(given, request.client) if given else Refusal(401, "the console asks for its token")
 
     def _right(self, token: str) -> bool:
         return hmac.compare_digest(token.encode("utf-8", "surrogatepass"), self._token.encode())
+
+
+class RequestGuard:
+    """An ASGI application that judges each request by `rules` before it calls `inner`."""
+
+    def __init__(self, inner: ASGIApp, rules: Access) -> None:
+        self._inner, self._rules = inner, rules
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        query = scope["query_string"].decode("latin-1")
+
+        async def strictly(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                more = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
+                if not any(name == b"cache-control" for name, _ in message["headers"]):
+                    more.append((b"cache-control", b"no-store"))
+                message = {**message, "headers": [*message["headers"], *more]}
+            await send(message)
+
+        client = (scope.get("client") or ("",))[0]
+        refusal = self._rules.judge(ConsoleRequest(scope["method"], scope["path"], headers, query, client))
+        if refusal is not None:
+            await refused(refusal)(scope, receive, strictly)
+        else:
+            await self._inner(scope, receive, strictly)
+
+
+def refused(refusal: Refusal) -> Response:
+    """The answer for a refusal."""
+    return JSONResponse({"error": refusal.text}, status_code=refusal.status)
 
 
 def _cookie(header: str) -> str:
@@ -139,7 +175,7 @@ def _cookie(header: str) -> str:
 
 
 def _network(client: str) -> str:
-    """The address, of IPv6 the network: one machine has as many addresses there as it likes."""
+    """The address; for IPv6 the /64 network, because one machine can have many addresses there."""
     try:
         address = ipaddress.ip_address(client)
     except ValueError:

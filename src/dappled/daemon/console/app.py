@@ -1,10 +1,11 @@
-"""The console's web application: one page, its events, its pictures, and the few things that may be asked of it."""
+"""The console's web application: the page, its events, its pictures, requests to the daemon, and KML for globes."""
 
 from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,14 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
-from dappled.daemon.console import access, globe, pictures
-from dappled.daemon.console.access import Refusal
-from dappled.daemon.console.control import ControlError
-from dappled.daemon.console.feed import FeedError
-from dappled.daemon.console.guard import Guard, refused
-from dappled.daemon.console.parts import Parts, file, make_picture, rectified_png
-from dappled.daemon.console.studio import StudioError
+from dappled.daemon.console import access, kml, pictures
+from dappled.daemon.console.access import Access, Refusal, RequestGuard, refused
+from dappled.daemon.console.feed import Feed, FeedError
+from dappled.daemon.console.placement import Background
+from dappled.daemon.console.process import ConsoleRequestError, DaemonChannel
+from dappled.daemon.console.studio import Studio, StudioError
 from dappled.daemon.health import metrics
+from dappled.decode.geometry.footprint import RectifiedFrame
 from dappled.errors import DappledError
 
 _PICTURES = (
@@ -31,182 +32,154 @@ _PICTURES = (
     "and map.png, which is north up"
 )
 _DISPARITY_PX = 8.0
-_MAP_PX = 320
+_MAP_PX, _GLOBE_BOUNDS_PX, _GLOBE_PICTURE_PX = 320, 320, 1024
+_LOG_EVERY_S = 0.7
+_STATIC = Path(str(resources.files("dappled.daemon.console") / "static"))
 
 
-def make(parts: Parts) -> ASGIApp:
-    """The application, behind its rules."""
-    static = str(resources.files("dappled.daemon.console") / "static")
-    routes = [
-        Route("/", _page(Path(static) / "index.html")),
-        Mount("/static", StaticFiles(directory=static)),
-        Route("/api/login", _login(parts), methods=["POST"]),
-        Route("/api/events", _events(parts)),
-        Route("/api/state", _state(parts)),
-        Route("/api/shoot", _act(parts, _shoot), methods=["POST"]),
-        Route("/api/interval", _act(parts, _interval), methods=["POST"]),
-        Route("/api/interval/stop", _act(parts, _stop), methods=["POST"]),
-        Route("/api/frames/{frame:int}/{name}", _picture(parts)),
-        Route("/api/map", _map(parts)),
-        Route("/metrics", _metrics(parts)),
-        Route("/kml", globe.link(parts)),
-        Route("/kml/latest.kml", globe.latest(parts)),
-        Route("/kml/{frame:int}.png", globe.picture(parts)),
-    ]
-    return Guard(Starlette(routes=routes, exception_handlers={DappledError: _told}), parts.access)
+class ConsoleApp:
+    """The application's endpoints. Pictures are made one at a time on a thread for that."""
 
+    def __init__(
+        self, feed: Feed, studio: Studio, daemon: DaemonChannel, rules: Access, background: Background | None
+    ) -> None:
+        self._feed, self._hub, self._studio, self._daemon = feed, feed.hub, studio, daemon
+        self._rules, self._background = rules, background
+        self._pictures = ThreadPoolExecutor(1, "pictures")
+        self._questions = ThreadPoolExecutor(2, "questions")  # they wait for the daemon
 
-Endpoint = Callable[[Request], Any]
+    def asgi(self) -> ASGIApp:
+        """The application behind its rules."""
+        routes = [
+            Route("/", self._page),
+            Mount("/static", StaticFiles(directory=_STATIC)),
+            Route("/api/login", self._login, methods=["POST"]),
+            Route("/api/events", self._events),
+            Route("/api/state", self._state),
+            Route("/api/shoot", self._shoot, methods=["POST"]),
+            Route("/api/interval", self._interval, methods=["POST"]),
+            Route("/api/interval/stop", self._stop_interval, methods=["POST"]),
+            Route("/api/frames/{frame:int}/{name}", self._frame_picture),
+            Route("/api/map", self._map),
+            Route("/metrics", self._metrics),
+            Route("/kml", self._kml_link),
+            Route("/kml/latest.kml", self._kml_latest),
+            Route("/kml/{frame:int}.png", self._kml_picture),
+        ]
+        return RequestGuard(Starlette(routes=routes, exception_handlers={DappledError: _failure}), self._rules)
 
+    async def follow_log(self) -> None:
+        """Send new lines of the daemon's log to the pages, while there are pages."""
+        after = 0
+        while True:
+            await asyncio.sleep(_LOG_EVERY_S)
+            if not len(self._hub):
+                continue
+            event = await self._log_after(after)
+            if event is not None:
+                after = event["lines"][-1]["number"]
+                self._hub.send(event)
 
-def _page(path: Path) -> Endpoint:
-    async def page(_: Request) -> Response:
-        return FileResponse(path)
+    def close(self) -> None:
+        """End the threads."""
+        self._pictures.shutdown()
+        self._questions.shutdown()
 
-    return page
+    # the page and its events
 
+    async def _page(self, _: Request) -> Response:
+        return FileResponse(_STATIC / "index.html")
 
-def _login(parts: Parts) -> Endpoint:
-    async def login(request: Request) -> Response:
-        body = await _body(request)
-        token = body.get("token")
-        refusal = parts.access.try_token(
-            token if isinstance(token, str) else "", request.client.host if request.client else ""
-        )
+    async def _login(self, request: Request) -> Response:
+        token = (await _body(request)).get("token")
+        client = request.client.host if request.client else ""
+        refusal = self._rules.try_token(token if isinstance(token, str) else "", client)
         if refusal is not None:
             return refused(refusal)
         answer = JSONResponse({"ok": True})
-        if parts.access.open:  # nothing to remember
-            return answer
-        answer.set_cookie(access.COOKIE, str(token), httponly=True, samesite="strict", max_age=7 * 86400)
+        if not self._rules.open:
+            answer.set_cookie(access.COOKIE, str(token), httponly=True, samesite="strict", max_age=7 * 86400)
         return answer
 
-    return login
-
-
-def _events(parts: Parts) -> Endpoint:
-    async def events(_: Request) -> Response:
-        feed = parts.feed
-        first = [_about(parts), feed.state(), *(feed.frame_event(index) for index in feed.frames), {"is": "ready"}]
-        if log := await _log(parts, 0):
+    async def _events(self, _: Request) -> Response:
+        feed = self._feed
+        first = [self._about(), feed.state(), *(feed.frame_event(index) for index in feed.frames), {"is": "ready"}]
+        if log := await self._log_after(0):
             first.append(log)
-        if parts.hub.full:
+        if self._hub.full:
             return refused(Refusal(503, "too many pages are open: close one"))
-        return StreamingResponse(_stream(parts.hub.listen(first)), media_type="text/event-stream")
+        return StreamingResponse(self._hub.listen(first), media_type="text/event-stream")
 
-    return events
+    async def _state(self, _: Request) -> Response:
+        own = {"pages": len(self._hub), "events_dropped": self._hub.dropped, "refused": self._rules.refused}
+        return JSONResponse({**self._feed.state(), "console": own, "newest": self._feed.newest()})
 
-
-async def _stream(events: AsyncIterator[str]) -> AsyncIterator[str]:
-    async for text in events:
-        yield text
-
-
-def _state(parts: Parts) -> Endpoint:
-    async def state(_: Request) -> Response:
-        hub, rules = parts.hub, parts.access
-        own = {"pages": len(hub), "events_dropped": hub.dropped, "refused": rules.refused}
-        return JSONResponse({**parts.feed.state(), "console": own, "newest": parts.feed.newest()})
-
-    return state
-
-
-def _metrics(parts: Parts) -> Endpoint:
-    async def answer(_: Request) -> Response:
-        health = parts.feed.health
+    async def _metrics(self, _: Request) -> Response:
+        health = self._feed.health
         if health is None:
             return refused(Refusal(503, "the daemon has not been heard yet: ask again"))
         return Response(metrics.text(health), media_type=metrics.CONTENT_TYPE)
 
-    return answer
+    def _about(self) -> dict[str, Any]:
+        return {
+            "is": "about",
+            "start": self._feed.start,
+            "map": None if self._background is None else self._background.bounds(),
+            "path": list(self._feed.path),
+        }
 
+    async def _log_after(self, number: int) -> dict[str, Any] | None:
+        """The lines of the daemon's log after this number, as an event; None without any."""
+        try:
+            answer = await self._ask({"do": "log", "after": number})
+        except ConsoleRequestError:
+            return None
+        return {"is": "log", "lines": answer["lines"]} if answer.get("lines") else None
 
-def _about(parts: Parts) -> dict[str, Any]:
-    background = parts.background
-    return {
-        "is": "about",
-        "start": parts.feed.start,
-        "map": None if background is None else background.bounds(),
-        "path": list(parts.feed.path),
-    }
+    # requests to the daemon
 
+    async def _shoot(self, request: Request) -> Response:
+        return await self._do({"do": "shoot", "sequence": _whole(await _body(request), "sequence", 0, 2**31)})
 
-async def _log(parts: Parts, after: int) -> dict[str, Any] | None:
-    """The daemon's log lines after a number, as an event; None where there are none."""
-    try:
-        answer = await _ask(parts, {"do": "log", "after": after})
-    except ControlError:
-        return None
-    return {"is": "log", "lines": answer["lines"]} if answer.get("lines") else None
+    async def _interval(self, request: Request) -> Response:
+        body = await _body(request)
+        seconds = body.get("interval_s")
+        if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds <= 86400:
+            raise StudioError("interval_s is a number of seconds from 0 to 86400")
+        count, sequence = _whole(body, "count", 0, 10**6), _whole(body, "sequence", 0, 2**31)
+        return await self._do({"do": "interval", "sequence": sequence, "interval_s": seconds, "count": count})
 
+    async def _stop_interval(self, request: Request) -> Response:
+        await _body(request)
+        return await self._do({"do": "stop interval"})
 
-async def follow_log(parts: Parts) -> None:
-    """Tell pages the log's new lines, as long as there are pages."""
-    after = 0
-    while True:
-        await asyncio.sleep(0.7)
-        if not len(parts.hub):
-            continue
-        event = await _log(parts, after)
-        if event is not None:
-            after = event["lines"][-1]["number"]
-            parts.hub.tell(event)
-
-
-def _act(parts: Parts, question: Callable[[Mapping[str, Any]], dict[str, Any]]) -> Endpoint:
-    async def act(request: Request) -> Response:
-        answer = await _ask(parts, question(await _body(request)))
+    async def _do(self, question: Mapping[str, Any]) -> Response:
+        answer = await self._ask(question)
         answer.pop("number", None)
         return JSONResponse(answer, status_code=200 if answer.get("ok") else 409)
 
-    return act
+    async def _ask(self, question: Mapping[str, Any]) -> dict[str, Any]:
+        return await asyncio.get_running_loop().run_in_executor(self._questions, self._daemon.ask, question)
 
+    # pictures
 
-def _shoot(body: Mapping[str, Any]) -> dict[str, Any]:
-    return {"do": "shoot", "sequence": _whole(body, "sequence", 0, 2**31)}
-
-
-def _interval(body: Mapping[str, Any]) -> dict[str, Any]:
-    seconds = body.get("interval_s")
-    if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds <= 86400:
-        raise StudioError("interval_s is a number of seconds from 0 to 86400")
-    count, sequence = _whole(body, "count", 0, 10**6), _whole(body, "sequence", 0, 2**31)
-    return {"do": "interval", "sequence": sequence, "interval_s": seconds, "count": count}
-
-
-def _stop(_: Mapping[str, Any]) -> dict[str, Any]:
-    return {"do": "stop interval"}
-
-
-def _whole(body: Mapping[str, Any], name: str, low: int, high: int) -> int:
-    value = body.get(name)
-    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-        raise StudioError(f"{name} is a whole number from {low} to {high}")
-    return value
-
-
-async def _ask(parts: Parts, question: Mapping[str, Any]) -> dict[str, Any]:
-    return await asyncio.get_running_loop().run_in_executor(parts.askers, parts.control.ask, question)
-
-
-def _picture(parts: Parts) -> Endpoint:
-    async def picture(request: Request) -> Response:
+    async def _frame_picture(self, request: Request) -> Response:
         frame, name = request.path_params["frame"], request.path_params["name"]
-        seen = parts.feed.frames.get(frame)
-        if seen is None:
+        known = self._feed.frames.get(frame)
+        if known is None:
             raise FeedError(f"there is no frame {frame} here")
-        if name == "thumb.jpg" and seen.thumb is not None:
-            return file(await make_picture(parts, pictures.jpeg, seen.thumb), name)
+        if name == "thumb.jpg" and known.thumb is not None:
+            return _file(await self._make(pictures.jpeg, known.thumb), name)
         if name == "map.png":
-            return file(await rectified_png(parts, frame, _MAP_PX), name)
+            return _file(await self._rectified_png(frame, _MAP_PX), name)
         if name == "depth.png":
-            if seen.depth is None:
+            if known.depth is None:
                 raise FeedError(f"frame {frame} has no depth (any more)")
-            return file(await make_picture(parts, parts.studio.depth, seen.depth), name)
-        message = await parts.feed.slices(frame)
-        studio = parts.studio
+            return _file(await self._make(self._studio.depth, known.depth), name)
+        message = await self._feed.slices(frame)
+        studio = self._studio
         if name == "refocus.jpg":
-            return file(await make_picture(parts, studio.refocused, message, _disparity(request)), name)
+            return _file(await self._make(studio.refocused, message, _disparity(request)), name)
         makers: dict[str, Callable[..., Any]] = {
             "thumb.jpg": lambda one: pictures.jpeg(studio.thumb(one)),
             "mean.jpg": studio.mean,
@@ -216,10 +189,75 @@ def _picture(parts: Parts) -> Endpoint:
             "views.json": lambda one: json.dumps(studio.views(one)[0]).encode(),
         }
         if name not in makers:
-            raise FeedError(f"a frame has {_PICTURES}, no {name}")
-        return file(await make_picture(parts, makers[name], message), name)
+            raise FeedError(f"a frame has {_PICTURES}, but no {name}")
+        return _file(await self._make(makers[name], message), name)
 
-    return picture
+    async def _map(self, _: Request) -> Response:
+        if self._background is None:
+            raise FeedError("no map is configured in console.map")
+        return FileResponse(self._background.file, headers={"cache-control": "private, max-age=3600"})
+
+    async def _make(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(self._pictures, function, *arguments)
+
+    async def _rectified(self, frame: int, longest_side: int, *, sharp: bool = False) -> RectifiedFrame | None:
+        """A frame on the ground; `sharp` from its slices, else from its small picture. None without a position."""
+        known = self._feed.frames.get(frame)
+        if known is None:
+            raise FeedError(f"there is no frame {frame} here")
+        picture, header = known.thumb, dict(known.tag)
+        if sharp or picture is None:
+            message = await self._feed.slices(frame)
+            header["frame_shape"] = message.header["frame_shape"]
+            picture = await self._make(self._studio.full, message)
+        found: RectifiedFrame | None = await self._make(self._studio.rectified, header, picture, longest_side)
+        return found
+
+    async def _rectified_png(self, frame: int, longest_side: int, *, sharp: bool = False) -> bytes:
+        one = await self._rectified(frame, longest_side, sharp=sharp)
+        if one is None:
+            raise FeedError(f"the position of frame {frame} on the ground is not known")
+        made: bytes = await self._make(pictures.png, one.picture)
+        return made
+
+    # virtual globes
+
+    async def _kml_link(self, request: Request) -> Response:
+        self._hub.globe_asked()
+        return Response(kml.network_link(_absolute(request, "/kml/latest.kml")), media_type=kml.MEDIA_TYPE)
+
+    async def _kml_latest(self, request: Request) -> Response:
+        self._hub.globe_asked()
+        frame, one = self._feed.newest(), None
+        if frame is not None:
+            try:
+                one = await self._rectified(frame, _GLOBE_BOUNDS_PX)
+            except FeedError:  # it is not decoded: the globe shows the track alone
+                one = None
+        picture = _absolute(request, f"/kml/{frame}.png")
+        return Response(kml.latest(f"frame {frame}", picture, one, self._feed.track()), media_type=kml.MEDIA_TYPE)
+
+    async def _kml_picture(self, request: Request) -> Response:
+        self._hub.globe_asked()
+        return _file(await self._rectified_png(request.path_params["frame"], _GLOBE_PICTURE_PX, sharp=True), "x.png")
+
+
+def _absolute(request: Request, path: str) -> str:
+    token = request.query_params.get("token")
+    tail = f"?token={token}" if token else ""
+    return f"{request.url.scheme}://{request.headers['host']}{path}{tail}"
+
+
+def _file(data: bytes, name: str) -> Response:
+    kind = {"jpg": "image/jpeg", "png": "image/png", "json": "application/json"}[name.rpartition(".")[2]]
+    return Response(data, media_type=kind)
+
+
+def _whole(body: Mapping[str, Any], name: str, low: int, high: int) -> int:
+    value = body.get(name)
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        raise StudioError(f"{name} is a whole number from {low} to {high}")
+    return value
 
 
 def _disparity(request: Request) -> float:
@@ -232,28 +270,18 @@ def _disparity(request: Request) -> float:
     return disparity
 
 
-def _map(parts: Parts) -> Endpoint:
-    async def background(_: Request) -> Response:
-        if parts.background is None:
-            raise FeedError("no map is named in console.map")
-        return FileResponse(parts.background.file, headers={"cache-control": "private, max-age=3600"})
-
-    return background
-
-
 async def _body(request: Request) -> dict[str, Any]:
     try:
         body = json.loads(await request.body() or b"{}")
     except (ValueError, RecursionError):
         body = None
     except ClientDisconnect:
-        raise StudioError("a request broke off before its end") from None
+        raise StudioError("the request ended before its body was complete") from None
     if not isinstance(body, dict):
         raise StudioError("a request's body is one JSON object")
     return body
 
 
-async def _told(_: Request, error: Exception) -> Response:
-    """A failure as its one sentence."""
-    status = 504 if isinstance(error, ControlError) else 404 if isinstance(error, FeedError) else 422
+async def _failure(_: Request, error: Exception) -> Response:
+    status = 504 if isinstance(error, ConsoleRequestError) else 404 if isinstance(error, FeedError) else 422
     return JSONResponse({"error": str(error)}, status_code=status)

@@ -1,17 +1,21 @@
-"""What the console knows: the stream's messages as they come, and older slices asked for again."""
+"""Receive the stream for the console, keep what the pages need, and send it to them as events."""
 
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
+import time
+import weakref
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import go_no_go
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.subscriber import AsyncSubscriber
@@ -20,19 +24,20 @@ from dappled.errors import DappledError, report
 
 log = logging.getLogger(__name__)
 FRAMES, STACK_BYTES, PATH = 400, 72_000_000, 3600
-_ASK_S = 20.0
+PAGES, WAITING = 24, 64
+GLOBE_S = 30.0  # a virtual globe counts as a viewer for so long after it asked
+_ASK_S, _KEEP_ALIVE_S = 20.0, 10.0
 
 Event = dict[str, Any]
 
 
 class FeedError(DappledError):
-    """Something is not there; one sentence."""
+    """A frame, a picture or a map that does not exist; one sentence."""
 
 
 @dataclass(slots=True)
-class Seen:
-    """One frame: its tag as published; once its slices came a small picture, and what they say of carriers; its depth
-    where there is one."""
+class FeedState:
+    """What is known of one frame: its tag; from its slices a small picture and the carriers; its depth, if any."""
 
     tag: dict[str, Any]
     thumb: NDArray[np.uint8] | None = None
@@ -41,25 +46,82 @@ class Seen:
     slices: dict[str, Any] | None = None
 
 
+class Hub:
+    """Sends events to the open pages. All calls on one event loop.
+
+    Each page has a bounded queue; one that stops reading loses its oldest events, and delays no other.
+    """
+
+    def __init__(self) -> None:
+        self._pages: weakref.WeakSet[asyncio.Queue[str]] = (
+            weakref.WeakSet()
+        )  # weak: a stream that was never read goes too
+        self._globe_s = -1e9
+        self.dropped = 0
+
+    def __len__(self) -> int:
+        return len(self._pages)
+
+    @property
+    def full(self) -> bool:
+        """Whether there are as many pages as allowed."""
+        return len(self._pages) >= PAGES
+
+    @property
+    def watched(self) -> bool:
+        """Whether a page is open, or a virtual globe has asked lately."""
+        return len(self._pages) > 0 or time.monotonic() - self._globe_s < GLOBE_S
+
+    def globe_asked(self) -> None:
+        """Note that a virtual globe has asked."""
+        self._globe_s = time.monotonic()
+
+    def send(self, event: Event) -> None:
+        """Send an event to every page."""
+        text = f"data: {json.dumps(event, separators=(',', ':'))}\n\n"
+        for page in self._pages:
+            if page.full():
+                page.get_nowait()
+                self.dropped += 1
+            page.put_nowait(text)
+
+    def listen(self, first: list[Event]) -> AsyncIterator[str]:
+        """Server-sent events for a new page: the first ones at once, a comment when there are none for a while."""
+        page: asyncio.Queue[str] = asyncio.Queue(WAITING)
+        self._pages.add(page)
+        return self._stream(page, first)
+
+    async def _stream(self, page: asyncio.Queue[str], first: list[Event]) -> AsyncIterator[str]:
+        try:
+            for event in first:
+                yield f"data: {json.dumps(event, separators=(',', ':'))}\n\n"
+            while True:
+                try:
+                    yield await asyncio.wait_for(page.get(), _KEEP_ALIVE_S)
+                except TimeoutError:
+                    yield ": still here\n\n"
+        finally:
+            self._pages.discard(page)
+
+
 class Feed:
-    """Owns what came. `tell` is called with each event for the pages; `thumb` and `corners` make what a frame's place
-    on the map needs. All on one event loop."""
+    """Keeps the stream's messages, and tells `hub` of each. `studio` makes small pictures and footprints for the map.
+
+    All calls on one event loop.
+    """
 
     def __init__(
         self,
         endpoint: str,
         ask: str,
-        *,
-        tell: Callable[[Event], None],
-        thumb: Callable[[Message], NDArray[np.uint8]],
-        corners: Callable[[dict[str, Any]], list[tuple[float, float]] | None],
-        watched: Callable[[], bool],
+        hub: Hub,
+        studio: Studio,
     ) -> None:
-        self._endpoints, self._tell, self._thumb, self._corners = (endpoint, ask), tell, thumb, corners
-        self._watched = watched
+        self.hub = hub
+        self._endpoints, self._studio = (endpoint, ask), studio
         self.health: dict[str, Any] | None = None
         self.start: dict[str, Any] | None = None
-        self.frames: OrderedDict[int, Seen] = OrderedDict()
+        self.frames: OrderedDict[int, FeedState] = OrderedDict()
         self._stacks: OrderedDict[int, Message] = OrderedDict()
         self._asked: dict[int, asyncio.Future[Message]] = {}
         self._stream: AsyncSubscriber | None = None
@@ -67,7 +129,7 @@ class Feed:
         self.path: deque[tuple[float, float]] = deque(maxlen=PATH)  # (longitude, latitude) of the vehicle
 
     async def run(self) -> None:
-        """Receive for ever. Slices are listened to only while somebody watches."""
+        """Receive until cancelled. Slices and depth are subscribed to only while a viewer is there."""
         topics = [topic for topic in wire.TOPICS if topic not in ("slices", "preview", "depth")]
         async with AsyncSubscriber(*self._endpoints, topics=topics, high_water_mark=3, recover=False) as stream:
             self._stream = stream
@@ -75,7 +137,7 @@ class Feed:
                 await stream.ask({"get": "start"})
             listening = False
             while True:
-                if self._watched() != listening:
+                if self.hub.watched != listening:
                     listening = not listening
                     for topic in ("slices", "depth"):
                         stream.listen(topic, listening)
@@ -83,11 +145,11 @@ class Feed:
                 if message is not None:
                     try:
                         self._take(message)
-                    except (KeyError, TypeError, ValueError, DappledError) as error:  # not what the schema says
-                        report(log, f"a {message.topic} message was passed over", error)
+                    except (KeyError, TypeError, ValueError, DappledError) as error:  # against the schema
+                        report(log, f"a {message.topic} message was ignored", error)
 
     async def slices(self, frame: int) -> Message:
-        """The slices of a frame: those kept, or decoded again by the daemon. Raises FeedError."""
+        """The slices of a frame: as kept, or asked for again. Raises FeedError."""
         if (kept := self._stacks.get(frame)) is not None:
             self._stacks.move_to_end(frame)
             return kept
@@ -104,18 +166,18 @@ class Feed:
             raise FeedError(f"the slices of frame {frame} did not come: the decoder is busy") from None
 
     def newest(self) -> int | None:
-        """The last frame whose slices came; else the last one."""
+        """The last frame that has slices; without any, the last frame."""
         if self._stacks:
             return max(self._stacks)
         return next(reversed(self.frames), None)
 
     @property
     def frame_bytes(self) -> float | None:
-        """What a frame takes on disk, the mean so far."""
+        """The mean size of a frame on disk so far."""
         return self._bytes / self._sized if self._sized else None
 
     def state(self) -> Event:
-        """The newest state as an event."""
+        """The newest health record as an event, with its checks."""
         health = self.health
         if health is None:
             return {"is": "state", "health": None, "checks": [], "verdict": None}
@@ -140,7 +202,7 @@ class Feed:
         }
 
     def track(self) -> list[tuple[float, float, float]]:
-        """(longitude, latitude, altitude) of the frames that have a place, in order."""
+        """(longitude, latitude, altitude) of the frames with a position, in order."""
         poses = [seen.tag["pose"] for seen in self.frames.values()]
         return [
             (pose["longitude_deg"], pose["latitude_deg"], pose["altitude_msl_m"] or 0.0)
@@ -153,8 +215,8 @@ class Feed:
         match message.topic:
             case "health":
                 self.health = header
-                self._follow(header.get("vehicle"))
-                self._tell(self.state())
+                self._add_to_path(header.get("vehicle"))
+                self.hub.send(self.state())
             case "start":
                 self._begin(header)
             case "frame":
@@ -164,12 +226,12 @@ class Feed:
             case "depth":
                 self._depth(message)
             case "end":
-                self._tell({"is": "end", "shots": header.get("shots")})
+                self.hub.send({"is": "end", "shots": header.get("shots")})
             case "error":
                 asked = header.get("asked") or {}
                 self._answer(asked.get("frame"), FeedError(str(header.get("error"))))
 
-    def _follow(self, vehicle: dict[str, Any] | None) -> None:
+    def _add_to_path(self, vehicle: dict[str, Any] | None) -> None:
         if vehicle is not None and vehicle["latitude_deg"] is not None:
             place = (vehicle["longitude_deg"], vehicle["latitude_deg"])
             if not self.path or self.path[-1] != place:
@@ -177,16 +239,16 @@ class Feed:
 
     def _begin(self, header: dict[str, Any]) -> None:
         self.start = header
-        self._tell({"is": "start", "start": header})
+        self.hub.send({"is": "start", "start": header})
 
     def _frame(self, header: dict[str, Any]) -> None:
         index = header["frame"]
-        self.frames[index] = Seen(header, corners=self._corners(header))
+        self.frames[index] = FeedState(header, corners=self._studio.corners(header))
         while len(self.frames) > FRAMES:
             self.frames.popitem(last=False)
         self._bytes += header["size"]
         self._sized += 1
-        self._tell(self.frame_event(index))
+        self.hub.send(self.frame_event(index))
 
     def _slices(self, message: Message) -> None:
         index = message.header["frame"]
@@ -199,18 +261,18 @@ class Feed:
         if seen is None:
             return
         if seen.thumb is None:
-            seen.thumb = self._thumb(message)
+            seen.thumb = self._studio.thumb(message)
             seen.slices = _facts(message)
-            seen.corners = self._corners({**seen.tag, "frame_shape": message.header.get("frame_shape")})
-        self._tell(self.frame_event(index))
+            seen.corners = self._studio.corners({**seen.tag, "frame_shape": message.header.get("frame_shape")})
+        self.hub.send(self.frame_event(index))
 
     def _depth(self, message: Message) -> None:
         seen = self.frames.get(message.header["frame"])
         if seen is not None:
             for older in self.frames.values():
-                older.depth = None  # one at a time is kept
+                older.depth = None  # only the newest is kept
             seen.depth = message
-            self._tell(self.frame_event(message.header["frame"]))
+            self.hub.send(self.frame_event(message.header["frame"]))
 
     def _answer(self, frame: Any, answer: Message | FeedError) -> None:
         waiting = self._asked.pop(frame, None)

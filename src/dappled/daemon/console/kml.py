@@ -1,18 +1,18 @@
-"""KML for a virtual globe: a link that asks again every few seconds, and the latest frame on the ground."""
+"""Write KML for a virtual globe: a network link that is read every few seconds, and the latest frame on the ground."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from xml.etree import ElementTree as ET
 
-from dappled.daemon.console.footprint import Rectified
+from dappled.decode.geometry.footprint import RectifiedFrame
 
 NAMESPACE = "http://www.opengis.net/kml/2.2"
 MEDIA_TYPE = "application/vnd.google-earth.kml+xml"
 
 
 def network_link(href: str, *, every_s: float = 2.0) -> bytes:
-    """A document that a globe opens once; it then asks for `href` again and again."""
+    """A document that a globe opens once; the globe then reads `href` every `every_s`."""
     root, document = _document("dappled")
     link = _add(document, "NetworkLink")
     _add(link, "name", "dappled, the latest frame")
@@ -23,7 +23,7 @@ def network_link(href: str, *, every_s: float = 2.0) -> bytes:
     return _bytes(root)
 
 
-def latest(name: str, picture: str, frame: Rectified | None, track: Sequence[tuple[float, float, float]]) -> bytes:
+def latest(name: str, picture: str, frame: RectifiedFrame | None, track: Sequence[tuple[float, float, float]]) -> bytes:
     """The frame's picture as an overlay, and the track of (longitude, latitude, altitude above sea level)."""
     root, document = _document("dappled")
     if frame is not None:

@@ -1,4 +1,4 @@
-"""The daemon's side of the console: its door, its process, and the few things that it may ask of the daemon."""
+"""Run the console in a process of its own, and answer what it asks of the daemon."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from typing import Any
 from dappled.config import settings as configuration
 from dappled.config.settings import ConsoleSettings, Settings
 from dappled.daemon.health.logbook import Logbook
+from dappled.daemon.pipeline.repeats import CaptureRequest
+from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
 from dappled.daemon.stream.curve import read_private
 from dappled.daemon.stream.sockets import is_loopback
 from dappled.drivers.process_channel import ChannelError, ProcessChannel
@@ -30,12 +32,17 @@ log = logging.getLogger(__name__)
 RESTARTS, RESTART_WINDOW_S = 5, 60.0
 _BACKLOG = 32
 _TOKEN_CHARACTERS = 12
+_ANSWER_S = 3.0
 
 Act = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
 class ConsoleError(DappledError):
     """The console can't be opened; one sentence."""
+
+
+class ConsoleRequestError(DappledError):
+    """The daemon did not answer the console; one sentence."""
 
 
 def listen(settings: ConsoleSettings) -> tuple[socket.socket, str]:
@@ -75,17 +82,17 @@ def address(bind: str) -> tuple[str, int]:
 
 
 def url(listener: socket.socket) -> str:
-    """Where a browser on this machine finds it."""
+    """The address for a browser on this machine."""
     host, port = listener.getsockname()[:2]
     host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)  # noqa: S104  # compared with
     return f"http://{host}:{port}/"
 
 
 class Console:
-    """Keeps the console's process running, and does what it asks: `act` gets a request and gives the answer.
+    """Keeps the console's process running, and answers its requests with `act`.
 
-    It runs at low priority. One that ends is started again, at most five times a minute; the socket stays open
-    meanwhile, so that browsers wait instead of failing.
+    The process has a low priority. When it ends it is started again, at most five times a minute; the listening socket
+    stays open meanwhile, so that browsers wait instead of failing.
     """
 
     def __init__(self, listener: socket.socket, setup: Mapping[str, Any], act: Act) -> None:
@@ -101,7 +108,7 @@ class Console:
         self._thread.start()
 
     def stop(self) -> None:
-        """End it, and close the door."""
+        """End the process, and close the listening socket."""
         self._stopping.set()
         if self._thread.is_alive():
             self._thread.join(5)
@@ -110,7 +117,7 @@ class Console:
     def _run(self) -> None:
         while not self._stopping.is_set():
             if len(self._begun) == RESTARTS and time.monotonic() - self._begun[0] < RESTART_WINDOW_S:
-                self.problem = "the console's process ended five times in a minute: it rests for one"
+                self.problem = "the console's process ended five times in a minute: it starts again in a minute"
                 log.warning("%s", self.problem)
                 self._stopping.wait(RESTART_WINDOW_S)
                 self._begun.clear()
@@ -119,7 +126,7 @@ class Console:
             self._begun.append(time.monotonic())
             try:
                 self._serve()
-            except Exception as error:  # noqa: BLE001  # whatever it was, it is started again, within the budget
+            except Exception as error:  # noqa: BLE001  # it is started again in any case, at most five times a minute
                 report(log, "the console ended", error)
 
     def _serve(self) -> None:
@@ -129,7 +136,7 @@ class Console:
                 [sys.executable, "-m", "dappled.daemon.console", str(there.fileno()), str(self._listener.fileno())],
                 pass_fds=[there.fileno(), self._listener.fileno()],
                 stdin=subprocess.DEVNULL,
-                # One thread for its arithmetic: the other cores are the flight's.
+                # One thread for its arithmetic: the other cores are for the flight.
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
             )
         try:
@@ -142,7 +149,7 @@ class Console:
             if not self._stopping.is_set():
                 log.warning("the console ended: %s", error)
         finally:
-            channel.close()  # which ends it
+            channel.close()  # this ends the process
             self._reap()
 
     def _reap(self) -> None:
@@ -158,46 +165,98 @@ class Console:
 
 
 @dataclass(frozen=True, slots=True)
-class Door:
-    """What a console needs from the start: its listening socket, its token, and where it may subscribe."""
+class ConsoleListener:
+    """A console's listening socket, its token, and the endpoint that it subscribes to."""
 
     listener: socket.socket
     token: str
-    private: str  # an endpoint of the daemon's own; "" where the stream itself is ipc
+    private: str  # a further ipc endpoint of the publisher; "" where the stream itself is ipc
 
     @property
     def url(self) -> str:
-        """Where a browser on this machine finds it."""
+        """The address for a browser on this machine."""
         return url(self.listener)
 
 
-def open_door(settings: Settings, stack: ExitStack) -> Door | None:
-    """The door of the configured console, None without one; closed with the stack. Raises as `listen`."""
+def open_listener(settings: Settings, stack: ExitStack) -> ConsoleListener | None:
+    """Open the configured console's socket; None without a console. The stack closes it. Raises like `listen`."""
     if not settings.console.bind:
         return None
     listener, token = listen(settings.console)
     stack.callback(listener.close)
     ipc = settings.publish.slices.startswith("ipc://")
-    return Door(listener, token, "" if ipc else f"ipc://{configuration.runtime_folder()}/own-{os.getpid()}")
+    return ConsoleListener(listener, token, "" if ipc else f"ipc://{configuration.runtime_folder()}/own-{os.getpid()}")
 
 
-def begin(
-    door: Door, settings: Settings, stack: ExitStack, *, recipe: Recipe | None, act: Act, logbook: Logbook
+def start(
+    opened: ConsoleListener, settings: Settings, stack: ExitStack, *, recipe: Recipe | None, act: Act, logbook: Logbook
 ) -> None:
-    """Start the console; it ends with the stack. `recipe` is what frames are decoded with."""
+    """Start the console; the stack ends it. `recipe` is how frames are decoded."""
     publish = settings.publish
     setup = {
-        "token": door.token,
+        "token": opened.token,
         "hosts": list(settings.console.hosts),
         "map": settings.console.map,
-        "endpoint": door.private or publish.slices,
-        "ask": f"{door.private}.ask" if door.private else publish.ask,
+        "endpoint": opened.private or publish.slices,
+        "ask": f"{opened.private}.ask" if opened.private else publish.ask,
         "recipe": None if recipe is None else asdict(recipe),
         "mount": list(settings.pose.mount),
     }
     logger = logging.getLogger("dappled")
     logger.addHandler(logbook)
     stack.callback(logger.removeHandler, logbook)
-    console = Console(door.listener, setup, act)
+    console = Console(opened.listener, setup, act)
     console.start()
     stack.callback(console.stop)
+
+
+class DaemonChannel:
+    """The console process' end: asks the daemon, from any thread, one question at a time."""
+
+    def __init__(self, channel: ProcessChannel) -> None:
+        self._channel = channel
+        self._turn = threading.Lock()
+        self._number = 0
+        self.gone = threading.Event()
+
+    def ask(self, question: Mapping[str, Any]) -> dict[str, Any]:
+        """The daemon's answer. Raises ConsoleRequestError; `gone` is set when the daemon has ended."""
+        with self._turn:
+            self._number += 1
+            try:
+                self._channel.send({**question, "number": self._number}, timeout_s=1.0)
+                while (answer := self._channel.receive(_ANSWER_S)) is not None:
+                    if answer.body.get("number") == self._number:
+                        return dict(answer.body)
+            except ChannelError:
+                self.gone.set()
+                raise ConsoleRequestError("the daemon has ended") from None
+        raise ConsoleRequestError("the daemon did not answer: check whether the shot was taken before you ask again")
+
+
+def answer(request: Mapping[str, Any], shutter: Shutter, logbook: Logbook) -> dict[str, Any]:
+    """Do what the console asks of the daemon: a shot, an interval, its end, or the last lines of the log.
+
+    A capture request follows the same rules as one over MAVLink: the page numbers its requests, and the same number
+    twice is one request.
+    """
+    match request.get("do"):
+        case "shoot":
+            return _decided(shutter.request(CaptureRequest("console", "console", request["sequence"])))
+        case "interval":
+            one = CaptureRequest("console", "console interval", request["sequence"])
+            return _decided(shutter.start_interval(one, float(request["interval_s"]), int(request["count"])))
+        case "stop interval":
+            ran = shutter.stop_interval()
+            return {"ok": True, "text": "the interval is stopped" if ran else "no interval was running"}
+        case "log":
+            return {"ok": True, "lines": logbook.after(request["after"])}
+        case _:
+            return {"ok": True}
+
+
+def _decided(decision: ShotDecision) -> dict[str, Any]:
+    if not decision.accepted:
+        return {"ok": False, "error": decision.reason, "index": None}
+    text = f"shot {decision.index}" if decision.outcome == "shot" else f"already shot {decision.index}"
+    return {"ok": True, "index": decision.index, "text": text}

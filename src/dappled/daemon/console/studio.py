@@ -1,4 +1,4 @@
-"""The darkroom of the console: makes what the page asks for of one frame, once, and keeps the last pictures."""
+"""Make the pictures of a frame that the page asks for, once each, and keep the last ones in memory."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config import profiles
-from dappled.daemon.console import footprint, pictures
-from dappled.daemon.console.footprint import Rectified
+from dappled.daemon.console import pictures
 from dappled.daemon.console.pictures import Mosaic
+from dappled.daemon.console.placement import oriented_frame
 from dappled.daemon.stream.wire import Message
 from dappled.decode.decoder import MaskDecoder
+from dappled.decode.geometry import footprint
+from dappled.decode.geometry.footprint import OrientedFrame, RectifiedFrame
 from dappled.decode.lightfield import view_stack
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.pictures import slice_mosaic
@@ -30,11 +32,11 @@ SLICES_PX = 1600
 
 
 class StudioError(DappledError):
-    """A picture can't be made of this frame; one sentence."""
+    """A request or picture that can't be made of this frame; one sentence."""
 
 
 class Studio:
-    """Works on one thread. A frame is given as its `slices` message; `mount` leads from camera to body axes."""
+    """Use it from one thread. A frame is given as its `slices` message; `mount` leads from camera to body axes."""
 
     def __init__(self, recipe: Recipe | None, mount: Sequence[float]) -> None:
         self._darkroom = None if recipe is None else Darkroom(recipe)
@@ -53,7 +55,7 @@ class Studio:
         )
 
     def spectrum(self, message: Message) -> bytes:
-        """The spectrum of the frame as far as its slices reach, JPEG; see `pictures.spectrum`."""
+        """The frame's spectrum where its slices cover it, JPEG; see `pictures.spectrum`."""
 
         def make() -> bytes:
             header = message.header
@@ -65,22 +67,24 @@ class Studio:
         return self._once(message, "spectrum", make)
 
     def mean(self, message: Message, longest_side: int = 1280) -> bytes:
-        """The slice of (0, 0): the frame as a photograph without parallax, JPEG."""
+        """The slice of carrier (0, 0): the frame as a photograph without parallax, JPEG."""
         return self._once(
             message, f"mean {longest_side}", lambda: pictures.jpeg(pictures.shown(_mean(message, longest_side)))
         )
 
     def thumb(self, message: Message) -> NDArray[np.uint8]:
-        """The same, small, uint8."""
+        """The same picture, small, uint8."""
         return pictures.shown(_mean(message, 256))
 
     def full(self, message: Message) -> NDArray[np.uint8]:
-        """The same, as large as it is, uint8."""
+        """The same picture in full size, uint8."""
         return pictures.shown(_stack(message)[0].real)
 
     def views(self, message: Message) -> tuple[dict[str, Any], bytes]:
-        """The views' mosaic as a JPEG, and its layout: how many, how large, where they stand, and where the phases
-        came from. Raises StudioError where this frame has none."""
+        """The mosaic of the views as JPEG, and its layout: size and place of each view, and the source of the phases.
+
+        Raises StudioError for a frame without views.
+        """
 
         def make() -> tuple[dict[str, Any], bytes]:
             made, source = self._mosaic(message)
@@ -100,7 +104,7 @@ class Studio:
         return pictures.jpeg(pictures.refocused(self._mosaic(message)[0], disparity))
 
     def depth(self, message: Message) -> bytes:
-        """A `depth` message in colours, PNG."""
+        """The picture of a `depth` message in colours, PNG."""
         arrays = message.arrays()
         return self._once(
             message,
@@ -109,21 +113,23 @@ class Studio:
         )
 
     def corners(self, header: Mapping[str, Any]) -> list[tuple[float, float]] | None:
-        """A frame's footprint on flat ground; see `footprint.corners`."""
-        one = self._geometry(header)
+        """A frame's footprint; see `footprint.corners`. None where it is unknown."""
+        one = self._oriented(header)
         return None if one is None else footprint.corners(one)
 
-    def rectified(self, header: Mapping[str, Any], picture: NDArray[np.uint8], longest_side: int) -> Rectified | None:
-        """A frame's picture north up; None where its place is not known."""
-        one = self._geometry(header)
+    def rectified(
+        self, header: Mapping[str, Any], picture: NDArray[np.uint8], longest_side: int
+    ) -> RectifiedFrame | None:
+        """A frame's picture on the ground, north up; None where its position is unknown."""
+        one = self._oriented(header)
         return None if one is None else footprint.rectify(one, picture, longest_side)
 
-    def _geometry(self, header: Mapping[str, Any]) -> footprint.Geometry | None:
+    def _oriented(self, header: Mapping[str, Any]) -> OrientedFrame | None:
         try:
             camera = profiles.camera(header["camera"])
         except DappledError:
-            return None  # a body without a profile has no known chip
-        return footprint.geometry(header["pose"], self._chip(camera, header), header["focal_length_mm"], self._mount)
+            return None  # the chip of a body without a profile is unknown
+        return oriented_frame(header["pose"], self._chip(camera, header), header["focal_length_mm"], self._mount)
 
     def _chip(self, camera: profiles.CameraProfile, header: Mapping[str, Any]) -> tuple[float, float] | None:
         shape = header.get("frame_shape")
@@ -140,9 +146,9 @@ class Studio:
     def _light_field(self, message: Message) -> LightField:
         header = message.header
         if self._darkroom is None:
-            raise StudioError("no mask is named: frames are not decoded")
+            raise StudioError("no mask is configured: frames are not decoded")
         if self._darkroom.recipe.mask == profiles.LENSLET:
-            raise StudioError("the views of a lenslet frame are made on the ground: dappled decode")
+            raise StudioError("the views of a lenslet frame are made after the flight: dappled decode")
         rows, columns = header["frame_shape"]
         decoder = self._darkroom.decoder((rows, columns), header["camera"], colours=header["mosaic"])
         assert isinstance(decoder, MaskDecoder)
@@ -166,7 +172,7 @@ class Studio:
         )
         if not views.size:
             raise StudioError(
-                "this frame has no views: without a calibration they need carriers that show in it, and its f-number"
+                "this frame has no views: without a calibration, its f-number and visible carriers are needed"
             )
         carriers = np.array(header["carriers"])
         return LightField(slices.values, carriers, views, offsets, grid, {"views_from": views_from})

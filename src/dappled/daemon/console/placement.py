@@ -1,24 +1,32 @@
-"""A picture behind the track: a PNG or JPEG in degrees, with the world file that GIS programs write beside it."""
+"""Place frames and the background picture on the console's map.
+
+The background is a PNG or JPEG in degrees, with the world file that GIS programs write beside it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from dappled.decode.geometry import camera_pose
+from dappled.decode.geometry.footprint import OrientedFrame
 from dappled.errors import DappledError
 
 _WORLD = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw"}
 
 
 class BackgroundError(DappledError):
-    """A map can't be used; one sentence."""
+    """A background map can't be used; one sentence."""
 
 
 @dataclass(frozen=True, slots=True)
 class Background:
-    """The picture's file, and its bounds in degrees."""
+    """The background picture's file, and its bounds in degrees."""
 
     file: Path
     north: float
@@ -31,9 +39,11 @@ class Background:
         return {"north": self.north, "south": self.south, "east": self.east, "west": self.west}
 
 
-def load(file: Path) -> Background:
-    """A map and its world file: six lines, degrees a pixel and the middle of the first pixel. Raises BackgroundError
-    for a picture that isn't one, is turned, or lies off the Earth."""
+def load_background(file: Path) -> Background:
+    """Read a map and its world file: six lines, with degrees per pixel and the centre of the first pixel.
+
+    Raises BackgroundError for a file that is no picture, is turned, or is not in degrees.
+    """
     if file.suffix.lower() not in _WORLD:
         raise BackgroundError(f"{file}: a map is a PNG or a JPEG")
     world = next((p for p in (file.with_suffix(_WORLD[file.suffix.lower()]), file.with_suffix(".wld")) if p.is_file()),
@@ -55,3 +65,17 @@ def load(file: Path) -> Background:
     if not (-180 <= west < east <= 181 and -90 <= south < north <= 90):
         raise BackgroundError(f"{file} is not in degrees; warp it first (gdalwarp -t_srs EPSG:4326)")
     return Background(file, north, south, east, west)
+
+
+def oriented_frame(
+    pose: Mapping[str, Any], size_mm: tuple[float, float] | None, focal_length_mm: float | None, mount: Sequence[float]
+) -> OrientedFrame | None:
+    """From the `pose` of a header; None where something is unknown. The ground is at the take-off point's height."""
+    needed = (pose["latitude_deg"], pose["longitude_deg"], pose.get("height_above_home_m"), pose["attitude"])
+    if any(value is None for value in needed) or size_mm is None or not focal_length_mm:
+        return None
+    height = float(pose["height_above_home_m"])
+    if height <= 0.5:
+        return None
+    rotation = camera_pose.matrix_of(tuple(pose["attitude"])) @ np.asarray(mount, dtype=np.float64).reshape(3, 3)
+    return OrientedFrame(size_mm, focal_length_mm, rotation, height, pose["latitude_deg"], pose["longitude_deg"])
