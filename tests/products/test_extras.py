@@ -20,6 +20,15 @@ def test_a_missing_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch)
     assert need("json").dumps([]) == "[]"
 
 
+def test_a_library_that_cannot_be_loaded_is_not_called_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(name: str) -> None:
+        raise ImportError("libxcb.so.1: cannot open shared object file", name=name)
+
+    monkeypatch.setattr("dappled.products.extras.importlib.import_module", broken)
+    with pytest.raises(MissingExtraError, match=r"opencv-python-headless is installed and can't be loaded: libxcb"):
+        need("cv2")
+
+
 def test_maps_can_be_imported_without_the_extras() -> None:
     code = (
         "import sys\n"

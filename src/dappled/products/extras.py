@@ -16,11 +16,13 @@ class MissingExtraError(DappledError):
 
 
 def need(module: str) -> Any:
-    """Import an optional module. Raises MissingExtraError saying what to install."""
+    """Import an optional module. Raises MissingExtraError: what to install, or why an installed one can't be loaded."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
         root = module.partition(".")[0]
+        if not (isinstance(error, ModuleNotFoundError) and error.name == root):
+            raise MissingExtraError(f"{_PACKAGES.get(root, root)} is installed and can't be loaded: {error}") from error
         extra = _EXTRAS.get(root, "ground")
         raise MissingExtraError(
             f"this needs {_PACKAGES.get(root, root)}: install it with pip install 'dappled[{extra}]'"
