@@ -31,7 +31,7 @@ import tomli_w
 
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.drivers.mavlink.links import Message, mavlink, pack
+from dappled.drivers.mavlink import Message, mavlink, pack
 from dappled.flight import flight_report
 from dappled.mocks.simulation import Simulation, World, free_port
 

@@ -29,7 +29,7 @@ from dappled.daemon.navigation.samples import AttitudeSample, PositionSample, at
 from dappled.daemon.navigation.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
 from dappled.decode.geometry.interpolation import metres_per_radian, turn_rad
 from dappled.decode.geometry.pose import Pose
-from dappled.drivers.mavlink.links import Message, PacketParser, mavlink
+from dappled.drivers.mavlink import Message, PacketParser, mavlink
 from dappled.flight import telemetry_log
 from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
 from dappled.mocks.autopilot.path import FlightPath

@@ -16,7 +16,7 @@ from dappled.daemon.navigation.navigation import Telemetry
 from dappled.daemon.pipeline import tagger
 from dappled.daemon.pipeline.tagger import FrameSettings
 from dappled.decode.geometry.pose import Pose
-from dappled.drivers.mavlink.links import Message, PacketParser, mavlink
+from dappled.drivers.mavlink import Message, PacketParser, mavlink
 from dappled.flight import Cause, LedgerReader, Result, Shot, recording
 from dappled.flight.check import check
 from dappled.mocks.autopilot.autopilot import BootTime, flight

@@ -20,7 +20,7 @@ import zmq
 from dappled.cli import main
 from dappled.config.settings import Settings
 from dappled.daemon.service import Service
-from dappled.drivers.mavlink.links import LinkError
+from dappled.drivers.mavlink import LinkError
 from dappled.errors import DappledError
 from dappled.flight import LedgerReader, check, flight_report
 from dappled.mocks.body.body import BodyOptions, SimulatedBody

@@ -14,7 +14,7 @@ import pytest
 
 from dappled.cli import main
 from dappled.drivers.gphoto2 import client
-from dappled.drivers.mavlink.links import mavlink
+from dappled.drivers.mavlink import mavlink
 from dappled.drivers.wired import shutter_line
 from dappled.flight import LedgerReader, check, flight_report
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern

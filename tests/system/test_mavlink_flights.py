@@ -12,8 +12,8 @@ import pytest
 from dappled.cli import main
 from dappled.config.schema import ConfigError
 from dappled.daemon.camera_protocol.parameters import code
+from dappled.drivers.mavlink import mavlink
 from dappled.drivers.mavlink import signing as mavlink_signing
-from dappled.drivers.mavlink.links import mavlink
 from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
 from dappled.flight import LedgerReader
 from dappled.mocks.body.body import BodyOptions, SimulatedBody

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from dappled.cli.arguments import Actions
 from dappled.daemon.stream import curve
-from dappled.drivers.mavlink.signing import SigningError, make_key
+from dappled.drivers.mavlink import SigningError, make_key
 
 HOME = Path("~/.config/dappled/keys")
 

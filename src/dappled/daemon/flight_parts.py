@@ -29,7 +29,7 @@ from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.camera import Camera, CameraError
-from dappled.drivers.mavlink.links import MavlinkLinks, Packet
+from dappled.drivers.mavlink import MavlinkLinks, Packet
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.flight import Recording, Shot
 

@@ -8,8 +8,7 @@ from typing import cast
 from dappled.clock import Clock
 from dappled.config.schema import ConfigError
 from dappled.config.settings import Settings
-from dappled.drivers.mavlink.links import MavlinkLinks
-from dappled.drivers.mavlink.signing import Signing, Unsigned, open_signing
+from dappled.drivers.mavlink import MavlinkLinks, Signing, Unsigned, open_signing
 
 TIME_FILE = ".mavlink-signing"
 

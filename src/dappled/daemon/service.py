@@ -26,7 +26,7 @@ from dappled.daemon.reload import merge
 from dappled.daemon.stream import curve, wire
 from dappled.daemon.stream.publisher import Publisher, Reply
 from dappled.drivers.camera import Camera
-from dappled.drivers.mavlink.links import Packet
+from dappled.drivers.mavlink import Packet
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot

@@ -6,7 +6,7 @@ import socket
 import sys
 import time
 
-from dappled.drivers.mavlink.links import mavlink, pack
+from dappled.drivers.mavlink import mavlink, pack
 
 
 def main(port: int, rate: int, seconds: float) -> None:

@@ -17,8 +17,7 @@ from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.navigation.navigation import Telemetry
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.drivers.camera import Setting, SettingName
-from dappled.drivers.mavlink.links import MavlinkLinks, Message, Packet, mavlink, pack
-from dappled.drivers.mavlink.signing import Signing
+from dappled.drivers.mavlink import MavlinkLinks, Message, Packet, Signing, mavlink, pack
 from dappled.flight import Cause, Shot
 from tests.daemon.fakes import eventually
 

@@ -12,7 +12,7 @@ from dappled.daemon.camera_protocol import camera_status
 from dappled.daemon.camera_protocol.camera_status import distance_message, sensor_orientation
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.drivers.camera import Identity
-from dappled.drivers.mavlink.links import mavlink
+from dappled.drivers.mavlink import mavlink
 from dappled.flight import Cause, ImageIndex, Shot
 
 SHOT = Shot(7, Cause("test", "console", 1), 1_000, 1_000)

@@ -16,7 +16,7 @@ from dappled.daemon.camera_protocol.component import Component
 from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters, code
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Setting, SettingName, check_change
-from dappled.drivers.mavlink.links import Message, Packet, mavlink, pack
+from dappled.drivers.mavlink import Message, Packet, mavlink, pack
 from tests.daemon.fakes import FakeSink
 
 NAN = math.nan

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.daemon.camera_protocol.ftp_server import FtpServer
-from dappled.drivers.mavlink.links import Message, mavlink
+from dappled.drivers.mavlink import Message, mavlink
 
 DATA = bytes(range(256)) * 40
 NONE, TERMINATE, RESET, LIST, OPEN, READ, CREATE, CRC32, BURST = 0, 1, 2, 3, 4, 5, 6, 14, 15

@@ -21,9 +21,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dappled.clock import SystemClock
+from dappled.drivers.mavlink import Unsigned
 from dappled.drivers.mavlink import signing as mavlink_signing
 from dappled.drivers.mavlink.links import Framer, Packet, mavlink
-from dappled.drivers.mavlink.signing import Unsigned
 from tests.daemon.camera_protocol.rig import Camera, Peer
 from tests.daemon.camera_protocol.test_component import Rig
 from tests.daemon.fakes import eventually

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from dappled.clock import RecordedClock
-from dappled.drivers.mavlink.links import mavlink
+from dappled.drivers.mavlink import mavlink
 from tests.daemon.camera_protocol.rig import Camera, Peer
 from tests.daemon.fakes import eventually
 

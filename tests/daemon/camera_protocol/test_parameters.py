@@ -19,7 +19,7 @@ from dappled.daemon.camera_protocol.parameters import (
     code,
 )
 from dappled.drivers.camera import Setting, SettingName
-from dappled.drivers.mavlink.links import Message, mavlink
+from dappled.drivers.mavlink import Message, mavlink
 
 
 class Body:

@@ -17,8 +17,7 @@ from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
-from dappled.drivers.mavlink.links import LinkStatistics
-from dappled.drivers.mavlink.signing import SigningStatistics
+from dappled.drivers.mavlink import LinkStatistics, SigningStatistics
 from dappled.workers import Worker
 
 WELL = Settings(

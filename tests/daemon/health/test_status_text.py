@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dappled.daemon.health.status_text import AGAIN_NS, AWAY_NS, PIECE_BYTES, Alarms, GroundStations, PilotMessages
-from dappled.drivers.mavlink.links import Message, mavlink
+from dappled.drivers.mavlink import Message, mavlink
 
 
 def test_a_problem_is_told_once_though_its_numbers_change_and_its_end_too() -> None:

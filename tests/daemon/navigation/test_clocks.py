@@ -22,7 +22,7 @@ from dappled.daemon.navigation.clocks import (
     mid_exposure,
 )
 from dappled.daemon.navigation.navigation import Telemetry
-from dappled.drivers.mavlink.links import Message, mavlink
+from dappled.drivers.mavlink import Message, mavlink
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath
 

@@ -21,7 +21,7 @@ from dappled.decode.geometry.interpolation import (
     turned_by_heading,
 )
 from dappled.decode.geometry.pose import Gnss, Pose
-from dappled.drivers.mavlink.links import Message, mavlink
+from dappled.drivers.mavlink import Message, mavlink
 
 START_NS = 1_790_000_000 * 10**9
 LATENCY_NS = 3_000_000

@@ -19,7 +19,7 @@ from dappled.daemon.navigation.navigation import HISTORY_NS, Telemetry, first_po
 from dappled.daemon.navigation.vehicle_history import MOST_SAMPLES
 from dappled.decode.geometry.interpolation import from_euler, hermite, metres_per_radian, normalised, slerp, turn_rad
 from dappled.decode.geometry.pose import Pose
-from dappled.drivers.mavlink.links import Message, PacketParser, mavlink
+from dappled.drivers.mavlink import Message, PacketParser, mavlink
 from dappled.flight import digest
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath, TruePose

@@ -9,7 +9,7 @@ import pytest
 from dappled.daemon.navigation import utc
 from dappled.daemon.navigation.navigation import Telemetry
 from dappled.daemon.navigation.utc import FLOOR_NS, UtcCorrection, UtcLearner
-from dappled.drivers.mavlink.links import mavlink
+from dappled.drivers.mavlink import mavlink
 from dappled.errors import DappledError
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath

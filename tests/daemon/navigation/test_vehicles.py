@@ -24,7 +24,7 @@ from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.daemon.service import Service
-from dappled.drivers.mavlink.links import Message, mavlink
+from dappled.drivers.mavlink import Message, mavlink
 from dappled.errors import DappledError
 from dappled.flight import digest, recording
 from tests.daemon.camera_protocol.rig import Peer

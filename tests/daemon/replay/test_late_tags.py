@@ -20,7 +20,7 @@ from dappled.daemon import service as module
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import Service
-from dappled.drivers.mavlink.links import mavlink
+from dappled.drivers.mavlink import mavlink
 from dappled.flight import FlightsLock, LedgerReader, check, layout, recovery
 from tests.daemon.camera_protocol.rig import Peer
 from tests.daemon.fakes import FakeCamera, eventually

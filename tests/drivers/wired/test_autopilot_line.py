@@ -10,7 +10,7 @@ import pytest
 
 from dappled.clock import SystemClock
 from dappled.drivers.camera import Identity
-from dappled.drivers.mavlink.links import MavlinkLinks, Packet, mavlink
+from dappled.drivers.mavlink import MavlinkLinks, Packet, mavlink
 from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.shutter_line import parse_line
 from dappled.drivers.wired.sources import FolderSource

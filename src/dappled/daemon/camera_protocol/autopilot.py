@@ -7,7 +7,7 @@ from typing import Protocol
 
 from dappled.clock import Clock
 from dappled.daemon.pipeline.repeats import AutopilotCommands
-from dappled.drivers.mavlink.links import Message, Packet, mavlink
+from dappled.drivers.mavlink import Message, Packet, mavlink
 
 TIMESYNC_NS = 200_000_000
 STREAMS_NS = 5 * 10**9

@@ -20,7 +20,7 @@ from dappled.daemon.pipeline.shutter import Shutter
 from dappled.decode.geometry import field_of_view
 from dappled.decode.geometry.pose import Pose
 from dappled.drivers.camera import Identity
-from dappled.drivers.mavlink.links import Message, mavlink
+from dappled.drivers.mavlink import Message, mavlink
 from dappled.errors import DappledError, report
 from dappled.flight import FlightFolder, ImageIndex, LedgerReader
 

@@ -14,7 +14,7 @@ from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
 from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
 from dappled.drivers.camera import CameraError
-from dappled.drivers.mavlink.links import Message, mavlink
+from dappled.drivers.mavlink import Message, mavlink
 
 ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
 DENIED = mavlink.MAV_RESULT_DENIED

@@ -26,7 +26,7 @@ from dappled.daemon.camera_protocol.parameters import ParameterReply, Parameters
 from dappled.daemon.health.status_text import GroundStations, PilotMessages
 from dappled.daemon.pipeline.repeats import CaptureRequest, PacketDedup
 from dappled.daemon.pipeline.shutter import Shutter
-from dappled.drivers.mavlink.links import Message, Packet, mavlink
+from dappled.drivers.mavlink import Message, Packet, mavlink
 
 HEARTBEAT_NS = 10**9
 STATUS_NS = 100_000_000

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.clock import SystemClock
-from dappled.drivers.mavlink.links import MavlinkLinks, Message, Packet, mavlink
-from dappled.drivers.mavlink.signing import open_signing
+from dappled.drivers.mavlink import MavlinkLinks, Message, Packet, mavlink, open_signing
 from dappled.errors import DappledError
 
 ACK_S = 0.5

@@ -12,7 +12,7 @@ from typing import Protocol
 from xml.sax.saxutils import escape, quoteattr
 
 from dappled.drivers.camera import CameraError, Setting, SettingName
-from dappled.drivers.mavlink.links import Message, mavlink
+from dappled.drivers.mavlink import Message, mavlink
 
 TYPE = mavlink.MAV_PARAM_EXT_TYPE_UINT32
 WAIT_NS = 5 * 10**9

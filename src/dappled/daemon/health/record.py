@@ -16,7 +16,7 @@ from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.decode.geometry.pose import Pose
-from dappled.drivers.mavlink.links import LinkStatistics
+from dappled.drivers.mavlink import LinkStatistics
 from dappled.errors import DappledError
 from dappled.flight import layout
 

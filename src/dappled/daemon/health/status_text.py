@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from dappled.daemon.health.logbook import NewProblems
-from dappled.drivers.mavlink.links import Message, mavlink
+from dappled.drivers.mavlink import Message, mavlink
 
 PIECE_BYTES = 50
 LONGEST_BYTES = 4 * PIECE_BYTES

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config.settings import CameraSettings
-from dappled.drivers.mavlink.links import Message
+from dappled.drivers.mavlink import Message
 from dappled.flight import Shot
 
 Array = NDArray[np.float64]

@@ -37,7 +37,7 @@ from dappled.decode.geometry.interpolation import (
     turned_by_heading,
 )
 from dappled.decode.geometry.pose import Gnss, Pose, Quaternion, Symmetric, Vector3
-from dappled.drivers.mavlink.links import Message, Packet
+from dappled.drivers.mavlink import Message, Packet
 from dappled.flight import LedgerReader, Recording
 
 HISTORY_NS = TIMESYNC_WINDOW_NS + 60 * 10**9

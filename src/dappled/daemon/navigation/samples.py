@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from dappled.decode.geometry.interpolation import from_euler, normalised
 from dappled.decode.geometry.pose import Quaternion, Vector3
-from dappled.drivers.mavlink.links import Message, mavlink
+from dappled.drivers.mavlink import Message, mavlink
 
 HALF_MS_NS = 500_000  # time_boot_ms is cut to whole milliseconds: its middle is meant
 GIMBAL_COMPONENTS = frozenset({1, 154, 171, 172, 173, 174, 175})  # an autopilot speaks for a gimbal without MAVLink

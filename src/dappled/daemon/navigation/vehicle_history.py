@@ -28,7 +28,7 @@ from dappled.daemon.navigation.samples import (
     GnssSample,
     PositionSample,
 )
-from dappled.drivers.mavlink.links import Message
+from dappled.drivers.mavlink import Message
 
 NEAREST_NS = 10 * 10**9
 POSITION_GAP_NS = 2_500_000_000

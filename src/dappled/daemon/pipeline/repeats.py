@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 
-from dappled.drivers.mavlink.links import Packet, mavlink
+from dappled.drivers.mavlink import Packet, mavlink
 
 SAME_LINK_NS = 500_000_000
 OTHER_LINK_NS = 2_500_000_000  # a radio may be seconds behind a cable

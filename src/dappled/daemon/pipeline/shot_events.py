@@ -14,7 +14,7 @@ from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Identity, SettingsChanged, StateChanged
-from dappled.drivers.mavlink.links import mavlink
+from dappled.drivers.mavlink import mavlink
 from dappled.errors import DappledError, report
 from dappled.flight import Recording
 

@@ -19,7 +19,7 @@ from dappled.daemon.pipeline.flight_writer import Expected, ReplayVerifier
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.decode.geometry.pose import Pose
-from dappled.drivers.mavlink.links import Message, PacketParser
+from dappled.drivers.mavlink import Message, PacketParser
 from dappled.drivers.replay import RecordedShot
 from dappled.errors import DappledError
 from dappled.flight import LIVE, Cause, Frame, LedgerReader, Result, Shot, ShotRow, durable, layout, telemetry_log

@@ -1,1 +1,42 @@
-"""MAVLink links: addresses, channels, framing, signing."""
+"""MAVLink links: packets in and out over UDP, TCP and serial, logged, and signed where there is a key.
+
+`links` receives and sends packets, `channels` opens connections, `signing` signs and verifies.
+"""
+
+from dappled.drivers.mavlink.channels import LinkError
+from dappled.drivers.mavlink.links import (
+    LinkStatistics,
+    MavlinkLinks,
+    Message,
+    Packet,
+    PacketParser,
+    PacketSink,
+    mavlink,
+    pack,
+)
+from dappled.drivers.mavlink.signing import (
+    Signing,
+    SigningError,
+    SigningStatistics,
+    Unsigned,
+    make_key,
+    open_signing,
+)
+
+__all__ = [
+    "LinkError",
+    "LinkStatistics",
+    "MavlinkLinks",
+    "Message",
+    "Packet",
+    "PacketParser",
+    "PacketSink",
+    "Signing",
+    "SigningError",
+    "SigningStatistics",
+    "Unsigned",
+    "make_key",
+    "mavlink",
+    "open_signing",
+    "pack",
+]

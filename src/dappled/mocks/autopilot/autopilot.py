@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dappled.clock import SystemClock
-from dappled.drivers.mavlink.links import LinkError, MavlinkLinks, Message, Packet, mavlink
+from dappled.drivers.mavlink import LinkError, MavlinkLinks, Message, Packet, mavlink
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 
 RATES_HZ: dict[int, float] = {

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Sequence
 
 from dappled.daemon.camera_protocol.ground_client import ACK_TRIES, GroundClient, GroundError, Outcome
-from dappled.drivers.mavlink.links import LinkError, Message, mavlink
+from dappled.drivers.mavlink import LinkError, Message, mavlink
 
 MANNERS = {
     "deaf": "hears no answer: each command is repeated four times, and never says so (confirmation 0)",

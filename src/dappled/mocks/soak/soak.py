@@ -22,7 +22,7 @@ import tomli_w
 
 from dappled.config import settings as configuration
 from dappled.daemon.camera_protocol.ground_client import GroundClient
-from dappled.drivers.mavlink.links import mavlink
+from dappled.drivers.mavlink import mavlink
 from dappled.flight import check, flight_report
 from dappled.mocks.simulation import Simulation, World, free_port
 from dappled.mocks.soak.supervised import Resources, Supervised
