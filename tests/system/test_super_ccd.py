@@ -44,7 +44,7 @@ def test_a_masked_raf_is_calibrated_and_decoded(seed: int, tmp_path: Path, capsy
 
     file, views = body.expose("bench", WIDE_OPEN)
     frame.write_bytes(file)
-    found = Darkroom(Recipe("auto", MASK, calibration=str(calibration), workers=2)).develop(frame).light_field
+    found = Darkroom(Recipe("auto", MASK, calibration=str(calibration), workers=2)).decode(frame).light_field
     assert found.attributes["camera"] == "fujifilm-s5200"
     assert found.attributes["mask_distance_mm"] == pytest.approx(body.installed.distance_mm, rel=1e-4)
     step = Grid.of(body.chip.shape, body.lattice).step

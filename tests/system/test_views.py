@@ -35,7 +35,7 @@ def _score(camera: MaskedCamera, folder: Path, *, least_disparity_px: float) -> 
     exposure = camera.expose(0.0, 0)
     (folder / "frame.dng").write_bytes(exposure.file)
     darkroom = Darkroom(Recipe(CAMERA, MASK, calibration=str(folder / "calibration.toml"), workers=2))
-    found = darkroom.develop(folder / "frame.dng").light_field
+    found = darkroom.decode(folder / "frame.dng").light_field
     assert found.attributes["carriers_from"] == "calibrated"
     assert found.attributes["decoded_from"] == ("grey" if camera.sensor.mono else "mosaic")
     return score(found, exposure.truth, least_disparity_px=least_disparity_px, pixel_mm=camera.sensor.pitch_mm)
@@ -78,7 +78,7 @@ def test_the_same_bytes_come_out_for_any_number_of_workers(tmp_path: Path) -> No
         found = from_frame(Darkroom(recipe), tmp_path / "bench.dng")
         text = tomli_w.dumps(found.to_dict())
         (tmp_path / "calibration.toml").write_text(text)
-        made = Darkroom(replace(recipe, calibration=str(tmp_path / "calibration.toml"))).develop(tmp_path / "frame.dng")
+        made = Darkroom(replace(recipe, calibration=str(tmp_path / "calibration.toml"))).decode(tmp_path / "frame.dng")
         field = made.light_field
         outcomes.add((text, field.slices.tobytes(), field.views.tobytes(), field.carriers.tobytes()))
     assert len(outcomes) == 1

@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     for frame in tqdm(arguments.frames, unit="frame", disable=len(arguments.frames) < 2 or not sys.stderr.isatty()):
         target = arguments.output if single else arguments.output / f"{frame.stem}.zarr"
         try:
-            made = darkroom.develop(frame, focal_length_mm=arguments.focal_length, f_number=arguments.f_number)
+            made = darkroom.decode(frame, focal_length_mm=arguments.focal_length, f_number=arguments.f_number)
             light_files.save(target, made.light_field, overwrite=arguments.overwrite)
             print(f"{target}: {summary(made)}")
         except DappledError as error:

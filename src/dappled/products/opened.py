@@ -176,7 +176,7 @@ class OpenedFrame:
     def light_field(self) -> OpenedLightField:
         """The decoded frame. Raises DappledError."""
         length, stop = (None, None) if self.tag is None else (self.tag.focal_length_mm, self.tag.f_number)
-        made = self.darkroom.develop(self.path, focal_length_mm=length, f_number=stop)
+        made = self.darkroom.decode(self.path, focal_length_mm=length, f_number=stop)
         return OpenedLightField(made.light_field, self.path, self.focus_m)
 
     @property

@@ -50,14 +50,14 @@ def test_targets_lead_to_metres(folder: Path, capsys: pytest.CaptureFixture[str]
 def test_frames_of_several_zooms_are_no_targets(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second frame says that the lens was zoomed in between."""
     recipe = Recipe("reference-36mm", "reference-5x5", calibration=str(folder / "c.toml"))
-    honest = Darkroom.develop
+    honest = Darkroom.decode
 
     def zoomed(self: Darkroom, path: Path, **asked: Any) -> DecodeResult:
         done = honest(self, path, **asked)
         said = {**done.light_field.attributes, "focal_length_mm": 50.0 if path.stem == "2" else 70.0}
         return replace(done, light_field=replace(done.light_field, attributes=said))
 
-    monkeypatch.setattr(Darkroom, "develop", zoomed)
+    monkeypatch.setattr(Darkroom, "decode", zoomed)
     with pytest.raises(DarkroomError, match=r"several focal lengths \(50, 70\)"):
         from_frames(recipe, [folder / "2.dng", folder / "6.dng"], [2.0, 6.0])
 

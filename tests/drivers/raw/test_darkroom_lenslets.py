@@ -33,8 +33,8 @@ def test_views_beat_lftoolbox_s_at_every_offset(shared_data: Path) -> None:
     truth = np.load(folder / "truth.npz")
     offsets = truth["offsets"][:7, ::-1].astype(float)[None]  # (x, y) in the file
     darkroom = Darkroom(_recipe(folder))
-    frame = darkroom.develop(folder / "raw.png", views=False).light_field
-    white = darkroom.develop(folder / "white.png", views=False).light_field
+    frame = darkroom.decode(folder / "raw.png", views=False).light_field
+    white = darkroom.decode(folder / "white.png", views=False).light_field
     (decoder,) = darkroom._decoders.values()
     assert isinstance(decoder, LensletDecoder)
     assert decoder.white is not None
@@ -57,10 +57,10 @@ def test_views_beat_lftoolbox_s_at_every_offset(shared_data: Path) -> None:
 
 def test_colour_views_have_the_grey_views_as_their_mean(shared_data: Path) -> None:
     folder = shared_data / "lenslet/lytro_like"
-    coloured = Darkroom(_recipe(folder, colour=True)).develop(folder / "raw.png").light_field.views
+    coloured = Darkroom(_recipe(folder, colour=True)).decode(folder / "raw.png").light_field.views
     assert coloured.shape[:2] == (9, 9)
     assert coloured.shape[4] == 3
-    grey = Darkroom(_recipe(folder)).develop(folder / "raw.png").light_field.views
+    grey = Darkroom(_recipe(folder)).decode(folder / "raw.png").light_field.views
     np.testing.assert_allclose(coloured[4, 4].mean(axis=-1), grey[4, 4], atol=2e-3)
     assert np.std(coloured[4, 4] - coloured[4, 4].mean(axis=-1, keepdims=True)) > 0.01
 
@@ -68,7 +68,7 @@ def test_colour_views_have_the_grey_views_as_their_mean(shared_data: Path) -> No
 def test_a_colour_pattern_that_is_none_is_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "frame.npy", np.random.default_rng(0).random((64, 64)).astype(np.float32))
     with pytest.raises(DarkroomError, match="as in BGGR"):
-        Darkroom(Recipe("auto", "lenslet", cfa="RGGX")).develop(tmp_path / "frame.npy")
+        Darkroom(Recipe("auto", "lenslet", cfa="RGGX")).decode(tmp_path / "frame.npy")
 
 
 def test_a_lytro_container_gives_the_same_light_field_as_its_pixels_in_a_png(shared_data: Path, tmp_path: Path) -> None:
@@ -77,8 +77,8 @@ def test_a_lytro_container_gives_the_same_light_field_as_its_pixels_in_a_png(sha
         values = np.asarray(Image.open(folder / f"{name}.png")).astype(np.uint16)
         told = metadata((values.shape[0], values.shape[1]), pattern="bggr")
         (tmp_path / f"{name}.lfp").write_bytes(container(values, told))
-    plain = Darkroom(_recipe(folder)).develop(folder / "raw.png", views=False).light_field
+    plain = Darkroom(_recipe(folder)).decode(folder / "raw.png", views=False).light_field
     packed = Darkroom(Recipe("auto", "lenslet", white=str(tmp_path / "white.lfp"), workers=2))
-    found = packed.develop(tmp_path / "raw.lfp", views=False).light_field
+    found = packed.decode(tmp_path / "raw.lfp", views=False).light_field
     assert found.attributes["camera"] == "F01"
     assert found.slices.tobytes() == plain.slices.tobytes()

@@ -349,7 +349,7 @@ def decoded(short_flight: Flown) -> tuple[Station, LightField, CameraProfile]:
     """The first frame of the flight."""
     (frame, *_), tags = photographs.recorded(short_flight.folder)
     darkroom = Darkroom(short_flight.recipe)
-    made = darkroom.develop(short_flight.folder / frame.name)
+    made = darkroom.decode(short_flight.folder / frame.name)
     station = photographs.station(frame, tags[frame.index], Mounting())
     return station, made.light_field, darkroom.camera(made.raw.camera_model or "")
 

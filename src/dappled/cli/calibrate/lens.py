@@ -70,7 +70,7 @@ def _picture(
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], tuple[int, int], str, float | None]:
     """What is looked at: behind a mask the decoded mean, else the frame itself."""
     if darkroom.recipe.mask:
-        made = darkroom.develop(path, focal_length_mm=focal_length_mm, views=False)
+        made = darkroom.decode(path, focal_length_mm=focal_length_mm, views=False)
         rows, columns = made.light_field.attributes["shape"]
         image = np.ascontiguousarray(made.light_field.slices[0].real)
         length = focal_length_mm or made.raw.focal_length_mm

@@ -33,7 +33,7 @@ def check_frame(frame: Path, recipe: Recipe | None) -> list[Check]:
         text = "no mask is configured: carriers, focus and motion were not checked (set mask.profile)"
         return [*found, Check("carriers", "caution", text)]
     try:
-        made = Darkroom(recipe).develop(frame, views=False)
+        made = Darkroom(recipe).decode(frame, views=False)
     except DappledError as error:
         return [*found, Check("carriers", "no-go", f"it can't be decoded: {error}")]
     picture = np.abs(made.light_field.slices[0])

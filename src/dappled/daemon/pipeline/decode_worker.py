@@ -60,7 +60,7 @@ class Worker:
             return {"error": _naming(body.get("path"), error)}, ()
 
     def _develop(self, darkroom: Darkroom, path: str, focal_length_mm: float | None, f_number: float | None) -> Reply:
-        done = darkroom.develop(path, focal_length_mm=focal_length_mm, f_number=f_number, views=False)
+        done = darkroom.decode(path, focal_length_mm=focal_length_mm, f_number=f_number, views=False)
         field = done.light_field
         ms = dict(done.ms)
         began = time.perf_counter()
@@ -100,7 +100,7 @@ def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> Reply:
     """Disparity and its sigma of one frame, float32 (h, w) each, at a lower priority than decoding."""
     if os.nice(0) < DEPTH_NICENESS:
         os.nice(DEPTH_NICENESS - os.nice(0))
-    done = darkroom.develop(asked["path"], focal_length_mm=asked["focal_length_mm"], f_number=asked["f_number"])
+    done = darkroom.decode(asked["path"], focal_length_mm=asked["focal_length_mm"], f_number=asked["f_number"])
     field = done.light_field
     found = estimate.estimate(evidence.of_light_field(field), asked["method"])
     both = [np.ascontiguousarray(one, dtype=np.float32) for one in (found.disparity, found.sigma)]

@@ -1,4 +1,4 @@
-"""Calibrations in files: TOML for people, NPZ with the same in arrays, each enough by itself."""
+"""Read and write calibrations: a TOML file and an NPZ file with the same as arrays; either is enough."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _TEXT = "calibration_toml"
 
 
 def save(path: Path, found: Calibration, more: dict[str, Any] | None = None) -> tuple[Path, Path]:
-    """Write the pair; `path` names either. `more` are tables beside the calibration. Returns both paths."""
+    """Write both files; `path` names either. `more` are tables beside the calibration. Returns both paths."""
     text = tomli_w.dumps({**found.to_dict(), **(more or {})})
     toml, npz = path.with_suffix(".toml"), path.with_suffix(".npz")
     toml.write_text(text, encoding="utf-8")
@@ -37,7 +37,7 @@ def save(path: Path, found: Calibration, more: dict[str, Any] | None = None) -> 
 
 
 def tables(path: Path) -> dict[str, Any]:
-    """All tables of a calibration's file, TOML or NPZ. Raises ConfigError where it can't be read."""
+    """Return all tables of a calibration file, TOML or NPZ. Raises ConfigError where it can't be read."""
     if path.suffix.lower() != ".npz":
         return read_toml(path)[0]
     try:
@@ -50,7 +50,7 @@ def tables(path: Path) -> dict[str, Any]:
 
 
 def load(path: Path) -> Calibration:
-    """The calibration of a file. Raises ConfigError where it is none."""
+    """Read a calibration file. Raises ConfigError where it is not one."""
     try:
         return Calibration.from_dict(tables(path))
     except DecodeError as error:

@@ -1,4 +1,4 @@
-"""From a raw file to a light field: profiles, raw reading and decoder put together, for daemon and commands alike."""
+"""Decode a raw file to a light field by a recipe: read it, make it linear, and choose its decoder by profiles."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,14 @@ from dappled.decode.spectrum.plane import Places, Plane, coloured, find_defects,
 from dappled.decode.spectrum.transform import Source
 from dappled.drivers.raw import calibration_files, reading
 from dappled.drivers.raw.reading import RawFile
-from dappled.drivers.raw.recipe import DarkroomError, Recipe, camera_name, camera_profile, naming, read, said
+from dappled.drivers.raw.recipe import DarkroomError, Recipe, camera_name, camera_profile, naming, override, read
 
 __all__ = ["Darkroom", "DarkroomError", "DecodeResult", "Recipe", "camera_name", "known_to"]
 
 
 @dataclass(frozen=True, slots=True)
 class DecodeResult:
-    """A decoded frame, what was decided on the way, and what took how many milliseconds."""
+    """A decoded frame, its report and raw file, and how many milliseconds each step took."""
 
     light_field: LightField
     report: DecodeReport
@@ -43,17 +44,17 @@ class DecodeResult:
 
     @property
     def carriers_found(self) -> int:
-        """Carriers seen in the whole plane, the mean left out: those of the half plane and their conjugates."""
+        """Carriers seen in the whole plane without the mean: those of the half plane and their conjugates."""
         return 2 * (self.report.found - 1)
 
     @property
     def carriers_predicted(self) -> int:
-        """Carriers predicted on the sensor, counted likewise."""
+        """Carriers predicted on the sensor, counted in the same way."""
         return 2 * (len(self.report.predicted) - 1)
 
 
 class Darkroom:
-    """Decodes frames by one recipe. Decoders are made once for each raw shape and camera, and kept."""
+    """Decodes frames by one recipe. Makes one decoder for each raw shape and camera, and keeps it."""
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
@@ -61,7 +62,7 @@ class Darkroom:
         self._lineariser = FrameLineariser(recipe)
 
     def check(self) -> None:
-        """Raises DappledError when the recipe names something that isn't there or isn't right."""
+        """Raise DappledError when the recipe names something that is missing or wrong."""
         if self.recipe.camera != "auto":
             profiles.camera(self.recipe.camera)
         if self.recipe.mask != profiles.LENSLET:
@@ -76,7 +77,7 @@ class Darkroom:
             if path:
                 reading.read_metadata(Path(path))
 
-    def develop(
+    def decode(
         self,
         path: Path | str,
         *,
@@ -84,7 +85,7 @@ class Darkroom:
         f_number: float | None = None,
         views: bool = True,
     ) -> DecodeResult:
-        """Decode a frame; what is not given is taken from its file. Without `views` only the slices are made.
+        """Decode a frame. Arguments that are None are taken from its file. Without `views` only the slices are made.
 
         Raises DappledError with the file's name and what is wrong.
         """
@@ -93,8 +94,8 @@ class Darkroom:
             raw = self.read(path)
         with naming(path):
             with _timed(ms, "plane"):
-                exposure, chroma = self._lineariser.expose(raw, colour=self.recipe.colour and views)
-                plane = self._lineariser.where_taken(exposure, raw)
+                rows, chroma = self._lineariser.rows(raw, colour=self.recipe.colour and views)
+                plane = self._lineariser.upright(rows, raw)
             decoder = self.decoder(plane.shape, raw.camera_model or "", colours=raw.cfa is not None)
             if isinstance(decoder, MaskDecoder):
                 decoder = known_to(decoder, None if focal_length_mm else raw.focal_sigma_mm)
@@ -113,42 +114,42 @@ class Darkroom:
             "camera": self.camera_name(raw.camera_model),
             "mask": self.recipe.mask,
             "decoded_from": "grey" if raw.cfa is None else "mosaic",
-            **(self._ranging() if views else {}),
+            **(self._ranging if views else {}),
         }
         return DecodeResult(replace(light_field, attributes=attributes), report, raw, ms)
 
     def plane(self, raw: RawFile) -> Plane:
-        """The linear plane of a frame: black, white, dark frame; for masks also colours evened out, and white frame."""
+        """Return a frame's linear plane: black, white and dark frame; for masks also even colours and white frame."""
         return self._lineariser.plane(raw)
 
     def read(self, path: Path | str) -> RawFile:
-        """A frame's file, with what the recipe says about it. Raises DappledError."""
+        """Read a frame's file, with the values that the recipe overrides. Raises DappledError."""
         return read(path, self.recipe)
 
     def decoder(self, shape: tuple[int, ...], model: str, *, colours: bool = False) -> Decoder:
-        """The decoder for frames of this shape from this camera; `colours` where they are colour mosaics."""
+        """Return the decoder for frames of this shape from this camera; `colours` where they are colour mosaics."""
         key = (shape[0], shape[1]), model, colours
         if key not in self._decoders:
             self._decoders[key] = self._make(*key)
         return self._decoders[key]
 
     def mask_decoder(self, shape: tuple[int, int], model: str) -> MaskDecoder:
-        """The decoder of a camera with a printed mask. Raises DarkroomError for lenslets."""
+        """Return the decoder of a camera with a printed mask. Raises DarkroomError for lenslets."""
         decoder = self.decoder(shape, model)
         if not isinstance(decoder, MaskDecoder):
             raise DarkroomError("lenslets have no mask to predict carriers of")
         return decoder
 
     def naming(self, path: Path | str) -> AbstractContextManager[None]:
-        """Around mathematics on a frame: its errors get the file's name."""
+        """Context in which a DecodeError becomes a DarkroomError with the file's name."""
         return naming(path)
 
     def camera(self, model: str) -> CameraProfile:
-        """The camera's profile: the recipe's, or by model. Raises DappledError."""
+        """Return the camera's profile: the recipe's, or by model. Raises DappledError."""
         return camera_profile(self.recipe, model)
 
     def camera_name(self, model: str | None) -> str:
-        """The profile's name, or the model, or "unknown": what tags and headers call the camera."""
+        """Return what tags and headers call the camera: the profile's name, the model, or "unknown"."""
         return camera_name(self.recipe.camera, model)
 
     def _make(self, shape: tuple[int, int], model: str, colours: bool) -> Decoder:
@@ -173,17 +174,18 @@ class Darkroom:
             taper=recipe.taper,
         )
 
+    @cached_property
     def _ranging(self) -> dict[str, Any]:
-        """What leads from disparity to metres, where the calibration was made with targets too."""
-        told = calibration_files.tables(Path(self.recipe.calibration)) if self.recipe.calibration else {}
-        return {RANGING: told[RANGING]} if RANGING in told else {}
+        """The attribute that leads from disparity to metres, where the calibration was made with targets too."""
+        tables = calibration_files.tables(Path(self.recipe.calibration)) if self.recipe.calibration else {}
+        return {RANGING: tables[RANGING]} if RANGING in tables else {}
 
     def _calibration(self) -> Calibration:
         return calibration_files.load(Path(self.recipe.calibration))
 
 
 def known_to(decoder: MaskDecoder, focal_sigma_mm: float | None) -> MaskDecoder:
-    """The same decoder for a frame whose focal length is known to this; None: as the decoder has it."""
+    """Return the decoder for a focal length with this standard error; None keeps the decoder's own."""
     return decoder if focal_sigma_mm is None else replace(decoder, focal_sigma_mm=focal_sigma_mm)
 
 
@@ -195,7 +197,7 @@ def _timed(ms: dict[str, float], what: str) -> Iterator[None]:
 
 
 class FrameLineariser:
-    """Makes frames of one recipe linear. What every frame needs (dark and white frame, gains) is made once and kept."""
+    """Makes frames of one recipe linear. Keeps what every frame needs: dark and white frame, defects, gains."""
 
     def __init__(self, recipe: Recipe) -> None:
         self._recipe = recipe
@@ -206,23 +208,22 @@ class FrameLineariser:
         self._staggered: dict[tuple[tuple[int, int], str], bool] = {}
 
     def plane(self, raw: RawFile) -> Plane:
-        """The linear plane of a frame: black, white, dark frame; for masks also colours evened out, and white frame."""
-        exposure = self.expose(raw, colour=False)[0]
-        source = self.where_taken(exposure, raw)
+        """Return a frame's linear plane: black, white and dark frame; for masks also even colours and white frame."""
+        source = self.upright(self.rows(raw, colour=False)[0], raw)
         return source.plane(self._recipe.workers) if isinstance(source, LinearRows) else source
 
-    def where_taken(self, exposure: LinearRows, raw: RawFile) -> Source:
-        """The plane with each sample where it stands on the chip: a staggered one spread out."""
+    def upright(self, rows: LinearRows, raw: RawFile) -> Source:
+        """Put each sample where it is on the chip: spread the samples of a staggered sensor."""
         if self._recipe.mask == profiles.LENSLET:
-            return exposure
-        key = exposure.shape, raw.camera_model or ""
+            return rows
+        key = rows.shape, raw.camera_model or ""
         if key not in self._staggered:
             self._staggered[key] = camera_profile(self._recipe, key[1]).staggered(key[0])
-        return spread(exposure.plane(self._recipe.workers)) if self._staggered[key] else exposure
+        return spread(rows.plane(self._recipe.workers)) if self._staggered[key] else rows
 
-    def expose(self, raw: RawFile, *, colour: bool) -> tuple[LinearRows, NDArray[np.float32] | None]:
-        """The plane to be, and local colours (3, rows, columns) as shares of it where they are asked for."""
-        raw = said(raw, self._recipe)
+    def rows(self, raw: RawFile, *, colour: bool) -> tuple[LinearRows, NDArray[np.float32] | None]:
+        """Return the plane's linear rows, and with `colour` local colours (3, rows, columns) as shares of it."""
+        raw = override(raw, self._recipe)
         lenslets = self._recipe.mask == profiles.LENSLET
         cfa, black = _one_index_a_colour(raw)
         balance = None if cfa is None or not lenslets else self._white_balance()
@@ -251,7 +252,7 @@ class FrameLineariser:
         return linear.apply(raw.mosaic, dark=dark, flat=flat), chroma
 
     def _white_balance(self) -> NDArray[np.float64] | None:
-        """The gains that make the white frame grey; None without one."""
+        """Return the gains that make the white frame grey; None without one."""
         if self._recipe.white and self._balance is None:
             raw = read(self._recipe.white, self._recipe)
             cfa, black = _one_index_a_colour(raw)
@@ -275,7 +276,7 @@ class FrameLineariser:
 
 
 def _one_index_a_colour(raw: RawFile) -> tuple[NDArray[np.int64] | None, float | tuple[float, ...]]:
-    """The colour pattern and black levels with both greens as one colour, where their black levels agree.
+    """Return colour pattern and black levels, with both greens as one colour where their black levels agree.
 
     LibRaw gives a Bayer pattern's second green an index of its own; it is then no longer the commonest colour.
     """

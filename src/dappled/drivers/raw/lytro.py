@@ -74,19 +74,19 @@ def find_bare(source: Source, file: BinaryIO, *, pixels: bool = True) -> RawFile
 
 
 def _beside(source: Source) -> Mapping[str, Any] | None:
-    """The JSON beside a bare .raw file, of the same name and .json or .txt; None without."""
+    """Return the JSON file beside a bare .raw file, of the same name with .json or .txt; None without."""
     if not isinstance(source, Path | str):
         return None
     for suffix in (".json", ".JSON", ".txt", ".TXT"):
         path = Path(source).with_suffix(suffix)
         if path.is_file():
-            told = json.loads(path.read_bytes())
-            return told if isinstance(told, dict) else None
+            metadata = json.loads(path.read_bytes())
+            return metadata if isinstance(metadata, dict) else None
     return None
 
 
 def _parts(data: bytes | memoryview) -> tuple[Mapping[str, Any], memoryview]:
-    """(metadata, packed pixels)."""
+    """Return (metadata, packed pixels)."""
     view = memoryview(data)
     named = dict(_walk(view))
     tables = [table for table in map(_json, named.values()) if table is not None]
@@ -98,14 +98,14 @@ def _parts(data: bytes | memoryview) -> tuple[Mapping[str, Any], memoryview]:
     missing = [str(frame[key])[:60] for key in ("metadataRef", "imageRef") if str(frame[key]) not in named]
     if missing:
         raise ValueError(f"its part {missing[0]} is missing; fetch it from the camera again")
-    told = _json(named[str(frame["metadataRef"])])
-    if told is None:
+    metadata = _json(named[str(frame["metadataRef"])])
+    if metadata is None:
         raise ValueError("its metadata is no JSON")
-    return _imaging(told), named[str(frame["imageRef"])]
+    return _imaging(metadata), named[str(frame["imageRef"])]
 
 
 def _walk(view: memoryview) -> Iterator[tuple[str, memoryview]]:
-    """The parts of a container, by name."""
+    """Yield the parts of a container with their names."""
     if bytes(view[: len(START)]) != START:
         raise ValueError("it is no Lytro container")
     at = _HEAD
@@ -126,7 +126,7 @@ def _walk(view: memoryview) -> Iterator[tuple[str, memoryview]]:
 
 
 def _json(part: memoryview) -> Any:
-    """A part that is JSON, else None."""
+    """Parse a part that is JSON; None for others."""
     if bytes(part[:1]) != b"{" or len(part) > 50_000_000:
         return None
     try:
@@ -136,7 +136,7 @@ def _json(part: memoryview) -> Any:
 
 
 def _dicts(value: Any) -> Iterator[Mapping[str, Any]]:
-    """All objects in a JSON value, the outer ones first."""
+    """Yield all objects in a JSON value, outer ones first."""
     waiting = [value]
     while waiting:
         one = waiting.pop(0)
@@ -147,16 +147,16 @@ def _dicts(value: Any) -> Iterator[Mapping[str, Any]]:
             waiting += one
 
 
-def _imaging(told: Any) -> Mapping[str, Any]:
-    """The object that describes camera and image: the whole, or what calibration files wrap it in."""
-    for found in _dicts(told):
+def _imaging(metadata: Any) -> Mapping[str, Any]:
+    """Return the object that describes camera and image; calibration files wrap it in others."""
+    for found in _dicts(metadata):
         if isinstance(found.get("image"), dict) and "width" in found["image"]:
             return found
     raise ValueError("its metadata doesn't say how wide the image is")
 
 
-def _frame(told: Mapping[str, Any], packed: bytes | memoryview | None) -> RawFile:
-    image = told["image"]
+def _frame(metadata: Mapping[str, Any], packed: bytes | memoryview | None) -> RawFile:
+    image = metadata["image"]
     details = image.get("rawDetails") if isinstance(image.get("rawDetails"), dict) else image
     width, height = _whole(image, "width"), _whole(image, "height")
     if not 0 < width * height <= _MOST_PIXELS:
@@ -168,9 +168,9 @@ def _frame(told: Mapping[str, Any], packed: bytes | memoryview | None) -> RawFil
     levels = _object(details, "pixelFormat")
     black = _levels(levels, "black")
     white = min(_levels(levels, "white"))
-    devices = told.get("devices") if isinstance(told.get("devices"), dict) else {}
+    devices = _maybe(metadata, "devices")
     lens, shutter, clock = (_maybe(devices, key) for key in ("lens", "shutter", "clock"))
-    camera = _maybe(told, "camera")
+    camera = _maybe(metadata, "camera")
     metres = _number(lens.get("focalLength"))
     mosaic = np.empty((0, 0), dtype=np.uint16)
     if packed is not None:
@@ -196,7 +196,7 @@ def _frame(told: Mapping[str, Any], packed: bytes | memoryview | None) -> RawFil
 
 
 def unpacked(packed: bytes | memoryview, count: int, bits: int, endianness: str) -> NDArray[np.uint16]:
-    """`count` pixels of 10, 12 or 16 bits. "big": a pixel's higher bits come first, "little": its lower ones.
+    """Unpack `count` pixels of 10, 12 or 16 bits. "big": a pixel's higher bits come first, "little": its lower ones.
 
     Ten bits pack four pixels into five bytes: the four high bytes, then the four pairs of low bits, the first pixel's
     in the byte's low end for "little". Raises ValueError for another packing or too few bytes.
@@ -229,7 +229,7 @@ def unpacked(packed: bytes | memoryview, count: int, bits: int, endianness: str)
 
 
 def _pattern(corner: str) -> NDArray[np.int64]:
-    """(2, 2) of indices into `_COLOURS`, from the name of the upper left pixel of the tile r,gr:gb,b."""
+    """Return (2, 2) indices into `_COLOURS`, by the name of the upper left pixel of the tile r,gr:gb,b."""
     tile = np.array([[0, 1], [3, 2]], dtype=np.int64)
     at = {"r": (0, 0), "gr": (0, 1), "gb": (1, 0), "b": (1, 1)}.get(corner)
     if at is None:
@@ -273,7 +273,7 @@ def _whole(parent: Mapping[str, Any], key: str) -> int:
 
 
 def _number(value: Any) -> float | None:
-    """A number above zero, else None."""
+    """Return a number above zero, else None."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
         return None
     return float(value)

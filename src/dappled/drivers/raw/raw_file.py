@@ -31,8 +31,11 @@ _BAD = (OSError, ValueError, SyntaxError, KeyError, TypeError, IndexError, struc
 
 @dataclass(frozen=True, slots=True)
 class ExposureSettings:
-    """Camera and exposure as the file tells them; None where it does not. `taken` is local time without a zone, ISO
-    8601 ("2008-04-15T13:11:23" or with a fraction). `focal_sigma_mm` is half of what the focal length is rounded to."""
+    """Camera and exposure as recorded in the file; None where they are not.
+
+    `taken` is local time without a zone, ISO 8601 ("2008-04-15T13:11:23" or with a fraction). `focal_sigma_mm` is half
+    of what the focal length is rounded to.
+    """
 
     make: str | None = None
     model: str | None = None
@@ -46,7 +49,7 @@ class ExposureSettings:
 
 @dataclass(frozen=True, slots=True)
 class RawFile:
-    """A frame's values and what its file says about them; unknown is None.
+    """A frame's values and what its file records about them; unknown is None.
 
     `mosaic` (H, W), uint8, uint16 or float, the visible part of the sensor, a copy. `black` and `white` in the same
     units; `black` is one number, or one for each colour index. `cfa` is an int array (a, b) of colour indices that
@@ -72,7 +75,7 @@ class RawFile:
 
     @classmethod
     def of(cls, settings: ExposureSettings, mosaic: Values, **known: Any) -> RawFile:
-        """A frame of these values with what its file says of the exposure; `known` are the other fields."""
+        """Make a frame of these values and exposure settings; `known` are the other fields."""
         return cls(
             mosaic=mosaic,
             camera_make=settings.make,
@@ -87,7 +90,7 @@ class RawFile:
         )
 
     def exposure_settings(self) -> ExposureSettings:
-        """Camera and exposure alone."""
+        """Return camera and exposure alone."""
         return ExposureSettings(
             self.camera_make,
             self.camera_model,
@@ -101,7 +104,7 @@ class RawFile:
 
 
 def read_exif(file: BinaryIO) -> ExposureSettings:
-    """The EXIF of an open file, from its start. Damaged or missing EXIF is no error: what can't be read is None."""
+    """Read the EXIF of an open file, from its start. Damaged or missing EXIF is no error: its values are None."""
     try:
         start = file.read(16)
         file.seek(0)
@@ -140,9 +143,9 @@ def _from(exif: Image.Exif) -> ExposureSettings:
 
 
 def _rounding(focal: object) -> float | None:
-    """Half of the last decimal that a body writes: 33/1 is known to 0.5 mm, 148/10 to 0.05 mm; not below 0.05 mm.
+    """Return half of the last decimal that a body writes: 0.5 mm for 33/1, 0.05 mm for 148/10, not below 0.05 mm.
 
-    Bodies step their zoom coarser than finer fractions say. None for an unknown length.
+    Bodies step their zoom more coarsely than finer fractions suggest. None for an unknown length.
     """
     if positive(focal) is None:
         return None
@@ -151,7 +154,7 @@ def _rounding(focal: object) -> float | None:
 
 
 def positive(value: object) -> float | None:
-    """A number above zero, else None. Of several numbers the first counts."""
+    """Return a number above zero, else None. Of several numbers the first counts."""
     if isinstance(value, tuple | list):
         value = value[0] if value else None
     try:

@@ -57,8 +57,10 @@ def read(source: Source, name: str | None = None) -> RawFile:
 
 
 def read_metadata(source: Source, name: str | None = None) -> ExposureSettings:
-    """Camera and exposure alone, without unpacking the pixels (milliseconds). Raises RawFileError as `read` does for
-    a file that can't be opened; a file of a kind that has no metadata gives None throughout."""
+    """Read camera and exposure alone, without unpacking the pixels (milliseconds).
+
+    A kind of file without metadata gives None throughout. Raises RawFileError as `read` does.
+    """
     label = _label(source, name)
     with _open(source, label) as file, _sentences(label):
         start = file.read(16)
@@ -66,21 +68,21 @@ def read_metadata(source: Source, name: str | None = None) -> ExposureSettings:
         if start.startswith(b"\x93NUMPY"):
             return ExposureSettings()
         if start.startswith((b"\x89PNG", b"\xff\xd8\xff")):
-            Image.open(file)  # refuses what is no picture
+            Image.open(file)  # raises for a file that is not a picture
             file.seek(0)
             return read_exif(file)
         if start.startswith(_TIFF_STARTS) and _is_plain_tiff(file, label):
             return read_exif(file)
         frame = _find_lytro(source, label, file, start, pixels=False)
-        told = read_exif(file) if frame is None else frame.exposure_settings()
-        if told.make is not None:
-            return told
+        settings = read_exif(file) if frame is None else frame.exposure_settings()
+        if settings.make is not None:
+            return settings
         file.seek(0)
         return _read_libraw_settings(file)
 
 
 def _find_lytro(source: Source, label: str, file: BinaryIO, start: bytes, *, pixels: bool = True) -> RawFile | None:
-    """The frame of a Lytro container, or of a bare file that is named .raw; None for other files."""
+    """Read a Lytro container, or a bare file that is named .raw; None for other files."""
     if start.startswith(lytro.START):
         return lytro.read_container(file.read(), pixels=pixels)
     return lytro.find_bare(source, file, pixels=pixels) if label.lower().endswith(".raw") else None
@@ -117,7 +119,7 @@ def _sentences(label: str) -> Iterator[None]:
         ) from error
     except Image.DecompressionBombError as error:
         raise RawFileError(f"{label} claims to be larger than any frame: {error}") from error
-    except Exception as error:  # the readers raise whatever damaged bytes lead them into
+    except Exception as error:  # the readers raise anything on damaged bytes
         raise RawFileError(
             f"{label} can't be read as a frame, it may be damaged or cut short: {_words(error)}"
         ) from error
@@ -132,7 +134,7 @@ def _words(error: BaseException) -> str:
 
 
 def _read_libraw(file: BinaryIO) -> RawFile:
-    """A raw file with a mosaic. Raises what LibRaw and EXIF raise, and ValueError for one without."""
+    """Read a raw file with a mosaic. Raises what LibRaw and EXIF raise, and ValueError for one without."""
     with rawpy.imread(file) as raw:
         if raw.raw_type != rawpy.RawType.Flat:
             raise ValueError("it holds no mosaic (linear or demosaiced raws have no masked light field to decode)")
@@ -153,35 +155,35 @@ def _read_libraw(file: BinaryIO) -> RawFile:
 
 
 def _read_libraw_settings(file: BinaryIO) -> ExposureSettings:
-    """What it says of the exposure. Raises what LibRaw raises."""
+    """Read camera and exposure. Raises what LibRaw raises."""
     with rawpy.imread(file) as raw:
         return _libraw_settings(file, raw)
 
 
 def _libraw_settings(file: BinaryIO, raw: Any) -> ExposureSettings:
-    """EXIF first; LibRaw's own reading where EXIF is silent (CRW, ORF variants …)."""
+    """Return what EXIF has, and LibRaw's own values where EXIF has none (CRW, ORF variants …)."""
     file.seek(0)
-    told = read_exif(file)
+    known = read_exif(file)
     other = raw.other
     stamp = other.timestamp
     taken = stamp.isoformat() if isinstance(stamp, datetime) and stamp.year > 1970 else None
     return replace(
-        told,
-        focal_length_mm=told.focal_length_mm or _short(other.focal_length),
-        f_number=told.f_number or _short(other.aperture),
-        exposure_s=told.exposure_s or _short(other.shutter_speed),
-        iso=told.iso or _short(other.iso_speed),
-        taken=told.taken or taken,
+        known,
+        focal_length_mm=known.focal_length_mm or _short(other.focal_length),
+        f_number=known.f_number or _short(other.aperture),
+        exposure_s=known.exposure_s or _short(other.shutter_speed),
+        iso=known.iso or _short(other.iso_speed),
+        taken=known.taken or taken,
     )
 
 
 def _short(value: float) -> float | None:
-    """LibRaw's single-precision numbers as the decimal that was meant: 14.8, not 14.800000190734863."""
+    """Return LibRaw's single-precision number as the shortest decimal: 14.8, not 14.800000190734863."""
     return positive(str(np.float32(value)))
 
 
 def _visible_pattern(raw: Any) -> NDArray[np.int64]:
-    """LibRaw's pattern, which starts at the first masked pixel, as the smallest block that repeats over the mosaic."""
+    """Return LibRaw's pattern, which starts at the first masked pixel, as the smallest block that repeats."""
     pattern = np.asarray(raw.raw_pattern, dtype=np.int64)
     visible = np.roll(pattern, (-raw.sizes.top_margin, -raw.sizes.left_margin), axis=(0, 1))
 
@@ -193,7 +195,7 @@ def _visible_pattern(raw: Any) -> NDArray[np.int64]:
 
 
 def _balance(gains: list[float], names: str) -> tuple[float, ...] | None:
-    """By colour index, green 1; LibRaw gives 0 for a second green that is as the first."""
+    """Return gains by colour index, green 1. LibRaw gives 0 for a second green that is equal to the first."""
     known = [float(gain) for gain in gains[: len(names)]]
     green = names.find("G")
     if green < 0 or positive(known[green]) is None:
@@ -208,7 +210,7 @@ def _balance(gains: list[float], names: str) -> tuple[float, ...] | None:
 
 
 def _read_picture(file: BinaryIO) -> RawFile:
-    """A PNG or a JPEG. Raises what Pillow raises, and ValueError for one that holds no frame."""
+    """Read a PNG or a JPEG. Raises what Pillow raises, and ValueError for one that holds no frame."""
     image: Image.Image = Image.open(file)
     if image.format == "PNG" and image.mode != "I;16" and _png_is_deep_colour(file):
         raise ValueError("it is a colour PNG of 16 bits, which would lose its lower 8; save it as TIFF or as grey PNG")
@@ -232,7 +234,7 @@ def _png_is_deep_colour(file: BinaryIO) -> bool:
 
 
 def _is_plain_tiff(file: BinaryIO, label: str) -> bool:
-    """Whether tifffile should read it: named a TIFF, and no DNG. Other files that begin as TIFF are camera raws."""
+    """Whether tifffile reads it: it is named a TIFF, and is not a DNG. Others that begin as TIFF are camera raws."""
     if not label.lower().endswith((".tif", ".tiff")):
         return False
     try:
@@ -245,7 +247,7 @@ def _is_plain_tiff(file: BinaryIO, label: str) -> bool:
 
 
 def _read_tiff(file: BinaryIO) -> RawFile:
-    """The first page of a TIFF. Raises what tifffile raises, and ValueError."""
+    """Read the first page of a TIFF. Raises what tifffile raises, and ValueError."""
     with tifffile.TiffFile(file) as tiff:
         page = tiff.pages.first
         values = page.asarray()
@@ -259,7 +261,7 @@ def _read_tiff(file: BinaryIO) -> RawFile:
 
 
 def _plain(values: NDArray[Any], settings: ExposureSettings) -> RawFile:
-    """An array without a mosaic: whole numbers reach to their type's largest, floats to 1. Raises ValueError."""
+    """Make a frame of an array without a mosaic; white is the largest integer of its type, or 1. Raises ValueError."""
     if values.dtype.kind == "b":
         values = values.astype(np.uint8) * np.uint8(255)
     if values.dtype not in (np.uint8, np.uint16, np.float32, np.float64):

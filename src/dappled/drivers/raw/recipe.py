@@ -1,4 +1,4 @@
-"""How frames are to be decoded, as a person names it, and what that says of a frame in its file's stead."""
+"""Recipes: how frames are decoded, by the settings or the options of a command, or as a recorded flight was."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +31,12 @@ class DarkroomError(DappledError):
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """What decoding needs to know, as a person names it; see the configuration's [camera], [mask] and [decode].
+    """What decoding needs to know; see [camera], [mask] and [decode] of the settings.
 
     `camera` a profile, a TOML file or "auto" (by the frame's model); `mask` a profile, a TOML file or "lenslet";
-    `law` "" takes the camera's; the files are "" where there are none.
-    `cfa` (as "BGGR", row by row), `black` and `white_level` are for files that don't say so themselves. `colour` asks
-    for views in red, green and blue; `taper`, 0 to 1, for slices whose bands fall off softly (printed masks).
+    `law` "" takes the camera's; a file is "" where there is none.
+    `cfa` (as "BGGR", row by row), `black` and `white_level` are for files that don't contain them. `colour` makes
+    views in red, green and blue; `taper`, 0 to 1, makes the bands of a printed mask's slices fall off softly.
     """
 
     camera: str
@@ -53,12 +54,12 @@ class Recipe:
 
 
 def read(path: Path | str, recipe: Recipe) -> RawFile:
-    """A frame's file, with what the recipe says about it. Raises DappledError."""
-    return said(reading.read(Path(path)), recipe)
+    """Read a frame's file, with the values that the recipe overrides. Raises DappledError."""
+    return override(reading.read(Path(path)), recipe)
 
 
-def said(raw: RawFile, recipe: Recipe) -> RawFile:
-    """What a file says, with what the recipe says instead. Raises DarkroomError for a pattern that is none."""
+def override(raw: RawFile, recipe: Recipe) -> RawFile:
+    """Replace the values that the recipe gives. Raises DarkroomError for a wrong colour pattern."""
     changed: dict[str, Any] = {}
     if recipe.cfa:
         side = math.isqrt(len(recipe.cfa))
@@ -80,7 +81,10 @@ def said(raw: RawFile, recipe: Recipe) -> RawFile:
 
 
 def of_flight(flight: Path, facts: Mapping[str, Any], overrides: Mapping[str, Any]) -> Recipe | None:
-    """The recipe that a recorded flight was decoded by, its files from the flight's own copies; overrides on top."""
+    """Return the recipe that a recorded flight was decoded by, with the flight's own copies of its files.
+
+    `facts` are those of flight.toml. `overrides` that are not None replace fields. None where no mask is named.
+    """
     settings = facts.get("settings", {})
     decode, folder = settings.get("decode", {}), flight / FOLDER
     files: dict[str, Any] = {name: _kept(decode.get(name, ""), folder, name) for name in FILES}
@@ -104,8 +108,9 @@ def _kept_profile(profile: str, folder: Path, kind: str) -> str:
     return str(copy) if copy.is_file() else profile
 
 
+@lru_cache(maxsize=64)  # each frame asks, and finding a model reads every profile
 def camera_name(camera: str, model: str | None) -> str:
-    """What a camera is called: its profile, by name or by model; else the model, or "unknown"."""
+    """Return what a camera is called: its profile, by name or by model; else the model, or "unknown"."""
     if camera != "auto":
         return Path(camera).stem if camera.endswith(".toml") else camera
     found = profiles.camera_for_model(model or "")
@@ -113,19 +118,19 @@ def camera_name(camera: str, model: str | None) -> str:
 
 
 def camera_profile(recipe: Recipe, model: str) -> CameraProfile:
-    """The camera's profile: the recipe's, or by model. Raises DarkroomError where no profile knows the model."""
+    """Return the camera's profile: the recipe's, or by model. Raises DarkroomError where no profile knows the model."""
     if recipe.camera != "auto":
         return profiles.camera(recipe.camera)
     found = profiles.camera_for_model(model)
     if found is None:
-        said = f"the frame says {model!r}" if model else "the frame names no camera"
-        raise DarkroomError(f"which camera? {said}, and no profile knows it: name one with --camera")
+        named = f"the frame says {model!r}" if model else "the frame names no camera"
+        raise DarkroomError(f"which camera? {named}, and no profile knows it: name one with --camera")
     return found
 
 
 @contextmanager
 def naming(path: Path | str) -> Iterator[None]:
-    """Around mathematics on a frame: its errors get the file's name."""
+    """Context in which a DecodeError becomes a DarkroomError with the file's name."""
     try:
         yield
     except DecodeError as error:

@@ -181,7 +181,7 @@ def refined(
 
 def develop(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, options: Options) -> DecodeResult:
     """One frame of a flight, decoded. Raises DappledError."""
-    return darkroom.develop(
+    return darkroom.decode(
         flight / frame.name,
         focal_length_mm=options.focal_length_mm or (tag.focal_length_mm if tag else None),
         f_number=options.f_number or (tag.f_number if tag else None),
