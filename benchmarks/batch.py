@@ -39,6 +39,7 @@ from dappled.products.batch import batch, workers
 from dappled.products.batch.batch import Done, Job
 from dappled.products.maps import photographs
 from dappled.products.maps.georeference import Options
+from dappled.products.mounting import Mounting
 
 CAMERA, MASK, F_NUMBER, SEED = "reference-36mm", "reference-5x5", 14.8, 5
 KINDS = ("npz", "cog")
@@ -76,7 +77,7 @@ def flight(folder: Path, count: int, scale: float) -> list[Job]:
             true.altitude_msl_m, -true.position_ned_m[2], None, true.attitude, 0.02, 0.001, 1.0, 1,
         )  # fmt: skip
         tag = Tag(index, pose.utc_ns, 1000, "hot shoe", 50.0, F_NUMBER, 0.001, 100.0, CAMERA, MASK, frame.sha256, pose)
-        station = photographs.station(frame, tag, photographs.Mounting())
+        station = photographs.station(frame, tag, Mounting())
         options = Options(crs="EPSG:32615")
         jobs.append(
             Job(str(folder / "flight"), frame, tag, station, "", path.home_altitude_msl_m, recipe, options, KINDS,

@@ -12,6 +12,7 @@ from dappled.daemon.service import Service
 from dappled.flight import ImageIndex, check, flight_report
 from dappled.mocks.simulation import Simulation, World
 from dappled.products.geotags import geotags
+from dappled.products.mounting import Mounting
 from tests.system.conftest import dappled
 
 SECOND_NS = 10**9
@@ -48,7 +49,7 @@ def test_a_flight_learns_utc_and_replays(tmp_path: Path, sockets: Path) -> None:
     assert 0 < time.time_ns() - began_utc_ns < 300 * SECOND_NS
     with ImageIndex(tmp_path / "flights") as index:
         assert index.flights() == {service.folder.name: began_utc_ns}
-    (placed,), _ = geotags.read(service.folder)
+    (placed,), _ = geotags.read(service.folder, Mounting())
     assert placed.utc_ns is not None
     assert abs(time.time_ns() - placed.utc_ns) < 300 * SECOND_NS
     assert placed.tag.utc_ns < 10**17  # as it was stamped: nothing is stamped anew

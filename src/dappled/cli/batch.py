@@ -16,8 +16,7 @@ from dappled.cli.arguments import whole
 from dappled.errors import DappledError
 from dappled.flight import layout
 from dappled.products.batch import batch, workers
-from dappled.products.batch.batch import KINDS, Job
-from dappled.products.batch.manifest import Manifest
+from dappled.products.batch.batch import KINDS, Job, Manifest
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

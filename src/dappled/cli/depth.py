@@ -20,7 +20,7 @@ from dappled.decode.errors import DecodeError
 from dappled.flight import layout
 from dappled.products.exports import exports, point_cloud, prints
 from dappled.products.maps import photographs
-from dappled.products.maps.photographs import Mounting
+from dappled.products.mounting import Mounting
 from dappled.products.opened import OpenedLightField, OpenError
 
 _POINTS = (".ply", ".las", ".laz")

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from dappled.cli import decode_arguments
-from dappled.products.exports import exports, light_files, rerun_log
+from dappled.products.exports import exports, light_files
 from dappled.products.opened import OpenedLightField
 
 KINDS = {
@@ -51,7 +51,7 @@ def write(found: OpenedLightField, kind: str, path: Path, arguments: argparse.Na
         case "rerun":
             depth = found.depth() if arguments.depth else None
             distances = found.distances(depth) if depth is not None and found.ranging is not None else None
-            rerun_log.write(path, found.field, found.refocus(), depth, distances)
+            exports.rerun(path, found.field, found.refocus(), depth, distances)
         case _:
             if path.suffix != f".{kind}":
                 raise exports.ExportError(f"{path}: --as {kind} writes a .{kind} file; name it so")

@@ -18,12 +18,12 @@ from dappled.daemon.pipeline import recipes
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import layout
-from dappled.products.maps import difference, drawings, earth, georeference, terrain
-from dappled.products.maps.basemap import BaseMapError
+from dappled.products.maps import difference, earth, georeference, map_files, terrain
 from dappled.products.maps.georeference import Options, Progress, Survey
 from dappled.products.maps.hyperstereo import HyperstereoError
-from dappled.products.maps.photographs import Mounting
-from dappled.products.maps.terrain import Terrain
+from dappled.products.maps.references import BaseMapError
+from dappled.products.maps.terrain import TerrainModel
+from dappled.products.mounting import Mounting
 
 KINDS = ("kmz", "cog", "footprints", "terrain", "difference")
 
@@ -122,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
             except DappledError as error:
                 missing.append(f"no difference to {arguments.against}: {error}")
     made = replace(made, notes=(*made.notes, *missing))
-    report = georeference.write_report(made, output, files)
+    report = map_files.write_report(made, output, files)
     if arguments.json:
         print(report.read_text(), end="")
     else:
@@ -134,7 +134,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if missing else 0
 
 
-def _heights(made: Survey, arguments: argparse.Namespace, progress: Progress) -> Terrain:
+def _heights(made: Survey, arguments: argparse.Namespace, progress: Progress) -> TerrainModel:
     low, high = arguments.between or (None, None)
     return terrain.of(made, progress, lowest_m=low, highest_m=high)
 
@@ -142,7 +142,7 @@ def _heights(made: Survey, arguments: argparse.Namespace, progress: Progress) ->
 def _compare(
     made: Survey,
     other: Survey,
-    heights: Terrain | None,
+    heights: TerrainModel | None,
     output: Path,
     *,
     arguments: argparse.Namespace,
@@ -195,20 +195,20 @@ def _refined(made: Survey, base: Path | None, arguments: argparse.Namespace, pro
 
 def _draw(made: Survey, output: Path, arguments: argparse.Namespace) -> list[Path]:
     files: list[Path] = []
-    gain = drawings.gain_of(made)
+    gain = map_files.gain_of(made)
     if "kmz" in arguments.kinds:
-        files.append(drawings.mosaic_kmz(made, output / "mosaic.kmz", gain))
+        files.append(map_files.mosaic_kmz(made, output / "mosaic.kmz", gain))
     if "cog" in arguments.kinds:
-        files.append(drawings.mosaic_cog(made, output / "mosaic.tif", gain))
+        files.append(map_files.mosaic_cog(made, output / "mosaic.tif", gain))
     if arguments.each:
         for one in made.photographs:
             beside = output / "frames" / one.name
             if "kmz" in arguments.kinds:
-                files.append(drawings.frame_kmz(made, one, beside.with_suffix(".kmz"), gain, quad=arguments.quad))
+                files.append(map_files.frame_kmz(made, one, beside.with_suffix(".kmz"), gain, quad=arguments.quad))
             if "cog" in arguments.kinds:
-                files.append(drawings.frame_cog(made, one, beside.with_suffix(".tif"), gain))
+                files.append(map_files.frame_cog(made, one, beside.with_suffix(".tif"), gain))
     if "footprints" in arguments.kinds:
-        files.append(georeference.write_footprints(made, output))
+        files.append(map_files.write_footprints(made, output))
     return files
 
 

@@ -7,6 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,9 @@ from dappled.decode.geometry import camera_pose
 from dappled.errors import DappledError
 from dappled.flight import layout
 from dappled.products.geotags import geotags
-from dappled.products.geotags.geotags import Mounting
 from dappled.products.maps import earth
 from dappled.products.maps.earth import EarthError, Geoid
+from dappled.products.mounting import Mounting
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -58,15 +59,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     facts = layout.read_facts(layout.open_folder(arguments.flight))
     tagged_late = _tag_late(arguments.flight)
-    mounting = _mounting(arguments, facts.get("settings", {}).get("pose", {}))
+    mounting, geoid = _mounting(arguments, facts), _geoid(arguments.geoid)
     written = geotags.write(
         arguments.flight,
         mounting,
+        geoid=geoid,
         output=arguments.output,
         replace_extension=arguments.lightroom,
         force=arguments.force,
     )
-    found = dict(_copies(arguments.flight, arguments.copies, mounting)) if arguments.copies else {}
+    found = dict(_copies(arguments.flight, arguments.copies, mounting, geoid)) if arguments.copies else {}
     copied = [str(path) for path in found.values() if isinstance(path, Path)]
     without_copy = {name: reason for name, reason in found.items() if isinstance(reason, str)}
     if arguments.json:
@@ -80,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
                     "tagged_late": tagged_late,
                     "copies": copied,
                     "without_copy": without_copy,
-                    "geoid": mounting.geoid.name if mounting.geoid else None,
+                    "geoid": geoid.name if geoid else None,
                 },
                 indent=2,
             )
@@ -110,21 +112,23 @@ def _tag_late(flight: Path) -> list[int]:
     return added
 
 
-def _copies(flight: Path, folder: Path, mounting: Mounting) -> Iterable[tuple[str, Path | str]]:
-    made = geotags.copies(flight, folder, mounting)
+def _copies(flight: Path, folder: Path, mounting: Mounting, geoid: Geoid | None) -> Iterable[tuple[str, Path | str]]:
+    made = geotags.copies(flight, folder, mounting, geoid)
     return tqdm(made, unit="frame", disable=None, delay=1.0, leave=False)
 
 
-def _mounting(arguments: argparse.Namespace, recorded: dict[str, Any]) -> Mounting:
-    lever = arguments.lever_arm or recorded.get("lever_arm_m") or (0.0, 0.0, 0.0)
-    values = arguments.mount or recorded.get("mount")
-    on_gimbal = recorded.get("on_gimbal", False) if arguments.on_gimbal is None else arguments.on_gimbal
-    return Mounting(
-        (float(lever[0]), float(lever[1]), float(lever[2])),
-        camera_pose.NADIR if values is None else camera_pose.mount(tuple(values)),
-        on_gimbal,
-        _geoid(arguments.geoid),
-    )
+def _mounting(arguments: argparse.Namespace, facts: dict[str, Any]) -> Mounting:
+    """The flight's own mounting, with what the arguments give instead. Raises DappledError for a wrong one."""
+    mounting = Mounting.of(facts)
+    if arguments.lever_arm is not None:
+        forward, right, down = arguments.lever_arm
+        mounting = replace(mounting, lever_m=(forward, right, down))
+    if arguments.mount is not None:
+        camera_pose.mount(mount := tuple(arguments.mount))
+        mounting = replace(mounting, mount=mount)
+    if arguments.on_gimbal is not None:
+        mounting = replace(mounting, on_gimbal=arguments.on_gimbal)
+    return mounting
 
 
 def _geoid(given: str | None) -> Geoid | None:

@@ -20,8 +20,7 @@ from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import Frame, durable
 from dappled.products.batch import batch, workers
-from dappled.products.batch.batch import Done, Job
-from dappled.products.batch.manifest import Manifest, ManifestError
+from dappled.products.batch.batch import Done, Job, Manifest, ManifestError
 from dappled.products.exports import light_files
 from dappled.products.maps import photographs
 from dappled.products.maps.georeference import Options
@@ -207,7 +206,7 @@ def test_two_batches_cant_share_a_folder(tmp_path: Path) -> None:
 
 def test_a_torn_manifest_keeps_its_whole_lines(tmp_path: Path) -> None:
     with Manifest(tmp_path) as manifest:
-        manifest.add(Done("a", "flight", "frames/0.dng", (batch.Output("x", 3, "00"),), None, 1.0, 1.0, 2.0))
+        manifest.add(Done("a", "flight", "frames/0.dng", (batch.BatchOutput("x", 3, "00"),), None, 1.0, 1.0, 2.0))
     path = tmp_path / "manifest.jsonl"
     path.write_bytes(path.read_bytes() + b'{"key": "b", "fli')
     with Manifest(tmp_path) as manifest:

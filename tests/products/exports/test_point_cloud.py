@@ -11,7 +11,7 @@ from dappled.flight import Frame, Tag
 from dappled.products.exports import point_cloud
 from dappled.products.exports.point_cloud import PointCloudError
 from dappled.products.maps import photographs
-from dappled.products.maps.photographs import Mounting
+from dappled.products.mounting import Mounting
 from tests.products.fields import light_field
 
 FIELD = light_field(shape=(60, 80))

@@ -31,8 +31,8 @@ from dappled.flight import recording
 from dappled.flight.check import check
 from dappled.products.geotags import exif_gps, geotags, sidecars
 from dappled.products.geotags.exif_gps import ExifError
-from dappled.products.geotags.geotags import Mounting
 from dappled.products.maps.earth import Geoid
+from dappled.products.mounting import Mounting
 from tests.flight.makers import deliver, pose, request, tag
 
 START_NS = 1_795_256_103_000_000_000
@@ -60,7 +60,7 @@ def attributes(path: Path) -> dict[str, str]:
 def test_everything_is_written_and_nothing_recorded_is_touched(flight: Path) -> None:
     kept = [*sorted((flight / "frames").iterdir()), flight / "flight.sqlite", flight / "shots.jsonl"]
     before = {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in kept}
-    written = geotags.write(flight)
+    written = geotags.write(flight, Mounting())
     assert {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in before} == before
     assert check(flight).problems == ()
     assert (written.placed, written.without_position, written.without_tag) == (
@@ -91,7 +91,7 @@ def test_everything_is_written_and_nothing_recorded_is_touched(flight: Path) -> 
 
 
 def test_a_sidecar_says_what_is_known_and_only_that(flight: Path) -> None:
-    geotags.write(flight)
+    geotags.write(flight, Mounting())
     known = attributes(flight / "frames" / "000000.cr2.xmp")
     assert known["{http://ns.adobe.com/exif/1.0/}GPSLatitude"].endswith("N")
     assert known["{http://ns.adobe.com/exif/1.0/}GPSLongitude"].endswith("W")
@@ -115,7 +115,7 @@ def test_somebody_elses_sidecar_stays(flight: Path, capsys: pytest.CaptureFixtur
 
 
 def test_the_other_convention_and_another_folder(flight: Path, tmp_path: Path) -> None:
-    written = geotags.write(flight, output=tmp_path / "out", replace_extension=True)
+    written = geotags.write(flight, Mounting(), output=tmp_path / "out", replace_extension=True)
     assert sorted(path.name for path in written.files) == [
         "000000.xmp",
         "000001.xmp",
@@ -145,7 +145,7 @@ def one_frame(root: Path, frame: bytes, name: str, where: Pose, *, utc_known: bo
 
 def test_accuracies_and_the_receivers_word_are_in_every_form(tmp_path: Path) -> None:
     flight = one_frame(tmp_path, b"raw", "IMG.CR2", rtk())
-    geotags.write(flight, Mounting(geoid=Geoid(offset_m=-33.5)))
+    geotags.write(flight, Mounting(), geoid=Geoid(offset_m=-33.5))
     said = attributes(flight / "frames" / "000000.cr2.xmp")
     assert said["{http://www.dji.com/drone-dji/1.0/}RtkFlag"] == "50"
     assert said["{http://www.dji.com/drone-dji/1.0/}RtkStdHgt"] == "0.0300"
@@ -164,7 +164,7 @@ def test_accuracies_and_the_receivers_word_are_in_every_form(tmp_path: Path) -> 
 
 def test_times_are_put_right_where_utc_was_learnt(tmp_path: Path) -> None:
     flight = one_frame(tmp_path, b"raw", "IMG.CR2", rtk(), utc_known=False)
-    geotags.write(flight)
+    geotags.write(flight, Mounting())
     said = attributes(flight / "frames" / "000000.cr2.xmp")
     assert said["{http://ns.adobe.com/exif/1.0/}GPSTimeStamp"] == "2026-11-22T10:15:03.123456Z"
 
@@ -239,7 +239,7 @@ FILES = {
 @pytest.mark.parametrize("name", FILES)
 def test_a_copy_has_its_place_in_exif_and_the_original_none(tmp_path: Path, name: str) -> None:
     flight = one_frame(tmp_path, FILES[name], name, rtk(latitude_rad=-0.7266))
-    ((frame, copy),) = geotags.copies(flight, tmp_path / "copies")
+    ((frame, copy),) = geotags.copies(flight, tmp_path / "copies", Mounting())
     assert isinstance(copy, Path)
     assert (flight / frame).read_bytes() == FILES[name]
     found = gps(copy.read_bytes())

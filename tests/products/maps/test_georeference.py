@@ -30,7 +30,8 @@ from dappled.products.maps import difference, georeference, photographs
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.georeference import Options, Survey
 from dappled.products.maps.ground import Flat
-from dappled.products.maps.photographs import Mounting, Photograph, PhotographError, Station
+from dappled.products.maps.photographs import Photograph, PhotographError, Station
+from dappled.products.mounting import Mounting
 from tests import globe
 from tests.flight.makers import deliver, pose, request
 from tests.products import flown

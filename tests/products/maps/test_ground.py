@@ -11,9 +11,9 @@ import rasterio.shutil
 from numpy.typing import NDArray
 
 from dappled.products.maps import ground as grounds
-from dappled.products.maps.basemap import BaseMap
 from dappled.products.maps.earth import Geoid, Projection
 from dappled.products.maps.ground import Flat, GroundError, Raster
+from dappled.products.maps.references import BaseMap
 from tests.products.maps.test_eye import eye_at
 
 PROJECTION = Projection("EPSG:32615")

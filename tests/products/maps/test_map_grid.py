@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dappled.config.profiles import Lens
-from dappled.products.maps import cog, drawings, footprints, kmz, map_grid, mosaic
+from dappled.products.maps import cog, kmz, map_files, map_grid
 from dappled.products.maps.earth import Projection, utm
 from dappled.products.maps.eye import Eye, through
 from dappled.products.maps.georeference import Survey
@@ -57,13 +57,21 @@ def survey(*photos: Photograph, ground: Ground | None = None, gsd_m: float = 0.1
     return Survey("20261121T101503Z-0a1b2c3d", photos, Projection(crs), ground or Flat(0.0), gsd_m, float("inf"), ())
 
 
+def draw(
+    image: NDArray[np.float32], eye: Eye, grid: MapGrid, ground: Ground, projection: Projection
+) -> NDArray[np.float32]:
+    """(rows, columns, c): one view on the map, as `pieces` draws it, but alone."""
+    smooth = map_grid.smoothed(image, eye, grid, ground)
+    return map_grid.sample(smooth, map_grid.seen_at(eye, grid, ground, projection))
+
+
 @pytest.mark.parametrize("ground", [Flat(0.0), hill()], ids=["flat", "hill"])
 @pytest.mark.parametrize("colour", [False, True])
 def test_every_cell_shows_the_ground_that_lies_there(ground: Ground, colour: bool) -> None:
     eye = eye_at(height_m=100.0)
     made = survey(photograph(eye, painted(eye, ground, colour)), ground=ground)
-    grid = mosaic.grid_of(made.photographs, ground, made.projection, 0.1)
-    drawn = map_grid.draw(made.photographs[0].image, eye, grid, ground, made.projection)
+    grid = map_grid.grid_of(made.photographs, ground, made.projection, 0.1)
+    drawn = draw(made.photographs[0].image, eye, grid, ground, made.projection)
     east, north = grid.places(made.projection)
     known = np.isfinite(drawn[..., 0])
     assert 0.3 < known.mean() < 0.9
@@ -77,12 +85,12 @@ def test_every_cell_shows_the_ground_that_lies_there(ground: Ground, colour: boo
 def test_a_map_in_degrees_shows_the_same() -> None:
     eye, ground = eye_at(60.0, 24.05, height_m=100.0), Flat(0.0)
     made = survey(photograph(eye, painted(eye, ground)), crs=utm(60.0, 24.05))
-    grid = mosaic.grid_of(made.photographs, ground, made.projection, 0.1, degrees=True)
+    grid = map_grid.grid_of(made.photographs, ground, made.projection, 0.1, degrees=True)
     east, north = grid.places(made.projection)
     x, y = grid.axes()
     exact = made.projection.to_map(np.repeat(y[:, None], len(x), 1), np.tile(x, (len(y), 1)))
     assert np.abs(np.stack([east, north]) - np.stack(exact)).max() < 1e-4
-    drawn = map_grid.draw(made.photographs[0].image, eye, grid, ground, made.projection)[..., 0]
+    drawn = draw(made.photographs[0].image, eye, grid, ground, made.projection)[..., 0]
     known = np.isfinite(drawn)
     assert (
         np.abs(drawn - wave(east, north))[known].max() < 0.03
@@ -109,12 +117,12 @@ def test_views_laid_over_each_other_on_the_ground_are_sharp_where_their_mean_is_
     views = np.stack([painted(through(eye, (y, x)), ground) for y, x in apertures])
     mean = photograph(eye, views.mean(axis=0))
     refocused = replace(mean, views=views, apertures_m=apertures)
-    grid = mosaic.grid_of([mean], ground, Projection("EPSG:32615"), 0.1)
+    grid = map_grid.grid_of([mean], ground, Projection("EPSG:32615"), 0.1)
     east, north = grid.places(Projection("EPSG:32615"))
     worst = []
     for one in (mean, refocused):
         drawn = np.full(grid.shape, np.nan)
-        for rows, columns, values in mosaic.pieces([one], grid, ground, Projection("EPSG:32615")):
+        for rows, columns, values in map_grid.pieces([one], grid, ground, Projection("EPSG:32615")):
             drawn[rows, columns] = values[..., 0]
         drawn = drawn[30:-30, 30:-30]
         worst.append(float(np.nanquantile(np.abs(drawn - wave(east, north)[30:-30, 30:-30]), 0.99)))
@@ -128,13 +136,13 @@ def test_a_mosaic_is_seamless_where_frames_agree() -> None:
     second = first.moved(np.array([12.0, 5.0, 3.0, 0.02, -0.01, 0.3]))
     photos = [photograph(eye, painted(eye, ground), name) for eye, name in ((first, "1"), (second, "2"))]
     projection = Projection("EPSG:32615")
-    grid = mosaic.grid_of(photos, ground, projection, 0.1)
+    grid = map_grid.grid_of(photos, ground, projection, 0.1)
     east, north = grid.places(projection)
     drawn = np.full(grid.shape, np.nan)
-    for rows, columns, values in mosaic.pieces(photos, grid, ground, projection):
+    for rows, columns, values in map_grid.pieces(photos, grid, ground, projection):
         drawn[rows, columns] = values[..., 0]
     known = np.isfinite(drawn)
-    single = [np.isfinite(map_grid.draw(p.image, p.eye, grid, ground, projection)[..., 0]) for p in photos]
+    single = [np.isfinite(draw(p.image, p.eye, grid, ground, projection)[..., 0]) for p in photos]
     assert np.array_equal(known, single[0] | single[1])
     assert (
         np.abs(drawn - wave(east, north))[known].max() < 0.03
@@ -144,7 +152,7 @@ def test_a_mosaic_is_seamless_where_frames_agree() -> None:
 def test_a_cog_is_one_to_gdal(tmp_path: Path) -> None:
     eye, ground = eye_at(height_m=100.0), Flat(0.0)
     made = survey(photograph(eye, painted(eye, ground, colour=True)), gsd_m=0.05)
-    path = drawings.mosaic_cog(made, tmp_path / "mosaic.tif", gain=1.0)
+    path = map_files.mosaic_cog(made, tmp_path / "mosaic.tif", gain=1.0)
     with rasterio.open(path) as read:
         assert read.crs.to_epsg() == 32615
         assert read.count == 4
@@ -157,14 +165,14 @@ def test_a_cog_is_one_to_gdal(tmp_path: Path) -> None:
     expected = cog.display(np.array([[[*(wave(met[:1], met[1:2])[0] * np.array([1, 0.5, 0.25]))]]], np.float32), 1.0)
     assert values.astype(int) == pytest.approx(expected[0, 0].astype(int), abs=6)
     assert not list(tmp_path.glob(".maps-*"))
-    again = drawings.mosaic_cog(made, tmp_path / "again.tif", gain=1.0)
+    again = map_files.mosaic_cog(made, tmp_path / "again.tif", gain=1.0)
     assert again.read_bytes() == path.read_bytes()
 
 
 @pytest.mark.skipif(shutil.which("gdalinfo") is None, reason="GDAL's command line is not installed")
 def test_gdals_own_command_reads_the_cog(tmp_path: Path) -> None:
     eye = eye_at(height_m=100.0)
-    path = drawings.mosaic_cog(survey(photograph(eye, painted(eye, Flat(0.0)))), tmp_path / "m.tif", gain=1.0)
+    path = map_files.mosaic_cog(survey(photograph(eye, painted(eye, Flat(0.0)))), tmp_path / "m.tif", gain=1.0)
     said = json.loads(subprocess.run(["gdalinfo", "-json", str(path)], check=True, capture_output=True).stdout)  # noqa: S607  on PATH
     assert said["metadata"]["IMAGE_STRUCTURE"]["LAYOUT"] == "COG"
     assert [band["colorInterpretation"] for band in said["bands"]] == ["Gray", "Alpha"]
@@ -175,7 +183,7 @@ def test_gdals_own_command_reads_the_cog(tmp_path: Path) -> None:
 @pytest.mark.skipif(shutil.which("gdalinfo") is None, reason="GDAL's command line is not installed")
 def test_gdals_own_command_reads_the_kmz(tmp_path: Path) -> None:
     eye = eye_at(height_m=100.0)
-    path = drawings.mosaic_kmz(survey(photograph(eye, painted(eye, Flat(0.0), colour=True))), tmp_path / "m.kmz", 1.0)
+    path = map_files.mosaic_kmz(survey(photograph(eye, painted(eye, Flat(0.0), colour=True))), tmp_path / "m.kmz", 1.0)
     said = json.loads(subprocess.run(["gdalinfo", "-json", str(path)], check=True, capture_output=True).stdout)  # noqa: S607  on PATH
     assert [band["colorInterpretation"] for band in said["bands"]] == ["Red", "Green", "Blue", "Alpha"]
     longitude, latitude = said["cornerCoordinates"]["center"]
@@ -204,7 +212,7 @@ def box(overlay: ET.Element) -> dict[str, float]:
 def test_a_kmz_is_north_up_and_lies_where_the_frame_looked(tmp_path: Path) -> None:
     eye, ground = eye_at(height_m=100.0), Flat(0.0)
     made = survey(photograph(eye, painted(eye, ground)))
-    root, pictures = overlays(drawings.mosaic_kmz(made, tmp_path / "m.kmz", gain=1.0))
+    root, pictures = overlays(map_files.mosaic_kmz(made, tmp_path / "m.kmz", gain=1.0))
     (overlay,) = root.iter(f"{{{kmz.KML}}}GroundOverlay")
     assert [child.tag.rpartition("}")[2] for child in overlay] == ["name", "Icon", "LatLonBox"]
     edges = box(overlay)
@@ -231,19 +239,19 @@ def test_a_kmz_is_north_up_and_lies_where_the_frame_looked(tmp_path: Path) -> No
 def test_across_the_antimeridian_there_are_two_overlays_and_a_cut_footprint(tmp_path: Path) -> None:
     eye, ground = eye_at(-17.0, 179.99999, height_m=100.0), Flat(0.0)
     made = survey(photograph(eye, painted(eye, ground)), crs="EPSG:32760")
-    root, pictures = overlays(drawings.mosaic_kmz(made, tmp_path / "m.kmz", gain=1.0))
+    root, pictures = overlays(map_files.mosaic_kmz(made, tmp_path / "m.kmz", gain=1.0))
     west, east = (box(one) for one in root.iter(f"{{{kmz.KML}}}GroundOverlay"))
     assert (west["east"], east["west"]) == (180.0, -180.0)
     assert 179.999 < west["west"] < 180
     assert -180 < east["east"] < -179.999
     assert len({picture.shape[0] for picture in pictures.values()}) == 1
-    shape = footprints.feature(made.photographs[0], ground, made.projection, {})["geometry"]
+    shape = map_files.feature(made.photographs[0], ground, made.projection, {})["geometry"]
     assert shape["type"] == "MultiPolygon"
     rings = [np.array(polygon[0]) for polygon in shape["coordinates"]]
     assert sorted(np.sign(ring[:, 0].mean()) for ring in rings) == [-1, 1]
     assert all((np.abs(ring[:, 0]) <= 180).all() for ring in rings)
     assert all((ring[0] == ring[-1]).all() for ring in rings)
-    drawn = drawings.mosaic_cog(made, tmp_path / "m.tif", gain=1.0)
+    drawn = map_files.mosaic_cog(made, tmp_path / "m.tif", gain=1.0)
     with rasterio.open(drawn) as read:
         assert read.width < 1000  # one piece: the projection goes on
 
@@ -297,7 +305,7 @@ def test_gdal_reads_the_tree_of_tiles(tmp_path: Path) -> None:
 def test_a_quad_keeps_the_view_as_it_is(tmp_path: Path) -> None:
     eye, ground = eye_at(height_m=100.0), Flat(0.0)
     made = survey(photograph(eye, painted(eye, ground)))
-    root, pictures = overlays(drawings.frame_kmz(made, made.photographs[0], tmp_path / "q.kmz", 1.0, quad=True))
+    root, pictures = overlays(map_files.frame_kmz(made, made.photographs[0], tmp_path / "q.kmz", 1.0, quad=True))
     text = root.findtext(".//gx:LatLonQuad/k:coordinates", namespaces=KML)
     assert text is not None
     quad = np.array([[float(word) for word in pair.split(",")] for pair in text.split()])
@@ -311,7 +319,7 @@ def test_footprints_are_polygons_to_others(tmp_path: Path) -> None:
     eye, ground = eye_at(height_m=100.0), hill()
     one = photograph(eye, painted(eye, ground))
     path = tmp_path / "footprints.geojson"
-    path.write_bytes(footprints.collection([footprints.feature(one, ground, Projection("EPSG:32615"), {"a": 1})]))
+    path.write_bytes(map_files._collection([map_files.feature(one, ground, Projection("EPSG:32615"), {"a": 1})]))
     info, _, shapes, values = pyogrio.raw.read(path)
     assert info["geometry_type"] == "Polygon"
     assert len(shapes) == 1

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from dappled.decode.geometry.interpolation import metres_per_radian
 from dappled.mocks.autopilot.path import TruePose
-from dappled.products.maps import control, georeference, hyperstereo, mosaic, refine, terrain
-from dappled.products.maps.basemap import BaseMap, BaseMapError
-from dappled.products.maps.control import ControlError
+from dappled.products.maps import georeference, hyperstereo, map_grid, references, refine, terrain
 from dappled.products.maps.eye import turn
 from dappled.products.maps.georeference import Options, Survey
 from dappled.products.maps.ground import Flat
 from dappled.products.maps.ground import load as load_ground
 from dappled.products.maps.photographs import Photograph
+from dappled.products.maps.references import BaseMap, BaseMapError, ControlPointError
 from tests.products import flown
 from tests.products.flown import Flown
 from tests.products.maps.test_eye import eye_at
@@ -143,7 +142,7 @@ def test_control_points_place_a_frame(rough: Case, tmp_path: Path) -> None:
         pixel = f"{truth.grid[1, 1] * column},{truth.grid[0, 0] * row}"
         lines.append(f"p{number},{one.name}.dng,{pixel},{float(latitude):.10f},{float(longitude):.10f},{altitude}")
     (tmp_path / "gcp.csv").write_text("\n".join(lines))
-    points = control.read(tmp_path / "gcp.csv", rough.survey.projection)
+    points = references.read_control_points(tmp_path / "gcp.csv", rough.survey.projection)
     better, said = refine.refine(
         rough.survey.photographs, rough.survey.ground, control=points, sigmas=(2.0, math.radians(1))
     )
@@ -189,7 +188,7 @@ def test_hyperstereo_finds_the_terrain_that_flat_ground_does_not_have(exact: Cas
 
 def test_frames_that_share_no_ground_have_no_heights(exact: Case) -> None:
     apart = [exact.survey.photographs[0], replace(exact.survey.photographs[1], eye=eye_at())]
-    grid = mosaic.grid_of(exact.survey.photographs[:1], exact.survey.ground, exact.survey.projection, 0.1)
+    grid = map_grid.grid_of(exact.survey.photographs[:1], exact.survey.ground, exact.survey.projection, 0.1)
     with pytest.raises(hyperstereo.HyperstereoError, match="no two frames"):
         hyperstereo.surface(apart, grid, exact.survey.projection, lowest_m=200.0, highest_m=206.0)
 
@@ -203,13 +202,15 @@ def test_bad_control_points_and_base_maps_are_sentences(exact: Case, tmp_path: P
         ("name,frame,column,row,latitude,longitude,altitude\na,0,1,2,141,9,3\n", "no place on Earth"),
     ):
         path.write_text(text)
-        with pytest.raises(ControlError, match=said):
-            control.read(path, projection)
-    with pytest.raises(ControlError, match="can't be read"):
-        control.read(tmp_path / "none.csv", projection)
+        with pytest.raises(ControlPointError, match=said):
+            references.read_control_points(path, projection)
+    with pytest.raises(ControlPointError, match="can't be read"):
+        references.read_control_points(tmp_path / "none.csv", projection)
     path.write_text("name,frame,column,row,latitude,longitude,altitude\na,999,1,2,41,9,3\n")
-    with pytest.raises(ControlError, match="names frame 999"):
-        refine.refine(exact.survey.photographs[:1], exact.survey.ground, control=control.read(path, projection))
+    with pytest.raises(ControlPointError, match="names frame 999"):
+        refine.refine(
+            exact.survey.photographs[:1], exact.survey.ground, control=references.read_control_points(path, projection)
+        )
     with rasterio.open(exact.folder / "base.tif") as read:
         profile = {**read.profile, "transform": rasterio.Affine(1e-6, 0, 10.0, 0, -1e-6, 50.0)}
         with rasterio.open(tmp_path / "elsewhere.tif", "w", **profile) as target:

@@ -7,26 +7,31 @@ be done twice, or on another machine that sees the same folders, and the outcome
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import hashlib
+import json
+import os
 import threading
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any, Self
 
 from dappled import __version__
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError, sentence
 from dappled.flight import Frame, Tag, canonical, durable
 from dappled.products.exports import light_files
-from dappled.products.maps import cog, drawings, georeference, photographs
+from dappled.products.maps import cog, georeference, map_files, photographs
 from dappled.products.maps.earth import Projection, utm
 from dappled.products.maps.georeference import Options
 from dappled.products.maps.photographs import Station
 
 KINDS = {"npz": ".npz", "zarr": ".zarr", "h5": ".h5", "cog": ".tif", "kmz": ".kmz"}
 MAPS = ("cog", "kmz")
+MANIFEST = "manifest.jsonl"
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # mallopt(3)
 
 
@@ -49,7 +54,7 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Output:
+class BatchOutput:
     """A file that was made: its name in the batch's folder, size and SHA-256."""
 
     name: str
@@ -64,7 +69,7 @@ class Done:
     key: str
     flight: str
     frame: str
-    outputs: tuple[Output, ...]
+    outputs: tuple[BatchOutput, ...]
     error: str | None
     seconds: float
     cpu_seconds: float
@@ -122,7 +127,7 @@ def make(job: Job) -> Done:
     """Do a job. What is wrong with this frame is an error in the answer: it never stops the others."""
     _settle_memory()
     began, cpu = time.monotonic(), time.process_time()
-    outputs: tuple[Output, ...] = ()
+    outputs: tuple[BatchOutput, ...] = ()
     error = None
     try:
         outputs = tuple(_made(job))
@@ -134,7 +139,7 @@ def make(job: Job) -> Done:
     return Done(job.key, Path(job.flight).name, job.frame.name, outputs, error, seconds, cpu, _peak_mb())
 
 
-def _made(job: Job) -> list[Output]:
+def _made(job: Job) -> list[BatchOutput]:
     flight = Path(job.flight)
     folder = Path(job.output) / flight.name
     durable.make_folder(folder)
@@ -165,25 +170,25 @@ def _made(job: Job) -> list[Output]:
         for kind in drawn:
             path = beside.with_suffix(KINDS[kind])
             if kind == "cog":
-                drawings.frame_cog(survey, one, path, gain)
+                map_files.frame_cog(survey, one, path, gain)
             else:
-                drawings.frame_kmz(survey, one, path, gain)
+                map_files.frame_kmz(survey, one, path, gain)
             outputs.append(_output(path, job))
     return outputs
 
 
-def _output(path: Path, job: Job) -> Output:
+def _output(path: Path, job: Job) -> BatchOutput:
     """A finished file or folder, with one hash over all that is in it."""
     name = str(path.relative_to(job.output))
     if path.is_file():
-        return Output(name, path.stat().st_size, durable.hash_file(path))
+        return BatchOutput(name, path.stat().st_size, durable.hash_file(path))
     whole = hashlib.sha256()
     size = 0
     for inner in sorted(path.rglob("*")):
         if inner.is_file():
             size += inner.stat().st_size
             whole.update(f"{inner.relative_to(path)} {durable.hash_file(inner)}\n".encode())
-    return Output(name, size, whole.hexdigest())
+    return BatchOutput(name, size, whole.hexdigest())
 
 
 def _digests(recipe: Recipe) -> dict[str, str]:
@@ -258,3 +263,76 @@ def _settle_memory() -> None:
         return
     mallopt(_TRIM_THRESHOLD, 1 << 30)
     mallopt(_MMAP_THRESHOLD, 1 << 25)
+
+
+class ManifestError(DappledError):
+    """A manifest that can't be used; one sentence."""
+
+
+class Manifest:
+    """The manifest of an output folder, held by one batch at a time. Use as a context manager."""
+
+    def __init__(self, output: Path) -> None:
+        """Raises ManifestError where another batch works in this folder, or the disk refuses."""
+        self.path = output / MANIFEST
+        try:
+            durable.make_folder(output)
+            self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            try:
+                fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                os.close(self._fd)
+                raise ManifestError(f"another batch works in {output}: wait for it, or choose another -o") from None
+        except OSError as error:
+            raise ManifestError(f"cannot keep a manifest in {output}: {error.strerror}") from None
+        self.done = self._read()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._fd)
+
+    def add(self, done: Done) -> None:
+        """Note an answer, durably."""
+        os.write(self._fd, json.dumps(asdict(done), sort_keys=True).encode() + b"\n")
+        os.fsync(self._fd)
+        self.done[done.key] = done
+
+    def holds(self, key: str) -> bool:
+        """Whether a job was done before and all that it made is still there."""
+        done = self.done.get(key)
+        if done is None or done.error is not None:
+            return False
+        return all(_size(self.path.parent / one.name) == one.size for one in done.outputs)
+
+    def _read(self) -> dict[str, Done]:
+        text = b""
+        while block := os.read(self._fd, 1 << 20):
+            text += block
+        whole = text.rfind(b"\n") + 1
+        if whole < len(text):  # torn by a power cut: that job is done again
+            os.ftruncate(self._fd, whole)
+            os.lseek(self._fd, 0, os.SEEK_END)
+        known: dict[str, Done] = {}
+        for number, line in enumerate(text[:whole].splitlines(), 1):
+            try:
+                done = _done(json.loads(line))
+            except (ValueError, TypeError, KeyError):
+                raise ManifestError(
+                    f"{self.path}, line {number} is no line of a manifest: move it away, and everything is made anew"
+                ) from None
+            known[done.key] = done
+        return known
+
+
+def _done(row: dict[str, Any]) -> Done:
+    return Done(**{**row, "outputs": tuple(BatchOutput(**one) for one in row["outputs"])})
+
+
+def _size(path: Path) -> int | None:
+    if path.is_file():
+        return path.stat().st_size
+    if path.is_dir():
+        return sum(inner.stat().st_size for inner in path.rglob("*") if inner.is_file())
+    return None

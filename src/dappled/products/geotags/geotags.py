@@ -7,17 +7,17 @@ import io
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from dappled.decode.geometry import camera_pose
-from dappled.decode.geometry.camera_pose import NADIR, CameraPose, Matrix
-from dappled.decode.geometry.pose import Pose, Vector3
+from dappled.decode.geometry.camera_pose import CameraPose
+from dappled.decode.geometry.pose import Pose
 from dappled.flight import FlightError, Frame, LedgerReader, Tag, disk_error, durable, layout
 from dappled.products.geotags import exif_gps, sidecars
 from dappled.products.geotags.exif_gps import ExifError
 from dappled.products.maps.earth import Geoid
+from dappled.products.mounting import Mounting
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,30 +46,17 @@ class Written:
     without_tag: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Mounting:
-    """How the camera hangs on the vehicle (see `camera_pose.of`), and what mean sea level stands on."""
-
-    lever_m: Vector3 = (0.0, 0.0, 0.0)
-    matrix: Matrix = field(default_factory=lambda: NADIR)
-    on_gimbal: bool = False
-    geoid: Geoid | None = None
-
-    def camera(self, pose: Pose) -> CameraPose | None:
-        """The camera's pose; None where the vehicle's position is not known. Raises EarthError."""
-        undulation_m = None
-        if self.geoid is not None and pose.latitude_rad is not None and pose.longitude_rad is not None:
-            undulation_m = self.geoid.undulation_m(math.degrees(pose.latitude_rad), math.degrees(pose.longitude_rad))
-        return camera_pose.of(pose, self.lever_m, self.matrix, on_gimbal=self.on_gimbal, undulation_m=undulation_m)
-
-
-def read(flight: Path, mounting: Mounting | None = None) -> tuple[list[Placed], list[str]]:
+def read(flight: Path, mounting: Mounting, geoid: Geoid | None = None) -> tuple[list[Placed], list[str]]:
     """A flight's tagged frames in order, and the names of frames without a tag. Raises FlightError and EarthError."""
-    mounting = mounting or Mounting()
     with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
         tags, frames, correction_ns = ledger.tags(), ledger.frames(), ledger.utc_correction_ns()
     placed = [
-        Placed(frame, tag, mounting.camera(tag.pose), None if correction_ns is None else tag.utc_ns + correction_ns)
+        Placed(
+            frame,
+            tag,
+            _camera(tag.pose, mounting, geoid),
+            None if correction_ns is None else tag.utc_ns + correction_ns,
+        )
         for frame in frames
         if (tag := tags.get(frame.index)) is not None
     ]
@@ -78,15 +65,16 @@ def read(flight: Path, mounting: Mounting | None = None) -> tuple[list[Placed], 
 
 def write(
     flight: Path,
-    mounting: Mounting | None = None,
+    mounting: Mounting,
     *,
+    geoid: Geoid | None = None,
     output: Path | None = None,
     replace_extension: bool = False,
     force: bool = False,
 ) -> Written:
     """Sidecars beside the frames, and geo.txt, pix4d.csv and track.geojson in `<flight>/geotags/`; all of it in
     `output` instead where that is given. Raises FlightError, SidecarError and EarthError."""
-    placed, without_tag = read(flight, mounting)
+    placed, without_tag = read(flight, mounting, geoid)
     folder = output or flight / "geotags"
     _make(folder)
     files = []
@@ -108,14 +96,16 @@ def write(
     return Written(tuple(files), len(placed) - len(lost), lost, tuple(without_tag))
 
 
-def copies(flight: Path, folder: Path, mounting: Mounting | None = None) -> Iterator[tuple[str, Path | str]]:
+def copies(
+    flight: Path, folder: Path, mounting: Mounting, geoid: Geoid | None = None
+) -> Iterator[tuple[str, Path | str]]:
     """Copies of the placed frames in `folder` with their place in EXIF: (frame, the copy or why there is none).
 
     The originals are only read. Raises FlightError, also for a folder within the flight.
     """
     if folder.resolve().is_relative_to(flight.resolve()):
         raise FlightError(f"cannot write copies into the flight itself ({folder}): give another folder")
-    placed, without_tag = read(flight, mounting)
+    placed, without_tag = read(flight, mounting, geoid)
     _make(folder)
     for one in placed:
         if one.camera is None:
@@ -138,6 +128,14 @@ def copies(flight: Path, folder: Path, mounting: Mounting | None = None) -> Iter
         yield one.frame.name, folder / one.file_name
     for name in without_tag:
         yield name, "it was never tagged"
+
+
+def _camera(pose: Pose, mounting: Mounting, geoid: Geoid | None) -> CameraPose | None:
+    """The camera's pose, with its ellipsoidal height where the geoid is known. Raises EarthError."""
+    if geoid is None or pose.latitude_rad is None or pose.longitude_rad is None:
+        return mounting.camera(pose)
+    latitude_deg, longitude_deg = math.degrees(pose.latitude_rad), math.degrees(pose.longitude_rad)
+    return mounting.camera(pose, geoid.undulation_m(latitude_deg, longitude_deg))
 
 
 def _make(folder: Path) -> None:

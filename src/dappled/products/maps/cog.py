@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from dappled.flight import durable
 from dappled.products.extras import need
-from dappled.products.maps.map_grid import Image, MapError, MapGrid
+from dappled.products.maps.eye import Image
+from dappled.products.maps.map_grid import MapError, MapGrid
 
 TILE = 512
 

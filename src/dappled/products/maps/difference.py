@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.errors import DappledError
-from dappled.products.maps import cog, mosaic
+from dappled.products.maps import cog, map_grid
+from dappled.products.maps.eye import Image
 from dappled.products.maps.georeference import Survey
-from dappled.products.maps.map_grid import Image, MapGrid
-from dappled.products.maps.terrain import Terrain
+from dappled.products.maps.map_grid import MapGrid
+from dappled.products.maps.terrain import TerrainModel
 
 Single = NDArray[np.float32]
 
@@ -22,7 +23,7 @@ class DifferenceError(DappledError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Difference:
+class MapDifference:
     """`values` float32 (rows, columns), second less first, NaN where not both know; `share` of the map that both know.
 
     For pictures the values are shares of the first one's mean brightness, after the second's was matched to it.
@@ -33,7 +34,7 @@ class Difference:
     share: float
 
 
-def of_pictures(first: Survey, second: Survey) -> Difference:
+def of_pictures(first: Survey, second: Survey) -> MapDifference:
     """The brightness that has changed. The second's is matched to the first's by gain and offset (median and spread)
     over the common ground: another hour's light is no change. Raises DifferenceError where there is none."""
     grid = _common(first, second)
@@ -44,10 +45,10 @@ def of_pictures(first: Survey, second: Survey) -> Difference:
     gain = spread[0] / spread[1] if spread[1] > 0 else 1.0
     offset = float(np.median(before[both]) - gain * np.median(after[both]))
     values = np.where(both, gain * after + offset - before, np.nan) / max(float(before[both].mean()), 1e-9)
-    return Difference(grid, values.astype(np.float32), float(both.mean()))
+    return MapDifference(grid, values.astype(np.float32), float(both.mean()))
 
 
-def of_heights(first: Terrain, second: Terrain) -> Difference:
+def of_heights(first: TerrainModel, second: TerrainModel) -> MapDifference:
     """The height that has been gained, m, on the first's grid; both surveys must lie on one projection."""
     a, b = first.surface, second.surface
     if a.grid.crs != b.grid.crs:
@@ -62,10 +63,10 @@ def of_heights(first: Terrain, second: Terrain) -> Difference:
     known = np.isfinite(values)
     if not known.any():
         raise DifferenceError("no height is known to both flights: they need common ground, each seen twice")
-    return Difference(a.grid, values, float(known.mean()))
+    return MapDifference(a.grid, values, float(known.mean()))
 
 
-def write(first: Survey, second: Survey, made: Difference, path: Path, unit: str) -> Path:
+def write(first: Survey, second: Survey, made: MapDifference, path: Path, unit: str) -> Path:
     """A COG of the difference."""
     tags = {**first.tags(), "DAPPLED_AGAINST": second.flight, "DAPPLED_UNIT": unit}
     cog.write(path, made.grid, made.values[..., None], tags, (f"{second.flight} less {first.flight}, {unit}",))
@@ -78,7 +79,7 @@ def _common(first: Survey, second: Survey) -> MapGrid:
             f"the flights lie on {first.projection.name} and {second.projection.name}: give one --crs"
         )
     step = max(first.gsd_m, second.gsd_m)
-    a, b = (mosaic.grid_of(one.photographs, one.ground, one.projection, step) for one in (first, second))
+    a, b = (map_grid.grid_of(one.photographs, one.ground, one.projection, step) for one in (first, second))
     top, left = max(0, round((a.north - b.north) / step)), max(0, round((b.west - a.west) / step))
     bottom = min(a.shape[0], round((a.north - b.bounds[1]) / step))
     right = min(a.shape[1], round((b.bounds[2] - a.west) / step))
@@ -89,7 +90,7 @@ def _common(first: Survey, second: Survey) -> MapGrid:
 
 def _whole(made: Survey, grid: MapGrid) -> Image:
     drawn = np.full(grid.shape, np.nan, dtype=np.float32)
-    for rows, columns, values in mosaic.pieces(made.photographs, grid, made.ground, made.projection, made.focus_m):
+    for rows, columns, values in map_grid.pieces(made.photographs, grid, made.ground, made.projection, made.focus_m):
         drawn[rows, columns] = values.mean(axis=2)
     return drawn
 

@@ -22,6 +22,7 @@ from dappled.errors import DappledError
 from dappled.products.maps.earth import GridAt
 
 Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
 _LOWEST = math.sin(math.radians(3))  # a ray that dips less is above the horizon for all that a map needs
 
 

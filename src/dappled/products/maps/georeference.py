@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -14,16 +13,16 @@ import numpy as np
 
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import DappledError
-from dappled.flight import Frame, Tag, durable
-from dappled.products.maps import control as control_points
-from dappled.products.maps import footprints, map_grid, photographs, refine
-from dappled.products.maps.basemap import BaseMap
+from dappled.flight import Frame, Tag
+from dappled.products.maps import map_grid, photographs, references, refine
 from dappled.products.maps.earth import Geoid, Projection, utm
 from dappled.products.maps.eye import EyeError
 from dappled.products.maps.ground import Flat, Ground, Raster
 from dappled.products.maps.ground import load as load_ground
 from dappled.products.maps.map_grid import MapError
-from dappled.products.maps.photographs import Mounting, Photograph, Station
+from dappled.products.maps.photographs import Photograph, Station
+from dappled.products.maps.references import BaseMap
+from dappled.products.mounting import Mounting
 
 Progress = Callable[[str, int, int], None]  # what, done, of
 
@@ -159,8 +158,8 @@ def refined(
     raster = None if base is None else BaseMap(base, made.projection, made.gsd_m)
     if raster is not None:
         raster.check(np.concatenate([map_grid.footprint(one.eye, made.ground)[:, :2] for one in made.photographs]))
-    points = [] if control is None else control_points.read(control, made.projection)
-    points, unseen = control_points.sighted(points, {one.name for one in made.photographs})
+    points = [] if control is None else references.read_control_points(control, made.projection)
+    points, unseen = references.sighted(points, {one.name for one in made.photographs})
     photos, judged = refine.refine(
         made.photographs,
         made.ground,
@@ -240,32 +239,3 @@ def _below(one: Photograph, ground: Ground) -> float:
 def _two_digits(value: float) -> float:
     """A length with two digits: a map's step that a person can read."""
     return float(f"{value:.1e}")
-
-
-def write_footprints(made: Survey, output: Path) -> Path:
-    """footprints.geojson."""
-    features = [
-        footprints.feature(one, made.ground, made.projection, made.facts.get(one.name, {})) for one in made.photographs
-    ]
-    path = output / "footprints.geojson"
-    durable.make_folder(output)
-    durable.write_file(path, footprints.collection(features))
-    return path
-
-
-def write_report(made: Survey, output: Path, files: Sequence[Path]) -> Path:
-    """report.json: what was mapped onto what, what was left out, and how each frame was refined."""
-    facts = {
-        "flight": made.flight,
-        "crs": made.projection.name,
-        "ground": made.ground.name,
-        "gsd_m": made.gsd_m,
-        "frames": [{"name": one.name, **made.facts.get(one.name, {})} for one in made.photographs],
-        "left_out": [{"name": name, "why": why} for name, why in made.left],
-        "notes": list(made.notes),
-        "files": [path.name for path in files],
-    }
-    path = output / "report.json"
-    durable.make_folder(output)
-    durable.write_file(path, (json.dumps(facts, indent=1, allow_nan=False) + "\n").encode())
-    return path

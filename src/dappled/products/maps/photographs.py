@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +12,14 @@ from numpy.typing import NDArray
 from dappled.config.profiles import CameraProfile, Lens
 from dappled.decode.geometry import camera_pose
 from dappled.decode.geometry.camera_pose import CameraPose, Matrix
-from dappled.decode.geometry.pose import Pose, Vector3
+from dappled.decode.geometry.pose import Pose
 from dappled.decode.lightfield.light_field import LightField
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
 from dappled.flight import Frame, LedgerReader, Tag, layout
 from dappled.products.maps.earth import Projection
-from dappled.products.maps.eye import Eye, intrinsics, look, through
-from dappled.products.maps.map_grid import Image
+from dappled.products.maps.eye import Eye, Image, intrinsics, look, through
+from dappled.products.mounting import Mounting
 
 DEFAULT_POSITION_SIGMA_M = 3.0
 DEFAULT_ATTITUDE_SIGMA_RAD = 0.02
@@ -81,32 +79,6 @@ class Photograph:
         ]
 
 
-@dataclass(frozen=True, slots=True)
-class Mounting:
-    """How the camera sits on the vehicle: antenna to camera in body axes, and camera axes to body axes, or with
-    `on_gimbal` to those of the gimbal's head, whose recorded attitude then counts."""
-
-    lever_m: Vector3 = (0.0, 0.0, 0.0)
-    mount: tuple[float, ...] = tuple(camera_pose.NADIR.ravel().tolist())
-    on_gimbal: bool = False
-
-    @classmethod
-    def of(cls, facts: Mapping[str, Any]) -> Mounting:
-        """As a flight's facts have it: its settings `pose.lever_arm_m`, `pose.mount` and `pose.on_gimbal`."""
-        said, plain = facts.get("settings", {}).get("pose", {}), cls()
-        forward, right, down = said.get("lever_arm_m") or plain.lever_m
-        return cls(
-            (float(forward), float(right), float(down)),
-            tuple(map(float, said.get("mount") or plain.mount)),
-            bool(said.get("on_gimbal", False)),
-        )
-
-    @property
-    def matrix(self) -> Matrix:
-        """(3, 3). Raises DappledError for what is no rotation."""
-        return camera_pose.mount(self.mount)
-
-
 def stations(flight: Path, mounting: Mounting) -> tuple[list[Station], list[tuple[str, str]]]:
     """A flight's frames that have a full pose, in order, and (name, sentence) of those that have none.
 
@@ -133,7 +105,7 @@ def station(frame: Frame, tag: Tag | None, mounting: Mounting) -> Station:
     """Where a frame was taken. Raises PhotographError where that isn't known."""
     if tag is None:
         raise PhotographError(f"{frame.name} was never tagged: `dappled geotag` tags what a crash left so")
-    camera = camera_pose.of(tag.pose, mounting.lever_m, mounting.matrix, on_gimbal=mounting.on_gimbal)
+    camera = mounting.camera(tag.pose)
     if camera is None:
         raise PhotographError(f"no position is known for {frame.name}: there was no telemetry at its exposure")
     attitude = tag.pose.gimbal_attitude if mounting.on_gimbal else tag.pose.attitude

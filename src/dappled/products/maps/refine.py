@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 
 from dappled.products.maps import matching
 from dappled.products.maps.adjust import Marks, Solution, Ties, adjust
-from dappled.products.maps.basemap import BaseMap
-from dappled.products.maps.control import ControlError, ControlPoint
 from dappled.products.maps.eye import Eye
 from dappled.products.maps.ground import Ground
 from dappled.products.maps.map_grid import between, footprint, sample, smoothed_to
 from dappled.products.maps.matching import Features
 from dappled.products.maps.photographs import Photograph
+from dappled.products.maps.references import BaseMap, ControlPoint, ControlPointError
 
 Floats = NDArray[np.float64]
 LEAST_INLIERS = 15
@@ -220,7 +219,9 @@ def _to_control(photographs: Sequence[Photograph], control: Sequence[ControlPoin
     numbers = {one.name: number for number, one in enumerate(photographs)}
     for point in control:
         if point.frame not in numbers:
-            raise ControlError(f"control point {point.name} names frame {point.frame}, which is not among those mapped")
+            raise ControlPointError(
+                f"control point {point.name} names frame {point.frame}, which is not among those mapped"
+            )
     groups: list[Marks | Ties] = []
     for name, number in numbers.items():
         mine = [point for point in control if point.frame == name]

@@ -1,7 +1,12 @@
-"""Heights as files: a GeoTIFF of heights and sigmas, and LAS points, each with the difference to given terrain."""
+"""Find a survey's heights and write them: a GeoTIFF of heights and sigmas, LAS points, and ground to lay frames on.
+
+Each holds the difference to the given terrain, where there is one. Frames that are laid on heights of their own show
+houses upright.
+"""
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,33 +17,43 @@ from typing import Any
 import numpy as np
 import pyproj
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from dappled.flight import durable
 from dappled.products.extras import need
-from dappled.products.maps import cog, hyperstereo, mosaic, own_ground
+from dappled.products.maps import cog, hyperstereo, map_grid
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.georeference import Survey
-from dappled.products.maps.ground import Flat
+from dappled.products.maps.ground import Flat, Ground
 from dappled.products.maps.hyperstereo import Surface
+from dappled.products.maps.map_grid import MapGrid
+
+Floats = NDArray[np.float64]
 
 VERTICAL = "EPSG:5773"  # EGM96 height: what autopilots call mean sea level
 CELL = 2.0  # of a map's cells: heights are coarser than pictures
+_MARGIN, _MARGIN_M = 0.25, 5.0  # around the frames, of their extent and in metres: terrain must cover more than they do
+_REACH = (1, 2, 4, 8, 16)  # cells: holes are filled from the nearest heights first, and not from farther off
+_LEAST_SAY = 0.05  # of a hole's surroundings that must be known
+_FADE = 8.0  # cells over which what was found gives way to the given ground
 _SEARCH_M = (3.0, 12.0)  # below and above flat ground, or the given terrain's lowest and highest
 
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Terrain:
+class TerrainModel:
     """A surface, and how far it lies above the given terrain float32 (rows, columns); None where there is none."""
 
     surface: Surface
     difference_m: NDArray[np.float32] | None
 
 
-def of(made: Survey, progress: Progress, *, lowest_m: float | None = None, highest_m: float | None = None) -> Terrain:
+def of(
+    made: Survey, progress: Progress, *, lowest_m: float | None = None, highest_m: float | None = None
+) -> TerrainModel:
     """The terrain of a survey by hyperstereo, searched between two heights above sea level. Raises HyperstereoError."""
-    grid = mosaic.grid_of(made.photographs, made.ground, made.projection, CELL * made.gsd_m)
+    grid = map_grid.grid_of(made.photographs, made.ground, made.projection, CELL * made.gsd_m)
     east, north = grid.places(made.projection)
     given = made.ground.heights(east, north)
     low = float(np.nanmin(given)) - _SEARCH_M[0] if lowest_m is None else lowest_m
@@ -49,10 +64,10 @@ def of(made: Survey, progress: Progress, *, lowest_m: float | None = None, highe
         made.photographs, grid, made.projection, lowest_m=low, highest_m=high, progress=progress
     )
     flat = isinstance(made.ground, Flat)
-    return Terrain(surface, None if flat else (surface.height_m - given).astype(np.float32))
+    return TerrainModel(surface, None if flat else (surface.height_m - given).astype(np.float32))
 
 
-def write_raster(made: Survey, terrain: Terrain, path: Path) -> Path:
+def write_raster(made: Survey, terrain: TerrainModel, path: Path) -> Path:
     """A COG with the bands height, sigma and, where terrain was given, difference; metres, NaN where unknown."""
     surface = terrain.surface
     bands = [surface.height_m, surface.sigma_m]
@@ -65,15 +80,15 @@ def write_raster(made: Survey, terrain: Terrain, path: Path) -> Path:
     return path
 
 
-def write_ground(made: Survey, terrain: Terrain, path: Path) -> Path:
+def write_ground(made: Survey, terrain: TerrainModel, path: Path) -> Path:
     """The heights as ground to lay frames on: a COG without holes, with the survey's own ground around it."""
-    grid, heights = own_ground.heights(terrain.surface, made.ground)
+    grid, heights = _filled_heights(terrain.surface, made.ground)
     names = ("height above sea level, m: found, between found ones, or given",)
     cog.write(path, grid, heights[..., None].astype(np.float32), made.tags(), names)
     return path
 
 
-def write_points(made: Survey, terrain: Terrain, path: Path) -> Path:
+def write_points(made: Survey, terrain: TerrainModel, path: Path) -> Path:
     """LAS 1.4 points, on the map's projection with EGM96 heights; `sigma` and, where terrain was given, `difference` as
     extra dimensions in metres."""
     laspy = need("laspy")
@@ -106,3 +121,53 @@ def compound(projection: Projection) -> pyproj.CRS:
     """The map's system with heights above mean sea level (EGM96)."""
     vertical = pyproj.CRS.from_user_input(VERTICAL)
     return pyproj.crs.CompoundCRS(f"{projection.crs.name} + {vertical.name}", [projection.crs, vertical])
+
+
+def _filled_heights(found: Surface, given: Ground) -> tuple[MapGrid, Floats]:
+    """(grid, heights (rows, columns) above sea level) of a surface and, around it, of the given ground.
+
+    Holes between found heights are filled from around them; where the given ground is unknown nothing is known.
+    """
+    grid = _wider(found.grid)
+    inner = _inside(found.grid, grid)
+    beneath = given.heights(*np.meshgrid(*grid.axes()))
+    above = np.full(grid.shape, np.nan)
+    above[inner] = found.height_m
+    above -= beneath
+    known = np.isfinite(above)
+    return grid, beneath + _filled(np.where(known, above, 0.0), known)
+
+
+def _wider(grid: MapGrid) -> MapGrid:
+    """The grid with a margin."""
+    rows, columns = grid.shape
+    more = math.ceil(_MARGIN * max(rows, columns) + _MARGIN_M / grid.step_x)
+    return MapGrid(
+        grid.crs,
+        grid.west - more * grid.step_x,
+        grid.north + more * grid.step_y,
+        grid.step_x,
+        grid.step_y,
+        (rows + 2 * more, columns + 2 * more),
+    )
+
+
+def _inside(inner: MapGrid, outer: MapGrid) -> tuple[slice, slice]:
+    more = round((inner.west - outer.west) / outer.step_x)
+    return slice(more, more + inner.shape[0]), slice(more, more + inner.shape[1])
+
+
+def _filled(above: Floats, known: NDArray[np.bool_]) -> Floats:
+    """Heights above the given ground (rows, columns) where they are known, and what follows from them elsewhere."""
+    made, settled = above.copy(), known.copy()
+    for reach in _REACH:
+        weight = ndimage.gaussian_filter(known.astype(np.float64), reach, mode="constant", truncate=3.0)
+        total = ndimage.gaussian_filter(above, reach, mode="constant", truncate=3.0)
+        fresh = ~settled & (weight > _LEAST_SAY)
+        made[fresh] = total[fresh] / weight[fresh]
+        settled |= fresh
+    # Beyond the last heights: those at the rim, ever less of them.
+    if settled.any() and not settled.all():
+        away, nearest = ndimage.distance_transform_edt(~settled, return_indices=True)
+        made = np.where(settled, made, made[tuple(nearest)] * np.exp(-away / _FADE))
+    return made
