@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, frame_line
-from dappled.daemon.health import log_format
+from dappled.daemon.health import systemd
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.drivers.camera import BodyState, StateChanged
-from tests.daemon.health.test_log_format import read
+from tests.daemon.health.test_systemd import read
 from tests.flight.makers import shot
 
 
@@ -95,7 +95,7 @@ def test_in_the_journal_a_frame_can_be_asked_for(tmp_path: Path, capsys: pytest.
         listener.bind(str(tmp_path / "j"))
         listener.settimeout(30)
         root = logging.getLogger()
-        handler, before = log_format.JournalHandler(str(tmp_path / "j")), root.level
+        handler, before = systemd.JournalHandler(str(tmp_path / "j")), root.level
         root.addHandler(handler)
         root.setLevel(logging.INFO)
         try:

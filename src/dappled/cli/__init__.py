@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 
 import dappled
-from dappled.daemon.health import log_format
+from dappled.daemon.health import systemd
 from dappled.errors import DappledError
 
 # Verb: (module of this package, one line). The module has `configure(parser)` and `run(arguments) -> exit code`.
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     wanted = next((word for word in words if not word.startswith("-")), None)
     parsed = parser(wanted).parse_args(words)
     quiet = logging.INFO if parsed.verb == "run" and "JOURNAL_STREAM" in os.environ else logging.WARNING
-    logging.basicConfig(level=logging.DEBUG if parsed.debug else quiet, handlers=[log_format.handler()])
+    logging.basicConfig(level=logging.DEBUG if parsed.debug else quiet, handlers=[systemd.handler()])
     logging.getLogger("PIL").setLevel(logging.INFO)
     try:
         code: int = parsed.run(parsed)

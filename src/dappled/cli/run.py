@@ -18,7 +18,7 @@ from dappled.config import settings as configuration
 from dappled.config.settings import Settings
 from dappled.daemon.flight_handover import FlightHandover, flights
 from dappled.daemon.health import record as health
-from dappled.daemon.health.notify import Notifier
+from dappled.daemon.health.systemd import Notifier
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.service import Service
 from dappled.daemon.stop_condition import Asker, StopCondition, Tally

@@ -16,8 +16,8 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any, Protocol
 
-from dappled.daemon.health.log_format import JournalHandler
 from dappled.daemon.health.logbook import NewProblems
+from dappled.daemon.health.systemd import JournalHandler
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.daemon.stream import wire
 from dappled.drivers.camera import StateChanged

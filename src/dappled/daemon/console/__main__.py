@@ -23,7 +23,7 @@ from dappled.daemon.console.connection import CONNECTIONS, Connection
 from dappled.daemon.console.feed import Feed, Hub
 from dappled.daemon.console.process import DaemonChannel
 from dappled.daemon.console.studio import Studio
-from dappled.daemon.health import log_format
+from dappled.daemon.health import systemd
 from dappled.daemon.pipeline.memory import CONSOLE_GOES, goes_first, reuse_large_blocks
 from dappled.drivers.process_channel import ProcessChannel
 from dappled.drivers.raw.darkroom import Recipe
@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 def main() -> int:
     """Serve until the daemon ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the daemon handles ^C
-    logging.basicConfig(level=logging.WARNING, handlers=[log_format.handler()])
+    logging.basicConfig(level=logging.WARNING, handlers=[systemd.handler()])
     os.nice(NICENESS)
     goes_first(CONSOLE_GOES)
     reuse_large_blocks()

@@ -1,4 +1,4 @@
-"""Place frames and the background picture on the console's map.
+"""Place frames on maps: the background picture of the console's map, footprints, and KML for virtual globes.
 
 The background is a PNG or JPEG in degrees, with the world file that GIS programs write beside it.
 """
@@ -9,14 +9,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from dappled.decode.geometry import camera_pose
-from dappled.decode.geometry.footprint import OrientedFrame
+from dappled.decode.geometry.footprint import OrientedFrame, RectifiedFrame
 from dappled.errors import DappledError
 
+KML_NAMESPACE = "http://www.opengis.net/kml/2.2"
+KML_MEDIA_TYPE = "application/vnd.google-earth.kml+xml"
 _WORLD = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw"}
 
 
@@ -79,3 +82,54 @@ def oriented_frame(
         return None
     rotation = camera_pose.matrix_of(tuple(pose["attitude"])) @ np.asarray(mount, dtype=np.float64).reshape(3, 3)
     return OrientedFrame(size_mm, focal_length_mm, rotation, height, pose["latitude_deg"], pose["longitude_deg"])
+
+
+def network_link_kml(href: str, *, every_s: float = 2.0) -> bytes:
+    """A document that a globe opens once; the globe then reads `href` every `every_s`."""
+    root, document = _document("dappled")
+    link = _add(document, "NetworkLink")
+    _add(link, "name", "dappled, the latest frame")
+    target = _add(link, "Link")
+    _add(target, "href", href)
+    _add(target, "refreshMode", "onInterval")
+    _add(target, "refreshInterval", f"{every_s:g}")
+    return _bytes(root)
+
+
+def latest_kml(
+    name: str, picture: str, frame: RectifiedFrame | None, track: Sequence[tuple[float, float, float]]
+) -> bytes:
+    """The frame's picture as an overlay, and the track of (longitude, latitude, altitude above sea level)."""
+    root, document = _document("dappled")
+    if frame is not None:
+        overlay = _add(document, "GroundOverlay")
+        _add(overlay, "name", name)
+        _add(_add(overlay, "Icon"), "href", picture)
+        box = _add(overlay, "LatLonBox")
+        for side in ("north", "south", "east", "west"):
+            _add(box, side, f"{getattr(frame, side):.9f}")
+    if len(track) > 1:
+        mark = _add(document, "Placemark")
+        _add(mark, "name", "track")
+        line = _add(mark, "LineString")
+        _add(line, "altitudeMode", "absolute")
+        _add(line, "coordinates", " ".join(f"{lon:.8f},{lat:.8f},{alt:.2f}" for lon, lat, alt in track))
+    return _bytes(root)
+
+
+def _document(name: str) -> tuple[ET.Element, ET.Element]:
+    root = ET.Element("kml", xmlns=KML_NAMESPACE)
+    document = _add(root, "Document")
+    _add(document, "name", name)
+    return root, document
+
+
+def _add(parent: ET.Element, name: str, text: str | None = None) -> ET.Element:
+    child = ET.SubElement(parent, name)
+    child.text = text
+    return child
+
+
+def _bytes(root: ET.Element) -> bytes:
+    text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
+    return text
