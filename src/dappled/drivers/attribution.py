@@ -1,7 +1,7 @@
 """Attribute a camera's file to the shot that made it, and correct its name by its content.
 
-A file may come after its shot was given up; it must not become the next shot's frame. The body's own clock tells the
-shots apart. Where it can't, the file is marked as doubtful.
+A file may come after its shot was given up; it must not become the next shot's frame. The body's own clock
+distinguishes the shots. Where it can't, the file is marked as doubtful.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from statistics import median
 
 TOLERANCE_S = 3.0
-"""A body's time has whole seconds, and is that of the exposure or of the writing of the file."""
+"""A body's time has whole seconds, and is the time of the exposure or of the writing of the file."""
 _KEPT = 16
 _DNG_VERSION = 50706
 
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """A shot that may have made a file: it was fired (`monotonic_ns` of the trigger call), and has none yet."""
+    """A shot that may have made a file: it was fired (monotonic time of the trigger call), and has no file yet."""
 
     shot: int
     fired_ns: int
@@ -27,7 +27,7 @@ class Claim:
 
 @dataclass(frozen=True, slots=True)
 class Attribution:
-    """The shot that made a file, None where that can't be said; a sentence where there is doubt."""
+    """The shot that made a file, None where that is unknown; a sentence where there is doubt."""
 
     shot: int | None
     doubt: str = ""
@@ -35,23 +35,26 @@ class Attribution:
 
 @dataclass(frozen=True, slots=True)
 class BodyClock:
-    """The body's time minus ours, in seconds, as the files of shots without rivals showed it (the last 16)."""
+    """The body's time minus this machine's, in seconds, from the last 16 files whose shot was certain."""
 
     offsets_s: tuple[float, ...] = ()
 
     def learnt(self, claim: Claim, taken_s: int) -> BodyClock:
-        """With one more file whose shot is certain. One that doesn't fit begins anew: the body's clock was set."""
+        """Add a file whose shot is certain. If it doesn't fit the earlier ones, drop them: the body's clock was set."""
         kept = self.offsets_s if self.offsets_s and self.fits(claim, taken_s) else ()
         return BodyClock((*kept, taken_s - claim.fired_ns / 1e9)[-_KEPT:])
 
     def fits(self, claim: Claim, taken_s: int) -> bool:
-        """Whether the file may be of this shot. Only to be asked when something was learnt."""
+        """Whether this shot may have made the file. Needs at least one offset."""
         return abs(taken_s - claim.fired_ns / 1e9 - median(self.offsets_s)) <= TOLERANCE_S
 
 
 def attribute(late: Sequence[Claim], current: Claim | None, taken_s: int | None, clock: BodyClock) -> Attribution:
-    """Whose file it is. `late` are shots that were given up after they had been fired, `current` the one that is waited
-    for. Without rivals, and without a time that says otherwise, the file is the current shot's."""
+    """Find the shot that made a file.
+
+    `late` are shots that were given up after they had been fired; `current` is the one whose file is awaited. The file
+    is the current shot's where there are no late ones and the body's time does not exclude it.
+    """
     claims = [*late, *([] if current is None else [current])]
     if not claims:
         return Attribution(None)
@@ -60,23 +63,23 @@ def attribute(late: Sequence[Claim], current: Claim | None, taken_s: int | None,
         if len(fitting) == 1:
             return Attribution(fitting[0].shot)
         if not fitting and current is None:
-            return Attribution(None, "by the body's clock it is no shot's")
+            return Attribution(None, "by the body's clock no shot that lacks a file made it")
         claims = fitting or claims
     if len(claims) == 1:
-        told = current is not None and not late
-        return Attribution(claims[0].shot, "" if told else _rivals(claims))
+        certain = current is not None and not late
+        return Attribution(claims[0].shot, "" if certain else _rivals(claims))
     return Attribution(current.shot if current in claims and current is not None else None, _rivals(claims))
 
 
 def _rivals(claims: Sequence[Claim]) -> str:
     shots = " or ".join(str(claim.shot) for claim in claims)
-    return f"it may be the file of shot {shots}: one had been given up, and the body's clock doesn't tell them apart"
+    return f"it may be the file of shot {shots}: one had been given up, and the body's clock doesn't distinguish them"
 
 
 def true_name(name: str, head: bytes) -> str:
-    """The file's name with the extension that its first bytes call for.
+    """Give a file's name the extension that its first bytes call for.
 
-    For pictures from the camera's memory libgphoto2 makes the name up, from a format code that knows no DNG.
+    libgphoto2 invents the names of pictures from the camera's memory, by a format code that does not include DNG.
     """
     suffix = _suffix(head)
     stem, dot, given = name.rpartition(".")

@@ -23,7 +23,9 @@ def open_camera(settings: CameraSettings) -> Camera:
     try:
         make = entry.load()
     except (ImportError, AttributeError) as error:
-        raise CameraError(f"the camera driver {settings.driver!r} can't be loaded ({error}); install it anew") from None
+        raise CameraError(
+            f"the camera driver {settings.driver!r} can't be loaded ({error}); install it again"
+        ) from None
     camera: Camera = make(options)
     return camera
 

@@ -1,4 +1,4 @@
-"""Who is on the USB bus, by PyUSB: cameras in their modes, who may open them, who holds them, and how to reset one."""
+"""Find cameras on the USB bus with PyUSB: their modes, their device files, the programs that hold them, and a reset."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _NO_LIBUSB = "no libusb works on this machine: install libusb-1.0-0 (Debian, Ubu
 
 
 class UsbError(CameraError):
-    """The bus can't be looked at, or a device can't be reset; one sentence."""
+    """The bus can't be read, or a device can't be reset; one sentence."""
 
 
 @dataclass(frozen=True, slots=True)
 class UsbBody:
-    """A camera on the bus. `name` is what it calls itself, "" where this user may not ask it."""
+    """A camera on the bus. `name` is its own name, "" where this user may not read it."""
 
     bus: int
     address: int
@@ -42,26 +42,26 @@ class UsbBody:
 
     @property
     def port(self) -> str:
-        """As libgphoto2 names it."""
+        """libgphoto2's name of the port."""
         return f"usb:{self.bus:03d},{self.address:03d}"
 
     @property
     def maker(self) -> str:
-        """By the vendor number."""
+        """The maker, by the vendor number."""
         return MAKERS.get(self.vendor, f"vendor {self.vendor:04x}")
 
     @property
     def fires(self) -> bool:
-        """Whether USB can fire it: no Fujifilm of the thesis' time, and nothing that is a disk at the moment."""
+        """Whether USB can fire it: not a Fujifilm of the thesis' time, and not a body in mass storage mode."""
         return self.mode == "PTP" and self.vendor != FUJIFILM
 
     def node(self, dev: Path = Path("/dev/bus/usb")) -> Path:
-        """Its device file."""
+        """Return its device file."""
         return dev / f"{self.bus:03d}" / f"{self.address:03d}"
 
 
 def bodies(backend: Any = None) -> list[UsbBody]:
-    """All cameras on the bus, in the order of their addresses. Raises UsbError without a libusb.
+    """List all cameras on the bus in the order of their addresses. Raises UsbError without a libusb.
 
     `backend` is PyUSB's; None: the libusb of this machine, or the one that the package libusb-package brings.
     """
@@ -70,7 +70,7 @@ def bodies(backend: Any = None) -> list[UsbBody]:
 
 
 def changes(before: Iterable[UsbBody], after: Iterable[UsbBody]) -> tuple[list[UsbBody], list[UsbBody]]:
-    """Who came and who went between two looks. A body that was plugged in again has another address: it did both."""
+    """Return the bodies that came and those that went. One plugged in again has a new address, and did both."""
     was, now = set(before), set(after)
     return sorted(now - was, key=lambda body: body.port), sorted(was - now, key=lambda body: body.port)
 
@@ -94,7 +94,7 @@ def reset(port: str, backend: Any = None) -> None:
 
 
 def holders(node: Path, proc: Path = Path("/proc")) -> list[str]:
-    """Programs that have a device file open, as "name (process 123)", as far as this user may see them."""
+    """List the programs that have a device file open, as "name (process 123)", as far as this user may see them."""
     found = []
     for process in proc.iterdir():
         if process.name.isdigit() and process.name != str(os.getpid()):
@@ -103,7 +103,7 @@ def holders(node: Path, proc: Path = Path("/proc")) -> list[str]:
                 if str(node) in open_files:
                     found.append(f"{(process / 'comm').read_text().strip()} (process {process.name})")
             except OSError:
-                continue  # another user's, or gone
+                continue  # another user's, or it has ended
     return sorted(found)
 
 
@@ -113,16 +113,16 @@ def _devices(backend: Any) -> Iterator[Any]:
     except usb.core.NoBackendError:
         raise UsbError(_NO_LIBUSB) from None
     except usb.core.USBError as error:
-        raise UsbError(f"the USB bus can't be looked at ({error})") from None
+        raise UsbError(f"the USB bus can't be read ({error})") from None
 
 
 def _libusb() -> Any:
-    """PyUSB's backend over the machine's libusb, else over the packaged one; None where neither can be loaded."""
+    """Return PyUSB's backend for the machine's libusb, else for the packaged one; None where neither can be loaded."""
     return usb.backend.libusb1.get_backend(lambda name: find_library(name) or libusb_package.find_library(name))
 
 
 def _body(device: Any) -> UsbBody | None:
-    """The device as a camera; None for hubs, mice and disks of others."""
+    """Return the device as a camera; None for a hub, a mouse, or another maker's disk."""
     try:
         classes = {interface.bInterfaceClass for configuration in device for interface in configuration}
     except usb.core.USBError:
@@ -138,6 +138,6 @@ def _name(device: Any) -> str:
     try:
         return str(device.product or "").strip()
     except (usb.core.USBError, ValueError, NotImplementedError):
-        return ""  # not ours to ask, or it has none
+        return ""  # this user may not read it, or it has none
     finally:
         usb.util.dispose_resources(device)

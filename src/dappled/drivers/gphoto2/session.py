@@ -248,7 +248,7 @@ class GPhoto2Session:
             return _time(self._camera.file_get_info(file.folder, file.name).file)
         except gp.GPhoto2Error as error:
             if error.code in _LOST:
-                raise LostError(_sentence(error, f"tell of {file.name}")) from error
+                raise LostError(_sentence(error, f"report the size and time of {file.name}")) from error
             return None
 
     def about(self, file: CameraFile) -> tuple[int, int | None]:
@@ -256,7 +256,7 @@ class GPhoto2Session:
         try:
             info = self._camera.file_get_info(file.folder, file.name).file
         except gp.GPhoto2Error as error:
-            raise _translated(error, f"tell of {file.name}") from error
+            raise _translated(error, f"report the size and time of {file.name}") from error
         return info.size, _time(info)
 
     def delete(self, file: CameraFile) -> None:
@@ -316,7 +316,7 @@ def _read_settings(camera: Any) -> tuple[Setting, ...]:
     try:
         found = [_read_setting(camera, name, widgets) for name, widgets in _WIDGETS.items()]
     except gp.GPhoto2Error as error:
-        raise LostError(_sentence(error, "tell its settings")) from error
+        raise LostError(_sentence(error, "report its settings")) from error
     return tuple(each for each in found if each is not None)
 
 
