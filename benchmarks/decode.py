@@ -27,9 +27,10 @@ from scipy import fft
 from dappled.config import profiles
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
-from dappled.decode.lightfield.views import Aperture, from_slices, transfer
+from dappled.decode.lightfield.aperture import Aperture, transfer
+from dappled.decode.lightfield.views import from_slices
 from dappled.decode.spectrum import plane as planes
-from dappled.decode.spectrum.lineariser import Lineariser, lineariser
+from dappled.decode.spectrum.lineariser import Lineariser, Plane, lineariser
 from dappled.decode.spectrum.plane import coloured, local_colours
 from dappled.decode.spectrum.slices import Slices, extract
 from dappled.decode.spectrum.transform import SpectrumBuffers, noise_rms, padded_shape, transform
@@ -129,7 +130,7 @@ def slices(buffers: SpectrumBuffers, linear: Lineariser, decoder: MaskDecoder, m
     return cut
 
 
-def search(decoder: MaskDecoder, frame: planes.Plane, length: float) -> Callable[[], Any]:
+def search(decoder: MaskDecoder, frame: Plane, length: float) -> Callable[[], Any]:
     """The search for the carriers in a spectrum that is there."""
     spectrum, predicted = decoder.transform(frame, length), decoder.predict(length)
     return lambda: decoder.locate(spectrum, length, predicted)
@@ -192,7 +193,7 @@ def lenslet_colour_views(rounds: int, workers: int) -> float:
     frame = (BLACK + (white - BLACK) * scene).astype(np.uint16)
     balance = planes.estimate_balance(white, black=BLACK, cfa=BAYER)
 
-    def plane(mosaic: Mosaic) -> planes.Plane:
+    def plane(mosaic: Mosaic) -> Plane:
         return planes.to_plane(mosaic, black=BLACK, white=WHITE, cfa=BAYER, balance=balance)
 
     linear = lineariser(LENSLETS, black=BLACK, white=WHITE, cfa=BAYER, balance=balance, reference=[0, 1, 2])

@@ -27,8 +27,7 @@ from dappled.daemon.navigation.clocks import BodyLatency, CameraClock, ExposureT
 from dappled.daemon.navigation.navigation import Telemetry
 from dappled.daemon.navigation.samples import AttitudeSample, PositionSample, attitude, position
 from dappled.daemon.navigation.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
-from dappled.decode.geometry.interpolation import metres_per_radian, turn_rad
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry.pose import Pose, metres_per_radian, turn_rad
 from dappled.drivers.mavlink import Message, PacketParser, mavlink
 from dappled.flight import telemetry_log
 from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message

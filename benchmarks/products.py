@@ -22,8 +22,8 @@ from tests.decode.scenes import boards, paint
 from dappled.decode.depth import estimate, evidence
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.decode.lightfield.fourier_refocus import Spectrum4D
+from dappled.decode.lightfield.light_field import ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
-from dappled.decode.lightfield.view_stack import ViewStack
 
 ROUNDS, WORKERS = 5, 2
 BORDER, BAD = 15, 0.07

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from dappled.decode.lightfield.view_stack import ViewStack, centred
+from dappled.decode.lightfield.light_field import ViewStack, centred
 
 Floats = NDArray[np.float32]
 

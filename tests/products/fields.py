@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from dappled.decode.lightfield.aperture import Aperture
 from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.lightfield.views import Aperture
 from tests.decode.scenes import Board, paint
 
 ATTRIBUTES: dict[str, Any] = {

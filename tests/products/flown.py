@@ -14,8 +14,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from dappled.decode.geometry import camera_pose
-from dappled.decode.geometry.interpolation import metres_per_radian
-from dappled.decode.geometry.pose import Pose, Quaternion
+from dappled.decode.geometry.pose import Pose, Quaternion, metres_per_radian
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.flight import Tag, recording
 from dappled.mocks import simulation

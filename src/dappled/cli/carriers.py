@@ -19,9 +19,9 @@ from dappled.decode.decoder import CarriersFrom, doubt
 from dappled.decode.optics.carrier_tables import crossed_orders, lattice_rotation
 from dappled.decode.optics.carriers import Carrier, Lattice, Mask, Order
 from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
+from dappled.decode.spectrum.lineariser import Plane
 from dappled.decode.spectrum.peaks import Measured, measure
 from dappled.decode.spectrum.pictures import LOOKS, Look, around, spectrum_boxes
-from dappled.decode.spectrum.plane import Plane
 from dappled.decode.spectrum.transform import padded_shape, transform
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, known_to
 

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from dappled.cli import decode_arguments
 from dappled.cli.arguments import metres
-from dappled.decode.lightfield.focal_stack import all_in_focus, focal_stack
 from dappled.decode.lightfield.fourier_refocus import Spectrum4D, difference
-from dappled.decode.lightfield.refocus import magnified
-from dappled.decode.lightfield.stereo_pair import anaglyph, side_by_side
+from dappled.decode.lightfield.refocus import all_in_focus, anaglyph, focal_stack, magnified, side_by_side
 from dappled.products.exports import prints
 from dappled.products.opened import OpenedLightField, OpenError
 

@@ -14,13 +14,20 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.calibration.calibration import Calibration, at_corner
-from dappled.decode.calibration.fit import origin_of
-from dappled.decode.calibration.lattice_fit import relative_transfer
+from dappled.decode.calibration.calibration import Calibration
 from dappled.decode.errors import DecodeError
-from dappled.decode.lightfield.aperture import used_aperture
+from dappled.decode.lightfield.aperture import (
+    Aperture,
+    angular_frequencies,
+    at_corner,
+    kappa,
+    origin_of,
+    relative_transfer,
+    transfer,
+    used_aperture,
+)
 from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.lightfield.views import Aperture, Views, angular_frequencies, from_slices, kappa, transfer
+from dappled.decode.lightfield.views import Views, from_slices
 from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Order, Sensor
 from dappled.decode.spectrum.peaks import (
     STRONG,

@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.calibration.calibration import at_centre, at_corner
-from dappled.decode.calibration.lattice_fit import relative_transfer
 from dappled.decode.decoder import DecodeReport, light_field, no_views
 from dappled.decode.errors import DecodeError
+from dappled.decode.lightfield.aperture import Aperture, at_centre, at_corner, relative_transfer
 from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.lightfield.views import Aperture, Views, from_lenslet_slices
+from dappled.decode.lightfield.views import Views, from_lenslet_slices
 from dappled.decode.optics.carriers import Carrier, Lattice
 from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
-from dappled.decode.spectrum.plane import size_text
+from dappled.decode.spectrum.lineariser import size_text
 from dappled.decode.spectrum.slices import Slices, extract
 from dappled.decode.spectrum.transform import Source, Spectrum, SpectrumBuffers, noise_rms, transform
 

@@ -28,11 +28,8 @@ from dappled.decode.depth.evidence import Evidence
 from dappled.decode.depth.ranging import RANGING, DistanceMap, Ranging
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import refocus as refocusing
-from dappled.decode.lightfield import view_stack
-from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.lightfield.refocus import FocalPlane
-from dappled.decode.lightfield.stereo_pair import StereoPair, eyes
-from dappled.decode.lightfield.view_stack import ViewStack
+from dappled.decode.lightfield.light_field import LightField, ViewStack
+from dappled.decode.lightfield.refocus import FocalPlane, StereoPair, eyes
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.drivers.raw.recipe import of_flight
 from dappled.errors import DappledError
@@ -76,7 +73,7 @@ class OpenedLightField:
     @cached_property
     def stack(self) -> ViewStack:
         """The views with their places. Raises DecodeError where there are none."""
-        return view_stack.of(self.field)
+        return ViewStack.of(self.field)
 
     @cached_property
     def evidence(self) -> Evidence:

@@ -14,7 +14,7 @@ from PIL import Image
 
 from dappled.daemon.console import pictures
 from dappled.daemon.console.pictures import Mosaic
-from dappled.decode.lightfield.view_stack import ViewStack, centred
+from dappled.decode.lightfield.light_field import ViewStack, centred
 from dappled.decode.optics.carriers import Lattice
 from dappled.decode.spectrum.slices import extract
 from dappled.decode.spectrum.transform import transform

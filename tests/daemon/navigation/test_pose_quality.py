@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 
 from dappled.daemon.navigation.clocks import from_arrivals
 from dappled.daemon.navigation.navigation import Telemetry
-from dappled.decode.geometry.interpolation import (
+from dappled.decode.geometry.pose import (
+    Gnss,
+    Pose,
     conjugate,
     from_euler,
     multiply,
@@ -20,7 +22,6 @@ from dappled.decode.geometry.interpolation import (
     turn_rad,
     turned_by_heading,
 )
-from dappled.decode.geometry.pose import Gnss, Pose
 from dappled.drivers.mavlink import Message, mavlink
 
 START_NS = 1_790_000_000 * 10**9

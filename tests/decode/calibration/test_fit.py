@@ -7,10 +7,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dappled.decode.calibration.calibration import Calibration, at_centre, at_corner
-from dappled.decode.calibration.fit import CalibrationFrame, calibrate, origin_of
+from dappled.decode.calibration.calibration import Calibration
+from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.errors import DecodeError
-from dappled.decode.lightfield.views import transfer
+from dappled.decode.lightfield.aperture import at_centre, at_corner, origin_of, transfer
 from dappled.decode.optics.carriers import Lattice, Mask, Pattern
 from tests.decode.rays import FOCAL_MM, MASK, SENSOR, STATED_DISTANCE_MM, STOPPED_F, Camera, Texture
 

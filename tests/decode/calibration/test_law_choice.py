@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dappled.decode.calibration.law_choice import Verdict, judge, steps_bins
+from dappled.decode.calibration.law_choice import LawVerdict, judge, steps_bins
 from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Sensor
 from tests.decode.thesis_tables import MASK_2, S5200
 
@@ -22,7 +22,7 @@ def _seen(law: str, distance_mm: float, *, pupil_mm: float = 0.0, stretch: float
     return found
 
 
-def _judged(seen: Seen, asked: str = "fd") -> Verdict:
+def _judged(seen: Seen, asked: str = "fd") -> LawVerdict:
     return judge(seen, sensor=CHIP, mask=MASK, stated_mm=0.48, asked=asked)
 
 

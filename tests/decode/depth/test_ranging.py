@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.decode.depth.ranging import Ranging, Target, fit_targets, target_shift
 from dappled.decode.errors import DecodeError
-from dappled.decode.lightfield.view_stack import ViewStack, centred
+from dappled.decode.lightfield.light_field import ViewStack, centred
 from dappled.decode.optics import lenses
 
 STACK = ViewStack(np.zeros((5, 5, 8, 10), np.float32), centred(5), centred(5), sensor_px_per_disparity=32.0)

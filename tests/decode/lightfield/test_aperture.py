@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dappled.decode.lightfield.aperture import used_aperture
-from dappled.decode.lightfield.views import Aperture, angular_frequencies, from_slices, transfer
+from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, transfer, used_aperture
+from dappled.decode.lightfield.views import from_slices
 from dappled.decode.optics.carriers import Mask
 
 ORDERS = Mask(15.5, 2).half_orders()

@@ -7,8 +7,8 @@ import pytest
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.fourier_refocus import Spectrum4D, difference
+from dappled.decode.lightfield.light_field import ViewStack, centred
 from dappled.decode.lightfield.refocus import shift_and_add
-from dappled.decode.lightfield.view_stack import ViewStack, centred
 from tests.decode.scenes import Board, boards, paint
 
 

@@ -10,7 +10,8 @@ from scipy import ndimage
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import refocus
-from dappled.decode.lightfield.view_stack import ViewStack, centred, from_cameras
+from dappled.decode.lightfield.light_field import ViewStack, centred
+from dappled.decode.lightfield.refocus import all_in_focus, anaglyph, eyes, focal_stack, shift_and_add, side_by_side
 from tests.decode.scenes import Board, paint
 
 INNER = (slice(8, -8), slice(8, -8))
@@ -63,11 +64,11 @@ def test_alpha_is_equation_29(alpha: float) -> None:
         for u in (-1, 0, 1):
             at = [v * (1 - 1 / alpha) + y / alpha + 31.5, u * (1 - 1 / alpha) + x / alpha + 31.5]
             total += ndimage.map_coordinates(views[v + 1, u + 1], at, order=5, mode="nearest")
-    made = refocus.by_alpha(from_cameras(views), alpha, magnify=True)
+    made = refocus.by_alpha(ViewStack.from_cameras(views), alpha, magnify=True)
     known = np.isfinite(made)
     assert known[INNER].mean() > (0.4 if alpha < 1 else 0.99)
     assert np.abs(made - total / 9)[INNER][known[INNER]].max() < 0.02
-    same_size = refocus.by_alpha(from_cameras(views), alpha)
+    same_size = refocus.by_alpha(ViewStack.from_cameras(views), alpha)
     assert psnr(same_size, refocus.shift_and_add(stack, 1 / alpha - 1)) > 100
 
 
@@ -143,3 +144,60 @@ def test_a_smaller_aperture_blurs_less() -> None:
 def test_nonsense_is_told(call, words: str) -> None:  # type: ignore[no-untyped-def]  # several signatures
     with pytest.raises(DecodeError, match=words):
         call(ramps(0))
+
+
+SCENE = [Board(-0.6), Board(0.8, half=(30, 30), texture=1)]
+
+
+def test_the_sharpest_picture_is_chosen_everywhere() -> None:
+    stack, truth = paint(SCENE, (120, 120), 7)
+    planes = np.linspace(-0.6, 0.8, 8)
+    made = all_in_focus(focal_stack(stack, planes))
+    inner = (slice(12, -12), slice(12, -12))
+    near_edge = ndimage.maximum_filter(truth, 17) != ndimage.minimum_filter(truth, 17)
+    judged = ~near_edge[inner]
+    chosen = planes[made.index]
+    assert np.mean(np.abs(chosen - truth)[inner][judged] < 0.11) > 0.97
+    middle = stack.middle()
+    error = np.sqrt(np.mean((made.picture - middle)[inner][judged] ** 2))
+    alone = min(np.sqrt(np.mean((shift_and_add(stack, d) - middle)[inner][judged] ** 2)) for d in planes)
+    assert error < alone / 3
+
+
+def test_colour_and_flat_parts() -> None:
+    stack, _ = paint(SCENE, (60, 60), 3)
+    stack.views[..., :20] = 0.5
+    colour = ViewStack(np.repeat(stack.views[..., None], 3, axis=4), stack.row_steps, stack.column_steps)
+    made = all_in_focus(focal_stack(colour, [-0.6, 0.0, 0.8]))
+    assert made.picture.shape == (60, 60, 3)
+    assert (made.index[:, :8] == -1).all()
+    assert (made.index[:, 40:] >= 0).all()
+    with pytest.raises(DecodeError, match="at least one plane"):
+        focal_stack(stack, [])
+
+
+def column_of_spot(picture: np.ndarray) -> float:
+    weight = picture - picture.min()
+    return float((weight * np.arange(picture.shape[1])).sum() / weight.sum())
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_near_things_are_further_right_for_the_left_eye(turned: bool) -> None:
+    stack, _ = paint([Board(0.0, contrast=0.0, mean=0.2), Board(1.0, half=(8, 8), contrast=0.0, mean=0.9)], (48, 64), 5)
+    if turned:
+        stack = ViewStack.from_cameras(stack.views[::-1, ::-1])
+    pair = eyes(stack, separation=0.8)
+    assert column_of_spot(pair.left) > column_of_spot(pair.right) + 0.3
+    both = anaglyph(pair)
+    np.testing.assert_array_equal(both[..., 0], pair.left)
+    np.testing.assert_array_equal(both[..., 2], pair.right)
+    np.testing.assert_array_equal(side_by_side(pair)[:, :64], pair.left)
+    np.testing.assert_array_equal(side_by_side(pair, crossed=True)[:, :64], pair.right)
+
+
+def test_eyes_that_do_not_fit_are_told() -> None:
+    stack, _ = paint([Board(0.0)], (16, 16), 3)
+    with pytest.raises(DecodeError, match="don't fit"):
+        eyes(stack, separation=1.2)
+    with pytest.raises(DecodeError, match="several columns"):
+        eyes(ViewStack(stack.views[:, :1], stack.row_steps, np.zeros(1)))

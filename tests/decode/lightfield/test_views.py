@@ -3,17 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dappled.decode.lightfield.aperture import SHAPES
-from dappled.decode.lightfield.views import (
-    Aperture,
-    angular_frequencies,
-    combine,
-    finest_detail,
-    from_slices,
-    kappa,
-    transfer,
-    unmixing,
-)
+from dappled.decode.lightfield.aperture import SHAPES, Aperture, angular_frequencies, kappa, transfer
+from dappled.decode.lightfield.views import combine, finest_detail, from_slices, unmixing
 from dappled.decode.optics.carriers import Mask
 
 ORDERS = Mask(15.5, 2).half_orders()

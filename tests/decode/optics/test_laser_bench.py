@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics import laser_bench
 from dappled.decode.optics.carriers import Mask
-from dappled.decode.optics.film import film_of
-from dappled.decode.optics.mask_image import MaskImage
+from dappled.decode.optics.film import MaskImage, film_of
 from tests.decode import thesis_tables as thesis
 
 BENCH = (laser_bench.THESIS_WAVELENGTH_NM, laser_bench.THESIS_DISTANCE_M)

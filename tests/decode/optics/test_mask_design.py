@@ -10,17 +10,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.optics import survey
+from dappled.decode.optics import lenses
 from dappled.decode.optics.carrier_tables import fresnel_number, lattice_of
 from dappled.decode.optics.carriers import Sensor
 from dappled.decode.optics.film import FILMS, film_of
-from dappled.decode.optics.mask_design import DESIGNS, FRESNEL_LIMIT, Wish
+from dappled.decode.optics.mask_design import DESIGNS, FRESNEL_LIMIT, DesignRequirements
 from tests.decode.thesis_tables import S5200
 
 REFERENCE = Sensor((2776, 3688), (0.01, 0.0), (0.0, 0.01))
 
 
-def _wish(**changed: Any) -> Wish:
+def _requirements(**changed: Any) -> DesignRequirements:
     values: dict[str, Any] = {
         "sensor": S5200,
         "focal_length_mm": 13.0,
@@ -28,13 +28,15 @@ def _wish(**changed: Any) -> Wish:
         "altitude_m": 40.0,
         "film": FILMS["16k"],
     }
-    return Wish(**{**values, **changed})
+    return DesignRequirements(**{**values, **changed})
 
 
 def test_the_reference_camera_is_what_the_rules_give() -> None:
     """3688 × 2776 px of 10 µm, v = 50 mm, aperture 6.7 mm: d = 0.48 mm and 15.5 periods a mm."""
-    wish = _wish(sensor=REFERENCE, focal_length_mm=50.0, f_number=7.4, film=film_of(8000, 8000, 113.8), altitude_m=1e5)
-    made = DESIGNS["geometric"](wish)
+    wanted = _requirements(
+        sensor=REFERENCE, focal_length_mm=50.0, f_number=7.4, film=film_of(8000, 8000, 113.8), altitude_m=1e5
+    )
+    made = DESIGNS["geometric"](wanted)
     assert made.works
     assert made.mask_distance_mm == pytest.approx(0.48, abs=0.005)
     assert made.mask.frequency_per_mm == pytest.approx(15.5, abs=0.2)
@@ -49,8 +51,10 @@ def test_the_reference_camera_is_what_the_rules_give() -> None:
     law=st.sampled_from(["fd", "geometric"]),
 )
 def test_what_works_keeps_every_rule(focal: float, stop: float, altitude: float, views: int, law: str) -> None:
-    wish = _wish(focal_length_mm=focal, f_number=stop, altitude_m=altitude, views=views, largest_distance_mm=5.0)
-    made = DESIGNS[law](wish)
+    wanted = _requirements(
+        focal_length_mm=focal, f_number=stop, altitude_m=altitude, views=views, largest_distance_mm=5.0
+    )
+    made = DESIGNS[law](wanted)
     if not made.works:
         assert made.problem is not None
         assert "no mask of" in made.problem
@@ -58,24 +62,24 @@ def test_what_works_keeps_every_rule(focal: float, stop: float, altitude: float,
     top = made.mask.p * made.mask.frequency_per_mm
     assert made.mask.views_per_axis == views
     assert made.mask_distance_mm <= 5.0
-    assert top <= wish.film.nyquist_per_mm * (1 + 1e-6)
+    assert top <= wanted.film.nyquist_per_mm * (1 + 1e-6)
     assert fresnel_number(made.mask_distance_mm, top) <= FRESNEL_LIMIT * (1 + 1e-6)
-    lattice = lattice_of(law, made.mask, S5200, made.mask_distance_mm, wish.image_mm)
+    lattice = lattice_of(law, made.mask, S5200, made.mask_distance_mm, wanted.image_mm)
     assert (made.mask.p + 0.5) * max(lattice.ky[0], lattice.kx[1]) <= 0.5 * (1 + 1e-6)
     assert 0 < made.spectrum_used <= 1 + 1e-9
     if law == "geometric":  # the ideal: f_m = v / (d·A)
-        assert made.mask.frequency_per_mm * made.mask_distance_mm * wish.aperture_mm == pytest.approx(wish.image_mm)
+        assert made.mask.frequency_per_mm * made.mask_distance_mm * wanted.aperture_mm == pytest.approx(wanted.image_mm)
 
 
 def test_fd_fills_the_shorter_side_of_the_spectrum() -> None:
-    made = DESIGNS["fd"](_wish())
+    made = DESIGNS["fd"](_requirements())
     lattice = lattice_of("fd", made.mask, S5200, made.mask_distance_mm, 13.0)
     assert 2.5 * lattice.ky[0] == pytest.approx(0.5)
 
 
 def test_depth_error_follows_eq_5() -> None:
-    made = DESIGNS["geometric"](_wish())
-    near, far = (DESIGNS["geometric"](_wish(altitude_m=h)).depth_sigma_m for h in (10.0, 20.0))
+    made = DESIGNS["geometric"](_requirements())
+    near, far = (DESIGNS["geometric"](_requirements(altitude_m=h)).depth_sigma_m for h in (10.0, 20.0))
     assert far / near == pytest.approx(4, rel=0.01)
     assert made.baseline_mm == pytest.approx(13 / 3.5 / 5)
 
@@ -90,7 +94,7 @@ def test_depth_error_follows_eq_5() -> None:
     ],
 )
 def test_why_no_mask_does_it(changed: dict[str, Any], said: str) -> None:
-    made = DESIGNS["geometric"](_wish(**changed))
+    made = DESIGNS["geometric"](_requirements(**changed))
     if made.works:
         pytest.fail(f"{made}")
     assert made.problem is not None
@@ -112,12 +116,12 @@ def test_why_no_mask_does_it(changed: dict[str, Any], said: str) -> None:
 )
 def test_nonsense_is_answered(changed: dict[str, Any], said: str) -> None:
     with pytest.raises(DecodeError, match=said):
-        _wish(**changed)
+        _requirements(**changed)
 
 
 def test_a_plan_by_hand() -> None:
     """10 µm pixels, 50 mm, 50 m: 1 cm a pixel, 36.88 × 27.76 m; 80 % overlap is 5.55 m, at 5.552 m/s a second."""
-    made = survey.plan(
+    made = lenses.plan_survey(
         REFERENCE,
         focal_length_mm=50,
         altitude_m=50.05,
@@ -135,7 +139,7 @@ def test_a_plan_by_hand() -> None:
     assert made.frames in (1800, 1801)
     assert made.disk_bytes == made.frames * 10_000_000
     assert made.longest_exposure_s == pytest.approx(0.01 / 5.552, rel=1e-6)
-    assert survey.plan(REFERENCE, focal_length_mm=50, altitude_m=50.05, speed_m_s=5, sideways=True).footprint_m[
+    assert lenses.plan_survey(REFERENCE, focal_length_mm=50, altitude_m=50.05, speed_m_s=5, sideways=True).footprint_m[
         0
     ] == pytest.approx(36.88, rel=1e-6)
 
@@ -152,5 +156,5 @@ def test_a_plan_by_hand() -> None:
 def test_a_wrong_plan_is_answered(changed: dict[str, Any], said: str) -> None:
     values: dict[str, Any] = {"focal_length_mm": 50.0, "altitude_m": 50.0, "speed_m_s": 5.0}
     with pytest.raises(DecodeError) as caught:
-        survey.plan(REFERENCE, **{**values, **changed})
+        lenses.plan_survey(REFERENCE, **{**values, **changed})
     assert " ".join(said.split()).replace(" ;", ";") in " ".join(str(caught.value).split()).replace(" ;", ";")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.optics.carriers import Carrier
-from dappled.decode.spectrum.plane import Plane
+from dappled.decode.spectrum.lineariser import Plane
 from dappled.decode.spectrum.transform import padded_shape
 
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
-from dappled.decode.calibration.calibration import at_corner
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
+from dappled.decode.lightfield.aperture import at_corner
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.views import from_lenslet_slices
 from dappled.decode.optics.carriers import Carrier

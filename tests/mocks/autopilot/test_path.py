@@ -8,7 +8,7 @@ import pytest
 from pyproj import Geod
 from scipy.spatial.transform import Rotation
 
-from dappled.decode.geometry import interpolation
+from dappled.decode.geometry.pose import from_euler, metres_per_radian, turn_rad
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 
 TIMES_S = (0.0, 3.7, 61.2, 599.0)
@@ -49,8 +49,8 @@ def test_the_daemons_mathematics_is_another_and_says_the_same(t_s: float) -> Non
     path = FlightPath(3)
     pose = path.pose(t_s)
     yaw, pitch, roll = turn(pose).as_euler("ZYX")
-    assert interpolation.turn_rad(interpolation.from_euler(roll, pitch, yaw), pose.attitude) < 1e-7
-    north_m, east_m = interpolation.metres_per_radian(math.radians(path.home_latitude_deg), path.home_altitude_msl_m)
+    assert turn_rad(from_euler(roll, pitch, yaw), pose.attitude) < 1e-7
+    north_m, east_m = metres_per_radian(math.radians(path.home_latitude_deg), path.home_altitude_msl_m)
     north, east, _ = pose.position_ned_m
     assert math.radians(pose.latitude_deg - path.home_latitude_deg) * north_m == pytest.approx(north, abs=1e-6)
     assert math.radians(pose.longitude_deg - path.home_longitude_deg) * east_m == pytest.approx(east, abs=1e-6)

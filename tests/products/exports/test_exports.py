@@ -12,7 +12,7 @@ from PIL import Image
 from scipy import io
 
 from dappled.decode.depth import estimate, evidence
-from dappled.decode.lightfield import view_stack
+from dappled.decode.lightfield.light_field import ViewStack
 from dappled.products.exports import exports, view_folders
 from dappled.products.exports.exports import ExportError
 from tests.products.fields import DISPARITY, light_field
@@ -33,7 +33,7 @@ def read_pfm(path: Path) -> np.ndarray:
 @pytest.mark.parametrize("lenslet", [False, True])
 def test_an_hci_folder_comes_back(tmp_path: Path, colour: bool, lenslet: bool) -> None:
     field = light_field(colour=colour, lenslet=lenslet)
-    found = estimate.estimate(evidence.of_views(view_stack.of(field)), between=(0, 1))
+    found = estimate.estimate(evidence.of_views(ViewStack.of(field)), between=(0, 1))
     exports.hci(tmp_path / "hci", field, found)
     assert len(list((tmp_path / "hci").glob("input_Cam*.png"))) == 25
     parser = configparser.ConfigParser()
@@ -43,10 +43,10 @@ def test_an_hci_folder_comes_back(tmp_path: Path, colour: bool, lenslet: bool) -
     np.testing.assert_array_equal(read_pfm(tmp_path / "hci" / "disp_estimate.pfm"), found.disparity)
     back = view_folders.read(tmp_path / "hci")
     assert back.views.shape == field.views.shape
-    again = estimate.estimate(evidence.of_views(view_stack.of(back)), between=(0, 1))
+    again = estimate.estimate(evidence.of_views(ViewStack.of(back)), between=(0, 1))
     assert np.nanmedian(again.disparity) == pytest.approx(DISPARITY, abs=0.01)
     white = parser.getfloat("dappled", "white")
-    ordered = exports.as_cameras(view_stack.of(field))
+    ordered = exports.as_cameras(ViewStack.of(field))
     assert np.median(np.abs(back.views * white - ordered)) < 0.005
 
 
@@ -64,7 +64,7 @@ def test_an_eslf_picture_comes_back(tmp_path: Path, lenslet_px: int) -> None:
     lf = sheet.reshape(60, side, 80, side, 3).transpose(1, 3, 0, 2, 4)
     first = (side - 5) // 2
     views = lf[first : first + 5, first : first + 5] / 65535 * float(told["white"])
-    wanted = exports.as_cameras(view_stack.of(field))
+    wanted = exports.as_cameras(ViewStack.of(field))
     assert np.abs(views - np.minimum(wanted, float(told["white"]))).max() < 1e-4
     assert lf.max() == 65535
     if first:
@@ -81,7 +81,7 @@ def test_a_mat_file_is_lftoolbox_s(tmp_path: Path) -> None:
     assert lf.dtype == np.uint16
     assert (lf[..., 3] == 65535).all()
     white = float(found["DecodeOptions"]["White"][0, 0][0, 0])
-    wanted = exports.as_cameras(view_stack.of(field))
+    wanted = exports.as_cameras(ViewStack.of(field))
     assert np.abs(lf[..., :3] / 65535 * white - np.minimum(wanted, white)).max() < 1e-4
     assert found["LFMetadata"]["camera"][0, 0][0] == "reference-36mm"
 
@@ -95,7 +95,7 @@ def test_a_quilt_begins_at_the_lower_left_with_the_leftmost_view(
     assert named.name == f"q_qs{columns}x{rows}a1.333.png"
     sheet = np.asarray(Image.open(named)).astype(float)
     assert sheet.shape == (60 * rows, 80 * columns)
-    stack = view_stack.of(field)
+    stack = ViewStack.of(field)
     middle = n // 2
     left_most = stack.views[middle, int(np.argmax(stack.column_steps))]
     tile = sheet[-60:, :80]

@@ -12,8 +12,7 @@ import pytest
 
 from dappled.decode.optics import laser_bench
 from dappled.decode.optics.carriers import Mask
-from dappled.decode.optics.film import film_of
-from dappled.decode.optics.mask_image import MaskImage
+from dappled.decode.optics.film import MaskImage, film_of
 from dappled.products.exports import mask_files
 
 

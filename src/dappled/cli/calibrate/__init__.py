@@ -16,8 +16,8 @@ from dappled.config import profiles
 from dappled.config.schema import ConfigError
 from dappled.decode.calibration import report
 from dappled.decode.calibration.calibration import Calibration
-from dappled.decode.calibration.fit import CalibrationFrame, of_sights, sight_of
-from dappled.decode.calibration.lattice_fit import Sight
+from dappled.decode.calibration.fit import CalibrationFrame, from_lattices, lattice_of
+from dappled.decode.calibration.lattice_fit import FrameLattice
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError
 from dappled.errors import DappledError
@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
 class CalibrationView:
     """What a calibration frame shows, and of which camera and size it is."""
 
-    sight: Sight
+    shown: FrameLattice
     shape: tuple[int, int]
     model: str
 
@@ -121,7 +121,7 @@ def view_of(
     with darkroom.naming(path):
         plane = darkroom.plane(raw)
         shape = plane.shape[0], plane.shape[1]
-        sight = sight_of(
+        shown = lattice_of(
             CalibrationFrame(plane, length, stop),
             camera.sensor(shape),
             profiles.mask(darkroom.recipe.mask).mask,
@@ -129,14 +129,14 @@ def view_of(
             camera.mask_distance_mm,
             workers=2,
         )
-    return CalibrationView(sight, shape, raw.camera_model or "")
+    return CalibrationView(shown, shape, raw.camera_model or "")
 
 
 def fit_views(darkroom: Darkroom, seen: list[CalibrationView], *, choose_law: bool = False) -> Calibration:
     """The calibration that these frames show together; with `choose_law` also which law explains them best."""
     camera = darkroom.camera(seen[0].model)
-    return of_sights(
-        [one.sight for one in seen],
+    return from_lattices(
+        [one.shown for one in seen],
         sensor=camera.sensor(seen[0].shape),
         mask=profiles.mask(darkroom.recipe.mask).mask,
         law=darkroom.recipe.law or camera.law,

@@ -14,7 +14,7 @@ from PIL import Image
 from dappled.cli.mask import arguments as mask_arguments
 from dappled.decode.optics import carrier_tables
 from dappled.decode.optics.film import FILMS
-from dappled.decode.optics.mask_design import DESIGNS, Design, Wish
+from dappled.decode.optics.mask_design import DESIGNS, Design, DesignRequirements
 from dappled.decode.spectrum import pictures
 
 HELP = "mask, distance and film for an altitude"
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
         return _best(arguments)
     camera, sensor, length = mask_arguments.camera_set(arguments)
     law = arguments.law or camera.law
-    wish = Wish(
+    wanted = DesignRequirements(
         sensor=sensor,
         focal_length_mm=length,
         f_number=arguments.f_number,
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         mask_distance_mm=arguments.mask_distance,
         largest_distance_mm=min(10.0, length) if arguments.room is None else arguments.room,
     )
-    made = DESIGNS[law](wish)
+    made = DESIGNS[law](wanted)
     if arguments.picture:
         Image.fromarray(_picture(made)).save(arguments.picture)
     if arguments.json:
@@ -83,10 +83,10 @@ def _best(arguments: argparse.Namespace) -> int:
 
 
 def _picture(made: Design) -> Any:
-    height, width = made.wish.sensor.shape
+    height, width = made.wanted.sensor.shape
     shrink = max(1, max(height, width) // 1200)
     lattice = carrier_tables.lattice_of(
-        made.law, made.mask, made.wish.sensor, made.mask_distance_mm, made.wish.focal_length_mm
+        made.law, made.mask, made.wanted.sensor, made.mask_distance_mm, made.wanted.focal_length_mm
     )
     carriers = [c for c in lattice.carriers(made.mask.half_orders()) if c.on_sensor]
     size = abs(lattice.ky[0]), abs(lattice.kx[1])
@@ -95,39 +95,39 @@ def _picture(made: Design) -> Any:
 
 def _as_json(made: Design) -> dict[str, Any]:
     told = asdict(made)
-    wish = told.pop("wish")
+    wanted = told.pop("wanted")
     return {
         "works": made.works,
         **told,
-        "film": wish["film"]["name"],
-        "views": wish["views"],
-        "altitude_m": wish["altitude_m"],
-        "aperture_mm": made.wish.aperture_mm,
+        "film": wanted["film"]["name"],
+        "views": wanted["views"],
+        "altitude_m": wanted["altitude_m"],
+        "aperture_mm": made.wanted.aperture_mm,
     }
 
 
 def _as_text(made: Design) -> str:
-    wish = made.wish
+    wanted = made.wanted
     rows, columns = made.view_shape
     lines = [
-        f"law {made.law}: {wish.views} × {wish.views} views of {columns} × {rows} px from {wish.altitude_m:g} m",
+        f"law {made.law}: {wanted.views} × {wanted.views} views of {columns} × {rows} px from {wanted.altitude_m:g} m",
         (
             f"mask       {made.mask.frequency_per_mm:.3f} periods/mm, p = {made.mask.p}, {made.mask.pattern}; "
-            f"{made.film_period_px:.2f} px a period on film {wish.film.name}"
+            f"{made.film_period_px:.2f} px a period on film {wanted.film.name}"
         ),
         f"distance   {made.mask_distance_mm:.3f} mm before the sensor",
-        f"aperture   {wish.aperture_mm:.2f} mm (f/{wish.f_number:g}), {made.baseline_mm:.2f} mm from view to view",
+        f"aperture   {wanted.aperture_mm:.2f} mm (f/{wanted.f_number:g}), {made.baseline_mm:.2f} mm from view to view",
         f"a view     ±{made.bandwidth_per_mm:.2f} cycles/mm, {made.ground_sample_m * 100:.1f} cm of ground a pixel",
         f"spectrum   {100 * made.spectrum_used:.0f} % used",
         (
-            f"depth      ±{made.depth_sigma_m:.2g} m at {wish.altitude_m:g} m, "
-            f"shifts known to {wish.shift_sigma_px:g} px a view"
+            f"depth      ±{made.depth_sigma_m:.2g} m at {wanted.altitude_m:g} m, "
+            f"shifts known to {wanted.shift_sigma_px:g} px a view"
         ),
         *(f"{'ok  ' if c.met else 'FAIL'}       {c.sentence}" for c in made.conditions),
     ]
     lines.append(f"film       {', '.join(made.films) or 'none of Table 2'} can print it")
     if made.problem:
         lines.append(made.problem)
-    elif made.depth_sigma_m > wish.altitude_m / 2:
+    elif made.depth_sigma_m > wanted.altitude_m / 2:
         lines.append("this depth is no measurement: fly lower, or take a longer lens with a wider aperture")
     return "\n".join(lines)

@@ -16,9 +16,8 @@ from dappled.cli.mask import make
 from dappled.config import profiles
 from dappled.config.profiles import MaskProfile
 from dappled.decode.optics import laser_bench
-from dappled.decode.optics.film import FILMS
+from dappled.decode.optics.film import FILMS, MaskImage
 from dappled.decode.optics.lenses import within
-from dappled.decode.optics.mask_image import MaskImage
 from dappled.products.exports import mask_files
 
 HELP = "where a laser's spots land, and what they say of the print"

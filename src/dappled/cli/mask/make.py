@@ -19,9 +19,8 @@ from dappled.config.profiles import MaskProfile
 from dappled.config.schema import ConfigError
 from dappled.decode.optics import film
 from dappled.decode.optics.carriers import Mask
-from dappled.decode.optics.film import FILMS, Film
+from dappled.decode.optics.film import FILMS, Film, MaskImage, period_on
 from dappled.decode.optics.lenses import within
-from dappled.decode.optics.mask_image import MaskImage, period_on
 from dappled.products.exports import mask_files
 
 HELP = "write the picture that goes on film, or a step wedge"

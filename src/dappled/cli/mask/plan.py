@@ -8,7 +8,7 @@ from dataclasses import asdict
 
 from dappled.cli.mask import arguments as mask_arguments
 from dappled.config import profiles
-from dappled.decode.optics import carrier_tables, lenses, survey
+from dappled.decode.optics import carrier_tables, lenses
 
 HELP = "interval, blur, body and disk of a flight"
 EXAMPLE = "dappled mask plan --altitude 40 --speed 8 --camera fujifilm-s5200 --focal-length 13"
@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
         lattice = carrier_tables.lattice_of(camera.law, mask, sensor, camera.mask_distance_mm, length)
         size = carrier_tables.slice_size(lattice, sensor.shape)
         columns = size[1] if size else None
-    made = survey.plan(
+    made = lenses.plan_survey(
         sensor,
         focal_length_mm=length,
         altitude_m=arguments.altitude,

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import fft
 
+from dappled.decode.lightfield.light_field import ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
-from dappled.decode.lightfield.view_stack import ViewStack
 
 Grey = NDArray[np.uint8]
 Colour = NDArray[np.uint8]

@@ -17,9 +17,7 @@ from dappled.daemon.stream.wire import Message
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.geometry import footprint
 from dappled.decode.geometry.footprint import OrientedFrame, RectifiedFrame
-from dappled.decode.lightfield import view_stack
-from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.lightfield.pictures import slice_mosaic
+from dappled.decode.lightfield.light_field import LightField, ViewStack, slice_mosaic
 from dappled.decode.optics.carriers import Carrier, Lattice
 from dappled.decode.spectrum.slices import Slices
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
@@ -139,7 +137,7 @@ class Studio:
     def _mosaic(self, message: Message) -> tuple[Mosaic, str]:
         def make() -> tuple[Mosaic, str]:
             field = self._light_field(message)
-            return pictures.views_mosaic(view_stack.of(field)), str(field.attributes["views_from"])
+            return pictures.views_mosaic(ViewStack.of(field)), str(field.attributes["views_from"])
 
         return self._once(message, "mosaic", make)
 

@@ -26,7 +26,12 @@ from dappled.daemon.navigation.clocks import (
 from dappled.daemon.navigation.samples import HALF_MS_NS, AttitudeSample, GnssSample, PositionSample
 from dappled.daemon.navigation.utc import UtcCorrection, UtcLearner
 from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, Around, Counts, VehicleHistory
-from dappled.decode.geometry.interpolation import (
+from dappled.decode.geometry.pose import (
+    Gnss,
+    Pose,
+    Quaternion,
+    Symmetric,
+    Vector3,
     hermite,
     hermite_doubt,
     metres_per_radian,
@@ -36,7 +41,6 @@ from dappled.decode.geometry.interpolation import (
     turn_rad,
     turned_by_heading,
 )
-from dappled.decode.geometry.pose import Gnss, Pose, Quaternion, Symmetric, Vector3
 from dappled.drivers.mavlink import Message, Packet
 from dappled.flight import LedgerReader, Recording
 

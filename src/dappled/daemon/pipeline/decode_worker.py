@@ -22,9 +22,7 @@ from dappled.decode.depth import estimate, evidence
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.decode.depth.ranging import RANGING, Ranging
 from dappled.decode.errors import DecodeError
-from dappled.decode.lightfield import view_stack
-from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.lightfield.pictures import slice_mosaic
+from dappled.decode.lightfield.light_field import LightField, ViewStack, slice_mosaic
 from dappled.drivers.camera import Blob
 from dappled.drivers.child_process import end_with_parent
 from dappled.drivers.process_channel import ChannelMessage
@@ -127,7 +125,7 @@ def nearest(field: LightField, found: DepthMap) -> tuple[float, float] | None:
         metres = Ranging.from_dict(ranging).at(*(field.attributes.get(k) for k in ("f_number", "focal_length_mm")))
     except DecodeError:
         return None  # another zoom: the autopilot gets no distance, rather than a wrong one
-    return metres.distances(found, view_stack.of(field)).nearest()
+    return metres.distances(found, ViewStack.of(field)).nearest()
 
 
 def _seen(done: DecodeResult) -> dict[str, Any]:

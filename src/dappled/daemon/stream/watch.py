@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from dappled.daemon.stream.wire import Message
-from dappled.decode.lightfield.pictures import slice_mosaic
+from dappled.decode.lightfield.light_field import slice_mosaic
 
 _LOOK_S = 0.5
 

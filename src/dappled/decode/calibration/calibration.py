@@ -142,18 +142,6 @@ class Calibration:
         return cls((int(shape[0]), int(shape[1])), law, mask, sensor, fits, pupil, verdict)
 
 
-def at_corner(origin: tuple[float, float], lattice: Lattice, shape: tuple[int, int]) -> tuple[float, float]:
-    """The origin in cycles at pixel (0, 0) for one at the frame's centre."""
-    shift = lattice.matrix() @ ((np.array(shape) - 1) / 2)
-    return float(origin[0] - shift[0]), float(origin[1] - shift[1])
-
-
-def at_centre(origin: tuple[float, float], lattice: Lattice, shape: tuple[int, int]) -> tuple[float, float]:
-    """The inverse of `at_corner`, cycles from −0.5 to 0.5."""
-    shift = lattice.matrix() @ ((np.array(shape) - 1) / 2)
-    return _turn(origin[0] + shift[0]), _turn(origin[1] + shift[1])
-
-
 def _sensor_values(sensor: Sensor) -> dict[str, Any]:
     values: dict[str, Any] = {"row_mm": list(sensor.row_mm), "column_mm": list(sensor.column_mm)}
     if sensor.picture is not None:
@@ -175,7 +163,3 @@ def _carrier(values: Sequence[float]) -> tuple[int, int, float, float, float]:
 def _pair(values: Sequence[float]) -> tuple[float, float]:
     first, second = values
     return float(first), float(second)
-
-
-def _turn(cycles: float) -> float:
-    return float(cycles - round(cycles))

@@ -6,7 +6,6 @@ at a small aperture, where every carrier stands; the frame's f-number says how m
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,13 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.calibration.calibration import Calibration, LatticeFit, at_centre
-from dappled.decode.calibration.lattice_fit import Sight, look
+from dappled.decode.calibration.calibration import Calibration, LatticeFit
+from dappled.decode.calibration.lattice_fit import FrameLattice, frame_lattice
 from dappled.decode.calibration.law_choice import PLAUSIBLE, judge, steps_bins
 from dappled.decode.errors import DecodeError
-from dappled.decode.lightfield.views import Aperture, angular_frequencies, kappa, transfer
+from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, at_centre, kappa, origin_of, transfer
 from dappled.decode.optics.carrier_tables import lattice_rotation
-from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Order, Sensor
+from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Sensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,8 +52,8 @@ def calibrate(
     if law not in LAWS:
         raise DecodeError(f"unknown law {law!r}; known are {', '.join(LAWS)}")
     aperture = aperture or Aperture(mask.views_per_axis)
-    return of_sights(
-        [sight_of(frame, sensor, mask, law, mask_distance_mm, workers=workers) for frame in frames],
+    return from_lattices(
+        [lattice_of(frame, sensor, mask, law, mask_distance_mm, workers=workers) for frame in frames],
         sensor=sensor,
         mask=mask,
         law=law,
@@ -64,8 +63,8 @@ def calibrate(
     )
 
 
-def of_sights(
-    sights: Sequence[Sight],
+def from_lattices(
+    lattices: Sequence[FrameLattice],
     *,
     sensor: Sensor,
     mask: Mask,
@@ -76,7 +75,7 @@ def of_sights(
 ) -> Calibration:
     """`calibrate` from what was seen in each frame, which is little to keep."""
     aperture = aperture or Aperture(mask.views_per_axis)
-    steps = [(sight.focal_length_mm, steps_bins(sight.lattice, sensor)) for sight in sights]
+    steps = [(shown.focal_length_mm, steps_bins(shown.lattice, sensor)) for shown in lattices]
     verdict = judge(steps, sensor=sensor, mask=mask, stated_mm=mask_distance_mm, asked=law)
     if choose_law and verdict.law is not None:
         law = verdict.law
@@ -84,10 +83,10 @@ def of_sights(
     several = fitted.explains and (fitted.pupil_mm is not None or fitted.offset_bins is not None)
     pupil = fitted.pupil_mm or 0.0 if several else 0.0
     fits = []
-    for length in sorted({sight.focal_length_mm for sight in sights}):
+    for length in sorted({shown.focal_length_mm for shown in lattices}):
         seen = [
             _fit_of(
-                sight,
+                shown,
                 sensor,
                 mask,
                 law,
@@ -95,18 +94,18 @@ def of_sights(
                 known_mm=fitted.mask_distance_mm if several else None,
                 aperture=aperture,
             )
-            for sight in sights
-            if sight.focal_length_mm == length
+            for shown in lattices
+            if shown.focal_length_mm == length
         ]
         fits.append(_mean(seen))
     return Calibration(sensor.shape, law, mask, sensor, tuple(fits), pupil, verdict.sentence)
 
 
-def sight_of(
+def lattice_of(
     frame: CalibrationFrame, sensor: Sensor, mask: Mask, law: str, mask_distance_mm: float, *, workers: int = 1
-) -> Sight:
+) -> FrameLattice:
     """What a frame shows. Raises DecodeError where it shows too little."""
-    return look(
+    return frame_lattice(
         frame.plane,
         focal_length_mm=frame.focal_length_mm,
         f_number=frame.f_number,
@@ -118,36 +117,8 @@ def sight_of(
     )
 
 
-def origin_of(orders: Sequence[Order], phases: NDArray[np.complex128]) -> tuple[tuple[float, float], float]:
-    """(x0, rms phase residual) for complex transfers (K,) that may be negative: phase_k = 2π k·x0, or that plus π.
-
-    Each weighs by its magnitude. Which of the four origins half a period apart is meant is told by the sign of (0, 1)
-    and (1, 0), or else of the innermost orders: those are positive.
-    """
-    k = np.asarray(orders, dtype=np.float64)
-    weights = np.abs(phases) ** 2
-    squares = phases**2 / np.maximum(np.abs(phases), 1e-30) ** 2
-    best, best_score = np.zeros(2), -math.inf
-    steps = np.arange(0, 1, 1 / 48)
-    inner = np.argsort(np.hypot(*k.T), kind="stable")
-    inner = inner[weights[inner] > 1e-4 * weights.max()][:4]
-    for y, x in itertools.product(steps, steps):
-        turn = np.exp(-2j * np.pi * (k @ (y, x)))
-        score = float((weights * (squares * turn**2).real).sum())
-        score += 1e-3 * float((weights[inner] * (phases[inner] / np.abs(phases[inner]) * turn[inner]).real).sum())
-        if score > best_score:
-            best, best_score = np.array([y, x]), score
-    for _ in range(20):  # Gauss–Newton on the doubled phases
-        residual = np.angle(squares * np.exp(-4j * np.pi * (k @ best))) / (4 * np.pi)
-        root = np.sqrt(weights)[:, None]
-        best = best + np.linalg.lstsq(k * root, residual[:, None] * root, rcond=None)[0][:, 0]
-    residual = np.angle(squares * np.exp(-4j * np.pi * (k @ best))) / 2
-    rms = float(np.sqrt((weights * residual**2).sum() / weights.sum()))
-    return (float(best[0]), float(best[1])), rms
-
-
 def _fit_of(
-    sight: Sight,
+    shown: FrameLattice,
     sensor: Sensor,
     mask: Mask,
     law: str,
@@ -160,33 +131,33 @@ def _fit_of(
     distance, fitted = (
         (known_mm, True)
         if known_mm is not None
-        else _distance(sight.lattice, sight.focal_length_mm, sensor=sensor, mask=mask, law=law, stated_mm=stated_mm)
+        else _distance(shown.lattice, shown.focal_length_mm, sensor=sensor, mask=mask, law=law, stated_mm=stated_mm)
     )
-    rotation = lattice_rotation(sight.lattice, sensor)
-    cycles = kappa(mask.frequency_per_mm, distance, sight.focal_length_mm, sight.f_number)
-    through = aperture.transform(angular_frequencies(sight.orders, cycles, rotation)).real
-    measured = sight.relative / np.where(np.abs(through) < 0.05, np.nan, through)
+    rotation = lattice_rotation(shown.lattice, sensor)
+    cycles = kappa(mask.frequency_per_mm, distance, shown.focal_length_mm, shown.f_number)
+    through = aperture.transform(angular_frequencies(shown.orders, cycles, rotation)).real
+    measured = shown.relative / np.where(np.abs(through) < 0.05, np.nan, through)
     usable = np.isfinite(measured)
     usable[0] = False
-    orders = [order for order, use in zip(sight.orders, usable, strict=True) if use]
+    orders = [order for order, use in zip(shown.orders, usable, strict=True) if use]
     if np.linalg.matrix_rank(orders) < 2:
         raise DecodeError("too few carriers show at this aperture: calibrate on a frame at an eighth of the widest")
     origin, phase_residual = origin_of(orders, measured[usable])
-    magnitudes = (measured * np.conj(transfer(sight.orders, np.ones(len(sight.orders)), origin))).real
-    known = dict(zip(sight.orders, np.nan_to_num(magnitudes), strict=True))
+    magnitudes = (measured * np.conj(transfer(shown.orders, np.ones(len(shown.orders)), origin))).real
+    known = dict(zip(shown.orders, np.nan_to_num(magnitudes), strict=True))
     return LatticeFit(
-        focal_length_mm=sight.focal_length_mm,
-        f_number=sight.f_number,
-        lattice=sight.lattice,
+        focal_length_mm=shown.focal_length_mm,
+        f_number=shown.f_number,
+        lattice=shown.lattice,
         rotation_rad=rotation,
         mask_distance_mm=distance,
         distance_fitted=fitted,
-        origin=at_centre(origin, sight.lattice, sensor.shape),
+        origin=at_centre(origin, shown.lattice, sensor.shape),
         transfer=tuple(float(known.get(order, 0.0)) if order != (0, 0) else 1.0 for order in mask.half_orders()),
-        residual_bins=sight.residual_bins,
+        residual_bins=shown.residual_bins,
         phase_residual_rad=phase_residual,
-        found=len(sight.found) + 1,
-        seen=tuple((c.ky, c.kx, m.fy, m.fx, m.strength) for c, m in sight.found),
+        found=len(shown.found) + 1,
+        seen=tuple((c.ky, c.kx, m.fy, m.fx, m.strength) for c, m in shown.found),
     )
 
 

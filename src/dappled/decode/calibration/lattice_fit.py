@@ -1,4 +1,4 @@
-"""What one stopped-down frame shows of a mask: the lattice of its carriers, wherever it is, to a hundredth of a bin."""
+"""Find the lattice of a mask's carriers in one stopped-down frame, wherever it is, to a hundredth of a bin."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
+from dappled.decode.lightfield.aperture import relative_transfer
 from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Order, Sensor
 from dappled.decode.spectrum.lattice import candidates, find_lattice
 from dappled.decode.spectrum.peaks import FARTHER, Measured, fit, measure, residual_bins
@@ -23,7 +24,7 @@ _ENOUGH = 0.6  # of a mask's carriers: a prediction near which so many stand is 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class FrameLattice:
     """What one calibration frame shows: its lattice, the carriers seen, and each slice's factor on the mean's.
 
     `relative` complex (K,) belongs to `orders`, DC first.
@@ -38,7 +39,7 @@ class Sight:
     relative: NDArray[np.complex128]
 
 
-def look(
+def frame_lattice(
     plane: NDArray[np.float32],
     *,
     focal_length_mm: float,
@@ -48,8 +49,8 @@ def look(
     law: str,
     mask_distance_mm: float,
     workers: int = 1,
-) -> Sight:
-    """Find the mask's carriers in a frame: near the law's prediction, near the other law's, or wherever they are."""
+) -> FrameLattice:
+    """Find the mask's carriers in a frame: near the prediction of the law, near that of the other one, or anywhere."""
     if plane.shape != sensor.shape:
         raise DecodeError(f"the calibration frame is {plane.shape}, the camera's are {sensor.shape}")
     spectrum = transform(plane, workers=workers)
@@ -66,7 +67,7 @@ def look(
     residual = residual_bins(lattice.carriers([(c.ky, c.kx) for c, _ in found]), [m for _, m in found], spectrum)
     carriers = [c for c in lattice.carriers(orders) if c.on_sensor]
     values = extract(spectrum, carriers, lattice=lattice, workers=workers).values
-    return Sight(
+    return FrameLattice(
         focal_length_mm,
         f_number,
         lattice,
@@ -182,14 +183,6 @@ def search(spectrum: Spectrum, predicted: Lattice, orders: Sequence[Order], tole
         )
     (ay, ax), (by, bx) = best
     return Lattice((float(ay), float(ax)), (float(by), float(bx)))
-
-
-def relative_transfer(slices: NDArray[np.complex64]) -> NDArray[np.complex128]:
-    """(K,) least-squares factor of each slice on the first: the carriers' transfer, a scene's texture taken out."""
-    dc = slices[0].astype(np.complex128).ravel()
-    products = np.array([np.vdot(dc, s.ravel()) for s in slices], dtype=np.complex128)
-    factors: NDArray[np.complex128] = products / np.vdot(dc, dc).real
-    return factors
 
 
 def refine(spectrum: Spectrum, lattice: Lattice, orders: Sequence[Order], workers: int = 1) -> Lattice:

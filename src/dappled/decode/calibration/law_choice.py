@@ -42,7 +42,7 @@ class LawFit:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class LawVerdict:
     """All laws as fitted, the one that explains the frames best (None: neither), and that in a sentence."""
 
     fits: tuple[LawFit, ...]
@@ -66,7 +66,7 @@ def judge(
     mask: Mask,
     stated_mm: float,
     asked: str,
-) -> Verdict:
+) -> LawVerdict:
     """The verdict on what was seen: focal lengths in mm with `steps_bins`. `asked` wins where nothing tells more."""
     lengths = np.array([length for length, _ in seen])
     steps = np.array([step for _, step in seen])
@@ -78,13 +78,13 @@ def judge(
         f"{fit.law} with the mask at {fit.mask_distance_mm:.3f} mm leaves {fit.rms_bins:.2f} bins rms" for fit in fits
     )
     if not able:
-        return Verdict(fits, None, f"neither law explains these frames ({words}; stated are {stated_mm:g} mm)")
+        return LawVerdict(fits, None, f"neither law explains these frames ({words}; stated are {stated_mm:g} mm)")
     if len(set(lengths.tolist())) < 2:
         law = asked if asked in {fit.law for fit in able} else able[0].law
         which = f"only {law} would do" if len(able) == 1 else "both would do"
-        return Verdict(fits, law, f"{which}, as far as one focal length tells the laws apart ({words})")
+        return LawVerdict(fits, law, f"{which}, as far as one focal length tells the laws apart ({words})")
     best = min(able, key=lambda fit: fit.rms_bins)
-    return Verdict(fits, best.law, f"{best.law} explains these frames ({words})")
+    return LawVerdict(fits, best.law, f"{best.law} explains these frames ({words})")
 
 
 def _fit_fd(

@@ -14,7 +14,7 @@ from scipy import fft
 
 from dappled.decode.depth.depth_map import DepthMap, Search, box, confidence, judged, peaked, windowed
 from dappled.decode.depth.evidence import Evidence
-from dappled.decode.lightfield.view_stack import centred
+from dappled.decode.lightfield.light_field import centred
 from dappled.decode.threads import each, spans
 
 Volume = NDArray[np.float32]

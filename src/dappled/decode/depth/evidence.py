@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.lightfield.view_stack import Image, ViewStack, needs_parallax, of
-from dappled.decode.lightfield.views import Aperture, finest_detail
+from dappled.decode.lightfield.aperture import Aperture
+from dappled.decode.lightfield.light_field import Image, LightField, ViewStack, needs_parallax
+from dappled.decode.lightfield.views import finest_detail
 
 _LEAST_NOISE = 1e-9  # variance: float32
 
@@ -72,7 +72,7 @@ def of_light_field(field: LightField) -> Evidence:
 
     Raises DecodeError where there are no views.
     """
-    stack = of(field)
+    stack = ViewStack.of(field)
     rows, noise = field.attributes.get("transfers"), field.attributes.get("noise_rms")
     if rows is None or not noise:
         return of_views(stack)

@@ -15,8 +15,8 @@ from scipy import ndimage
 
 from dappled.decode.depth.depth_map import DepthMap, Search, box, judged, windowed
 from dappled.decode.depth.evidence import Evidence
+from dappled.decode.lightfield.light_field import Image, ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
-from dappled.decode.lightfield.view_stack import Image, ViewStack
 from dappled.decode.threads import each
 
 _SMOOTH_PX = 0.8  # sigma: finer detail is not linear over the shifts

@@ -1,13 +1,16 @@
-"""Pose of the vehicle at an instant, with what is known of its errors."""
+"""The pose of the vehicle at an instant with its errors, interpolated by cubic Hermite (place) and slerp (attitude)."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Symmetric = tuple[float, float, float, float, float, float]  # a 3 × 3 matrix's upper triangle: xx, xy, xz, yy, yz, zz
+_WGS84_A_M = 6378137.0
+_WGS84_E2 = 6.69437999014e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,3 +62,125 @@ class Pose:
     gimbal_source: str | None = None
     position_covariance_m2: Symmetric | None = None
     attitude_covariance_rad2: Symmetric | None = None
+
+
+def hermite(ends: tuple[float, float], slopes: tuple[float, float], span_s: float, share: float) -> float:
+    """The cubic with these values and slopes (per second) at the ends of `span_s`, at `share` in 0..1 of it."""
+    (p0, p1), (v0, v1), u = ends, slopes, share
+    return (
+        (2 * u**3 - 3 * u**2 + 1) * p0
+        + (u**3 - 2 * u**2 + u) * span_s * v0
+        + (3 * u**2 - 2 * u**3) * p1
+        + (u**3 - u**2) * span_s * v1
+    )
+
+
+def slerp(a: Quaternion, b: Quaternion, share: float) -> Quaternion:
+    """The unit quaternion at `share` of the shorter turn from `a` to `b` (both unit)."""
+    dot = sum(x * y for x, y in zip(a, b, strict=True))
+    if dot < 0:
+        b, dot = (-b[0], -b[1], -b[2], -b[3]), -dot
+    if dot > 0.9999:  # sin(angle) loses digits; the chord is as good as the arc here, once normalised
+        return normalised((1 - share) * a[0] + share * b[0], (1 - share) * a[1] + share * b[1],
+                          (1 - share) * a[2] + share * b[2], (1 - share) * a[3] + share * b[3])  # fmt: skip
+    angle = math.acos(dot)
+    wa, wb = math.sin((1 - share) * angle) / math.sin(angle), math.sin(share * angle) / math.sin(angle)
+    return normalised(*(wa * x + wb * y for x, y in zip(a, b, strict=True)))
+
+
+def normalised(*parts: float) -> Quaternion:
+    """Four numbers as a unit quaternion. Raises ValueError where they are none (zero length, not finite)."""
+    w, x, y, z = parts
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    if not (math.isfinite(length) and length > 1e-6):
+        raise ValueError("not a quaternion")
+    return w / length, x / length, y / length, z / length
+
+
+def hermite_doubt(moved: float, slopes: tuple[float, float], span_s: float, share: float) -> float:
+    """How far (1 σ) `hermite` may miss at `share` of a way `moved`, with these slopes at its ends.
+
+    A way that disagrees with its slopes' mean was not wholly told by them: half of the difference, in the middle.
+    """
+    return 0.5 * abs(moved - 0.5 * (slopes[0] + slopes[1]) * span_s) * (4 * share * (1 - share)) ** 2
+
+
+def slerp_doubt(
+    ends: tuple[Quaternion, Quaternion], rates: tuple[Vector3, Vector3], span_s: float, share: float
+) -> float:
+    """Radians (1 σ) by which `slerp` may miss at `share`: the cubic that also has the body's rates (rad/s) at the ends,
+    less the even turn."""
+    even = rotation_vector(multiply(conjugate(ends[0]), ends[1]))
+    u = share
+    begin, end = u**3 - 2 * u**2 + u, u**3 - u**2
+    off = [begin * (rates[0][i] * span_s - even[i]) + end * (rates[1][i] * span_s - even[i]) for i in range(3)]
+    return math.hypot(*off)
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """The turn `b`, then the turn `a`, of vectors."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+def conjugate(q: Quaternion) -> Quaternion:
+    """The turn back."""
+    return q[0], -q[1], -q[2], -q[3]
+
+
+def rotation_vector(q: Quaternion) -> Vector3:
+    """A unit quaternion as axis × angle, the shorter way."""
+    sign = math.copysign(1.0, q[0])
+    length = norm((q[1], q[2], q[3]))
+    scale = 2.0 if length < 1e-12 else 2 * math.atan2(length, abs(q[0])) / length
+    return sign * scale * q[1], sign * scale * q[2], sign * scale * q[3]
+
+
+def turned_by_heading(q: Quaternion, vehicle: Quaternion) -> Quaternion:
+    """`q`, whose yaw counts from the vehicle's nose, to north: turned about the vertical by the vehicle's heading."""
+    w, x, y, z = vehicle
+    half = 0.5 * math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return multiply((math.cos(half), 0.0, 0.0, math.sin(half)), q)
+
+
+def from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
+    """Aerospace angles (yaw, then pitch, then roll) as a quaternion, body to north-east-down."""
+    cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
+    cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
+    cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def turn_rad(a: Quaternion, b: Quaternion) -> float:
+    """The angle between two attitudes."""
+    cross = (
+        a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2],
+        a[0] * b[2] - a[2] * b[0] - a[3] * b[1] + a[1] * b[3],
+        a[0] * b[3] - a[3] * b[0] - a[1] * b[2] + a[2] * b[1],
+    )
+    dot = sum(x * y for x, y in zip(a, b, strict=True))
+    return 2 * math.atan2(math.hypot(*cross), abs(dot))
+
+
+def metres_per_radian(latitude_rad: float, altitude_m: float) -> tuple[float, float]:
+    """North and east metres for one radian of latitude and of longitude, on WGS 84."""
+    curvature = 1 - _WGS84_E2 * math.sin(latitude_rad) ** 2
+    north = _WGS84_A_M * (1 - _WGS84_E2) / curvature**1.5 + altitude_m
+    east = (_WGS84_A_M / math.sqrt(curvature) + altitude_m) * math.cos(latitude_rad)
+    return north, east
+
+
+def norm(vector: Vector3) -> float:
+    """Length."""
+    return math.hypot(*vector)

@@ -1,29 +1,173 @@
-"""How wide the lens really stood open: κ from the frame itself, as an f-number is only a rounded word for it.
+"""Model how mask and aperture turn a light field into slices, and fit the aperture that a frame was taken with.
 
-f/7.4 may be 7.46, and f/22 is 22.6 on most lenses. Near the ideal aperture such a percent decides: it moves the views
-apart or together, and what all views share then leaks into the carriers' coefficients, which should hold none of it.
-The mean of slice k over the frame is T_k·A(κ·k) of the plane's mean (A the aperture's transform, see `views`); parallax
-and texture have no part in it but by the frame's edges. So κ is where A agrees with the means.
+Light from aperture point θ (mm, at distance v in front of the sensor) reaches sensor point x through mask point
+(1−α)x + αθ, α = d/v. With a mask Σ_k M_k e^{2πi k·(f_m R ξ + x0)} and R its rotation the plane is
+
+    I(x) = Σ_k M_k e^{2πi k·(F x + x0)} ∫ L(x, θ) e^{2πi ω_k·θ} dθ,   ω_k = κ k·R,   κ = f_m α A,
+
+θ counted in shares of the aperture's diameter A. So slice_k / T_k, with T_k = M_k e^{2πi k·x0}, is the angular Fourier
+coefficient of L at ω_k cycles over the aperture, known up to the frame's noise.
+
+The aperture is fitted because an f-number is rounded: f/7.4 may be 7.46, and f/22 is 22.6 on most lenses. Near the
+ideal aperture such a percent moves the views apart or together, and what all views share then leaks into coefficients
+which should hold none of it. The mean of slice k over the frame is T_k·A(κ·k) of the plane's mean (A the aperture's
+transform); parallax and texture only enter at the frame's edges. So κ is where A agrees with the means.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
-from dappled.decode.lightfield.views import Aperture, Shape, angular_frequencies
-from dappled.decode.optics.carriers import Order
+from dappled.decode.optics.carriers import Lattice, Order
 
+Shape = Literal["beams", "filled", "round"]
+_PARTS = 15  # of a cell's side, where a circle cuts through cells
 ROUNDING = 0.05  # relative: f-numbers are off by no more (nominal f/22 is 22.6, f/3.5 is 3.56)
 _NOMINAL_SIGMA = 0.02  # relative: how far an f-number is believed
 _TEXTURE = 1.5e-3  # of the mean: what the scene adds to the mean of a slice
 _EVIDENCE = 9.0  # squared deviations: less doesn't tell one shape from another (beams from filled cells never at κ = 1)
 SHAPES: tuple[Shape, ...] = ("beams", "filled", "round")
 _AGREEMENT = 6.0  # times their own error: means further from any aperture's are some other aperture's
+
+
+@dataclass(frozen=True, slots=True)
+class Aperture:
+    """How light comes through the aperture in the model: N views an axis over its full width, each one cell of it.
+
+    "beams": through the middle of each cell. "filled": through the whole of each cell. "round": through what of each
+    cell lies in the circle; a view whose cell lies outside keeps its place, and shows what the others say about it.
+    """
+
+    views: int
+    shape: Shape = "beams"
+
+    def points(self) -> NDArray[np.float64]:
+        """(V·U, 2) the cells' middles (v, u) in shares of the full aperture, −0.5 to 0.5, rows first."""
+        return _middles(self.views)
+
+    def offsets(self) -> NDArray[np.float64]:
+        """(V, U, 2) the views' own points."""
+        return self.points().reshape(self.views, self.views, 2)
+
+    def cells(self, angular: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """(K, V·U) ∫ e^{2πi ω·θ} dθ over each view's cell for (K, 2) frequencies ω in cycles over the aperture, as a
+        share of the whole aperture: at 0 the share of the light that each view has."""
+        angular, n = np.asarray(angular), self.views
+        if self.shape != "round":
+            cells = np.asarray(np.exp(2j * np.pi * angular @ self.points().T) / n**2, dtype=np.complex128)
+            if self.shape == "filled":
+                cells *= np.sinc(angular / n).prod(axis=1)[:, None]
+            return cells
+        fine = n * _PARTS
+        parts = np.exp(2j * np.pi * angular @ _middles(fine).T) * _in_circle(fine)
+        parts *= np.sinc(angular / fine).prod(axis=1)[:, None]
+        return np.asarray(parts.reshape(-1, n, _PARTS, n, _PARTS).sum(axis=(2, 4)).reshape(-1, n * n))
+
+    def transform(self, angular: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """(K,) the same over the whole aperture; 1 at 0."""
+        if self.shape != "round":
+            return np.asarray(self.cells(angular).sum(axis=1), dtype=np.complex128)
+        turns = np.pi * np.hypot(*np.asarray(angular).T)
+        whole = 2 * special.j1(turns) / np.where(turns > 0, turns, 1.0)
+        return np.where(turns > 0, whole, 1.0).astype(np.complex128)
+
+
+def _middles(n: int) -> NDArray[np.float64]:
+    """(n², 2) the middles of n × n cells over the full aperture, rows first."""
+    axis = (np.arange(n) - (n - 1) / 2) / n
+    return np.array(list(itertools.product(axis, axis)), dtype=np.float64)
+
+
+@cache
+def _in_circle(n: int) -> NDArray[np.float64]:
+    """(n²,) what each of n × n cells has of the circle, as a share of the circle."""
+    fine = 16
+    axis = (np.arange(n * fine) - (n * fine - 1) / 2) / (n * fine)
+    inside = (np.hypot(axis[:, None], axis[None, :]) <= 0.5).reshape(n, fine, n, fine).sum(axis=(1, 3)).ravel()
+    return np.asarray(inside / inside.sum(), dtype=np.float64)
+
+
+def kappa(frequency_per_mm: float, mask_distance_mm: float, focal_length_mm: float, f_number: float) -> float:
+    """κ = f_m · α · A: cycles of the mask's fundamental that the aperture A = v / f-number sweeps over."""
+    return frequency_per_mm * mask_distance_mm / focal_length_mm * (focal_length_mm / f_number)
+
+
+def angular_frequencies(orders: Sequence[Order], kappa_cycles: float, rotation_rad: float) -> NDArray[np.float64]:
+    """(K, 2) ω_k = κ k·R in cycles over the aperture, rotated as `Lattice.rotated` rotates the carriers."""
+    c, s = math.cos(rotation_rad), math.sin(rotation_rad)
+    turn = np.array([[c, s], [-s, c]])
+    rotated: NDArray[np.float64] = kappa_cycles * np.asarray(orders, dtype=np.float64).reshape(-1, 2) @ turn
+    return rotated
+
+
+def transfer(
+    orders: Sequence[Order], magnitudes: Sequence[float] | NDArray[np.float64], origin: tuple[float, float]
+) -> NDArray[np.complex128]:
+    """(K,) T_k = M_k e^{2πi k·x0}, lattice-linear phases from one origin x0 (cycles of ky and of kx)."""
+    turns = np.asarray(orders, dtype=np.float64).reshape(-1, 2) @ np.asarray(origin)
+    transfers: NDArray[np.complex128] = np.asarray(magnitudes) * np.exp(2j * np.pi * turns)
+    return transfers
+
+
+def at_corner(origin: tuple[float, float], lattice: Lattice, shape: tuple[int, int]) -> tuple[float, float]:
+    """The origin in cycles at pixel (0, 0) for one at the frame's centre."""
+    shift = lattice.matrix() @ ((np.array(shape) - 1) / 2)
+    return float(origin[0] - shift[0]), float(origin[1] - shift[1])
+
+
+def at_centre(origin: tuple[float, float], lattice: Lattice, shape: tuple[int, int]) -> tuple[float, float]:
+    """The inverse of `at_corner`, cycles from −0.5 to 0.5."""
+    shift = lattice.matrix() @ ((np.array(shape) - 1) / 2)
+    return _turn(origin[0] + shift[0]), _turn(origin[1] + shift[1])
+
+
+def _turn(cycles: float) -> float:
+    return float(cycles - round(cycles))
+
+
+def relative_transfer(slices: NDArray[np.complex64]) -> NDArray[np.complex128]:
+    """(K,) least-squares factor of each slice on the first: the carriers' transfer, a scene's texture taken out."""
+    dc = slices[0].astype(np.complex128).ravel()
+    products = np.array([np.vdot(dc, s.ravel()) for s in slices], dtype=np.complex128)
+    factors: NDArray[np.complex128] = products / np.vdot(dc, dc).real
+    return factors
+
+
+def origin_of(orders: Sequence[Order], phases: NDArray[np.complex128]) -> tuple[tuple[float, float], float]:
+    """(x0, rms phase residual) for complex transfers (K,) that may be negative: phase_k = 2π k·x0, or that plus π.
+
+    Each weighs by its magnitude. Which of the four origins half a period apart is meant is told by the sign of (0, 1)
+    and (1, 0), or else of the innermost orders: those are positive.
+    """
+    k = np.asarray(orders, dtype=np.float64)
+    weights = np.abs(phases) ** 2
+    squares = phases**2 / np.maximum(np.abs(phases), 1e-30) ** 2
+    best, best_score = np.zeros(2), -math.inf
+    steps = np.arange(0, 1, 1 / 48)
+    inner = np.argsort(np.hypot(*k.T), kind="stable")
+    inner = inner[weights[inner] > 1e-4 * weights.max()][:4]
+    for y, x in itertools.product(steps, steps):
+        turn = np.exp(-2j * np.pi * (k @ (y, x)))
+        score = float((weights * (squares * turn**2).real).sum())
+        score += 1e-3 * float((weights[inner] * (phases[inner] / np.abs(phases[inner]) * turn[inner]).real).sum())
+        if score > best_score:
+            best, best_score = np.array([y, x]), score
+    for _ in range(20):  # Gauss–Newton on the doubled phases
+        residual = np.angle(squares * np.exp(-4j * np.pi * (k @ best))) / (4 * np.pi)
+        root = np.sqrt(weights)[:, None]
+        best = best + np.linalg.lstsq(k * root, residual[:, None] * root, rcond=None)[0][:, 0]
+    residual = np.angle(squares * np.exp(-4j * np.pi * (k @ best))) / 2
+    rms = float(np.sqrt((weights * residual**2).sum() / weights.sum()))
+    return (float(best[0]), float(best[1])), rms
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import fft, special
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.lightfield.view_stack import Image, ViewStack, centred, needs_parallax
+from dappled.decode.lightfield.light_field import Image, ViewStack, centred, needs_parallax
 
 _OVERSAMPLED = 2
 _TAPS = 4
@@ -87,14 +87,14 @@ class Spectrum4D:
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class ViewDifference:
     """How far two pictures are apart, the edges left out: PSNR in dB over the first one's range, and the largest."""
 
     psnr_db: float
     largest: float
 
 
-def difference(one: Image, other: Image, border: int) -> Difference:
+def difference(one: Image, other: Image, border: int) -> ViewDifference:
     """The difference of two pictures (h, w), `border` px left out; PSNR inf where there is none."""
     cut = (slice(border, -border or None),) * 2
     gap = (one - other)[cut].astype(np.float64)
@@ -102,7 +102,7 @@ def difference(one: Image, other: Image, border: int) -> Difference:
         raise DecodeError(f"a border of {border} px leaves nothing of pictures of {one.shape} px")
     span = float(np.ptp(one[cut]))
     rms = math.sqrt(float(np.mean(gap**2)))
-    return Difference(math.inf if rms == 0 else 20 * math.log10(max(span, 1e-12) / rms), float(np.abs(gap).max()))
+    return ViewDifference(math.inf if rms == 0 else 20 * math.log10(max(span, 1e-12) / rms), float(np.abs(gap).max()))
 
 
 def _taps(frequencies: NDArray[np.float64], size: int, count: int) -> tuple[NDArray[np.intp], NDArray[np.float32]]:

@@ -1,13 +1,19 @@
-"""The decoded light field as one value; its files are laid out in the same words."""
+"""The decoded light field as a value, the stack of its views, and its slices as one picture."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dappled.decode.errors import DecodeError
+
+Image = NDArray[np.float32]
+CAMERAS = "cameras"  # an attribute of light fields: true where each view is a camera's, further right with larger u
+_REGULAR = 1e-3  # of a view: how far views may stand from a grid of rows and columns
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,3 +36,134 @@ class LightField:
     view_offsets: NDArray[np.float64]
     grid: NDArray[np.float64]
     attributes: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewStack:
+    """Views with the places they were seen from, which refocusing and depth work on, wherever the views came from.
+
+    `views` float32 (V, U, h, w) or (V, U, h, w, 3); their places are `row_steps` (V,) and `column_steps` (U,). The
+    convention: a point of disparity D that the aperture's middle sees at (y, x) is seen by the view (v, u) at
+    (y + D·row_steps[v], x + D·column_steps[u]). Disparity is in columns of a view from one view to the next, 0 where
+    the camera was focused, larger for what is nearer.
+
+    `sensor_px_per_disparity` is what a disparity of 1 moves over the whole aperture, in columns of the sensor: it leads
+    to metres (see `ranging`). None where the sensor is unknown.
+    """
+
+    views: NDArray[np.float32]
+    row_steps: NDArray[np.float64]
+    column_steps: NDArray[np.float64]
+    sensor_px_per_disparity: float | None = None
+
+    def __post_init__(self) -> None:
+        """Raises DecodeError for shapes that don't fit together, and for no views at all."""
+        if self.views.ndim not in (4, 5) or (self.views.ndim == 5 and self.views.shape[4] != 3):
+            raise DecodeError(f"views of shape {self.views.shape}: they must be (V, U, h, w), or (V, U, h, w, 3)")
+        if 0 in self.views.shape:
+            raise DecodeError("there are no views: decode the frame with a calibration, or with carriers to be seen")
+        if (len(self.row_steps), len(self.column_steps)) != self.views.shape[:2]:
+            raise DecodeError(
+                f"{len(self.row_steps)} × {len(self.column_steps)} places for "
+                f"{self.views.shape[0]} × {self.views.shape[1]} views"
+            )
+
+    @classmethod
+    def of(cls, field: LightField, views: NDArray[np.float32] | None = None) -> ViewStack:
+        """The views of a light field, or others on the same places.
+
+        Behind a mask a larger aperture coordinate sees nearer things at larger ones. A lenslet turns the picture of the
+        aperture round, so there they are at smaller ones, as for a camera further to the right. Raises DecodeError
+        where there are no views, or where they are not on rows and columns.
+        """
+        values = field.views if views is None else views
+        if 0 in values.shape:
+            raise DecodeError("the light field has no views: decode the frame with a calibration")
+        offsets = np.asarray(field.view_offsets, dtype=np.float64)
+        across, down = offsets[0, :, 1], offsets[:, 0, 0]
+        on_rows = np.abs(offsets[..., 0] - down[:, None]).max(), np.abs(offsets[..., 1] - across[None, :]).max()
+        count = max(values.shape[:2])
+        if max(on_rows) > _REGULAR / count:
+            raise DecodeError("the light field's views don't stand on rows and columns of the aperture")
+        cameras = bool(field.attributes.get(CAMERAS))
+        sign = -1.0 if cameras or field.attributes.get("lenslet_pitch_px") else 1.0
+        row_px, column_px = float(np.hypot(*field.grid[:, 0])), float(np.hypot(*field.grid[:, 1]))
+        # One step is 1/count of the aperture; a row of a view may be taller than a column is wide.
+        return cls(
+            values,
+            sign * count * down * column_px / row_px,
+            sign * count * across,
+            sensor_px_per_disparity=None if cameras else count * column_px,
+        )
+
+    @classmethod
+    def from_cameras(cls, views: NDArray[np.floating[Any]]) -> ViewStack:
+        """Views (V, U, h, w(, 3)) of cameras side by side, rows first, as in light fields of HCI and LFToolbox.
+
+        Further to the right, near things are further to the left.
+        """
+        v, u = views.shape[:2]
+        return cls(np.asarray(views, dtype=np.float32), -centred(v), -centred(u))
+
+    @property
+    def reach(self) -> float:
+        """The largest step: so many pixels does the outermost view move for a disparity of 1."""
+        return float(max(np.abs(self.row_steps).max(), np.abs(self.column_steps).max()))
+
+    @property
+    def colour(self) -> bool:
+        """Whether the views are red, green and blue."""
+        return self.views.ndim == 5
+
+    def grey(self) -> ViewStack:
+        """The mean of the colours; grey views as they are."""
+        return replace(self, views=self.views.mean(axis=4, dtype=np.float32)) if self.colour else self
+
+    def middle(self) -> NDArray[np.float32]:
+        """The view nearest to the aperture's middle, (h, w) or (h, w, 3)."""
+        found: NDArray[np.float32] = self.views[
+            int(np.argmin(np.abs(self.row_steps))), int(np.argmin(np.abs(self.column_steps)))
+        ]
+        return found
+
+
+def centred(count: int) -> NDArray[np.float64]:
+    """0…count−1 about their middle."""
+    return np.arange(count, dtype=np.float64) - (count - 1) / 2
+
+
+def needs_parallax(stack: ViewStack, what: str) -> None:
+    """Raises DecodeError for views that all stand on one spot."""
+    if stack.reach == 0:
+        raise DecodeError(f"{what} needs views from several places, and this light field's stand on one spot")
+
+
+def slice_mosaic(
+    slices: NDArray[np.complex64], carriers: NDArray[np.float64], *, longest_side: int = 2400
+) -> NDArray[np.uint8]:
+    """uint8 (H, W): the slices' magnitudes placed by their orders, conjugate halves filled in.
+
+    `slices` (K, h, w) with `carriers` rows [ky, kx, …] as in a LightField. Each slice from its own 0 to its own
+    99.5th percentile. Missing orders (of an octave or diagonal mask) take no room where a whole row or column lacks.
+    A conjugate has the same magnitude.
+    """
+    tiles = {}
+    for image, (ky, kx) in zip(slices, carriers[:, :2].astype(int).tolist(), strict=True):
+        tile = _stretched(np.abs(image))
+        tiles[(ky, kx)] = tile
+        tiles.setdefault((-ky, -kx), tile)
+    rows = sorted({ky for ky, _ in tiles})
+    columns = sorted({kx for _, kx in tiles})
+    height, width = slices.shape[1:]
+    out = np.full((len(rows) * (height + 2), len(columns) * (width + 2)), 255, dtype=np.uint8)
+    for (ky, kx), tile in tiles.items():
+        top, left = rows.index(ky) * (height + 2) + 1, columns.index(kx) * (width + 2) + 1
+        out[top : top + height, left : left + width] = tile
+    step = max(1, -(-max(out.shape) // longest_side))
+    return np.ascontiguousarray(out[::step, ::step])
+
+
+def _stretched(image: NDArray[np.floating]) -> NDArray[np.uint8]:
+    high = max(float(np.quantile(image, 0.995)), 1e-12)
+    grey: NDArray[np.uint8] = np.rint(255 * np.clip(image / high, 0, 1)).astype(np.uint8)
+    return grey

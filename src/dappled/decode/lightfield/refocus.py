@@ -1,4 +1,4 @@
-"""Refocusing by shift and add (Eq 28 and 29): any α, any disparity, any part of the aperture, any plane.
+"""Refocus by shift and add (Eq 28 and 29): on any α, disparity or plane, in focal stacks, for two eyes.
 
 Eq 29 sums L(u(1 − 1/α) + x/α, v(1 − 1/α) + y/α, u, v) over the views. u and v count views from the middle, x and y
 pixels of a view from the picture's middle, as in the thesis. α > 1 moves the focus into the background, α < 1 into
@@ -8,6 +8,7 @@ the foreground; the plane in focus is that of disparity 1/α − 1.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,9 +16,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.lightfield.view_stack import Image, ViewStack
+from dappled.decode.lightfield.light_field import Image, ViewStack
 from dappled.decode.threads import each
 
+_SHARPNESS_BOX = 5  # px: the side of the box that sharpness is averaged over, twice
 _LEAST_WEIGHT = 1e-6  # of all views: a pixel that less is seen of is unknown
 
 
@@ -150,6 +152,94 @@ def disc(stack: ViewStack, diameter: float, centre: tuple[float, float] = (0.0, 
     weights: NDArray[np.float64] = np.clip(diameter * count / 2 - away + 0.5, 0, 1)
     weights[np.unravel_index(np.argmin(away), away.shape)] = 1.0
     return weights
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FocalStack:
+    """`pictures` float32 (D, h, w) or (D, h, w, 3), focused on `disparities` (D,)."""
+
+    pictures: NDArray[np.float32]
+    disparities: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AllInFocus:
+    """`picture` (h, w(, 3)): each pixel from the picture of the stack that is sharpest there. `index` int16 (h, w) says
+    which, −1 where nothing is sharp: there the picture is the stack's middle one."""
+
+    picture: Image
+    index: NDArray[np.int16]
+
+
+def focal_stack(
+    stack: ViewStack, disparities: Sequence[float] | NDArray[np.float64], *, workers: int = 1
+) -> FocalStack:
+    """The pictures focused on each disparity. Raises DecodeError for none."""
+    if len(disparities) == 0:
+        raise DecodeError("a focal stack needs at least one plane")
+    made = np.stack([shift_and_add(stack, float(d), workers=workers) for d in disparities])
+    return FocalStack(made, np.asarray(disparities, dtype=np.float64))
+
+
+def all_in_focus(stack: FocalStack, *, least_contrast: float = 1e-4) -> AllInFocus:
+    """The sharpest of the stack at every pixel: the largest local energy of the Laplacian.
+
+    `least_contrast` (rms of the Laplacian, of white 1.0): what is smoother has no sharpest picture.
+    """
+    pictures = np.nan_to_num(stack.pictures)
+    grey = pictures.mean(axis=3) if pictures.ndim == 4 else pictures
+    energy = np.stack([ndimage.laplace(p, mode="nearest") for p in grey]) ** 2
+    for axis in (1, 2):
+        for _ in range(2):  # a box used twice is a smooth window
+            energy = ndimage.uniform_filter1d(energy, _SHARPNESS_BOX, axis=axis)
+    index = ndimage.median_filter(energy.argmax(axis=0), 3)
+    smooth = energy.max(axis=0) < least_contrast**2
+    chosen = np.where(smooth, len(pictures) // 2, index)
+    gather = chosen[None, ..., None] if pictures.ndim == 4 else chosen[None]
+    picture = np.take_along_axis(pictures, gather, axis=0)[0]
+    return AllInFocus(picture, np.where(smooth, -1, index).astype(np.int16))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoPair:
+    """What the left and the right eye see, float32 (h, w) or (h, w, 3)."""
+
+    left: Image
+    right: Image
+
+
+def eyes(
+    stack: ViewStack, *, separation: float = 0.6, pupil: float = 0.35, disparity: float = 0.0, workers: int = 1
+) -> StereoPair:
+    """Two synthetic apertures `separation` apart, `pupil` wide (shares of the whole aperture), converging on a
+    disparity. Raises DecodeError where there is only one column of views."""
+    if not 0 < separation <= 1:
+        raise DecodeError(f"eyes {separation:g} of the aperture apart don't fit into it: give more than 0, at most 1")
+    if np.ptp(stack.column_steps) == 0:
+        raise DecodeError("a stereo pair needs views from several columns of the aperture")
+    # A point nearer than the focus is seen further to the right by the view with the larger step: that is the left eye.
+    towards_left = float(np.sign(stack.column_steps[-1] - stack.column_steps[0]))
+    left, right = (
+        shift_and_add(
+            stack, disparity, weights=disc(stack, pupil, (0.0, side * towards_left * separation / 2)), workers=workers
+        )
+        for side in (1, -1)
+    )
+    return StereoPair(left, right)
+
+
+def anaglyph(pair: StereoPair) -> NDArray[np.float32]:
+    """(h, w, 3) for red-cyan glasses: red is the left eye's, green and blue the right one's."""
+    left, right = (p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in (pair.left, pair.right))
+    made: NDArray[np.float32] = np.concatenate([left[..., :1], right[..., 1:]], axis=2).astype(np.float32)
+    return made
+
+
+def side_by_side(pair: StereoPair, *, crossed: bool = False) -> Image:
+    """(h, 2w(, 3)): the left eye's picture left, or right for crossed eyes."""
+    both = (pair.right, pair.left) if crossed else (pair.left, pair.right)
+    made: Image = np.concatenate(both, axis=1)
+    return made
 
 
 def magnified(image: Image, factor: float) -> Image:

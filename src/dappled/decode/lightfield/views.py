@@ -1,16 +1,11 @@
-"""Views: the inverse angular transform of the slices.
+"""Make views from slices: the inverse angular transform.
 
-The model. Light from aperture point θ (mm, at distance v in front of the sensor) reaches sensor point x through mask
-point (1−α)x + αθ, α = d/v. With a mask Σ_k M_k e^{2πi k·(f_m R ξ + x0)} and R its rotation the plane is
-
-    I(x) = Σ_k M_k e^{2πi k·(F x + x0)} ∫ L(x, θ) e^{2πi ω_k·θ} dθ,   ω_k = κ k·R,   κ = f_m α A,
-
-θ counted in shares of the aperture's diameter A. So slice_k / T_k, with T_k = M_k e^{2πi k·x0}, is the angular Fourier
-coefficient of L at ω_k cycles over the aperture, known up to the frame's noise. The views are the light field at N×N
-points of the aperture: the most probable ones (minimum mean square error) given these coefficients, their noise, and
-that all views share one image and differ by a certain power. At κ = 1 and without noise this is the inverse DFT; with
-noise it is its Wiener form M²/(M² + λ); at other κ it allows for the aperture's true size; and what a mask does not
-sample (a diagonal mask's missing orders, a stopped-down frame's parallax) is left at the common image, not made up.
+A slice over its transfer is an angular Fourier coefficient of the light field (see `aperture`). The views are the light
+field at N×N points of the aperture: the most probable ones (minimum mean square error) given these coefficients, their
+noise, and that all views share one image and differ by a certain power. At κ = 1 and without noise this is the inverse
+DFT. With noise it is its Wiener form M²/(M² + λ). At other κ it allows for the aperture's true size. What a mask does
+not sample (the missing orders of a diagonal mask, the parallax of a stopped-down frame) stays at the common image and
+is not made up.
 
 For lenslets u counts from a lenslet's centre, the coefficient's sign is the other one, and all orders below the
 Nyquist frequency are there: the views are the plain Fourier sum.
@@ -18,105 +13,20 @@ Nyquist frequency are there: the views are the plain Fourier sum.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
+from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, transfer
 from dappled.decode.optics.carriers import Carrier, Order
 
 Views = NDArray[np.float32]
-Shape = Literal["beams", "filled", "round"]
 _SHARED = 1e3  # variance of what all views share, over that of what one view has alone
 _MODEL_ERROR = 0.45  # over the root of a slice's shorter side: the frame's end rings in a share of each slice
 _COLOURED = 0.3  # of a band's finest detail is taken for chroma; all of it would take parallax for chroma, too
-_PARTS = 15  # of a cell's side, where a circle cuts through cells
 _SMALLEST_NOISE = 1e-9  # relative variance of a coefficient: float32 and its transforms
-
-
-@dataclass(frozen=True, slots=True)
-class Aperture:
-    """How light comes through the aperture in the model: N views an axis over its full width, each one cell of it.
-
-    "beams": through the middle of each cell. "filled": through the whole of each cell. "round": through what of each
-    cell lies in the circle; a view whose cell lies outside keeps its place, and shows what the others say about it.
-    """
-
-    views: int
-    shape: Shape = "beams"
-
-    def points(self) -> NDArray[np.float64]:
-        """(V·U, 2) the cells' middles (v, u) in shares of the full aperture, −0.5 to 0.5, rows first."""
-        return _middles(self.views)
-
-    def offsets(self) -> NDArray[np.float64]:
-        """(V, U, 2) the views' own points."""
-        return self.points().reshape(self.views, self.views, 2)
-
-    def cells(self, angular: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """(K, V·U) ∫ e^{2πi ω·θ} dθ over each view's cell for (K, 2) frequencies ω in cycles over the aperture, as a
-        share of the whole aperture: at 0 the share of the light that each view has."""
-        angular, n = np.asarray(angular), self.views
-        if self.shape != "round":
-            cells = np.asarray(np.exp(2j * np.pi * angular @ self.points().T) / n**2, dtype=np.complex128)
-            if self.shape == "filled":
-                cells *= np.sinc(angular / n).prod(axis=1)[:, None]
-            return cells
-        fine = n * _PARTS
-        parts = np.exp(2j * np.pi * angular @ _middles(fine).T) * _in_circle(fine)
-        parts *= np.sinc(angular / fine).prod(axis=1)[:, None]
-        return np.asarray(parts.reshape(-1, n, _PARTS, n, _PARTS).sum(axis=(2, 4)).reshape(-1, n * n))
-
-    def transform(self, angular: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """(K,) the same over the whole aperture; 1 at 0."""
-        if self.shape != "round":
-            return np.asarray(self.cells(angular).sum(axis=1), dtype=np.complex128)
-        turns = np.pi * np.hypot(*np.asarray(angular).T)
-        whole = 2 * special.j1(turns) / np.where(turns > 0, turns, 1.0)
-        return np.where(turns > 0, whole, 1.0).astype(np.complex128)
-
-
-def _middles(n: int) -> NDArray[np.float64]:
-    """(n², 2) the middles of n × n cells over the full aperture, rows first."""
-    axis = (np.arange(n) - (n - 1) / 2) / n
-    return np.array(list(itertools.product(axis, axis)), dtype=np.float64)
-
-
-@cache
-def _in_circle(n: int) -> NDArray[np.float64]:
-    """(n²,) what each of n × n cells has of the circle, as a share of the circle."""
-    fine = 16
-    axis = (np.arange(n * fine) - (n * fine - 1) / 2) / (n * fine)
-    inside = (np.hypot(axis[:, None], axis[None, :]) <= 0.5).reshape(n, fine, n, fine).sum(axis=(1, 3)).ravel()
-    return np.asarray(inside / inside.sum(), dtype=np.float64)
-
-
-def kappa(frequency_per_mm: float, mask_distance_mm: float, focal_length_mm: float, f_number: float) -> float:
-    """κ = f_m · α · A: cycles of the mask's fundamental that the aperture A = v / f-number sweeps over."""
-    return frequency_per_mm * mask_distance_mm / focal_length_mm * (focal_length_mm / f_number)
-
-
-def angular_frequencies(orders: Sequence[Order], kappa_cycles: float, rotation_rad: float) -> NDArray[np.float64]:
-    """(K, 2) ω_k = κ k·R in cycles over the aperture, rotated as `Lattice.rotated` rotates the carriers."""
-    c, s = math.cos(rotation_rad), math.sin(rotation_rad)
-    turn = np.array([[c, s], [-s, c]])
-    rotated: NDArray[np.float64] = kappa_cycles * np.asarray(orders, dtype=np.float64).reshape(-1, 2) @ turn
-    return rotated
-
-
-def transfer(
-    orders: Sequence[Order], magnitudes: Sequence[float] | NDArray[np.float64], origin: tuple[float, float]
-) -> NDArray[np.complex128]:
-    """(K,) T_k = M_k e^{2πi k·x0}, lattice-linear phases from one origin x0 (cycles of ky and of kx)."""
-    turns = np.asarray(orders, dtype=np.float64).reshape(-1, 2) @ np.asarray(origin)
-    transfers: NDArray[np.complex128] = np.asarray(magnitudes) * np.exp(2j * np.pi * turns)
-    return transfers
 
 
 def unmixing(

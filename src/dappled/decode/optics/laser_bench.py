@@ -181,7 +181,7 @@ def spots(screen: Screen, *, separation_mm: float = 1.0, faintest: float = 1e-4)
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class BenchVerdict:
     """What a measured pattern says of a printed mask.
 
     `kind` is "as designed", "scaled" or "not this mask". `frequency_scale` is measured over expected distance of the
@@ -203,7 +203,7 @@ def judge(
     distance_m: float = THESIS_DISTANCE_M,
     *,
     tolerance_mm: float = 0.5,
-) -> Verdict:
+) -> BenchVerdict:
     """Compare measured spots (x, y), mm from the centre of the pattern, with the mask's impulses.
 
     A scale fits when each measured spot belongs to one impulse of its own, none that should lie inside the outermost
@@ -234,18 +234,18 @@ def judge(
             text = f"as designed: {len(seen)} spots within {np.abs(off).max():.2f} mm of where they should be"
             if unseen := len(expected) - len(seen):
                 text += f"; {unseen} fainter or farther ones were not seen"
-            return Verdict("as designed", fitted, rms, len(seen), text)
+            return BenchVerdict("as designed", fitted, rms, len(seen), text)
         shown = scale if scale in (0.5, 2.0, 1 / 3, 3.0, 0.25, 4.0) else fitted
         text = (
             f"printed at scale {shown:.2g}: the spots stand at {fitted:.3f} of the expected distance, so the periods "
             f"on film are {1 / fitted:.2f} times the design's; the printer scaled the picture"
         )
-        return Verdict("scaled", fitted, rms, len(seen), text)
+        return BenchVerdict("scaled", fitted, rms, len(seen), text)
     text = (
         f"not this mask: {len(seen)} measured spots fit its impulses at no scale within {tolerance_mm:g} mm, "
         "or inner spots are missing"
     )
-    return Verdict("not this mask", None, None, 0, text)
+    return BenchVerdict("not this mask", None, None, 0, text)
 
 
 def _match(expected: NDArray[np.float64], seen: NDArray[np.float64], tolerance_mm: float) -> NDArray[np.intp] | None:

@@ -25,7 +25,7 @@ FRESNEL_LIMIT = 0.25
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class DesignRequirements:
     """What a mask is designed for.
 
     `shift_sigma_px` is how well a shift from view to view will be known, in pixels of a view (0.02 is a good matcher).
@@ -95,7 +95,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """A mask for a wish. `problem` is None where it works, else the sentence why it does not.
+    """A mask for a wanted. `problem` is None where it works, else the sentence why it does not.
 
     `view_shape` (rows, columns) of one view, `bandwidth_per_mm` (±, on the sensor) of one view, `spectrum_used` the
     share of the frame's spectrum that slices cover, `baseline_mm` between neighbouring views on the aperture,
@@ -103,7 +103,7 @@ class Design:
     `films` the formats of Table 2 that can print it.
     """
 
-    wish: Wish
+    wanted: DesignRequirements
     law: str
     mask: Mask
     mask_distance_mm: float
@@ -124,62 +124,62 @@ class Design:
         return self.problem is None
 
 
-def design_geometric(wish: Wish) -> Design:
-    """The mask at the least distance that meets every condition, or at the wish's own distance."""
-    v, aperture, p = wish.image_mm, wish.aperture_mm, wish.p
-    nyquist = min(1 / math.hypot(*wish.sensor.row_mm), 1 / math.hypot(*wish.sensor.column_mm)) / 2
-    if wish.mask_distance_mm is None:
+def design_geometric(wanted: DesignRequirements) -> Design:
+    """The mask at the least distance that meets every condition, or at the wanted's own distance."""
+    v, aperture, p = wanted.image_mm, wanted.aperture_mm, wanted.p
+    nyquist = min(1 / math.hypot(*wanted.sensor.row_mm), 1 / math.hypot(*wanted.sensor.column_mm)) / 2
+    if wanted.mask_distance_mm is None:
         by_sensor = v / (1 + nyquist * aperture / (p + 0.5))  # (p + 1/2)·f_m·(1 − d/v) ≤ nyquist
-        by_film = p * v / (aperture * wish.film.nyquist_per_mm)
-        by_light = wish.wavelength_nm * 1e-6 / FRESNEL_LIMIT * (p * v / aperture) ** 2  # λ·d·(p·f_m)² ≤ 0.25
+        by_film = p * v / (aperture * wanted.film.nyquist_per_mm)
+        by_light = wanted.wavelength_nm * 1e-6 / FRESNEL_LIMIT * (p * v / aperture) ** 2  # λ·d·(p·f_m)² ≤ 0.25
         distance_mm = max(by_sensor, by_film, by_light)
     else:
-        distance_mm = wish.mask_distance_mm
-    if distance_mm > min(wish.largest_distance_mm, 0.99 * v) and wish.mask_distance_mm is None:
-        distance_mm = min(wish.largest_distance_mm, 0.99 * v)
+        distance_mm = wanted.mask_distance_mm
+    if distance_mm > min(wanted.largest_distance_mm, 0.99 * v) and wanted.mask_distance_mm is None:
+        distance_mm = min(wanted.largest_distance_mm, 0.99 * v)
     mask = Mask(v / (distance_mm * aperture), p)
     step = mask.frequency_per_mm * (1 - distance_mm / v)
     sensor = Condition("slices under the sensor's Nyquist frequency", (p + 0.5) * step, nyquist, "cycles/mm")
-    return _finish(wish, "geometric", mask, distance_mm, sensor)
+    return _finish(wanted, "geometric", mask, distance_mm, sensor)
 
 
-def design_fd(wish: Wish) -> Design:
+def design_fd(wanted: DesignRequirements) -> Design:
     """The mask whose outer slices just reach the edge of the spectrum, as high in frequency as film and light allow."""
-    p, (height_mm, width_mm) = wish.p, wish.sensor.size_mm
-    product = min(height_mm, width_mm) * wish.focal_length_mm / wish.views  # f_m·d
-    if wish.mask_distance_mm is None:
-        by_film = product * p / wish.film.nyquist_per_mm
-        by_light = wish.wavelength_nm * 1e-6 / FRESNEL_LIMIT * (product * p) ** 2
-        distance_mm = min(max(by_film, by_light), wish.largest_distance_mm, 0.99 * wish.focal_length_mm)
+    p, (height_mm, width_mm) = wanted.p, wanted.sensor.size_mm
+    product = min(height_mm, width_mm) * wanted.focal_length_mm / wanted.views  # f_m·d
+    if wanted.mask_distance_mm is None:
+        by_film = product * p / wanted.film.nyquist_per_mm
+        by_light = wanted.wavelength_nm * 1e-6 / FRESNEL_LIMIT * (product * p) ** 2
+        distance_mm = min(max(by_film, by_light), wanted.largest_distance_mm, 0.99 * wanted.focal_length_mm)
     else:
-        distance_mm = wish.mask_distance_mm
+        distance_mm = wanted.mask_distance_mm
     mask = Mask(product / distance_mm, p)
-    outer = (p + 0.5) * product / wish.focal_length_mm
+    outer = (p + 0.5) * product / wanted.focal_length_mm
     sensor = Condition("outer slices from the middle of the spectrum", outer, min(height_mm, width_mm) / 2, "mm")
-    return _finish(wish, "fd", mask, distance_mm, sensor)
+    return _finish(wanted, "fd", mask, distance_mm, sensor)
 
 
-DESIGNS: dict[str, Callable[[Wish], Design]] = {"fd": design_fd, "geometric": design_geometric}
+DESIGNS: dict[str, Callable[[DesignRequirements], Design]] = {"fd": design_fd, "geometric": design_geometric}
 
 
-def _finish(wish: Wish, law: str, mask: Mask, distance_mm: float, sensor: Condition) -> Design:
-    p = wish.p
+def _finish(wanted: DesignRequirements, law: str, mask: Mask, distance_mm: float, sensor: Condition) -> Design:
+    p = wanted.p
     lattice = lattice_of(
-        law, mask, wish.sensor, distance_mm, wish.image_mm if law == "geometric" else wish.focal_length_mm
+        law, mask, wanted.sensor, distance_mm, wanted.image_mm if law == "geometric" else wanted.focal_length_mm
     )
     steps = abs(lattice.ky[0]), abs(lattice.kx[1])
-    shape = math.floor(steps[0] * wish.sensor.shape[0]), math.floor(steps[1] * wish.sensor.shape[1])
+    shape = math.floor(steps[0] * wanted.sensor.shape[0]), math.floor(steps[1] * wanted.sensor.shape[1])
     conditions = (
         sensor,
-        Condition("highest harmonic on film", p * mask.frequency_per_mm, wish.film.nyquist_per_mm, "cycles/mm"),
+        Condition("highest harmonic on film", p * mask.frequency_per_mm, wanted.film.nyquist_per_mm, "cycles/mm"),
         Condition(
             "diffraction λ·d·(p·f_m)²",
-            fresnel_number(distance_mm, p * mask.frequency_per_mm, wish.wavelength_nm),
+            fresnel_number(distance_mm, p * mask.frequency_per_mm, wanted.wavelength_nm),
             FRESNEL_LIMIT,
             "",
         ),
-        Condition("height of the mask on film", wish.sensor.size_mm[0], wish.film.vertical.length_mm, "mm"),
-        Condition("width of the mask on film", wish.sensor.size_mm[1], wish.film.horizontal.length_mm, "mm"),
+        Condition("height of the mask on film", wanted.sensor.size_mm[0], wanted.film.vertical.length_mm, "mm"),
+        Condition("width of the mask on film", wanted.sensor.size_mm[1], wanted.film.horizontal.length_mm, "mm"),
     )
     failed = [c.sentence for c in conditions if not c.met]
     if min(shape) < 8:
@@ -187,30 +187,30 @@ def _finish(wish: Wish, law: str, mask: Mask, distance_mm: float, sensor: Condit
     problem = None
     if failed:
         problem = (
-            f"no mask of {wish.views} × {wish.views} views does it at {distance_mm:.3g} mm from the sensor: "
+            f"no mask of {wanted.views} × {wanted.views} views does it at {distance_mm:.3g} mm from the sensor: "
             f"{'; '.join(failed)}. Take fewer views, a smaller f-number, finer film, or more room for the mask"
         )
-    pitch_mm = wish.sensor.size_mm[1] / max(shape[1], 1)
-    baseline = wish.aperture_mm / wish.views
+    pitch_mm = wanted.sensor.size_mm[1] / max(shape[1], 1)
+    baseline = wanted.aperture_mm / wanted.views
     return Design(
-        wish=wish,
+        wanted=wanted,
         law=law,
         mask=mask,
         mask_distance_mm=distance_mm,
         conditions=conditions,
         view_shape=shape,
-        bandwidth_per_mm=min(shape[0] / wish.sensor.size_mm[0], shape[1] / wish.sensor.size_mm[1]) / 2,
-        spectrum_used=min(1.0, steps[0] * wish.views) * min(1.0, steps[1] * wish.views),
+        bandwidth_per_mm=min(shape[0] / wanted.sensor.size_mm[0], shape[1] / wanted.sensor.size_mm[1]) / 2,
+        spectrum_used=min(1.0, steps[0] * wanted.views) * min(1.0, steps[1] * wanted.views),
         baseline_mm=baseline,
-        depth_sigma_m=depth_sigma_m(wish.altitude_m, wish.image_mm, baseline, wish.shift_sigma_px * pitch_mm),
-        ground_sample_m=ground_sample_m(pitch_mm, wish.focal_length_mm, wish.altitude_m),
-        film_period_px=min(wish.film.px_per_mm) / mask.frequency_per_mm,
-        films=tuple(name for name, film in FILMS.items() if _prints(film, wish, mask)),
+        depth_sigma_m=depth_sigma_m(wanted.altitude_m, wanted.image_mm, baseline, wanted.shift_sigma_px * pitch_mm),
+        ground_sample_m=ground_sample_m(pitch_mm, wanted.focal_length_mm, wanted.altitude_m),
+        film_period_px=min(wanted.film.px_per_mm) / mask.frequency_per_mm,
+        films=tuple(name for name, film in FILMS.items() if _prints(film, wanted, mask)),
         problem=problem,
     )
 
 
-def _prints(film: Film, wish: Wish, mask: Mask) -> bool:
-    height_mm, width_mm = wish.sensor.size_mm
+def _prints(film: Film, wanted: DesignRequirements, mask: Mask) -> bool:
+    height_mm, width_mm = wanted.sensor.size_mm
     fits = height_mm <= film.vertical.length_mm and width_mm <= film.horizontal.length_mm
     return fits and mask.p * mask.frequency_per_mm <= film.nyquist_per_mm

@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.spectrum.plane import Plane, check_frame, colour_gains, levels_of, size_text
 from dappled.decode.threads import each, spans
 
+Plane = NDArray[np.float32]
+LARGEST_PIXELS = 120_000_000  # 480 MB of float32; a spectrum of it takes as much again
+_SMALLEST_SIDE = 16
 _ROWS = 96  # at a time: with fewer the interpreter's overhead outweighs what the cache gains
 _PRODUCT = 250_000  # multiplications in a matrix product: larger ones would start BLAS' own threads beside ours
 _STEP = 29  # every so many rows and columns are sampled for the mean: odd, so that all colours are among them
@@ -344,3 +346,78 @@ def _between(size: int, cells: int, step: int) -> Between:
     places = np.clip((np.arange(size) + 0.5) / step - 0.5, 0, cells - 1)
     below = np.minimum(np.floor(places), max(cells - 2, 0)).astype(np.intp)
     return below, (places - below).astype(np.float32)
+
+
+def colour_gains(pattern: NDArray[np.intp], means: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gains per colour index that give all colours the mean of the commonest one, from the means (a, b) of the
+    pattern's places. 1.0 for a colour without light."""
+    counts = np.bincount(pattern.ravel())
+    colours = np.bincount(pattern.ravel(), weights=means.ravel()) / np.maximum(counts, 1)
+    reference = colours[int(np.argmax(counts))]
+    lit = colours > 1e-3 * max(reference, 1e-12)
+    return np.where(lit, reference / np.where(lit, colours, 1.0), 1.0)
+
+
+def levels_of(
+    pattern: NDArray[np.intp],
+    *,
+    black: float | Sequence[float],
+    white: float,
+    balance: Sequence[float] | NDArray[np.float64] | None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Black levels and gains per colour index; None where none are given. Raises DecodeError for impossible ones."""
+    colours = int(pattern.max()) + 1
+    levels = np.broadcast_to(np.asarray(black, dtype=np.float64), (colours,))
+    if not np.all(levels < white):
+        raise DecodeError(f"the white level {white:g} is not above the black level {levels.max():g}")
+    if balance is None:
+        return levels, None
+    gains = np.asarray(balance, dtype=np.float64)
+    if gains.shape != (colours,) or not np.all(np.isfinite(gains) & (gains > 0)):
+        raise DecodeError(f"the white balance needs {colours} positive gains, one per colour, and is {balance}")
+    return levels, gains
+
+
+def check_shape(mosaic: NDArray[Any]) -> None:
+    """Raises DecodeError for what isn't a single plane of a size that can be decoded."""
+    if mosaic.ndim != 2:
+        raise DecodeError(f"a raw mosaic has two axes, this array has {mosaic.ndim}: give one plane")
+    check_sides((mosaic.shape[0], mosaic.shape[1]))
+
+
+def check_sides(shape: tuple[int, int]) -> None:
+    """Raises DecodeError for frames that are too small to hold carriers, or too large for memory."""
+    size = size_text(shape)
+    if min(shape) < _SMALLEST_SIDE:
+        raise DecodeError(f"the frame is {size}: too small to hold carriers")
+    if shape[0] * shape[1] > LARGEST_PIXELS:
+        raise DecodeError(f"the frame is {size}: more than {LARGEST_PIXELS // 10**6} megapixels, cut it first")
+
+
+def check_frame(
+    mosaic: NDArray[Any], white: float, *, dark: NDArray[Any] | None = None, flat: Plane | None = None
+) -> None:
+    """Raises DecodeError for a frame that holds no picture, or a dark or white frame of another size."""
+    check_shape(mosaic)
+    for name, other in (("dark", dark), ("white", flat)):
+        if other is not None and other.shape != mosaic.shape:
+            its, ours = size_text(other.shape), size_text(mosaic.shape)
+            raise DecodeError(f"the {name} frame is {its}, the frame {ours}: take a {name} frame of its size")
+    _check_values(mosaic, white)
+
+
+def _check_values(mosaic: NDArray[Any], white: float) -> None:
+    if mosaic.dtype.kind not in "uif":
+        raise DecodeError(f"the frame holds {mosaic.dtype} values: give integers or floats")
+    if mosaic.dtype.kind == "f" and not np.isfinite(mosaic).all():
+        raise DecodeError("the frame holds NaN or infinite values")
+    some = mosaic[:: mosaic.shape[0] // 256 | 1, :: mosaic.shape[1] // 256 | 1]  # odd steps: all colours are among them
+    if some.min() == some.max() and mosaic.min() == mosaic.max():
+        raise DecodeError(f"the frame is constant: every pixel is {mosaic.flat[0]}")
+    if np.mean(some >= 0.995 * white) > 0.5:
+        raise DecodeError(f"the frame is saturated: more than half of its pixels are at white ({white:g})")
+
+
+def size_text(shape: Sequence[int]) -> str:
+    """A shape as a person reads it: rows × columns."""
+    return "×".join(map(str, shape)) + " px"

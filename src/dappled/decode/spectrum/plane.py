@@ -13,13 +13,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from dappled.decode.errors import DecodeError
+from dappled.decode.spectrum.lineariser import Plane, check_frame, colour_gains, levels_of
 from dappled.decode.threads import spans
 
-Plane = NDArray[np.float32]
 Places = tuple[NDArray[np.intp], NDArray[np.intp]]
 Period = tuple[int, int]
-LARGEST_PIXELS = 120_000_000  # 480 MB of float32; a spectrum of it takes as much again
-_SMALLEST_SIDE = 16
 _ROWS = 96  # at a time: a run of them stays in the cache
 _STANDS_OUT = 12.0  # robust standard deviations of the dark frame's own noise
 _LEAST_LEVELS = 8.0
@@ -97,36 +95,6 @@ def estimate_balance(mosaic: NDArray[Any], *, black: float | Sequence[float], cf
     return colour_gains(pattern, means)
 
 
-def colour_gains(pattern: NDArray[np.intp], means: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gains per colour index that give all colours the mean of the commonest one, from the means (a, b) of the
-    pattern's places. 1.0 for a colour without light."""
-    counts = np.bincount(pattern.ravel())
-    colours = np.bincount(pattern.ravel(), weights=means.ravel()) / np.maximum(counts, 1)
-    reference = colours[int(np.argmax(counts))]
-    lit = colours > 1e-3 * max(reference, 1e-12)
-    return np.where(lit, reference / np.where(lit, colours, 1.0), 1.0)
-
-
-def levels_of(
-    pattern: NDArray[np.intp],
-    *,
-    black: float | Sequence[float],
-    white: float,
-    balance: Sequence[float] | NDArray[np.float64] | None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Black levels and gains per colour index; None where none are given. Raises DecodeError for impossible ones."""
-    colours = int(pattern.max()) + 1
-    levels = np.broadcast_to(np.asarray(black, dtype=np.float64), (colours,))
-    if not np.all(levels < white):
-        raise DecodeError(f"the white level {white:g} is not above the black level {levels.max():g}")
-    if balance is None:
-        return levels, None
-    gains = np.asarray(balance, dtype=np.float64)
-    if gains.shape != (colours,) or not np.all(np.isfinite(gains) & (gains > 0)):
-        raise DecodeError(f"the white balance needs {colours} positive gains, one per colour, and is {balance}")
-    return levels, gains
-
-
 def white_gain(white_plane: Plane, cell_px: float) -> Plane:
     """What a frame is multiplied by to take off the lens' smooth vignetting: float32 (H, W), 1.0 at the brightest.
 
@@ -139,51 +107,6 @@ def white_gain(white_plane: Plane, cell_px: float) -> Plane:
     if not top > 0:
         raise DecodeError("the white frame is black: take another, of an evenly lit card")
     return np.asarray(top / np.maximum(smooth, 0.02 * top), dtype=np.float32)
-
-
-def check_shape(mosaic: NDArray[Any]) -> None:
-    """Raises DecodeError for what isn't a single plane of a size that can be decoded."""
-    if mosaic.ndim != 2:
-        raise DecodeError(f"a raw mosaic has two axes, this array has {mosaic.ndim}: give one plane")
-    check_sides((mosaic.shape[0], mosaic.shape[1]))
-
-
-def check_sides(shape: tuple[int, int]) -> None:
-    """Raises DecodeError for frames that are too small to hold carriers, or too large for memory."""
-    size = size_text(shape)
-    if min(shape) < _SMALLEST_SIDE:
-        raise DecodeError(f"the frame is {size}: too small to hold carriers")
-    if shape[0] * shape[1] > LARGEST_PIXELS:
-        raise DecodeError(f"the frame is {size}: more than {LARGEST_PIXELS // 10**6} megapixels, cut it first")
-
-
-def check_frame(
-    mosaic: NDArray[Any], white: float, *, dark: NDArray[Any] | None = None, flat: Plane | None = None
-) -> None:
-    """Raises DecodeError for a frame that holds no picture, or a dark or white frame of another size."""
-    check_shape(mosaic)
-    for name, other in (("dark", dark), ("white", flat)):
-        if other is not None and other.shape != mosaic.shape:
-            its, ours = size_text(other.shape), size_text(mosaic.shape)
-            raise DecodeError(f"the {name} frame is {its}, the frame {ours}: take a {name} frame of its size")
-    _check_values(mosaic, white)
-
-
-def _check_values(mosaic: NDArray[Any], white: float) -> None:
-    if mosaic.dtype.kind not in "uif":
-        raise DecodeError(f"the frame holds {mosaic.dtype} values: give integers or floats")
-    if mosaic.dtype.kind == "f" and not np.isfinite(mosaic).all():
-        raise DecodeError("the frame holds NaN or infinite values")
-    some = mosaic[:: mosaic.shape[0] // 256 | 1, :: mosaic.shape[1] // 256 | 1]  # odd steps: all colours are among them
-    if some.min() == some.max() and mosaic.min() == mosaic.max():
-        raise DecodeError(f"the frame is constant: every pixel is {mosaic.flat[0]}")
-    if np.mean(some >= 0.995 * white) > 0.5:
-        raise DecodeError(f"the frame is saturated: more than half of its pixels are at white ({white:g})")
-
-
-def size_text(shape: Sequence[int]) -> str:
-    """A shape as a person reads it: rows × columns."""
-    return "×".join(map(str, shape)) + " px"
 
 
 def find_defects(dark: NDArray[Any], period: Period = (1, 1)) -> Places:

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.spectrum.lineariser import ArraySource, LinearRows, rows_at_once
-from dappled.decode.spectrum.plane import Plane, check_sides
+from dappled.decode.spectrum.lineariser import ArraySource, LinearRows, Plane, check_sides, rows_at_once
 from dappled.decode.threads import each, share, spans
 
 Source: TypeAlias = "Plane | LinearRows"

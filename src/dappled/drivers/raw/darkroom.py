@@ -23,8 +23,8 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.spectrum import plane as planes
-from dappled.decode.spectrum.lineariser import LinearRows, lineariser
-from dappled.decode.spectrum.plane import Places, Plane, coloured, find_defects, local_colours, mended, spread
+from dappled.decode.spectrum.lineariser import LinearRows, Plane, check_shape, lineariser
+from dappled.decode.spectrum.plane import Places, coloured, find_defects, local_colours, mended, spread
 from dappled.decode.spectrum.transform import Source
 from dappled.drivers.raw import calibration_files, reading
 from dappled.drivers.raw.reading import RawFile
@@ -245,7 +245,7 @@ class FrameLineariser:
                 chroma = local_colours(even, cfa, [names.index(name) for name in "RGB"], reference)
         elif colour:
             raise DecodeError("the frame has no colour pattern: decode it without --colour, or name it with --cfa")
-        planes.check_shape(raw.mosaic)
+        check_shape(raw.mosaic)
         shape = raw.mosaic.shape[0], raw.mosaic.shape[1]
         linear = lineariser(shape, black=black, white=raw.white, cfa=cfa, balance=balance, reference=reference)
         flat = self._gain(shape) if self._recipe.white and not lenslets else None

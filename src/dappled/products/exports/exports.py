@@ -24,10 +24,8 @@ from scipy import io
 
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.decode.depth.ranging import DistanceMap
-from dappled.decode.lightfield import view_stack
-from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.light_field import LightField, ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
-from dappled.decode.lightfield.view_stack import ViewStack
 from dappled.errors import DappledError
 from dappled.products.exports import point_cloud, prints
 
@@ -52,7 +50,7 @@ def as_cameras(stack: ViewStack) -> NDArray[np.float32]:
 def hci(path: Path, field: LightField, depth: DepthMap | None = None) -> None:
     """HCI's 4D light field benchmark: a folder of input_Cam000.png …, parameters.cfg and, with a depth map,
     disp_estimate.pfm (NaN where unknown). Raises ExportError."""
-    stack = view_stack.of(field)
+    stack = ViewStack.of(field)
     views = as_cameras(stack)
     white = prints.white_of([views])
 
@@ -76,7 +74,7 @@ def eslf(path: Path, field: LightField, lenslet_px: int = 0) -> None:
     0 takes the number of views an axis; more leave black pixels around them. The size and the white are written beside
     it, in a .txt of the same name. Raises ExportError, also where either of them stands already.
     """
-    views = as_cameras(view_stack.of(field))
+    views = as_cameras(ViewStack.of(field))
     side = lenslet_px or max(views.shape[:2])
     if side < max(views.shape[:2]):
         raise ExportError(f"{views.shape[0]} × {views.shape[1]} views don't fit into lenslets of {side} px")
@@ -103,7 +101,7 @@ def eslf(path: Path, field: LightField, lenslet_px: int = 0) -> None:
 def mat(path: Path, field: LightField) -> None:
     """A MATLAB version 5 file as LFToolbox' LFUtilDecodeLytroFolder leaves it: `LF` uint16 [t, s, v, u, c], c red,
     green, blue and weight. Raises ExportError."""
-    values, white = _sixteen_bits(as_cameras(view_stack.of(field)))
+    values, white = _sixteen_bits(as_cameras(ViewStack.of(field)))
     rgb = values if values.ndim == 5 else np.repeat(values[..., None], 3, axis=4)
     weight = np.full((*rgb.shape[:4], 1), 65535, dtype=np.uint16)
     lf = np.concatenate([rgb, weight], axis=4)
@@ -128,7 +126,7 @@ def mat(path: Path, field: LightField) -> None:
 def quilt(path: Path, field: LightField, *, disparity: float = 0.0) -> Path:
     """A quilt for a light-field display: the views of the middle row from the left one (bottom left) to the right one,
     converging on a disparity. Returns the path, whose name tells `_qs<columns>x<rows>a<aspect>`. Raises ExportError."""
-    stack = view_stack.of(field)
+    stack = ViewStack.of(field)
     middle = int(np.argmin(np.abs(stack.row_steps)))
     order = np.argsort(-stack.column_steps)  # the left camera has the largest step
     pictures = []
@@ -250,7 +248,7 @@ def rerun(
         raise ExportError(f"{path}: a Rerun recording is written as .rrd; name it so")
     recording = rr.RecordingStream("dappled")
     recording.save(str(path))
-    stack = view_stack.of(field)
+    stack = ViewStack.of(field)
     white = prints.white_of([stack.views])
     for v, line in enumerate(stack.views):
         for u, view in enumerate(line):

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.lightfield.view_stack import CAMERAS, centred
+from dappled.decode.lightfield.light_field import CAMERAS, LightField, centred
 from dappled.errors import DappledError
 
 _ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
