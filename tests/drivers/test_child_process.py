@@ -61,7 +61,7 @@ def started(code: str) -> subprocess.Popen[bytes]:
     return process
 
 
-def test_one_that_ends_by_itself_is_let() -> None:
+def test_a_child_that_ends_by_itself_is_not_killed() -> None:
     with started("import sys; print('here', flush=True); sys.exit(sys.stdin.read() != '')") as process:
         assert process.stdin is not None
         process.stdin.close()
@@ -69,14 +69,14 @@ def test_one_that_ends_by_itself_is_let() -> None:
         assert process.returncode == 0
 
 
-def test_one_that_does_not_is_killed() -> None:
+def test_a_child_that_does_not_end_is_killed() -> None:
     with started("import sys; print('here', flush=True); sys.stdin.read()") as process:
-        process.send_signal(signal.SIGSTOP)  # as deaf as can be
+        process.send_signal(signal.SIGSTOP)  # it handles no signal but SIGKILL now
         end_child(process, 0.0)
         assert process.wait(20) == -signal.SIGKILL
 
 
-def test_one_that_can_not_be_started_leaves_nothing_open(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_child_that_can_not_be_started_leaves_nothing_open(monkeypatch: pytest.MonkeyPatch) -> None:
     pairs: list[tuple[ProcessChannel, socket.socket]] = []
     pair = ProcessChannel.pair
 
@@ -100,7 +100,7 @@ def test_one_that_can_not_be_started_leaves_nothing_open(monkeypatch: pytest.Mon
             near.send({})
 
 
-def test_budget_allows_its_number_in_any_window() -> None:
+def test_the_restart_budget_allows_its_limit_in_any_window() -> None:
     budget = RestartBudget(limit=2, window_s=60.0)
     second = 1_000_000_000
     for at in (0, 10):

@@ -22,7 +22,7 @@ def test_nothing_to_receive_is_none(ends: Ends) -> None:
     assert ends[0].receive(0.0) is None
 
 
-def test_the_other_end_s_end_is_told(ends: Ends) -> None:
+def test_the_end_of_the_other_end_is_reported(ends: Ends) -> None:
     ends[1].close()
     with pytest.raises(ChannelError, match="ended"):
         ends[0].receive(5.0)

@@ -1,4 +1,4 @@
-"""Drivers by name."""
+"""Finding drivers by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The udev rule that ships: no tool here reads it, so its form is held against udev(7)."""
+"""The udev rule that ships: no tool here reads it, so its form is checked against udev(7)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_keys_that_only_match_are_never_assigned(rules: list[list[tuple[str, str
         assert all(operator in ("==", "!=") for key, operator, _ in rule if key in _MATCH_ONLY)
 
 
-def test_it_comes_before_logind_gives_access_to_who_sits_there() -> None:
+def test_it_comes_before_logind_gives_access_to_the_seat() -> None:
     assert int(RULES.name[:2]) < 73  # 73-seat-late.rules acts on the tag uaccess
 
 

@@ -1,4 +1,4 @@
-"""The bus as PyUSB tells it, with devices made of descriptors."""
+"""Cameras on the bus as PyUSB lists it, with devices made of descriptors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dappled.drivers.usb_bus import UsbError, bodies, changes, holders, reset
 from tests.simulated.usb_devices import EOS_450D, FINEPIX_DISK, MOUSE, UsbDevices
 
 
-def test_cameras_are_told_from_mice() -> None:
+def test_cameras_are_distinguished_from_mice() -> None:
     found = bodies(UsbDevices([FINEPIX_DISK, MOUSE, EOS_450D]))
     assert [(one.port, one.maker, one.mode, one.fires) for one in found] == [
         ("usb:001,005", "Canon", "PTP", True),
@@ -27,7 +27,7 @@ def test_a_fujifilm_in_ptp_mode_can_t_be_fired_over_usb() -> None:
     assert (one.mode, one.fires) == ("PTP", False)
 
 
-def test_a_camera_of_an_unknown_maker_is_one_by_its_class() -> None:
+def test_a_camera_of_an_unknown_maker_is_found_by_its_class() -> None:
     (one,) = bodies(UsbDevices([replace(EOS_450D, vendor=0x1234)]))
     assert one.maker == "vendor 1234"
 
@@ -46,7 +46,7 @@ def test_without_a_libusb_it_says_what_to_install(monkeypatch: pytest.MonkeyPatc
         bodies()
 
 
-def test_hot_plug_is_the_difference_of_two_looks() -> None:
+def test_hot_plug_is_the_difference_of_two_listings() -> None:
     bus = UsbDevices([EOS_450D])
     before = bodies(bus)
     bus.devices = [replace(EOS_450D, address=9), FINEPIX_DISK]

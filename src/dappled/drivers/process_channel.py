@@ -109,7 +109,7 @@ def _parsed(raw: bytes, flags: int) -> dict[str, Any]:
     try:
         body = json.loads(raw)
     except ValueError as error:
-        raise ChannelError(f"a message was no JSON: {error}") from error
+        raise ChannelError(f"a message was not JSON: {error}") from error
     if not isinstance(body, dict):
         raise ChannelError(f"a message must be an object, not {type(body).__name__}")
     return body

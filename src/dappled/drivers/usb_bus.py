@@ -17,7 +17,7 @@ import usb.util
 
 from dappled.drivers.camera import CameraError
 
-Mode = Literal["PTP", "mass storage", "other"]
+UsbMode = Literal["PTP", "mass storage", "other"]
 
 CANON, FUJIFILM = 0x04A9, 0x04CB
 MAKERS = {CANON: "Canon", FUJIFILM: "Fujifilm", 0x04B0: "Nikon", 0x054C: "Sony", 0x07B4: "Olympus", 0x04DA: "Panasonic"}
@@ -37,7 +37,7 @@ class UsbBody:
     address: int
     vendor: int
     product: int
-    mode: Mode
+    mode: UsbMode
     name: str = ""
 
     @property
@@ -130,7 +130,7 @@ def _body(device: Any) -> UsbBody | None:
     camera = _STILL_IMAGE in classes
     if not camera and device.idVendor not in MAKERS:
         return None
-    mode: Mode = "PTP" if camera else "mass storage" if _MASS_STORAGE in classes else "other"
+    mode: UsbMode = "PTP" if camera else "mass storage" if _MASS_STORAGE in classes else "other"
     return UsbBody(device.bus, device.address, device.idVendor, device.idProduct, mode, _name(device))
 
 

@@ -51,7 +51,7 @@ def body() -> Iterator[SimulatedBody]:
 
 @pytest.fixture
 def make(body: SimulatedBody) -> Iterator[Make]:
-    """Drivers for the body, all stopped at the end."""
+    """Make drivers for the body; all are stopped at the end."""
     made: list[GPhoto2Camera] = []
 
     def make(**settings: Any) -> GPhoto2Camera:
@@ -94,7 +94,7 @@ class TestContractToMemory(CameraContract):
 
 
 class TestContractOfTheVirtualUsbCamera(CameraContract):
-    """libgphoto2's own simulated body: a Nikon over (pretended) USB, which shares no line with ours."""
+    """libgphoto2's own simulated body, a Nikon over simulated USB: it shares no code with this project."""
 
     @pytest.fixture
     def rig(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
@@ -152,7 +152,7 @@ def test_only_the_body_with_the_serial_number_is_taken(make: Make) -> None:
     until_state(wanted, "ready")
 
 
-def test_no_camera_says_what_to_do_and_goes_on_looking() -> None:
+def test_without_a_camera_it_says_what_to_do_and_keeps_looking() -> None:
     with SimulatedBody.start(BodyOptions(picture="pattern:1000:jpg")) as gone:
         port = gone.port
     camera = open_camera({"port": port, "timeouts": {"retry_s": 0.05}})
@@ -405,7 +405,7 @@ def test_a_process_that_keeps_dying_is_not_started_for_ever(body: SimulatedBody)
 
 
 def test_the_process_dies_with_its_parent(body: SimulatedBody) -> None:
-    """A parent that is killed can't say goodbye; its child must go all the same."""
+    """A parent that is killed can't end its child; the child must end all the same."""
     script = (
         "import sys\n"
         "from dappled.drivers.gphoto2.client import spawn_process\n"

@@ -35,7 +35,7 @@ events = st.one_of(
 
 
 @given(events)
-def test_events_survive_the_journey(event: CameraEvent) -> None:
+def test_events_survive_encoding(event: CameraEvent) -> None:
     assert message_event(event_message(event)) == event
 
 

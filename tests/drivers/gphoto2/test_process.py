@@ -1,4 +1,4 @@
-"""The loop of the camera's process, with a camera made of lists and a clock that the test turns."""
+"""The loop of the camera's process, with a fake camera and a clock that the test advances."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def on_card(number: int) -> CameraFile:
 
 @dataclass
 class FakeCamera:
-    """A camera and its card. `news` is what its next session call reports; `errors` are raised in turn by the call
-    that they name."""
+    """A camera and its card. `coming` is what the next `news` returns; `errors` are raised in turn by the call they
+    name."""
 
     keeps_files: bool = True
     identity: Identity = field(default=Identity("Canon", "450D", "1", "usb:1,2"))
@@ -178,7 +178,7 @@ def test_absent_camera_is_looked_for_until_it_comes(harness: Harness) -> None:
     assert states(harness.turn()) == [("starting", ""), ("absent", "nothing here")]
     harness.fire(1)
     assert "nothing here" in failures(harness.turn())[1]
-    assert states(harness.turn(1.1, steps=1)) == []  # the same state isn't told twice
+    assert states(harness.turn(1.1, steps=1)) == []  # the same state isn't sent twice
     assert states(harness.turn(1.1)) == [("ready", "")]
 
 
@@ -199,7 +199,7 @@ def test_more_than_64_waiting_shots_are_refused(ready: Harness) -> None:
     assert sorted(failures(ready.turn(steps=1))) == [64, 65, 66, 67, 68, 69]
 
 
-def test_a_file_that_nobody_asked_for_has_no_shot(ready: Harness) -> None:
+def test_a_file_without_a_shot_has_none(ready: Harness) -> None:
     ready.camera.adds(on_card(1))
     (arrival,) = arrivals(ready.turn())
     assert arrival.shot is None
@@ -341,7 +341,9 @@ def shot_on(harness: Harness, shot: int, taken_s: int | None, number: int) -> li
 
 
 @pytest.mark.parametrize("hours_wrong", [0, 1, -24])
-def test_a_late_file_is_told_from_the_next_shot_s_by_the_body_s_own_time(ready: Harness, hours_wrong: int) -> None:
+def test_a_late_file_is_distinguished_from_the_next_shot_s_by_the_body_s_own_time(
+    ready: Harness, hours_wrong: int
+) -> None:
     def body_s() -> int:
         return ready.clock.monotonic_ns() // 10**9 + 1_700_000_000 + hours_wrong * 3600
 
@@ -431,7 +433,7 @@ def test_settings_are_read_at_the_start_and_after_a_change(harness: Harness) -> 
     assert [(event.settings[0].value, event.refused) for event in told] == [("200", "")]
 
 
-def test_a_setting_that_is_refused_is_told(ready: Harness) -> None:
+def test_a_refused_setting_is_reported(ready: Harness) -> None:
     ready.camera.errors["change"] = [RefusedError("the dial stands at M")]
     ready.channel.send({"do": "change", "name": "iso", "value": "200"})
     (told,) = [event for event in ready.turn() if isinstance(event, SettingsChanged)]
@@ -468,7 +470,7 @@ def test_a_name_used_again_after_deletion_is_a_new_file(ready: Harness) -> None:
         ready.turn()
 
 
-def test_a_body_that_is_gone_when_its_card_is_searched_is_told_as_absent(ready: Harness) -> None:
+def test_a_body_that_is_gone_when_its_card_is_searched_is_reported_as_absent(ready: Harness) -> None:
     ready.fire(1)
     ready.turn()
     ready.camera.errors["open"] = [AbsentError("nothing here")]

@@ -1,4 +1,4 @@
-"""What no body of ours does, at the session's face: files without bytes, names without end."""
+"""What the simulated bodies don't do: files without bytes, very long names."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Told:
 
 @dataclass
 class FakeLibrary:
-    """As much of `gphoto2.Camera` as reading a file takes."""
+    """The part of `gphoto2.Camera` that reading a file needs."""
 
     card: dict[str, bytes] = field(default_factory=dict)
 

@@ -13,7 +13,7 @@ def test_an_empty_table_is_a_working_camera() -> None:
     assert parse_settings({"port": "", "serial": ""}) == GPhoto2Settings()
 
 
-def test_settings_survive_the_journey_to_the_process() -> None:
+def test_settings_survive_encoding() -> None:
     settings = GPhoto2Settings("usb:", "123", "ram", True, Timeouts(busy_s=1.5))
     assert parse_settings(settings.to_json()) == settings
 

@@ -40,7 +40,7 @@ def test_a_malformed_url_is_named_in_the_sentence(url: str) -> None:
         parse(url)
 
 
-def test_a_client_is_not_let_go_while_somebody_writes_to_it() -> None:
+def test_a_client_is_not_closed_while_another_thread_writes_to_it() -> None:
     """Its descriptor could be another file's by then."""
     told: list[str] = []
     began, go_on = threading.Event(), threading.Event()
@@ -76,9 +76,9 @@ def test_a_client_is_not_let_go_while_somebody_writes_to_it() -> None:
 
 
 @pytest.mark.parametrize("number", [errno.ECONNABORTED, errno.EHOSTUNREACH])
-def test_one_who_left_before_it_was_let_in_costs_nobody_the_link(number: int) -> None:
-    class Knocked:
-        """A listening socket at which somebody knocks and runs away."""
+def test_a_client_that_left_before_it_was_accepted_does_not_break_the_link(number: int) -> None:
+    class Deserted:
+        """A listening socket whose client leaves before it is accepted."""
 
         def __init__(self, sock: socket.socket) -> None:
             self.sock, self.away = sock, True
@@ -93,22 +93,22 @@ def test_one_who_left_before_it_was_let_in_costs_nobody_the_link(number: int) ->
             self.sock.close()
 
     with socket.create_server(("127.0.0.1", 0)) as server:
-        door = Knocked(server)
+        listening = Deserted(server)
         server.setblocking(False)
-        listener = TcpServer(door)  # type: ignore[arg-type]  # all that it asks of one
+        listener = TcpServer(listening)  # type: ignore[arg-type]  # all that it asks of one
         with socket.create_connection(server.getsockname()) as client:
-            assert listener.read() == b""  # who ran away
+            assert listener.read() == b""  # the one that left
             client.sendall(b"here")
             deadline, heard = time.monotonic() + 20, listener.read()
             while not heard:
                 assert time.monotonic() < deadline
-                door.away = not door.away  # again and again
+                listening.away = not listening.away  # again and again
                 heard = listener.read()
             assert heard == b"here"
         listener.close()
 
 
-def test_a_connection_whose_other_side_vanished_is_given_up_within_seconds() -> None:
+def test_a_connection_whose_other_side_vanished_fails_within_seconds() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as client:
         over_tcp(client)
         # The kernel's own limits are a quarter of an hour where something was sent, and two hours where nothing was.

@@ -21,7 +21,7 @@ from tests.needs import without
 
 
 class Side:
-    """One end, with all that it saw and logged."""
+    """One end of a link, with all packets that it saw and logged."""
 
     def __init__(self, url: str, *, system_id: int = 1, on_packet: Callable[[Packet], None] | None = None) -> None:
         self.packets: list[Packet] = []
@@ -123,7 +123,7 @@ def test_a_client_that_fell_silent_does_not_keep_the_next_one_waiting() -> None:
             second.settimeout(10)
             assert second.recv(300)[0] == 0xFD
             vanished.settimeout(10)
-            assert vanished.recv(300) == b""  # let go: a machine that is still there comes again
+            assert vanished.recv(300) == b""  # closed: a client that is still there connects again
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # what it provokes
@@ -162,7 +162,7 @@ def test_a_channel_that_is_opened_after_the_end_is_closed(monkeypatch: pytest.Mo
     with socket.create_server(("127.0.0.1", 0)) as gone:
         port = gone.getsockname()[1]
     side = Side(f"tcp:127.0.0.1:{port}")
-    side.links.open()  # nobody is there yet
+    side.links.open()  # no server is there yet
     monkeypatch.setattr(mavlink_links, "open_channel", late)
     side.start()
     assert asked.wait(20)
@@ -192,7 +192,7 @@ def test_a_serial_device() -> None:
         os.close(far)
 
 
-def test_a_port_in_use_is_said_in_one_sentence() -> None:
+def test_a_port_in_use_is_reported_in_one_sentence() -> None:
     with Side("udpin:127.0.0.1:0") as server, pytest.raises(LinkError, match="in use"):
         Side(f"udpin:127.0.0.1:{server.links.port(0)}").start()
 
@@ -206,12 +206,12 @@ def test_a_port_in_use_is_said_in_one_sentence() -> None:
         ("udpin:203.0.113.7:0", "is no address of this machine"),
     ],
 )
-def test_what_can_not_be_opened_is_said_in_one_sentence(url: str, words: str) -> None:
+def test_a_link_that_can_not_be_opened_is_reported_in_one_sentence(url: str, words: str) -> None:
     with pytest.raises(LinkError, match=words):
         Side(url).start()
 
 
-def test_a_log_that_fails_and_a_handler_that_raises_end_nothing() -> None:
+def test_a_log_that_fails_and_a_handler_that_raises_do_not_end_the_link() -> None:
     def fail(packet: Packet) -> None:
         raise RuntimeError("unforeseen")
 
@@ -272,7 +272,7 @@ def test_a_stream_finds_its_way_after_garbage_and_counts_it() -> None:
     assert framer.bad >= 1
 
 
-def test_the_decoder_refuses_what_is_no_packet() -> None:
+def test_the_parser_refuses_bytes_that_are_no_packet() -> None:
     decode = PacketParser()
     assert decode(b"") is None
     assert decode(sound_packets(1)[0][:-1]) is None

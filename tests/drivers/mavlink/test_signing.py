@@ -1,4 +1,4 @@
-"""Signed links: what is signed right counts once, and nothing else counts or moves the time."""
+"""Signed links: a packet with a valid signature is accepted once; no other is accepted or advances the time."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Clock:
 
 
 class Peer:
-    """Another machine with pymavlink's own signing: not a line of ours."""
+    """Another machine with pymavlink's own signing: it shares no code with this project."""
 
     def __init__(self, key: bytes = KEY, system: int = 255, offset_s: float = 0.0) -> None:
         self.packer = mavlink.MAVLink(None, srcSystem=system, srcComponent=190)
@@ -61,7 +61,7 @@ def judged(guard: SignatureGuard, raw: bytes) -> str:
     return guard.judge(raw, message.get_srcSystem(), message.get_srcComponent(), message.get_msgId())
 
 
-def test_pymavlinks_signatures_are_good_once(tmp_path: Path) -> None:
+def test_pymavlinks_signatures_are_accepted_once(tmp_path: Path) -> None:
     guard, peer = guard_in(tmp_path), Peer()
     first, second, third = peer.packet(), peer.packet(), peer.packet()
     assert judged(guard, first) == "obey"
@@ -72,7 +72,7 @@ def test_pymavlinks_signatures_are_good_once(tmp_path: Path) -> None:
     assert (counts.good, counts.replayed, counts.forged) == (2, 2, 0)
 
 
-def test_pymavlink_takes_what_we_sign(tmp_path: Path) -> None:
+def test_pymavlink_accepts_signed_packets(tmp_path: Path) -> None:
     guard, packer = guard_in(tmp_path), mavlink.MAVLink(None, srcSystem=1, srcComponent=100)
     other = mavlink.MAVLink(None)
     other.signing.secret_key = KEY
@@ -88,7 +88,7 @@ def test_pymavlink_takes_what_we_sign(tmp_path: Path) -> None:
 
 
 @given(st.integers(0, 200), st.integers(1, 255))
-def test_no_changed_byte_is_good_and_none_moves_the_time(place: int, change: int) -> None:
+def test_a_packet_with_a_changed_byte_is_refused_and_does_not_advance_the_time(place: int, change: int) -> None:
     import tempfile  # noqa: PLC0415  # hypothesis and tmp_path do not go together
 
     with tempfile.TemporaryDirectory() as folder:
@@ -123,7 +123,7 @@ def test_unsigned_packets_go_by_the_rule_and_a_radios_status_is_heard(
 
 
 @pytest.mark.parametrize("orderly", [True, False])
-def test_nothing_from_before_a_restart_is_good_after_it(tmp_path: Path, orderly: bool) -> None:
+def test_packets_from_before_a_restart_are_refused_after_it(tmp_path: Path, orderly: bool) -> None:
     clock, peer = Clock(), Peer()
     guard = guard_in(tmp_path, clock=clock)
     old = peer.packet()
@@ -150,7 +150,7 @@ def test_a_key_file_is_made_once_for_its_owner_alone(tmp_path: Path) -> None:
 
 
 class Disk:
-    """What is asked of the disk, in order: fsync of a file with its size then, or of a folder; replace."""
+    """Record the calls to the disk in order: fsync of a file with its size, fsync of a folder, replace."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.calls: list[str | int] = []
@@ -175,7 +175,7 @@ def test_a_key_is_on_the_disk_when_it_is_made(tmp_path: Path, monkeypatch: pytes
     assert disk.calls == [65, "folder"]
 
 
-def test_a_key_that_could_not_be_written_is_in_nobodys_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_key_that_could_not_be_written_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_fd: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -192,7 +192,7 @@ def test_a_power_cut_brings_no_older_times_back(tmp_path: Path, monkeypatch: pyt
     assert disk.calls == [(tmp_path / "time").stat().st_size, "replace", "folder"]
 
 
-def test_a_key_that_others_can_read_or_that_is_none_is_refused(tmp_path: Path) -> None:
+def test_a_key_that_others_can_read_or_that_is_malformed_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "radio.key"
     signing.make_key(path)
     path.chmod(0o640)
@@ -206,7 +206,7 @@ def test_a_key_that_others_can_read_or_that_is_none_is_refused(tmp_path: Path) -
         signing.read_key(tmp_path / "missing.key")
 
 
-def test_a_damaged_time_is_said_and_a_missing_one_begins_anew(tmp_path: Path) -> None:
+def test_a_damaged_time_is_reported_and_a_missing_one_starts_at_zero(tmp_path: Path) -> None:
     (tmp_path / "time").write_text("nonsense")
     with pytest.raises(SigningError, match="signing times"):
         guard_in(tmp_path)

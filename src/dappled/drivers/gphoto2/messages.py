@@ -131,4 +131,4 @@ def _event(body: Mapping[str, Any], fds: tuple[int, ...]) -> CameraEvent:
             made = Arrival if kind == "arrival" else Companion
             return made(body["shot"], body["name"], Blob(fd, body["size"]), body["ns"], body["facts"])
         case other:
-            raise ValueError(f"nothing is called {other!r}")
+            raise ValueError(f"unknown event {other!r}")

@@ -120,7 +120,7 @@ class CameraLoop:
             case {"do": "stop"}:
                 return False
             case _:
-                raise ChannelError(f"no command is called {command!r}")
+                raise ChannelError(f"unknown command {command!r}")
         return True
 
     def _take(self, shot: int) -> None:

@@ -14,10 +14,10 @@ from typing import Literal, Protocol
 
 from dappled.errors import DappledError
 
-Kind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial"]
+LinkKind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial"]
 FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, udpbcast:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or /dev/ttyX[,BAUD]"
 DEFAULT_BAUD = 115200
-_SCHEMES: dict[str, Kind] = {
+_SCHEMES: dict[str, LinkKind] = {
     "udp": "udpin",
     "udpin": "udpin",
     "udpout": "udpout",
@@ -45,7 +45,7 @@ class Address:
     """One parsed connection string. `port` is the UDP or TCP port, or the baud rate of a serial device."""
 
     url: str
-    kind: Kind
+    kind: LinkKind
     host: str
     port: int
 
@@ -63,7 +63,7 @@ def parse(url: str) -> Address:
     raise LinkError(f"mavlink.url {url!r} is not a connection string; write {FORMS}")
 
 
-def _socket_address(url: str, kind: Kind, rest: str) -> Address:
+def _socket_address(url: str, kind: LinkKind, rest: str) -> Address:
     host, _, port = rest.rpartition(":")
     if not host or ":" in host:
         raise LinkError(f"mavlink.url {url!r} needs a host and a port, as in {kind}:127.0.0.1:14550")
