@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.config import settings
-from dappled.config.schema import ConfigError, Source
+from dappled.config.schema import ConfigError, TomlSource
 
 
 def parse(text: str) -> settings.Settings:
-    return settings.parse(tomllib.loads(text), Source("test.toml", text))
+    return settings.parse(tomllib.loads(text), TomlSource("test.toml", text))
 
 
 def test_empty_file_is_a_whole_configuration(tmp_path: Path) -> None:
@@ -81,7 +81,7 @@ def test_settings_survive_a_round_trip_through_toml() -> None:
 def test_any_tables_give_settings_or_one_sentence(tables: dict[str, dict[str, int]]) -> None:
     said = "any"
     try:
-        settings.parse(tables, Source("any"))
+        settings.parse(tables, TomlSource("any"))
     except ConfigError as error:
         said = str(error)
     assert said.startswith("any")

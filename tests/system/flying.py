@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled.config import settings as configuration
-from dappled.config.schema import Source
+from dappled.config.schema import TomlSource
 from dappled.config.settings import Settings
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision
@@ -38,7 +38,7 @@ def settings_of(folder: Path, **tables: Mapping[str, Any]) -> Settings:
     }
     for name, table in tables.items():
         ours.setdefault(name, {}).update(table)
-    return configuration.resolve(configuration.parse(ours, Source("test")))
+    return configuration.resolve(configuration.parse(ours, TomlSource("test")))
 
 
 class Flying:

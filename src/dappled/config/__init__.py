@@ -1,1 +1,1 @@
-"""What a person configures: settings, camera and mask profiles, and errors that say where and what."""
+"""Settings, camera and mask profiles, and the errors of both, which name file, line and key."""

@@ -1,4 +1,4 @@
-"""Camera and mask profiles: shipped ones by name, a person's own by file, with the same validation."""
+"""Camera and mask profiles: shipped ones by name, a user's own by file, with the same validation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from dappled.config.schema import ConfigError, Source, build, read_toml, setting
+from dappled.config.schema import ConfigError, TomlSource, build, read_toml, setting
 from dappled.decode.optics.carriers import LAWS, Mask, Sensor
 
 LENSLET = "lenslet"  # not a profile: the lattice is found in the frame itself
@@ -18,9 +18,9 @@ LENSLET = "lenslet"  # not a profile: the lattice is found in the frame itself
 
 @dataclass(frozen=True, slots=True)
 class RawShape:
-    """One raw shape that a camera is known to deliver, and where its samples stand on the chip.
+    """One raw shape that a camera delivers, and the positions of its samples on the chip.
 
-    `staggered`: every second row, from the second on, sits half a column to the right.
+    `staggered`: every second row, from the second on, is shifted half a column to the right.
     """
 
     name: str
@@ -30,8 +30,8 @@ class RawShape:
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """The lens at one focal length, as `dappled calibrate --lens` found it: `v_mm` from perspective centre to sensor,
-    the principal point (y, x) in mm from the sensor's middle, OpenCV's five distortion numbers (k1, k2, p1, p2, k3)."""
+    """The lens at one focal length, as `dappled calibrate --lens` finds it: `v_mm` from perspective centre to sensor,
+    the principal point (y, x) in mm from the sensor's middle, OpenCV's distortion (k1, k2, p1, p2, k3)."""
 
     focal_length_mm: float
     v_mm: float
@@ -41,7 +41,7 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class CameraProfile:
-    """What must be known of a body to predict carriers. `law` is a name in `dappled.decode.optics.carriers.LAWS`."""
+    """What predicting carriers needs to know of a body. `law` is a name in `dappled.decode.optics.carriers.LAWS`."""
 
     name: str
     description: str
@@ -53,7 +53,7 @@ class CameraProfile:
     lenses: tuple[Lens, ...] = ()
 
     def lens(self, focal_length_mm: float) -> Lens | None:
-        """The lens as calibrated within 2 % of a focal length; None where nobody did."""
+        """The lens calibrated within 2 % of a focal length; None where there is none."""
         nearest = min(self.lenses, key=lambda lens: abs(lens.focal_length_mm - focal_length_mm), default=None)
         if nearest is None or abs(nearest.focal_length_mm / focal_length_mm - 1) > 0.02:
             return None
@@ -74,13 +74,13 @@ class CameraProfile:
         )
 
     def staggered(self, shape: tuple[int, ...]) -> bool:
-        """Whether mosaics of this shape are staggered, and are to be spread before they are decoded."""
+        """Whether mosaics of this shape are staggered and must be spread before they are decoded."""
         return any(known.staggered and known.sensor.shape == shape for known in self.raw)
 
 
 @dataclass(frozen=True, slots=True)
 class MaskProfile:
-    """A mask by name. `period_px` and `film_px_per_mm` say how it was printed, None where only a frequency is known."""
+    """A mask. `period_px` and `film_px_per_mm` are those of its print; None where only the frequency is known."""
 
     name: str
     description: str
@@ -132,12 +132,12 @@ class _MaskTable:
 
 
 def tables(name: str, kind: str) -> dict[str, Any]:
-    """A profile as its file has it; kind is "cameras" or "masks"."""
+    """The tables of a profile's file; `kind` is "cameras" or "masks"."""
     return _read(name, kind)[0]
 
 
 def camera(name: str) -> CameraProfile:
-    """A camera profile by shipped name or TOML file."""
+    """The camera profile of a shipped name or a TOML file. Raises ConfigError."""
     tables, source = _read(name, "cameras")
     table = build(_CameraTable, tables, source, "")
     if not table.raw:
@@ -150,7 +150,7 @@ def camera(name: str) -> CameraProfile:
         picture = next((known.sensor for known in shapes if known.name == raw.picture), None)
         if raw.picture and picture is None:
             raise ConfigError(
-                f"{source.name}: [[raw]] {raw.name!r} names the picture {raw.picture!r}, none above it is"
+                f"{source.name}: [[raw]] {raw.name!r} names the picture {raw.picture!r}, which no [[raw]] above has"
             )
         shapes.append(RawShape(raw.name, Sensor(raw.shape, raw.row_mm, raw.column_mm, picture), raw.staggered))
     lenses = []
@@ -172,7 +172,7 @@ def camera(name: str) -> CameraProfile:
 
 
 def mask(name: str) -> MaskProfile:
-    """A mask profile by shipped name or TOML file."""
+    """The mask profile of a shipped name or a TOML file. Raises ConfigError."""
     tables, source = _read(name, "masks")
     table = build(_MaskTable, tables, source, "")
     if table.frequency_per_mm is not None and (table.period_px is not None or table.film_px_per_mm is not None):
@@ -195,13 +195,13 @@ def mask(name: str) -> MaskProfile:
 
 
 def shipped(kind: str) -> list[str]:
-    """Names of the shipped profiles: kind is "cameras" or "masks"."""
+    """Names of the shipped profiles; `kind` is "cameras" or "masks"."""
     folder = resources.files("dappled.config") / "profiles" / kind
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
 def camera_for_model(model: str) -> CameraProfile | None:
-    """The shipped profile of a body by its model name, spaces and case aside; None where none knows it."""
+    """The shipped profile that lists a body's model name, ignoring spaces and case; None where none does."""
     wanted = _plain(model)
     for name in shipped("cameras"):
         profile = camera(name)
@@ -218,7 +218,7 @@ def _stem(name: str) -> str:
     return Path(name).stem if name.endswith(".toml") else name
 
 
-def _read(name: str, kind: str) -> tuple[dict[str, Any], Source]:
+def _read(name: str, kind: str) -> tuple[dict[str, Any], TomlSource]:
     if name.endswith(".toml"):
         return read_toml(Path(name).expanduser())
     names = shipped(kind)
@@ -227,4 +227,4 @@ def _read(name: str, kind: str) -> tuple[dict[str, Any], Source]:
         hint = f"did you mean {near[0]}?" if near else f"shipped: {', '.join(names)}"
         raise ConfigError(f"no {kind[:-1]} profile {name!r}; {hint} A profile of your own is named by its .toml file")
     text = (resources.files("dappled.config") / "profiles" / kind / f"{name}.toml").read_text(encoding="utf-8")
-    return tomllib.loads(text), Source(f"profile {name}", text)
+    return tomllib.loads(text), TomlSource(f"profile {name}", text)

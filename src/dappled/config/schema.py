@@ -1,4 +1,4 @@
-"""From a TOML table to a typed, frozen record, with errors that name the file, the line, the key and what to do."""
+"""Build typed, frozen records from TOML tables, with errors that name file, line, key and remedy."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ Record = TypeVar("Record")
 
 
 class ConfigError(DappledError):
-    """Something configured is wrong; one sentence with the place, the value, and what to do."""
+    """A setting or a profile is wrong: one sentence with the place, the value, and what to do."""
 
     exit_code = 2
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Rule:
-    """What a setting means and which values it takes. `unit` is shown, `low` and `high` are inclusive."""
+    """A setting's meaning and the values it takes. `low` and `high` are inclusive."""
 
     text: str
     unit: str = ""
@@ -43,19 +43,19 @@ def setting(
     high: float = math.inf,
     choices: tuple[str, ...] = (),
 ) -> Any:
-    """A dataclass field with its meaning and range."""
+    """Declare a dataclass field with its meaning and range."""
     return dataclasses.field(default=default, metadata={"rule": Rule(text, unit, low, high, choices)})
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Source:
-    """Where a table was read: for the errors only."""
+class TomlSource:
+    """The file that a table was read from, for error sentences."""
 
     name: str
     text: str = ""
 
     def where(self, table: str, key: str) -> str:
-        """ "flight.toml, line 7: [camera] port" as exactly as it can be told."""
+        """The place of a key, as exactly as it is known: "flight.toml, line 7: [camera] port"."""
         line = self._line(table, key)
         place = f"{self.name}, line {line}" if line else self.name
         return f"{place}: [{table}] {key}" if table else f"{place}: {key}"
@@ -72,8 +72,8 @@ class Source:
         return None
 
 
-def read_toml(path: Path) -> tuple[dict[str, Any], Source]:
-    """A TOML file's tables and its source. Raises ConfigError when it can't be read or isn't TOML."""
+def read_toml(path: Path) -> tuple[dict[str, Any], TomlSource]:
+    """Read a TOML file: its tables and its source. Raises ConfigError when it can't be read or isn't TOML."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -81,13 +81,13 @@ def read_toml(path: Path) -> tuple[dict[str, Any], Source]:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} can't be read: {error}") from None
     try:
-        return tomllib.loads(text), Source(str(path), text)
+        return tomllib.loads(text), TomlSource(str(path), text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path} is not valid TOML: {error}") from None
 
 
-def build(cls: type[Record], table: Mapping[str, Any], source: Source, name: str) -> Record:
-    """The record `cls` from a table; unknown keys are errors with the nearest known key."""
+def build(cls: type[Record], table: Mapping[str, Any], source: TomlSource, name: str) -> Record:
+    """Build the record `cls` from a table. Raises ConfigError, for an unknown key with the nearest known one."""
     hints = get_type_hints(cls)
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]  # cls is a dataclass
     for key in table:

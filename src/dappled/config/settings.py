@@ -1,4 +1,4 @@
-"""The one file a person writes. Every default flies: an empty file and a camera on the bus are a working daemon."""
+"""The settings file: every key with its default, unit and range. With an empty file and a camera the daemon works."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dappled.config.schema import ConfigError, Rule, Source, build, read_toml, setting
+from dappled.config.schema import ConfigError, Rule, TomlSource, build, read_toml, setting
 
 DEPTH_METHODS = ("gradient", "contrast", "combined")  # fast to good
 SOCKET_MODES = ("0600", "0660", "0666")
@@ -21,74 +21,90 @@ class CameraSettings:
     driver: str = setting(
         "gphoto2", "Driver by name: gphoto2, fujifilm, folder, simulated, or one that another package registers"
     )
-    profile: str = setting("auto", "Camera profile by name or TOML file; auto goes by the model in the frame")
-    serial: str = setting("", "Only the body with this serial number; empty takes the first found")
-    port: str = setting("", "libgphoto2 port, such as usb: or ptpip:127.0.0.1:15740:15740; empty takes the first found")
-    capture_target: str = setting("card", "Where the body keeps the file before it is fetched", choices=("card", "ram"))
-    delete_after_download: bool = setting(False, "Delete from the card what is safe on disk; the card is a second copy")
+    profile: str = setting("auto", "Camera profile by name or TOML file; auto chooses by the model named in the frame")
+    serial: str = setting("", "Use only the body with this serial number; empty: the first found")
+    port: str = setting("", "libgphoto2 port, such as usb: or ptpip:127.0.0.1:15740:15740; empty: the first found")
+    capture_target: str = setting("card", "Where the body stores a file until it is fetched", choices=("card", "ram"))
+    delete_after_download: bool = setting(
+        False, "Delete a file from the card once it is safe on disk; otherwise the card is a second copy"
+    )
     shutter: str = setting(
         "",
-        "Shutter line of fujifilm and folder: gpio:CHIP:LINE, servo:OUTPUT:PRESSED:RELEASED, relay:NUMBER, autopilot",
+        "Shutter of fujifilm and folder: gpio:CHIP:LINE, servo:OUTPUT:PRESSED:RELEASED, relay:NUMBER, autopilot",
     )
-    pickup: str = setting("", "Where fujifilm and folder find files: later, storage, a libgphoto2 port, or a folder")
-    options: dict | None = setting(None, "What the driver alone knows")  # type: ignore[type-arg]  # noqa: RUF009  the field's default is None; the driver checks what is in it
-    latency_ms: float = setting(60.0, "From the trigger call to the start of the exposure", unit="ms", low=0, high=5000)
-    latency_sigma_ms: float = setting(30.0, "How well that is known, 1 σ", unit="ms", low=0, high=5000)
-    max_pending: int = setting(2, "Shots under way at once; a wish above that is refused", low=1, high=1000)
-    file_timeout_s: float = setting(30.0, "A shot without a file for this long has failed", unit="s", low=1, high=3600)
+    pickup: str = setting(
+        "", "Where fujifilm and folder get the files from: later, storage, a libgphoto2 port, or a folder"
+    )
+    options: dict | None = setting(None, "A table of the driver's own options")  # type: ignore[type-arg]  # noqa: RUF009  the field's default is None; the driver checks what is in it
+    latency_ms: float = setting(
+        60.0, "Time from the trigger call to the start of the exposure", unit="ms", low=0, high=5000
+    )
+    latency_sigma_ms: float = setting(30.0, "Standard deviation of latency_ms", unit="ms", low=0, high=5000)
+    max_pending: int = setting(
+        2, "Shots that may be pending at once; further capture requests are refused", low=1, high=1000
+    )
+    file_timeout_s: float = setting(
+        30.0, "A shot fails when its file has not come after this time", unit="s", low=1, high=3600
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class MaskSettings:
-    profile: str = setting("", "Mask profile by name or TOML file, or lenslet; empty: frames are kept, not decoded")
+    profile: str = setting(
+        "", "Mask profile by name or TOML file, or lenslet; empty: frames are recorded but not decoded"
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class MavlinkSettings:
-    url: tuple[str, ...] = setting((), "pymavlink connection strings, one or a list; empty: no link, no poses")
-    component_id: int = setting(
-        100, "MAV_COMP_ID_CAMERA and the five after it are what autopilots look for", low=1, high=255
+    url: tuple[str, ...] = setting((), "pymavlink connection string, or a list of them; empty: no link and no poses")
+    component_id: int = setting(100, "MAVLink component id; autopilots look for cameras at 100 to 105", low=1, high=255)
+    system_id: int = setting(
+        1, "MAVLink system id until an autopilot is heard; then the autopilot's is used", low=1, high=255
     )
-    system_id: int = setting(1, "Used until an autopilot is heard, whose id is then adopted", low=1, high=255)
     keys: tuple[str, ...] = setting(
-        (), 'Signing key files (dappled mavlink key), one a link in the order of url, "" for none; one alone is for all'
+        (), 'Signing key files (dappled mavlink key), one for each url in order, "" for none; a single one is for all'
     )
     unsigned: str = setting(
         "refuse",
-        "Packets without a signature on a link with a key: refused, heard but not obeyed, or allowed",
+        "Packets without a signature on a link with a key: refuse; listen (read, but not obeyed); or allow",
         choices=("refuse", "listen", "allow"),
     )
     feedback_is_shot: bool = setting(
-        False, "The autopilot fires the camera by wire, and each CAMERA_FEEDBACK of it is a shot"
+        False, "The autopilot fires the camera by wire, and each of its CAMERA_FEEDBACK messages is a shot"
     )
 
 
 @dataclass(frozen=True, slots=True)
 class RecordSettings:
-    directory: str = setting("~/flights", "Folder that holds one folder a flight")
+    directory: str = setting("~/flights", "Folder for the flights, one folder each")
     utc: str = setting(
         "auto",
-        "Who knows UTC: the system; the autopilot (learnt in flight, folders named by boot); auto judges the system",
+        "Source of UTC: system; autopilot (learnt in flight, folders named by boot); auto: system if it is plausible",
         choices=("auto", "system", "autopilot"),
     )
-    warn_free_mb: int = setting(2000, "Below this free space a warning is given", unit="MB", low=0, high=10_000_000)
-    min_free_mb: int = setting(500, "Below this free space new shots are refused", unit="MB", low=0, high=10_000_000)
+    warn_free_mb: int = setting(
+        2000, "Warn when less disk space than this is free; 0: never", unit="MB", low=0, high=10_000_000
+    )
+    min_free_mb: int = setting(
+        500, "Refuse new shots when less disk space than this is free; 0: never", unit="MB", low=0, high=10_000_000
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class PoseSettings:
     wait_ms: float = setting(
-        700.0, "How long a tag may wait for telemetry after the exposure", unit="ms", low=0, high=10_000
+        700.0, "How long a tag waits for telemetry after the exposure", unit="ms", low=0, high=10_000
     )
     attitude_sigma_deg: float = setting(
         0.0,
-        "How well the autopilot knows its attitude, 1 σ, where it doesn't say; 0: not known",
+        "Standard deviation of the attitude where the autopilot sends none; 0: not known",
         unit="°",
         low=0,
         high=90,
     )
     lever_arm_m: tuple[float, float, float] = setting(
-        (0.0, 0.0, 0.0), "From the antenna to the camera: forward, right, down", unit="m", low=-100, high=100
+        (0.0, 0.0, 0.0), "Vector from the antenna to the camera: forward, right, down", unit="m", low=-100, high=100
     )
     mount: tuple[float, float, float, float, float, float, float, float, float] = setting(
         (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0),
@@ -97,47 +113,60 @@ class PoseSettings:
         high=1,
     )
     on_gimbal: bool = setting(
-        False, "The camera hangs on the gimbal: its reported attitude counts, and mount turns camera axes into its axes"
+        False, "The camera is on the gimbal: use the gimbal's attitude; mount then leads to the gimbal's axes"
     )
 
 
 @dataclass(frozen=True, slots=True)
 class DecodeSettings:
-    enabled: bool = setting(True, "Decode in flight; frames can always be decoded later")
-    law: str = setting("", "Carrier law; empty takes the camera profile's", choices=("", "fd", "geometric"))
-    calibration: str = setting("", "File written by dappled calibrate; empty predicts from the profiles alone")
+    enabled: bool = setting(True, "Decode in flight; recorded frames can also be decoded later")
+    law: str = setting("", "Carrier law; empty: the camera profile's", choices=("", "fd", "geometric"))
+    calibration: str = setting(
+        "", "File written by dappled calibrate; empty: carriers are predicted from the profiles alone"
+    )
     white: str = setting("", "White frame; empty: none")
     dark: str = setting("", "Dark frame; empty: none")
-    workers: int = setting(1, "Threads of one decode; 1 leaves the other core to capture", low=1, high=64)
-    depth: str = setting("", "Depth in flight by this method; empty: none", choices=("", *DEPTH_METHODS))
-    depth_to_autopilot: bool = setting(
-        False, "Send the nearest distance as DISTANCE_SENSOR, where the calibration has targets' distances"
+    workers: int = setting(
+        1, "Threads that decode one frame; with 1, a two-core board keeps a core for capture", low=1, high=64
     )
-    depth_interval_s: float = setting(5.0, "At most one frame's depth in this time", unit="s", low=0, high=3600)
-    queue: int = setting(4, "Frames that may wait; more stay in the record, to be decoded later", low=1, high=1000)
+    depth: str = setting("", "Method of depth maps in flight; empty: no depth maps", choices=("", *DEPTH_METHODS))
+    depth_to_autopilot: bool = setting(
+        False, "Send the nearest distance as DISTANCE_SENSOR; needs a calibration with targets at known distances"
+    )
+    depth_interval_s: float = setting(
+        5.0, "Shortest time between two depth maps; 0: one for every frame", unit="s", low=0, high=3600
+    )
+    queue: int = setting(
+        4,
+        "Frames that may wait for decoding; further ones stay in the record and can be decoded later",
+        low=1,
+        high=1000,
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class PublishSettings:
     slices: str = setting("", "ZeroMQ endpoint of the stream; empty: ipc in the user's runtime folder")
-    ask: str = setting("", "ZeroMQ endpoint that answers questions about recorded frames; empty: beside the stream")
+    ask: str = setting("", "ZeroMQ endpoint that answers requests for recorded frames; empty: beside the stream")
     high_water_mark: int = setting(
-        3, "Messages, so stacks of slices, that may wait for one slow subscriber", low=1, high=1000
+        3, "Messages (each a frame's slices) that may wait for a slow subscriber", low=1, high=1000
     )
-    preview_interval_s: float = setting(1.0, "At most one preview in this time", unit="s", low=0, high=3600)
-    socket_mode: str = setting("0660", "Who may connect to ipc sockets, as chmod says it", choices=SOCKET_MODES)
-    keys: str = setting("", "Secret CURVE key for tcp endpoints, made by dappled keys make; empty: none off loopback")
-    clients: str = setting("", "Folder with the public key, NAME.key, of each who may subscribe over tcp")
+    preview_interval_s: float = setting(
+        1.0, "Shortest time between two previews; 0: one for every frame", unit="s", low=0, high=3600
+    )
+    socket_mode: str = setting("0660", "Permissions of ipc sockets, as for chmod", choices=SOCKET_MODES)
+    keys: str = setting(
+        "", "Secret CURVE key for tcp endpoints, made by dappled keys make; empty: tcp on loopback only"
+    )
+    clients: str = setting("", "Folder with the public keys (NAME.key) of those who may subscribe over tcp")
 
 
 @dataclass(frozen=True, slots=True)
 class ConsoleSettings:
     bind: str = setting("", "host:port of the operator's console; empty: no console")
-    token: str = setting("", "File with the token that a console beyond loopback asks for, made by dappled keys token")
-    hosts: tuple[str, ...] = setting((), "More names that browsers may reach the console by")
-    map: str = setting(
-        "", "Picture behind the track: PNG or JPEG with a world file in degrees beside it; empty: a grid"
-    )
+    token: str = setting("", "File with the token that a console off loopback requires, made by dappled keys token")
+    hosts: tuple[str, ...] = setting((), "Further host names under which browsers may open the console")
+    map: str = setting("", "Map behind the track: PNG or JPEG with a world file in degrees beside it; empty: a grid")
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +194,7 @@ def load(path: Path | None) -> Settings:
     return resolve(parse(tables, source), path.parent)
 
 
-def parse(tables: Mapping[str, Any], source: Source) -> Settings:
+def parse(tables: Mapping[str, Any], source: TomlSource) -> Settings:
     """Settings from TOML tables."""
     records: dict[str, Any] = {}
     for name, table in tables.items():
@@ -180,7 +209,7 @@ def parse(tables: Mapping[str, Any], source: Source) -> Settings:
 
 
 def resolve(settings: Settings, beside: Path | None = None) -> Settings:
-    """Paths made absolute (relative ones stand beside the file that names them) and endpoints filled in."""
+    """Make paths absolute (relative to the folder `beside` of the settings file) and fill in the endpoints."""
     beside = (beside or Path.cwd()).absolute()
 
     def path(value: str) -> str:
@@ -214,7 +243,7 @@ def resolve(settings: Settings, beside: Path | None = None) -> Settings:
 
 
 def runtime_folder() -> Path:
-    """Where sockets live: systemd's RUNTIME_DIRECTORY, the user's runtime folder, or a private one in /tmp."""
+    """The folder for sockets: systemd's RUNTIME_DIRECTORY, the user's runtime folder, or a private one in /tmp."""
     if given := os.environ.get("RUNTIME_DIRECTORY"):
         return Path(given.split(":")[0])
     if given := os.environ.get("XDG_RUNTIME_DIR"):
@@ -223,8 +252,8 @@ def runtime_folder() -> Path:
 
 
 def of_tables(tables: Mapping[str, Any], name: str) -> Settings:
-    """Settings from the tables that `to_tables` made, as they stand in the file `name`."""
-    return parse(tables, Source(name))
+    """Settings from tables that `to_tables` made; `name` is the file that holds them."""
+    return parse(tables, TomlSource(name))
 
 
 def to_tables(settings: Settings) -> dict[str, Any]:

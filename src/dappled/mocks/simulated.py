@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from dappled.config.schema import ConfigError, Source, build, setting
+from dappled.config.schema import ConfigError, TomlSource, build, setting
 from dappled.drivers.camera import CameraError, Identity, check_options, seconds_option
 from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.sources import FolderSource
@@ -47,7 +47,7 @@ def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
     check_options(settings, _KNOWN)
     given = {name: value for name, value in settings.items() if name != "timeouts"}
     try:
-        wanted = asdict(build(_Options, given, Source("camera.options"), ""))
+        wanted = asdict(build(_Options, given, TomlSource("camera.options"), ""))
     except ConfigError as error:
         raise CameraError(str(error)) from None
     folder = wanted.pop("folder")
