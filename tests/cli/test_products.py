@@ -197,7 +197,7 @@ def test_a_rerun_recording_is_written_and_can_be_read(field: str, tmp_path: Path
         (["depth", "{}", "--window", "4"], "a window of 4 px"),
         (["export", "{}", "--as", "npz", "-o", "{out}.h5"], "writes a .npz file"),
         (["depth", "{}", "--calibration", "{toml}"], "knows no distances"),
-        (["views", "{}.gone.npz", "-o", "{out}.png"], "there is no"),
+        (["views", "{}.gone.npz", "-o", "{out}.png"], "does not exist"),
     ],
 )
 def test_wrong_calls_are_one_sentence(

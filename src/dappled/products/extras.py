@@ -1,4 +1,4 @@
-"""The libraries of the ground extra, imported where they are needed; the onboard install leaves them out."""
+"""Import libraries of the extras `ground` and `cluster` where they are needed; the onboard install has none."""
 
 from __future__ import annotations
 

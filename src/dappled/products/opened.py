@@ -1,4 +1,4 @@
-"""The face for programs: `dappled.open(path)` gives a light field, a frame or a flight.
+"""`dappled.open`: open a light field, a raw frame or a flight from Python. `docs/api.md` says what is promised.
 
 with_views = dappled.open("frame.zarr")              # or a folder of n × n pictures
 sharp = with_views.refocus(alpha=0.8)                 # float32 (h, w) or (h, w, 3)
@@ -40,14 +40,14 @@ _LIGHT_FIELDS = (".zarr", ".npz", ".h5")
 
 
 class OpenError(DappledError):
-    """Something that can't be opened; one sentence."""
+    """A path can't be opened, or lacks what was requested of it; one sentence."""
 
 
 @dataclass(frozen=True)
 class OpenedLightField:
-    """A decoded light field and what can be made of it. `field` is the plain value, `path` where it came from.
+    """A decoded light field. `field` is the plain value, `path` the file or folder that it was read from.
 
-    `focus_m` is where the lens was focused (inf: infinity), for metres where no calibration says it.
+    `focus_m` is the distance at which the lens was focused (inf: infinity), for metres without a calibration.
     """
 
     field: LightField
@@ -72,19 +72,20 @@ class OpenedLightField:
 
     @cached_property
     def stack(self) -> ViewStack:
-        """The views with their places. Raises DecodeError where there are none."""
+        """The views with their places in the aperture. Raises DecodeError where there are none."""
         return ViewStack.of(self.field)
 
     @cached_property
     def evidence(self) -> Evidence:
-        """What depth is estimated from. Raises DecodeError where there are no views, or only one."""
+        """What depth is estimated from. Raises DecodeError where there are fewer than 2 views."""
         return evidences.of_light_field(self.field)
 
     @cached_property
     def ranging(self) -> Ranging | None:
-        """From disparity to metres: by a calibration with targets, or by `focus_m`; None: only relative depth.
+        """The conversion from disparity to metres, by a calibration with targets or by `focus_m`.
 
-        A calibration at another focal length is none. `metres` says what is missing."""
+        None where depth is only relative, also where the calibration is for another focal length; `metres` says why.
+        """
         with contextlib.suppress(DecodeError):
             kept = self._kept_ranging()
             if kept is not None:
@@ -92,7 +93,7 @@ class OpenedLightField:
         return None if self.focus_m is None else lens_ranging(self.field, self.focus_m)
 
     def _kept_ranging(self) -> Ranging | None:
-        """That of the attributes, for this frame's lens. Raises DecodeError where it is for another one."""
+        """Return that of the attributes. Raises DecodeError where it is for another focal length or f-number."""
         kept = self.attributes.get(RANGING)
         if not kept:
             return None
@@ -101,8 +102,10 @@ class OpenedLightField:
     def disparity_of(
         self, *, alpha: float | None = None, disparity: float | None = None, distance_m: float | None = None
     ) -> float:
-        """The disparity that one of the three names; 0 for none. Raises DappledError for more than one, and for metres
-        without a calibration."""
+        """Return the disparity that one of the three arguments names; 0 for none.
+
+        Raises DappledError for more than one, and for metres without a calibration.
+        """
         given = [value for value in (alpha, disparity, distance_m) if value is not None]
         if len(given) > 1:
             raise OpenError("give one of alpha, disparity and distance, not several")
@@ -113,7 +116,7 @@ class OpenedLightField:
         return 0.0 if disparity is None else disparity
 
     def metres(self) -> Ranging:
-        """`ranging`, or DappledError with what to do."""
+        """Return `ranging`. Raises DappledError with what to do where it is None."""
         if self.ranging is None:
             self._kept_ranging()
             raise OpenError(
@@ -131,7 +134,7 @@ class OpenedLightField:
         aperture: float | None = None,
         tilt: tuple[float, float] = (0.0, 0.0),
     ) -> NDArray[np.float32]:
-        """The picture focused at one α (Eq 29), disparity or distance; none of them: as it was taken.
+        """Return the picture focused at one α (Eq 29), disparity or distance; without one, as it was taken.
 
         `aperture` is the diameter of a round synthetic aperture as a share of the whole; `tilt` the change of
         disparity over the picture's height and width. float32 (h, w) or (h, w, 3), NaN where no view sees.
@@ -143,15 +146,15 @@ class OpenedLightField:
     def depth(
         self, method: str = "combined", *, between: tuple[float, float] | None = None, window: int = depths.WINDOW
     ) -> DepthMap:
-        """Disparities with standard errors and confidence, NaN where unknown; `method` one of `depth.METHODS`."""
+        """Return disparities with standard errors and confidence, NaN where unknown; `method` is one of `METHODS`."""
         return depths.estimate(self.evidence, method, between=between, window=window, workers=self.workers)
 
     def distances(self, depth: DepthMap) -> DistanceMap:
-        """A depth map in metres with standard errors. Raises OpenError where no calibration leads to metres."""
+        """Return a depth map in metres with standard errors. Raises DappledError as `metres`."""
         return self.metres().distances(depth, self.stack)
 
     def eyes(self, *, separation: float = 0.6, disparity: float = 0.0) -> StereoPair:
-        """A virtual stereo pair that converges on a disparity."""
+        """Return a virtual stereo pair that converges on a disparity."""
         return eyes(self.stack, separation=separation, disparity=disparity, workers=self.workers)
 
     def save(self, path: Path | str, *, overwrite: bool = False) -> None:
@@ -161,7 +164,7 @@ class OpenedLightField:
 
 @dataclass(frozen=True)
 class OpenedFrame:
-    """A raw frame: `light_field` decodes it, once. `tag` says when and where it was taken, where a flight knows."""
+    """A raw frame, decoded once, by `light_field`. `tag` says when and where it was taken; None outside a flight."""
 
     path: Path
     darkroom: Darkroom
@@ -192,7 +195,7 @@ class OpenedFrame:
 
 @dataclass(frozen=True)
 class OpenedFlight:
-    """A recorded flight: a sequence of its safe frames, decoded by its own recipe when they are looked at."""
+    """A recorded flight: the sequence of its safe frames, each decoded by the flight's recipe when it is used."""
 
     path: Path
     record: flight_report.FlightContents
@@ -206,7 +209,7 @@ class OpenedFlight:
         return (self._frame(line) for line in self.record.lines if line.frame is not None)
 
     def __getitem__(self, index: int) -> OpenedFrame:
-        """The frame of an image index. Raises KeyError."""
+        """Return the frame of an image index. Raises KeyError."""
         for line in self.record.lines:
             if line.frame is not None and line.frame.index == index:
                 return self._frame(line)
@@ -223,15 +226,15 @@ Opened = OpenedLightField | OpenedFrame | OpenedFlight
 
 
 def open(path: str | Path, *, focus_m: float | None = None, **recipe: Any) -> Opened:
-    """What a path holds: a light field (.zarr, .npz, .h5, or a folder of n × n pictures), a flight, or a raw frame.
+    """Open a light field (.zarr, .npz, .h5, or a folder of n × n pictures), a flight, or a raw frame.
 
-    `focus_m` is where the lens was focused (inf: infinity). `recipe` says how frames are decoded: `camera`, `mask`,
-    `law`, `calibration`, `white`, `dark`, `colour` … as `Recipe`; a flight has its own, on top of which these are laid.
-    Raises DappledError, also for a recipe where nothing is left to decode.
+    `focus_m` is the distance at which the lens was focused (inf: infinity). `recipe` says how frames are decoded:
+    `camera`, `mask`, `law`, `calibration`, `white`, `dark`, `colour` … as in `Recipe`; in a flight these replace values
+    of its own recipe. Raises DappledError, also for a recipe with a light field, which is decoded already.
     """
     found = Path(path).expanduser()
     if not found.exists():
-        raise OpenError(f"there is no {found}; check the path")
+        raise OpenError(f"{found} does not exist; check the path")
     if found.suffix in _LIGHT_FIELDS:
         _refuse(recipe, found)
         return OpenedLightField(light_files.load(found), found, focus_m)
@@ -247,32 +250,31 @@ def open(path: str | Path, *, focus_m: float | None = None, **recipe: Any) -> Op
 
 
 def light_field(path: str | Path, *, focus_m: float | None = None) -> OpenedLightField:
-    """`open`, for a light field only. Raises DappledError."""
+    """Open a light field only. Raises DappledError."""
     here = Path(path).expanduser()
     raw = here.is_file() and here.suffix not in _LIGHT_FIELDS
     found = None if raw else open(here, focus_m=focus_m)
     if not isinstance(found, OpenedLightField):
-        raise OpenError(f"{path} is no light field: decode it first (dappled decode), or name a .zarr, .npz or .h5")
+        raise OpenError(f"{path} is not a light field: decode it first (dappled decode), or name a .zarr, .npz or .h5")
     return found
 
 
 def lens_ranging(field: LightField, focus_m: float) -> Ranging | None:
-    """Eq 5 by what a light field says of its camera: focal length, f-number and the profile's pixels; None where it
-    doesn't."""
-    said = field.attributes
-    length, stop, camera = said.get("focal_length_mm"), said.get("f_number"), said.get("camera")
-    if not (length and stop and camera and said.get("shape")) or said.get("lenslet_pitch_px"):
+    """Return distances by Eq 5, from a light field's focal length, f-number and camera; None without one of them."""
+    known = field.attributes
+    length, stop, camera = known.get("focal_length_mm"), known.get("f_number"), known.get("camera")
+    if not (length and stop and camera and known.get("shape")) or known.get("lenslet_pitch_px"):
         return None
     try:
-        rows, columns = said["shape"]
+        rows, columns = known["shape"]
         sensor = profiles.camera(str(camera)).sensor((int(rows), int(columns)))
     except DappledError:
-        return None  # a camera that no profile knows: relative depth only
+        return None  # no profile has this camera: relative depth only
     return Ranging.of_lens(float(length), float(stop), math.hypot(*sensor.column_mm), focus_m)
 
 
 def with_ranging(field: LightField, ranging: Ranging) -> LightField:
-    """The light field with its way to metres among its attributes."""
+    """Return the light field with `ranging` among its attributes."""
     return replace(field, attributes={**field.attributes, RANGING: ranging.to_dict()})
 
 
@@ -285,7 +287,7 @@ def _recipe(plain: Recipe, given: Mapping[str, Any], path: Path) -> Recipe:
     try:
         made = replace(plain, **given)
     except TypeError as error:
-        raise OpenError(f"{path} can't be opened so: {error}") from None
+        raise OpenError(f"{path} can't be opened with these arguments: {error}") from None
     if not made.mask:
         raise OpenError(f"{path} is a raw frame: say how to decode it, as in dappled.open(path, mask='mask-2')")
     return made

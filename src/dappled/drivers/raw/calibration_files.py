@@ -46,7 +46,7 @@ def tables(path: Path) -> dict[str, Any]:
     except FileNotFoundError as error:
         raise ConfigError(f"no calibration at {path}: check the path") from error
     except (OSError, ValueError, KeyError, BadZipFile, EOFError) as error:
-        raise ConfigError(f"{path} is no calibration: make one with dappled calibrate ({error})") from error
+        raise ConfigError(f"{path} is not a calibration: make one with dappled calibrate ({error})") from error
 
 
 def load(path: Path) -> Calibration:

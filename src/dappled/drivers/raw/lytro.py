@@ -100,14 +100,14 @@ def _parts(data: bytes | memoryview) -> tuple[Mapping[str, Any], memoryview]:
         raise ValueError(f"its part {missing[0]} is missing; fetch it from the camera again")
     metadata = _json(named[str(frame["metadataRef"])])
     if metadata is None:
-        raise ValueError("its metadata is no JSON")
+        raise ValueError("its metadata is not JSON")
     return _imaging(metadata), named[str(frame["imageRef"])]
 
 
 def _walk(view: memoryview) -> Iterator[tuple[str, memoryview]]:
     """Yield the parts of a container with their names."""
     if bytes(view[: len(START)]) != START:
-        raise ValueError("it is no Lytro container")
+        raise ValueError("it is not a Lytro container")
     at = _HEAD
     for _ in range(_MOST_PARTS):
         if at + _HEAD > len(view):

@@ -158,7 +158,7 @@ def positive(value: object) -> float | None:
     if isinstance(value, tuple | list):
         value = value[0] if value else None
     try:
-        number = float(value)  # type: ignore[arg-type]  # whatever EXIF holds; what is no number is caught
+        number = float(value)  # type: ignore[arg-type]  # EXIF may hold anything; what is not a number is caught
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     return number if math.isfinite(number) and number > 0 else None

@@ -66,7 +66,7 @@ def override(raw: RawFile, recipe: Recipe) -> RawFile:
         pattern = recipe.cfa.upper()
         if side < 2 or side * side != len(pattern) or set(pattern) != set("RGB"):
             raise DarkroomError(
-                f"--cfa {recipe.cfa} is no colour pattern: name its letters R, G, B row by row, as in BGGR"
+                f"--cfa {recipe.cfa} is not a colour pattern: give its letters R, G, B row by row, as in BGGR"
             )
         changed["cfa"] = np.array(["RGB".index(letter) for letter in pattern], dtype=np.int64).reshape(side, side)
         changed["colour_names"] = ("R", "G", "B")

@@ -27,7 +27,7 @@ def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
         raise CameraError("which folder? set camera.pickup to the one that the other program fills")
     path = Path(folder).expanduser()
     if not path.is_dir():
-        raise CameraError(f"camera.pickup = {folder!r} is no folder: make it, or correct the path")
+        raise CameraError(f"camera.pickup = {folder!r} is not a folder: make it, or correct the path")
     identity = Identity("folder", text_option(settings, "model") or path.name, "", str(path))
     composed = ComposedSettings(file_s=seconds_option(settings, "file_s", 30.0), hold_s=hold_s(settings))
     return ComposedCamera(

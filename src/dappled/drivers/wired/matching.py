@@ -1,8 +1,8 @@
-"""Which picked-up file belongs to which shot: by order, count and the time that the camera wrote into the file.
+"""Match picked-up files with shots by order, count and the time that the camera wrote into each file.
 
-The camera's clock is off by something constant that nobody knows, and shows whole seconds. Shots and files are matched
-in order, so that one offset explains as many pairs as possible. A pair is sure when every such best matching has it;
-what remains is in doubt, and is listed, never guessed.
+The camera's clock is off by an unknown constant, and has whole seconds. Shots and files are matched in order, so that
+one offset explains as many pairs as possible. A pair is certain when every best matching has it; the others are listed
+as doubtful, never guessed.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 WINDOW_S = 1.6
-"""How far offsets of true pairs lie apart: the whole second that the camera shows, and the spread of its latency."""
+"""How much offsets of true pairs differ: by the whole second of the camera's time, and the spread of its latency."""
 _GRID_S = 0.1
 _HAIR_S = 1e-5
 PLAUSIBLE_S = 26 * 3600.0
-"""A camera's clock is off by a time zone, a summer time, a forgotten minute; by more it was never set."""
+"""A camera's clock is off by a time zone, daylight saving time or some minutes; by more where it was never set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class FiredShot:
 
 @dataclass(frozen=True, slots=True)
 class DatedFile:
-    """A file that waits for its shot. `taken_s`: the camera's time as if it were UTC; None where the file says none."""
+    """A file that waits for its shot. `taken_s`: the camera's time as if it were UTC; None where the file has none."""
 
     name: str
     taken_s: float | None
@@ -40,9 +40,9 @@ class DatedFile:
 
 @dataclass(frozen=True, slots=True)
 class Matching:
-    """`pairs` are sure. `shots` and `files` are left over; each one in doubt has a sentence in `doubts`.
+    """`pairs` are certain. `shots` and `files` are left over; each doubtful file has a sentence in `doubts`.
 
-    `offset_s` is the camera's clock minus that of the shots, None where no pair is sure.
+    `offset_s` is the camera's clock minus that of the shots, None where no pair is certain.
     """
 
     pairs: tuple[tuple[int, str], ...]
@@ -59,12 +59,14 @@ def match(
     offset_s: float | None = None,
     plausible_s: float = PLAUSIBLE_S,
 ) -> Matching:
-    """Match shots and files. `offset_s`, where it is known, is the camera's clock minus the shots'; else every offset
-    up to `plausible_s` may be it. Files without a time stay in doubt."""
+    """Match shots and files. Files without a time stay doubtful.
+
+    `offset_s` is the camera's clock minus the shots' where it is known; else every offset up to `plausible_s` is tried.
+    """
     shots = sorted(shots, key=lambda shot: (shot.fired_s, shot.index))
     dated = sorted((f for f in files if f.taken_s is not None), key=lambda f: (f.taken_s, f.name))
     doubts = [
-        f"{f.name} says no time: name its shot with --pair, or take all by --by-order"
+        f"{f.name} has no time: name its shot with --pair, or take all by --by-order"
         for f in files
         if f.taken_s is None
     ]
@@ -86,7 +88,7 @@ def match(
 
 
 def in_order(shots: Sequence[FiredShot], files: Sequence[DatedFile]) -> tuple[tuple[int, str], ...] | None:
-    """Pairs by order alone, where there are as many shots as files; None where there are not."""
+    """Pair by order alone where there are as many shots as files; else return None."""
     if len(shots) != len(files):
         return None
     by_time = sorted(shots, key=lambda shot: (shot.fired_s, shot.index))
@@ -95,7 +97,7 @@ def in_order(shots: Sequence[FiredShot], files: Sequence[DatedFile]) -> tuple[tu
 
 
 def seconds(taken: str | None) -> float | None:
-    """EXIF's time, ISO 8601 without a zone, as seconds, as if it were UTC; None for none."""
+    """Return EXIF's time, ISO 8601 without a zone, as seconds as if it were UTC; None where there is none."""
     try:
         return None if taken is None else datetime.fromisoformat(taken[:26]).replace(tzinfo=UTC).timestamp()
     except ValueError:
@@ -103,19 +105,19 @@ def seconds(taken: str | None) -> float | None:
 
 
 def _starts(offsets: NDArray[np.float64], known_s: float | None, plausible_s: float) -> NDArray[np.float64]:
-    """Where a window of offsets may begin, on a grid, ascending."""
+    """Return where a window of offsets may begin, on a grid, ascending."""
     flat = np.sort(offsets.ravel())
     near = flat[np.abs(flat - known_s) <= WINDOW_S] if known_s is not None else flat[np.abs(flat) <= plausible_s]
     return np.unique(np.floor(near / _GRID_S) * _GRID_S)
 
 
 def _bounds(offsets: NDArray[np.float64], starts: NDArray[np.float64]) -> NDArray[np.int64]:
-    """For each window the most pairs that it can hold: the fewer of the shots and the files with an offset in it."""
+    """Return the most pairs that each window can hold: the fewer of the shots and the files with an offset in it."""
     return np.minimum(_touched(offsets, starts), _touched(offsets.T, starts))
 
 
 def _touched(offsets: NDArray[np.float64], starts: NDArray[np.float64]) -> NDArray[np.int64]:
-    """How many rows have an offset in each window; a hair too many where one lies on its edge."""
+    """Count the rows that have an offset in each window; slightly too many where one lies on its edge."""
     ordered = np.sort(offsets, axis=1)
     first = np.searchsorted(starts, ordered - WINDOW_S - _HAIR_S, "left")
     last = np.searchsorted(starts, ordered + _HAIR_S, "right")
@@ -126,7 +128,7 @@ def _touched(offsets: NDArray[np.float64], starts: NDArray[np.float64]) -> NDArr
 
 
 def _best(offsets: NDArray[np.float64], starts: NDArray[np.float64]) -> tuple[list[tuple[int, int]], NDArray[np.bool_]]:
-    """(pairs that all best matchings share, pairs that some have)."""
+    """Return (pairs that all best matchings share, pairs that any has)."""
     best = 0
     bounds = _bounds(offsets, starts)
     seen: set[bytes] = set()
@@ -150,7 +152,7 @@ def _best(offsets: NDArray[np.float64], starts: NDArray[np.float64]) -> tuple[li
 
 
 def _chains(fits: NDArray[np.bool_]) -> tuple[int, set[tuple[int, int]], NDArray[np.bool_]]:
-    """The longest matchings in order: their length, the pairs that all of them have, and those that any has.
+    """Return the length of the longest matchings in order, the pairs that all of them have, and those that any has.
 
     A pair with `before` pairs at most before it and `after` at most after it is in a longest one when before + 1 +
     after is the whole length. Each longest one has exactly one pair with each number of pairs before it, so a pair that
@@ -167,7 +169,7 @@ def _chains(fits: NDArray[np.bool_]) -> tuple[int, set[tuple[int, int]], NDArray
 
 
 def _longest(fits: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(n + 1, m + 1): the most pairs in order among the first i shots and the first j files."""
+    """Return (n + 1, m + 1): the most pairs in order among the first i shots and the first j files."""
     n, m = fits.shape
     table = np.zeros((n + 1, m + 1), dtype=np.int64)
     for i in range(n):

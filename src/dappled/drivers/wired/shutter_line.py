@@ -79,7 +79,7 @@ class GpioLine:
                 self._output = (self._request or request_output)(self._chip, self._line, self._active_low)
             except (OSError, ValueError) as error:
                 raise CameraError(
-                    f"the shutter line {self._line} of {self._chip} can't be had ({error}): "
+                    f"the shutter line {self._line} of {self._chip} can't be opened ({error}): "
                     "check camera.shutter, and that you are in the group that owns the chip"
                 ) from None
 
@@ -145,7 +145,7 @@ class AutopilotLine:
     def _send(self, command: tuple[int, tuple[float, ...]]) -> None:
         problem = "no MAVLink link is configured: set mavlink.url" if self._sender is None else self._sender(*command)
         if problem is not None:
-            raise CameraError(f"the autopilot was not told to fire: {problem}")
+            raise CameraError(f"the autopilot did not get the command to fire: {problem}")
 
     def close(self) -> None:
         """See ShutterLine."""
@@ -173,7 +173,7 @@ def parse_line(text: str) -> ShutterLine:
     try:
         return _LINES[kind](parts)
     except (KeyError, ValueError, IndexError):
-        raise CameraError(f"camera.shutter = {text!r} is no shutter line; there are {KINDS}") from None
+        raise CameraError(f"camera.shutter = {text!r} is not a shutter line; the kinds are {KINDS}") from None
 
 
 def _gpio(parts: list[str]) -> ShutterLine:
