@@ -28,7 +28,7 @@ import tomli_w
 
 from dappled.config import profiles
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry import Pose
 from dappled.decode.spectrum.plane import to_plane
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Recipe

@@ -22,12 +22,11 @@ from dataclasses import dataclass
 from pathlib import Path as File
 from typing import TypeVar
 
-from dappled.daemon.navigation import navigation
-from dappled.daemon.navigation.clocks import BodyLatency, CameraClock, ExposureTime, exposure_from_camera, mid_exposure
-from dappled.daemon.navigation.navigation import Telemetry
+from dappled.daemon.navigation import BodyLatency, CameraClock, ExposureTime, Telemetry, navigation
+from dappled.daemon.navigation.clocks import exposure_from_camera, mid_exposure
 from dappled.daemon.navigation.samples import AttitudeSample, PositionSample, attitude, position
 from dappled.daemon.navigation.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
-from dappled.decode.geometry.pose import Pose, metres_per_radian, turn_rad
+from dappled.decode.geometry import Pose, metres_per_radian, turn_rad
 from dappled.drivers.mavlink import Message, PacketParser, mavlink
 from dappled.flight import telemetry_log
 from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message

@@ -23,14 +23,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.clock import SystemClock
-from dappled.daemon.navigation.clocks import BodyLatency, ExposureTime
+from dappled.daemon.navigation import BodyLatency, ExposureTime
 from dappled.daemon.navigation.navigation import unknown_pose
 from dappled.daemon.pipeline.decode_process import DecodedFrame
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry import Pose
 from dappled.drivers.camera import (
     Arrival,
     Blob,

@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dappled.clock import RecordedClock, SystemClock
-from dappled.daemon.navigation.clocks import BodyLatency
+from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcessError
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry import Pose
 from dappled.drivers.camera import (
     Arrival,
     Blob,

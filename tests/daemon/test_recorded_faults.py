@@ -10,12 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from dappled.daemon.navigation import clocks
-from dappled.daemon.navigation.clocks import BodyLatency
-from dappled.daemon.navigation.navigation import Telemetry
+from dappled.daemon.navigation import BodyLatency, Telemetry, clocks
 from dappled.daemon.pipeline import tagger
 from dappled.daemon.pipeline.tagger import FrameSettings
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import Message, PacketParser, mavlink
 from dappled.flight import Cause, LedgerReader, Result, Shot, recording
 from dappled.flight.check import check

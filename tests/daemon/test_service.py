@@ -15,7 +15,7 @@ from dappled.config.settings import MaskSettings, PoseSettings, PublishSettings,
 from dappled.daemon import flight_parts
 from dappled.daemon import service as module
 from dappled.daemon.flight_handover import FlightHandover
-from dappled.daemon.navigation.utc import UtcCorrection
+from dappled.daemon.navigation import UtcCorrection
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import Service

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry import Pose
 from dappled.flight import Cause, Frame, Recording, Shot, Tag
 
 

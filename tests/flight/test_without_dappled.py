@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry import Pose
 from dappled.flight import LedgerReader, Tag, recording
 from dappled.flight.ledger import SCHEMA
 from tests.flight.conftest import START_UTC_NS

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from dappled.decode.geometry import camera_pose
-from dappled.decode.geometry.pose import Pose, Quaternion, metres_per_radian
+from dappled.decode.geometry import Pose, Quaternion, camera_pose, metres_per_radian
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.flight import Tag, recording
 from dappled.mocks import simulation

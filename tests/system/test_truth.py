@@ -12,7 +12,7 @@ import numpy as np
 from dappled.clock import SystemClock
 from dappled.config.settings import Settings, resolve
 from dappled.daemon.service import Service
-from dappled.decode.geometry.pose import metres_per_radian
+from dappled.decode.geometry import metres_per_radian
 from dappled.flight import flight_report
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.simulation import Simulation, World

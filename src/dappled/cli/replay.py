@@ -14,7 +14,7 @@ from typing import Any
 from dappled.cli.arguments import positive, seconds
 from dappled.cli.terminal import frame_json, frame_line
 from dappled.config import settings as configuration
-from dappled.daemon.navigation.clocks import BodyLatency
+from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.decode_process import DecodeProcess
 from dappled.daemon.pipeline.flight_writer import ReplayVerifier

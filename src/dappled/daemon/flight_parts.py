@@ -16,8 +16,7 @@ from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.health import record
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.health.status_text import Alarms
-from dappled.daemon.navigation.clocks import BodyLatency
-from dappled.daemon.navigation.navigation import Navigation
+from dappled.daemon.navigation import BodyLatency, Navigation
 from dappled.daemon.pipeline.decode_process import DecodeProcess
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.live_depth import LiveDepth
@@ -27,7 +26,7 @@ from dappled.daemon.pipeline.shot_events import ShotEvents
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry import Pose
 from dappled.drivers.camera import Camera, CameraError
 from dappled.drivers.mavlink import MavlinkLinks, Packet
 from dappled.drivers.raw.darkroom import Recipe

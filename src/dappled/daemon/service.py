@@ -17,7 +17,7 @@ from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.flight_parts import FlightParts
 from dappled.daemon.health import record as health
 from dappled.daemon.health.logbook import Logbook
-from dappled.daemon.navigation import utc
+from dappled.daemon.navigation.clocks import utc_known
 from dappled.daemon.periodic_tasks import PeriodicTask
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.pending_shot import Names, Observer
@@ -105,9 +105,9 @@ class Service:
 
     def _begin_recording(self, camera: Camera, names: Names, recipe: Recipe | None, stack: ExitStack) -> Recipe | None:
         """The flight folder, and the parts that work on it. Returns the recipe as the flight keeps it."""
-        utc_known = utc.known(self.settings.record.utc, self._clock.utc_ns())
+        known = utc_known(self.settings.record.utc, self._clock.utc_ns())
         self._recording = live_record.begin(
-            self.settings, self._clock.utc_ns, names, decodes=recipe is not None, utc_known=utc_known
+            self.settings, self._clock.utc_ns, names, decodes=recipe is not None, utc_known=known
         )
         stack.callback(self._remove_litter)
         stack.callback(live_record.close, self._recording)
@@ -124,7 +124,7 @@ class Service:
             publisher=self._publisher,
             logbook=self._logbook,
             outside=self._outside,
-            utc_known=utc_known,
+            utc_known=known,
             after=self._after,
             end=self.ask_to_stop,
         )

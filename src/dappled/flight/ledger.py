@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
-from dappled.decode.geometry.pose import Gnss, Pose
+from dappled.decode.geometry import Gnss, Pose
 from dappled.flight.errors import FlightError
 from dappled.flight.records import (
     Cause,

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry import Pose
 
 ShotState = Literal["wished", "fired", "safe", "failed"]
 

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from dappled.decode.geometry import camera_pose
+from dappled.decode.geometry import Pose, Vector3, camera_pose
 from dappled.decode.geometry.camera_pose import CameraPose, Matrix
-from dappled.decode.geometry.pose import Pose, Vector3
 
 
 @dataclass(frozen=True, slots=True)

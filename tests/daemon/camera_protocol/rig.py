@@ -14,7 +14,7 @@ from dappled.config.settings import PoseSettings
 from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, Storage
 from dappled.daemon.camera_protocol.component import Component
 from dappled.daemon.camera_protocol.parameters import Parameters
-from dappled.daemon.navigation.navigation import Telemetry
+from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink import MavlinkLinks, Message, Packet, Signing, mavlink, pack

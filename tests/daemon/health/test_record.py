@@ -12,7 +12,7 @@ import pytest
 
 from dappled.config.settings import MaskSettings, MavlinkSettings, RecordSettings, Settings
 from dappled.daemon.health import record as health
-from dappled.daemon.navigation.navigation import Telemetry
+from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.stream import wire

@@ -10,18 +10,8 @@ from typing import Any
 
 import pytest
 
-from dappled.daemon.navigation import clocks
-from dappled.daemon.navigation.clocks import (
-    BodyLatency,
-    BootClock,
-    CameraClock,
-    ExposureTime,
-    Feedback,
-    camera_time,
-    exposure_from_camera,
-    mid_exposure,
-)
-from dappled.daemon.navigation.navigation import Telemetry
+from dappled.daemon.navigation import BodyLatency, BootClock, CameraClock, ExposureTime, Telemetry, clocks
+from dappled.daemon.navigation.clocks import Feedback, camera_time, exposure_from_camera, mid_exposure
 from dappled.drivers.mavlink import Message, mavlink
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from dappled.config.settings import PoseSettings, Settings
-from dappled.daemon.navigation.clocks import ExposureTime
-from dappled.daemon.navigation.navigation import AHEAD_NS, Navigation
+from dappled.daemon.navigation import ExposureTime, Navigation
+from dappled.daemon.navigation.navigation import AHEAD_NS
 from dappled.flight import recording
 
 NOW_NS = 1_790_000_000 * 10**9

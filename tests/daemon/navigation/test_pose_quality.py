@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dappled.daemon.navigation import Telemetry
 from dappled.daemon.navigation.clocks import from_arrivals
 from dappled.daemon.navigation.navigation import Telemetry
-from dappled.decode.geometry.pose import (
+from dappled.decode.geometry import (
     Gnss,
     Pose,
     conjugate,

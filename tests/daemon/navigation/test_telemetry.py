@@ -14,10 +14,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dappled.daemon.navigation import Telemetry, first_position_utc_ns
 from dappled.daemon.navigation.clocks import TimesyncAnswer, from_arrivals, from_timesync
-from dappled.daemon.navigation.navigation import HISTORY_NS, Telemetry, first_position_utc_ns
+from dappled.daemon.navigation.navigation import HISTORY_NS
 from dappled.daemon.navigation.vehicle_history import MOST_SAMPLES
-from dappled.decode.geometry.pose import Pose, from_euler, hermite, metres_per_radian, normalised, slerp, turn_rad
+from dappled.decode.geometry import Pose, from_euler, hermite, metres_per_radian, normalised, slerp, turn_rad
 from dappled.drivers.mavlink import Message, PacketParser, mavlink
 from dappled.flight import digest
 from dappled.mocks.autopilot.autopilot import BootTime, flight

@@ -17,8 +17,7 @@ from dappled.config.settings import MavlinkSettings, PoseSettings, PublishSettin
 from dappled.daemon import service as module
 from dappled.daemon.camera_protocol import autopilot
 from dappled.daemon.camera_protocol.autopilot import SystemIdentity
-from dappled.daemon.navigation.clocks import ExposureTime
-from dappled.daemon.navigation.navigation import Navigation, Telemetry, recorded_vehicles
+from dappled.daemon.navigation import ExposureTime, Navigation, Telemetry, recorded_vehicles
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.replay import replay

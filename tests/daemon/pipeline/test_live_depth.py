@@ -10,7 +10,7 @@ import jsonschema
 import numpy as np
 import pytest
 
-from dappled.daemon.navigation.clocks import ExposureTime
+from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcessError, FrameDepth
 from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.pending_shot import PendingShot

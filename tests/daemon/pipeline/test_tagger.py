@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dappled.daemon.navigation.clocks import BodyLatency, mid_exposure
+from dappled.daemon.navigation import BodyLatency
+from dappled.daemon.navigation.clocks import mid_exposure
 from dappled.daemon.pipeline import tagger
 from dappled.daemon.pipeline.tagger import FrameSettings
 from dappled.flight import Frame

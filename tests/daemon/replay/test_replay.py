@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled.daemon.navigation.clocks import BodyLatency
+from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.replay import replay

@@ -10,7 +10,7 @@ import pytest
 
 from dappled.daemon.camera_protocol.ground_client import GroundClient, GroundError
 from dappled.daemon.navigation.clocks import BootClock
-from dappled.decode.geometry.pose import turn_rad
+from dappled.decode.geometry import turn_rad
 from dappled.mocks.autopilot.autopilot import Autopilot, BootTime
 from dappled.mocks.autopilot.ground_station import GroundStation
 from dappled.mocks.autopilot.path import FlightPath

@@ -8,7 +8,7 @@ import pytest
 from pyproj import Geod
 from scipy.spatial.transform import Rotation
 
-from dappled.decode.geometry.pose import from_euler, metres_per_radian, turn_rad
+from dappled.decode.geometry import from_euler, metres_per_radian, turn_rad
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 
 TIMES_S = (0.0, 3.7, 61.2, 599.0)

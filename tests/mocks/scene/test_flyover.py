@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dappled.decode.geometry.pose import from_euler
+from dappled.decode.geometry import from_euler
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.scene import flyover
 from dappled.mocks.scene.flyover import TerrainScene

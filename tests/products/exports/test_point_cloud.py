@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dappled.decode.depth.ranging import DistanceMap
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry import Pose
 from dappled.flight import Frame, Tag
 from dappled.products.exports import point_cloud
 from dappled.products.exports.point_cloud import PointCloudError

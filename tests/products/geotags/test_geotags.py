@@ -21,9 +21,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from dappled.cli import main
-from dappled.decode.geometry import camera_pose
+from dappled.decode.geometry import Gnss, Pose, camera_pose, from_euler
 from dappled.decode.geometry.camera_pose import FORWARD, NADIR, Angles
-from dappled.decode.geometry.pose import Gnss, Pose, from_euler
 from dappled.drivers.raw.raw_file import read_exif
 from dappled.errors import DappledError
 from dappled.flight import recording

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from dappled.config.profiles import Lens
-from dappled.decode.geometry import camera_pose
+from dappled.decode.geometry import camera_pose, from_euler
 from dappled.decode.geometry.camera_pose import NADIR
-from dappled.decode.geometry.pose import from_euler
 from dappled.decode.optics.carriers import Sensor
 from dappled.products.maps import eye as eyes
 from dappled.products.maps.earth import Projection, utm

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from dappled.cli import main
 from dappled.config.profiles import CameraProfile
-from dappled.decode.geometry import camera_pose
-from dappled.decode.geometry.pose import from_euler
+from dappled.decode.geometry import camera_pose, from_euler
 from dappled.decode.lightfield.light_field import LightField
 from dappled.drivers.raw.darkroom import Darkroom
 from dappled.errors import DappledError

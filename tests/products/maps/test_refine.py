@@ -13,7 +13,7 @@ import pytest
 import rasterio
 from numpy.typing import NDArray
 
-from dappled.decode.geometry.pose import metres_per_radian
+from dappled.decode.geometry import metres_per_radian
 from dappled.mocks.autopilot.path import TruePose
 from dappled.products.maps import georeference, hyperstereo, map_grid, references, refine, terrain
 from dappled.products.maps.eye import turn

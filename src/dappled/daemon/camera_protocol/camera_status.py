@@ -17,8 +17,7 @@ from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol.parameters import DEFINITION_PATH, Definition, Parameters, camera_definition
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.daemon.pipeline.shutter import Shutter
-from dappled.decode.geometry import field_of_view
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry import Pose, field_of_view
 from dappled.drivers.camera import Identity
 from dappled.drivers.mavlink import Message, mavlink
 from dappled.errors import DappledError, report

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from dappled.config.settings import Settings
 from dappled.daemon.health.go_no_go import Check
-from dappled.daemon.navigation import utc
+from dappled.daemon.navigation.clocks import kernel_synchronised
 from dappled.drivers import usb_bus
 from dappled.drivers.camera import CameraError, StateChanged
 from dappled.drivers.registry import open_camera
@@ -35,7 +35,7 @@ class Machine:
     proc: Path = Path("/proc")
     dev: Path = Path("/dev")
     open_s: float = OPEN_S
-    unsynchronised: Callable[[], bool] = field(default=lambda: not utc.kernel_synchronised())
+    unsynchronised: Callable[[], bool] = field(default=lambda: not kernel_synchronised())
 
 
 HostCheck = Callable[[Settings, Machine], list[Check]]

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from dappled.config.settings import Settings
-from dappled.daemon.navigation.clocks import BootClock
-from dappled.daemon.navigation.navigation import TelemetryStatistics
+from dappled.daemon.navigation import BootClock, TelemetryStatistics
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import LinkStatistics
 from dappled.errors import DappledError
 from dappled.flight import layout

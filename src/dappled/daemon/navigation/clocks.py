@@ -1,4 +1,4 @@
-"""Say when a frame was exposed, from the clocks of this machine, the autopilot and the camera.
+"""Relate the clocks of this machine, the autopilot and the camera: when a frame was exposed, and whether UTC is known.
 
 The expected time is the trigger call's plus the body's latency. The autopilot's hot-shoe feedback replaces it; the
 camera's own clock stands in where the trigger call is unknown. Pure functions of what was observed, so a replay gets
@@ -7,15 +7,21 @@ the same numbers.
 Hot-shoe feedback is CAMERA_FEEDBACK (ArduPilot: boot time with a feedback pin, else GPS epoch) and CAMERA_TRIGGER (PX4:
 boot time). Both are also sent for the mere command to fire, without a contact in the hot shoe. Such a message is
 recognised by its time: it is not after our own trigger call, and nothing exposes before that.
+
+Where this machine's UTC can't be believed, the autopilot's satellites give the correction (`UtcLearner`). Stamps
+already written stay as they are; the correction is recorded beside them.
 """
 
 from __future__ import annotations
 
+import ctypes
+import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Literal, Self
+from pathlib import Path
+from typing import Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +31,7 @@ from dappled.drivers.mavlink import Message
 from dappled.flight import Shot
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 LATENCY_SOURCE = "trigger call + body latency"
 REQUEST_SOURCE = "wish + body latency"
@@ -32,6 +39,10 @@ CAMERA_SOURCE = "camera clock (EXIF)"
 CONTACT_SIGMA_NS = 1_000_000  # interrupt and contact bounce; the best bodies were measured at 0.56 ms
 EPOCH_US = 10**15  # 2001; no autopilot has been running for that long
 DRIFT_SIGMA = 50e-6  # crystals of autopilots: some tens of ppm between two machines
+FLOOR_NS = 1_735_689_600 * 10**9  # 2025: a clock that shows less has never been set
+_UTC_BETTER = 2
+_UTC_AGREES_NS = 10**9  # clocks that differ by less are not reported
+_TIMEX_BYTES = 512  # more than any kernel's struct timex
 _UNSEEN_NS = 10**9  # how late a trigger call may be, where not even the file's arrival bounds it
 _REACH_SIGMAS = 4
 _REACH_NS = 50_000_000
@@ -324,3 +335,93 @@ def camera_time(taken: str | None) -> tuple[int, int] | None:
         return None
     digits = fraction[:9]
     return seconds * 10**9 + int(digits.ljust(9, "0") or 0), 10 ** (9 - len(digits))
+
+
+@dataclass(frozen=True, slots=True)
+class UtcCorrection:
+    """What to add to this machine's UTC to get the autopilot's (from its satellites), ± 1 σ."""
+
+    correction_ns: int
+    sigma_ns: int
+    source: str
+
+
+class UtcNotes(Protocol):
+    """Where a correction is recorded; see `flight.recording.Recording`."""
+
+    def learn_utc(self, correction_ns: int, sigma_ns: int, source: str) -> None: ...
+
+
+def machine_knows_utc(utc_ns: int, *, synchronised: Callable[[], bool] | None = None, root: Path = Path("/")) -> bool:
+    """Whether the machine's time of day can be believed: it was set, and is kept by the network, by a hardware clock
+    that runs while the machine is off, or by a host.
+
+    A single-board computer without these shows the time of its last shutdown. A systemd service with `ProtectClock=`
+    may not ask the kernel, so systemd-timesyncd's mark counts as well.
+    """
+    if utc_ns < FLOOR_NS:
+        return False
+    if (synchronised or kernel_synchronised)() or (root / "run/systemd/timesync/synchronized").exists():
+        return True
+    board = (root / "proc/device-tree/model").exists()
+    return not board or any((root / "sys/class/rtc").glob("rtc*"))
+
+
+def kernel_synchronised() -> bool:
+    """Whether the kernel's clock is synchronised (adjtimex(2)); False where the kernel can't be asked."""
+    try:
+        adjtimex = ctypes.CDLL(None, use_errno=True).adjtimex
+    except (OSError, AttributeError):
+        return False
+    timex = ctypes.create_string_buffer(_TIMEX_BYTES)  # modes = 0: only read
+    return int(adjtimex(timex)) in range(5)  # 5 is TIME_ERROR: not synchronised; -1 an error
+
+
+def utc_known(setting: str, utc_ns: int) -> bool:
+    """Whether UTC is known by the setting `record.utc`: system, autopilot (only once it reports UTC), or auto."""
+    return setting == "system" or (setting == "auto" and machine_knows_utc(utc_ns))
+
+
+class UtcLearner:
+    """Records the autopilot's UTC once it is known, and again when it is twice as precise.
+
+    Where the machine's own clock is believed nothing is recorded; `doubt` reports a difference.
+    """
+
+    def __init__(self, notes: UtcNotes, *, known: bool) -> None:
+        self._known, self._notes = known, notes
+        self.learnt: UtcCorrection | None = None
+        self._last: UtcCorrection | None = None
+
+    @property
+    def known(self) -> bool:
+        """Whether the stamps of this flight can be converted to UTC."""
+        return self._known or self.learnt is not None
+
+    def look(self, found: UtcCorrection | None) -> None:
+        """Take what telemetry says now. Raises DappledError when it can't be recorded; the next call tries again."""
+        self._last = found or self._last
+        if self._known or found is None:
+            return
+        if self.learnt is None or found.sigma_ns * _UTC_BETTER <= self.learnt.sigma_ns:
+            log.info("UTC is %+.3f s from this machine's, by %s", found.correction_ns / 1e9, found.source)
+            self._notes.learn_utc(found.correction_ns, found.sigma_ns, found.source)
+            self.learnt = found
+
+    def doubt(self) -> str | None:
+        """A sentence where the machine's clock is believed, and the autopilot's satellites say something else."""
+        last = self._last
+        if not self._known or last is None or abs(last.correction_ns) <= 3 * last.sigma_ns + _UTC_AGREES_NS:
+            return None
+        way = "slow" if last.correction_ns > 0 else "fast"
+        off_s = abs(last.correction_ns) / 1e9
+        return (
+            f"this machine's clock is {off_s:.0f} s {way}, by the autopilot's satellites, and believed all the same: "
+            'set it, or set record.utc = "autopilot"'
+        )
+
+    def utc_ns(self, utc_ns: int) -> int | None:
+        """A stamp of this flight as UTC; None while that is not known."""
+        if self.learnt is not None:
+            return utc_ns + self.learnt.correction_ns
+        return utc_ns if self._known else None

@@ -19,14 +19,15 @@ from dappled.daemon.navigation.clocks import (
     CONTACT_SIGMA_NS,
     BootClock,
     ExposureTime,
+    UtcCorrection,
+    UtcLearner,
     choose_feedback,
     reach_ns,
     refine,
 )
 from dappled.daemon.navigation.samples import HALF_MS_NS, AttitudeSample, GnssSample, PositionSample
-from dappled.daemon.navigation.utc import UtcCorrection, UtcLearner
 from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, Around, Counts, VehicleHistory
-from dappled.decode.geometry.pose import (
+from dappled.decode.geometry import (
     Gnss,
     Pose,
     Quaternion,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from dappled.decode.geometry.pose import Quaternion, Vector3, from_euler, normalised
+from dappled.decode.geometry import Quaternion, Vector3, from_euler, normalised
 from dappled.drivers.mavlink import Message, mavlink
 
 HALF_MS_NS = 500_000  # time_boot_ms is cut to whole milliseconds: its middle is meant

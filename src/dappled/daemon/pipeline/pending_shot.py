@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from dappled.daemon.navigation.clocks import ExposureTime
+from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.pipeline.decode_process import DecodedFrame
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry import Pose
 from dappled.drivers.camera import Blob, Fired, SettingsChanged, StateChanged
 from dappled.flight import Frame, Result, Shot, Tag
 

@@ -16,9 +16,7 @@ from statistics import median
 from typing import Any
 
 from dappled.config import settings as configuration
-from dappled.daemon.navigation import clocks
-from dappled.daemon.navigation.clocks import BodyLatency
-from dappled.daemon.navigation.navigation import recorded_vehicles
+from dappled.daemon.navigation import BodyLatency, clocks, recorded_vehicles
 from dappled.daemon.pipeline import tagger
 from dappled.daemon.pipeline.tagger import Zoom
 from dappled.daemon.replay.replay import RecordedTelemetry

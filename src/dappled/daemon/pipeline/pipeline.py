@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from dappled.daemon.navigation.clocks import BodyLatency
+from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import Capture
 from dappled.daemon.pipeline.decode_process import FrameDecoder
 from dappled.daemon.pipeline.decoding import Decoding

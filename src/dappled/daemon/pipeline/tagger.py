@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Self
 
-from dappled.daemon.navigation.clocks import ExposureTime
-from dappled.decode.geometry.pose import Pose
+from dappled.daemon.navigation import ExposureTime
+from dappled.decode.geometry import Pose
 from dappled.drivers.raw.raw_file import ExposureSettings
 from dappled.flight import Frame, Tag
 

@@ -7,8 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from dappled.daemon.navigation import clocks
-from dappled.daemon.navigation.clocks import BodyLatency, CameraClock, ExposureTime
+from dappled.daemon.navigation import BodyLatency, CameraClock, ExposureTime, clocks
 from dappled.daemon.pipeline import tagger
 from dappled.daemon.pipeline.pending_shot import FlightWriter, Names, Observer, PendingShot, PoseSource
 from dappled.daemon.pipeline.pending_shots import PendingShots

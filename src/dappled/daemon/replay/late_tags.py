@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dappled.config import settings as configuration
-from dappled.daemon.navigation.clocks import BodyLatency
+from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.flight_writer import ReplayVerifier
 from dappled.daemon.pipeline.pending_shot import Names, Observer
 from dappled.daemon.pipeline.pipeline import Pipeline

@@ -13,12 +13,11 @@ from typing import Self
 
 from dappled.clock import RecordedClock
 from dappled.config.settings import Settings
-from dappled.daemon.navigation.clocks import ExposureTime
-from dappled.daemon.navigation.navigation import Telemetry, first_position_utc_ns, recorded_vehicles
+from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_vehicles
 from dappled.daemon.pipeline.flight_writer import Expected, ReplayVerifier
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
-from dappled.decode.geometry.pose import Pose
+from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import Message, PacketParser
 from dappled.drivers.replay import RecordedShot
 from dappled.errors import DappledError

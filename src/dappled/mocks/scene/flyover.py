@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from dappled.decode.geometry.pose import Quaternion
+from dappled.decode.geometry import Quaternion
 from dappled.mocks.autopilot.path import TruePose
 from dappled.mocks.scene import landscape
 from dappled.mocks.scene.landscape import DETAIL_TEXEL_M, TEXEL_M, Landscape

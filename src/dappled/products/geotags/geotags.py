@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from dappled.decode.geometry import Pose
 from dappled.decode.geometry.camera_pose import CameraPose
-from dappled.decode.geometry.pose import Pose
 from dappled.flight import FlightError, Frame, LedgerReader, Tag, disk_error, durable, layout
 from dappled.products.geotags import exif_gps, sidecars
 from dappled.products.geotags.exif_gps import ExifError

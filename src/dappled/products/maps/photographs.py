@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config.profiles import CameraProfile, Lens
-from dappled.decode.geometry import camera_pose
+from dappled.decode.geometry import Pose, camera_pose
 from dappled.decode.geometry.camera_pose import CameraPose, Matrix
-from dappled.decode.geometry.pose import Pose
 from dappled.decode.lightfield.light_field import LightField
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
