@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from dappled.daemon.navigation import Telemetry
 from dappled.daemon.navigation.clocks import from_arrivals
-from dappled.daemon.navigation.navigation import Telemetry
 from dappled.decode.geometry import (
     Gnss,
     Pose,

@@ -1,8 +1,31 @@
-"""Poses of vehicle and camera, interpolation between samples, and the field of view; for daemon and products.
+"""Poses of vehicle and camera, interpolation between samples, field of view and footprint; for daemon and products.
 
 `camera_pose` loads pyproj: import it where it is needed.
 """
 
-from dappled.decode.geometry.pose import Gnss, Pose, Quaternion, Symmetric, Vector3
+from dappled.decode.geometry.pose import (
+    Gnss,
+    Pose,
+    Quaternion,
+    Symmetric,
+    Vector3,
+    conjugate,
+    from_euler,
+    hermite,
+    hermite_doubt,
+    metres_per_radian,
+    multiply,
+    norm,
+    normalised,
+    rotation_vector,
+    slerp,
+    slerp_doubt,
+    turn_rad,
+    turned_by_heading,
+)
 
-__all__ = ["Gnss", "Pose", "Quaternion", "Symmetric", "Vector3"]
+__all__ = [
+    "Gnss", "Pose", "Quaternion", "Symmetric", "Vector3", "conjugate", "from_euler", "hermite", "hermite_doubt",
+    "metres_per_radian", "multiply", "norm", "normalised", "rotation_vector", "slerp", "slerp_doubt", "turn_rad",
+    "turned_by_heading",
+]  # fmt: skip
