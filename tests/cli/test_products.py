@@ -196,7 +196,7 @@ def test_a_rerun_recording_is_written_and_can_be_read(field: str, tmp_path: Path
         (["depth", "{}", "--focus", "inf", "--flight", "x", "-o", "{out}.ply"], "--frame N"),
         (["depth", "{}", "--window", "4"], "a window of 4 px"),
         (["export", "{}", "--as", "npz", "-o", "{out}.h5"], "writes a .npz file"),
-        (["depth", "{}", "--calibration", "{toml}"], "knows no distances"),
+        (["depth", "{}", "--calibration", "{toml}"], "has no distances"),
         (["views", "{}.gone.npz", "-o", "{out}.png"], "does not exist"),
     ],
 )

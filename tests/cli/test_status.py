@@ -45,7 +45,7 @@ def test_one_screen_says_how_it_is(stream: str, capsys: pytest.CaptureFixture[st
     assert "camera    faulted: it hangs" in said
     assert "udpin:0.0.0.0:14560: 1200 in, 34 out, 2 bad, 0 unsent; signed: 9 good, 3 forged, 1 replayed" in said
     assert "disk      unknown, /x" in said
-    assert "9 wished, 7 safe, 1 failed, 1 pending, 3 refused" in said
+    assert "9 requested, 7 safe, 1 failed, 1 pending, 3 refused" in said
     assert "problem   the camera is faulted: it hangs" in said
 
 

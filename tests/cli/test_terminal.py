@@ -15,6 +15,7 @@ from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, fram
 from dappled.daemon.health import systemd
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.drivers.camera import BodyState, StateChanged
+from tests.daemon.health.test_metrics import HEALTH
 from tests.daemon.health.test_systemd import read
 from tests.flight.makers import shot
 
@@ -61,32 +62,40 @@ def test_the_camera_is_told_of_when_it_changes() -> None:
 
 def test_a_problem_is_said_once_each_time_it_comes_up() -> None:
     said: list[str] = []
-    records: list[Mapping[str, Any]] = []
+    lines: list[str] = []
     problems: list[str] = []
     now_s = 10.0
 
+    class Daemon:
+        def health(self) -> Mapping[str, Any]:
+            return {**HEALTH, "problems": list(problems)}
+
+    class Manager:
+        def status(self, text: str) -> None:
+            lines.append(text)
+
     remarks = ProblemRemarks(
-        lambda: {"problems": list(problems)},
-        records.append,
+        Daemon(),
+        Manager(),
         say=lambda text, *_, **__: said.append(text),
         clock_s=lambda: now_s,
     )
-    remarks.tell()
-    assert records == []  # not yet a second old
+    remarks.look()
+    assert lines == []  # not yet a second old
     for here in (["b", "a"], ["a"], ["a", "b"]):
         problems[:] = here
         now_s += 1.0
-        remarks.tell()
-        remarks.tell()
+        remarks.look()
+        remarks.look()
     assert said == ["problem: a", "problem: b", "problem: b"]
-    assert len(records) == 3
+    assert [line.split("; ", 1)[1] for line in lines] == ["b; a", "a", "a; b"]
     for here in (["disk: 12 MB left"], ["disk: 11 MB left"]):
         problems[:] = here
         now_s += 1.0
-        remarks.tell()
+        remarks.look()
     assert said[3:] == ["problem: disk: 12 MB left"]  # numbers that change are no news
     problems[:] = ["the end"]
-    remarks.tell(now=True)
+    remarks.look(now=True)
     assert said[-1] == "problem: the end"
 
 

@@ -113,7 +113,7 @@ def test_a_changed_slices_hash_is_found(copied: Path) -> None:
 def test_verify_needs_a_flight(tmp_path: Path) -> None:
     done = dappled("replay", str(tmp_path), "--verify")
     assert done.returncode == 1
-    assert "no recorded flight" in done.stderr
+    assert "is not a recorded flight" in done.stderr
 
 
 def test_a_new_recipe_writes_beside_the_old_results(copied: Path) -> None:
@@ -150,7 +150,7 @@ def test_flights_are_found_by_the_daemon_s_settings(flown: Flown, tmp_path: Path
     config = tmp_path / "dappled.toml"
     config.write_text(f'[record]\ndirectory = "{flown.flight.parent}"\n', encoding="utf-8")
     assert flown.flight.name in dappled("flight", "list", "--config", str(config)).stdout
-    assert "the books balance" in dappled("flight", "report", "--config", str(config)).stdout
+    assert "the counts agree" in dappled("flight", "report", "--config", str(config)).stdout
 
 
 def test_the_flight_decodes_again_on_the_ground(flown: Flown, tmp_path: Path) -> None:

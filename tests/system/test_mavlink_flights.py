@@ -133,7 +133,7 @@ def test_decoding_is_switched_from_the_ground_and_the_flight_says_so(tmp_path: P
     assert "not decoded: decoding was switched off" in told(folder)
     verified = dappled("replay", str(folder), "--verify", timeout_s=150)
     assert verified.returncode == 0, verified.stderr
-    assert verified.stdout.endswith("verified 2 frames: all hashes the same (1 were left undecoded in flight)\n")
+    assert verified.stdout.endswith("verified 2 frames: all hashes the same (1 left undecoded in flight)\n")
 
 
 @pytest.mark.slow

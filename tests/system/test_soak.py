@@ -1,4 +1,4 @@
-"""Two minutes of the soak: everything goes wrong, and the books balance to the last shot."""
+"""Two minutes of the soak: everything goes wrong, and every shot is accounted for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The `dappled` command: a thin face over the rooms. Verbs are stable; each lives in a module of its own here."""
+"""The `dappled` command. Each verb has a module or folder here, which is loaded only when the verb is called."""
 
 from __future__ import annotations
 
@@ -13,35 +13,40 @@ import dappled
 from dappled.daemon.health import systemd
 from dappled.errors import DappledError
 
-# Verb: (module of this package, one line). The module has `configure(parser)` and `run(arguments) -> exit code`.
+# Verb: (module, its line in --help). The module has `configure(parser)` and `run(arguments) -> exit code`.
 VERBS: dict[str, tuple[str, str]] = {
-    "run": ("run", "the daemon: fire, record, tag, decode, publish"),
-    "replay": ("replay", "a recorded flight, or a folder of frames, through the same daemon"),
-    "doctor": ("doctor", "what is missing on this machine; a test shot, and its latency"),
-    "status": ("status", "how the running daemon is"),
-    "watch": ("watch", "subscribe: show and save what arrives"),
-    "keys": ("keys", "keys for who may subscribe over the network, and the console's token"),
-    "trigger": ("trigger", "the ground station's part: ask for frames over MAVLink"),
-    "mavlink": ("keys", "keys for signed MAVLink links"),
-    "decode": ("decode", "frames to light fields"),
-    "carriers": ("carriers", "predicted and measured carriers of a frame"),
-    "calibrate": ("calibrate", "fit lattice, law and phases to frames"),
-    "views": ("views", "a light field's views, slices or shifts as one picture"),
-    "refocus": ("refocus", "pictures focused anew: by α, disparity or metres, on a plane, with two eyes"),
-    "depth": ("depth", "disparities and distances, each with its uncertainty; point clouds"),
-    "export": ("export", "light fields for other tools: hci, eslf, mat, quilt, h5 …"),
+    "run": ("run", "run the daemon: fire, record, tag, decode, publish"),
+    "replay": ("replay", "run a recorded flight, or a folder of frames, through the same pipeline"),
+    "doctor": ("doctor", "say what is missing on this machine; fire a test shot; measure latency"),
+    "status": ("status", "show the state of the running daemon"),
+    "watch": ("watch", "subscribe to the stream: show and save what arrives"),
+    "keys": ("keys", "make keys for subscribers on the network, and the console's token"),
+    "trigger": ("trigger", "ask for frames over MAVLink, as a ground station does"),
+    "mavlink": ("keys", "make keys for signed MAVLink links"),
+    "decode": ("decode", "decode frames to light fields"),
+    "carriers": ("carriers", "show the predicted and the measured carriers of a frame"),
+    "calibrate": ("calibrate", "fit lattice, law and phases to calibration frames"),
+    "views": ("views", "draw a light field's views, slices or shifts as one picture"),
+    "refocus": ("refocus", "refocus a light field: by α, disparity or metres, on a plane, as a stereo pair"),
+    "depth": ("depth", "measure disparities and distances with their uncertainty; write point clouds"),
+    "export": ("export", "write light fields for other tools: hci, eslf, mat, quilt, h5 …"),
     "mask": ("mask", "the printed mask: make, table, diffraction, design, and plan a flight with it"),
     "flight": ("flight", "recorded flights: list, show, check, report, offload, pickup"),
-    "geotag": ("geotag", "positions and attitudes for other programs: XMP sidecars, geo.txt, CSV, GeoJSON"),
-    "georeference": ("georeference", "a flight as maps: KMZ overlay, GeoTIFF, footprints, terrain"),
-    "batch": ("batch", "whole flights frame by frame, on all cores or a Dask cluster"),
+    "geotag": ("geotag", "write positions and attitudes for other programs: XMP, geo.txt, CSV, GeoJSON"),
+    "georeference": ("georeference", "make maps of a flight: KMZ overlay, GeoTIFF, footprints, terrain"),
+    "batch": ("batch", "process whole flights frame by frame, on all cores or a Dask cluster"),
     "config": ("config", "check or show settings"),
-    "profiles": ("config", "shipped camera and mask profiles"),
+    "profiles": ("config", "list the shipped camera and mask profiles"),
 }
 
 
+def counted(count: int, noun: str, width: int = 0) -> str:
+    """A number with its noun: 1 frame, 2 frames."""
+    return f"{count:{width}d} {noun}" + ("" if count == 1 else "s")
+
+
 def parser(wanted: str | None = None) -> argparse.ArgumentParser:
-    """The whole command line; only the wanted verb's module is loaded, so that the others cost nothing."""
+    """The whole command line. Only the module of the wanted verb is loaded."""
     top = argparse.ArgumentParser(
         prog="dappled",
         description="Acquisition daemon for masked light-field cameras that fly.",
@@ -62,7 +67,7 @@ def parser(wanted: str | None = None) -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code: 0, 1 for a failure, 2 for a wrong call."""
+    """Run the command line; returns the exit code: 0, 1 for a failure, 2 for a wrong call, 130 when interrupted."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     wanted = next((word for word in words if not word.startswith("-")), None)
     parsed = parser(wanted).parse_args(words)
@@ -80,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nobody reads any more: end quietly
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader is gone: end quietly
         return 1
     except OSError as error:
         if parsed.debug:

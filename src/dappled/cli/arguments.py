@@ -1,4 +1,4 @@
-"""Arguments of any verb: numbers that are checked, and actions, as in `dappled flight show`."""
+"""Parse what any verb may take: checked numbers, and actions such as `show` in `dappled flight show`."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 
 def whole(text: str) -> int:
-    """An argument that is a whole number from 1."""
+    """Parse a whole number from 1."""
     if not (text.isdecimal() and int(text) >= 1):
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1")
     return int(text)
 
 
 def seconds(text: str) -> float:
-    """An argument that is a time of 0 s or more."""
+    """Parse a time of 0 s or more."""
     number = _number(text)
     if number is None or not (math.isfinite(number) and number >= 0):
         raise argparse.ArgumentTypeError(f"{text!r} is not a time of 0 s or more")
@@ -24,7 +24,7 @@ def seconds(text: str) -> float:
 
 
 def positive(text: str) -> float:
-    """An argument that is a number above 0."""
+    """Parse a number above 0."""
     number = _number(text)
     if number is None or not (math.isfinite(number) and number > 0):
         raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
@@ -32,7 +32,7 @@ def positive(text: str) -> float:
 
 
 def metres(text: str) -> float:
-    """An argument that is a distance above 0 m; inf too."""
+    """Parse a distance above 0 m, or inf."""
     number = float(text)
     if not number > 0 or math.isnan(number):
         raise argparse.ArgumentTypeError(f"{text} is not a distance above 0 m")
@@ -48,22 +48,22 @@ def _number(text: str) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Actions:
-    """The actions of one verb; one must be named, and stands in `arguments.action`."""
+    """The actions of one verb. The call must name one; `arguments.action` holds it."""
 
     among: argparse._SubParsersAction[argparse.ArgumentParser]
 
     @classmethod
     def of(cls, parser: argparse.ArgumentParser) -> Actions:
-        """A verb's actions: none yet."""
+        """No actions yet, for the parser of a verb."""
         return cls(parser.add_subparsers(dest="action", required=True, metavar="ACTION"))
 
     @property
     def all(self) -> Collection[argparse.ArgumentParser]:
-        """Their parsers, for what all of them take."""
+        """The parsers of all actions, to add what all of them take."""
         return self.among.choices.values()
 
     def add(self, name: str, line: str, *examples: str) -> argparse.ArgumentParser:
-        """The parser of an action that `line` explains, and calls of it that work."""
+        """Add an action: its line in --help, and example calls. Returns its parser."""
         head = "example" if len(examples) == 1 else "examples"
         made: argparse.ArgumentParser = self.among.add_parser(
             name,

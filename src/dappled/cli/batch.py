@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dappled.cli import georeference
+from dappled.cli import counted, georeference
 from dappled.cli.arguments import whole
 from dappled.errors import DappledError
 from dappled.flight import layout
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not jobs:
         raise DappledError("these flights hold no frames")
     if not arguments.json:
-        print(f"{len(todo) - bad} frames made, {len(jobs) - len(todo)} were there already, {bad} could not be made")
+        print(f"{counted(len(todo) - bad, 'frame')} made, {len(jobs) - len(todo)} already there, {bad} failed")
     return 1 if bad or refused else 0
 
 

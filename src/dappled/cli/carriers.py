@@ -1,4 +1,4 @@
-"""`dappled carriers`: where the carriers should be, and where they are."""
+"""`dappled carriers`: predict the carriers, measure them in a frame, print a table, draw the spectrum."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 from PIL import Image
 
-from dappled.cli import decode_arguments
+from dappled.cli import counted, decode_arguments
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
 from dappled.decode.decoder import CarriersFrom, doubt
@@ -35,7 +35,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     decode_arguments.add_frames(parser, "?")
     decode_arguments.add_recipe(parser)
     parser.add_argument(
-        "--crossed", action="store_true", help="also the orders between harmonics that the pattern doesn't ask for"
+        "--crossed",
+        action="store_true",
+        help="also the orders between harmonics that the pattern is not designed to make",
     )
     parser.add_argument("--shape", type=int, nargs=2, metavar=("H", "W"), help="predict only, for frames of this size")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the spectrum with its boxes")
@@ -48,7 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """What is printed: the carriers of both half planes, and what was seen of each."""
+    """What is printed: the carriers of both half planes, predicted and measured."""
 
     shape: tuple[int, int]
     law: str
@@ -63,12 +65,12 @@ class Table:
 
     @property
     def used(self) -> Lattice:
-        """What slices are cut at: the frame's own lattice where it shows one, else the predicted."""
+        """The lattice that slices are cut at: the frame's own if it shows one, else the predicted."""
         return self.own or self.lattice
 
     @property
     def seen(self) -> int:
-        """How many carriers the frame shows, the mean and suspect ones left out."""
+        """How many carriers the frame shows, without the mean and suspect ones."""
         return sum(m is not None and not m.suspect and (c.ky, c.kx) != (0, 0) for c, m in self.rows)
 
 
@@ -87,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def picture(plane: Plane, table: Table, look: Look = "magnitude") -> Any:
-    """The spectrum with a box a slice, uint8 RGB (Figs 36, 41, 42)."""
+    """The spectrum with a box around each slice, uint8 RGB (Figs 36, 41, 42)."""
     half = [(c, m) for c, m in table.rows if (c.ky, c.kx) >= (0, 0) and c.on_sensor]
     high, wide = padded_shape(table.shape)
     size = table.used.slice_size((high, wide))
@@ -106,15 +108,17 @@ def _picture(plane: Plane, table: Table, arguments: argparse.Namespace) -> Any:
         return picture(plane, table, arguments.look or "magnitude")
     (carrier,) = table.used.carriers([tuple(arguments.around)])
     if not carrier.on_sensor:
-        raise DarkroomError(f"the carrier {carrier.ky} {carrier.kx} falls off the sensor: --around another one")
+        raise DarkroomError(
+            f"the carrier {carrier.ky} {carrier.kx} falls off the sensor: choose another one with --around"
+        )
     return around(plane, (carrier.fy, carrier.fx), look=arguments.look or "phase")
 
 
 def _predicted(arguments: argparse.Namespace) -> Table:
     if not arguments.shape or arguments.camera == "auto" or arguments.mask == profiles.LENSLET:
-        raise ConfigError("name a frame; or say what to predict for: --shape, --camera, --mask and --focal-length")
+        raise ConfigError("name a frame, or give --shape, --camera, --mask and --focal-length to predict")
     if not arguments.focal_length or arguments.focal_length <= 0:
-        raise ConfigError("without a frame nothing tells the focal length: give --focal-length, in mm")
+        raise ConfigError("without a frame the focal length is unknown: give --focal-length, in mm")
     camera = profiles.camera(arguments.camera)
     darkroom = Darkroom(decode_arguments.recipe(arguments))
     decoder = darkroom.mask_decoder((arguments.shape[0], arguments.shape[1]), next(iter(camera.models), ""))
@@ -173,7 +177,7 @@ def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
 
 
 def measure_mean() -> Measured:
-    """The mean of a frame, which is always there."""
+    """The mean of a frame, which every frame has."""
     return Measured(0.0, 0.0, 1.0, 0.0, 1.0, False)
 
 
@@ -242,7 +246,7 @@ def _as_text(table: Table) -> str:
         elif seen is not None:
             at = Carrier(0, 0, seen.fy, seen.fx).index(table.shape)
             line += f"   {at[0]:9.2f} {at[1]:9.2f} {seen.strength:8.4f}"
-            line += "  suspect: a simple fraction of the frame, where sensor artefacts stand" if seen.suspect else ""
+            line += "  suspect: at a simple fraction of the frame, as sensor artefacts are" if seen.suspect else ""
         lines.append(line)
     if any((c.ky, c.kx) not in table.main for c, _ in table.rows):
         lines.append("x: a crossed order, between the two diagonals of harmonics")
@@ -251,12 +255,12 @@ def _as_text(table: Table) -> str:
 
 
 def _summary(table: Table) -> str:
-    """What was found, in a sentence."""
+    """The result in a sentence."""
     if table.found:
         pitch = " × ".join(f"{p:.2f}" for p in table.found.spacing_px)
         return (
             f"a lattice of {pitch} px, turned by {math.degrees(table.found.rotation_rad):.2f}°, "
-            f"residual {table.found.residual_bins:.2f} bins; {table.seen} carriers"
+            f"residual {table.found.residual_bins:.2f} bins; {counted(table.seen, 'carrier')}"
         )
     start = f"law {table.law}, focal length {table.focal_length_mm:g} mm"
     if table.carriers_from is None:
@@ -271,7 +275,7 @@ def _summary(table: Table) -> str:
     whose = "calibration's" if table.carriers_from == "calibrated" else "law's"
     if table.seen == 0:
         return (
-            f"{start}; no carriers in this frame: it is no frame from behind this mask, or was taken near the mask's "
-            f"ideal aperture, where flat parts show none; a decode uses the {whose} prediction"
+            f"{start}; no carriers in this frame: it was not taken through this mask, or near the mask's ideal "
+            f"aperture, where flat parts show none; a decode uses the {whose} prediction"
         )
     return f"{start}; {table.seen} of {there} carriers seen, too few or weak: a decode uses the {whose} prediction"

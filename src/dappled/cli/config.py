@@ -1,4 +1,4 @@
-"""`dappled config check|show` and `dappled profiles`."""
+"""`dappled config check|show` and `dappled profiles`: check and show settings, list profiles."""
 
 from __future__ import annotations
 
@@ -20,10 +20,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
         return
     parser.epilog = "example: dappled config check /etc/dappled/dappled.toml"
     actions = Actions.of(parser)
-    check = actions.add("check", "is this file right?", "dappled config check /etc/dappled/dappled.toml")
-    check.add_argument("file", type=Path, metavar="FILE", help="settings")
-    show = actions.add("show", "every setting with its value, unit and meaning", "dappled config show > dappled.toml")
-    show.add_argument("file", type=Path, nargs="?", metavar="FILE", help="settings (default: every default)")
+    check = actions.add("check", "check a settings file", "dappled config check /etc/dappled/dappled.toml")
+    check.add_argument("file", type=Path, metavar="FILE", help="settings file")
+    show = actions.add(
+        "show", "show every setting with its value, unit and meaning", "dappled config show > dappled.toml"
+    )
+    show.add_argument(
+        "file", type=Path, nargs="?", metavar="FILE", help="settings file (default: the default settings)"
+    )
     show.add_argument("--json", action="store_true", help="as JSON")
 
 

@@ -1,4 +1,4 @@
-"""`dappled decode`: frames to light fields."""
+"""`dappled decode`: decode frames to light fields."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dappled.cli import decode_arguments
+from dappled.cli import counted, decode_arguments
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.errors import DappledError
 from dappled.products.exports import light_files
@@ -26,8 +26,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="light field (.zarr, .npz, .h5); with several frames a folder")  # fmt: skip
     parser.add_argument("--colour", action="store_true", help="views in red, green and blue (default: grey)")
     parser.add_argument("--taper", type=float, default=0.0, metavar="SHARE",
-                        help="share of each band that falls off softly, 0 to 1: less ringing, less detail")  # fmt: skip
-    parser.add_argument("--overwrite", action="store_true", help="replace what stands there")
+                        help="share of each band with a soft edge, 0 to 1: less ringing, less detail")  # fmt: skip
+    parser.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
             bad += 1
             print(f"dappled decode: {error}", file=sys.stderr)
     if bad:
-        print(f"{bad} of {len(arguments.frames)} frames could not be decoded", file=sys.stderr)
+        print(f"{bad} of {counted(len(arguments.frames), 'frame')} could not be decoded", file=sys.stderr)
     return 1 if bad else 0
 
 
@@ -69,7 +69,7 @@ def summary(made: DecodeResult) -> str:
     """Slices, views, and where both came from."""
     field = made.light_field
     rows, columns = field.views.shape[:2]
-    views = f"{rows} × {columns} views" if rows else "no views (they need a calibration, or carriers to be seen)"
+    views = f"{rows} × {columns} views" if rows else "no views (they need a calibration, or visible carriers)"
     size = " × ".join(str(n) for n in field.slices.shape)
     found = f"{made.carriers_found} of {made.carriers_predicted} carriers seen"
     whole = f"slices {size}, {views}; {found}, {made.report.carriers_from}"

@@ -1,4 +1,4 @@
-"""Arguments of verbs that decode frames or read light fields: camera, mask, files, focus and disparities."""
+"""Parse what verbs take that decode frames or read light fields: camera, mask, files, focus, disparities."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from dappled.products.opened import OpenedLightField
 
 
 def add_frames(parser: argparse.ArgumentParser, count: str) -> None:
-    """The frames, as positional arguments."""
+    """Add the frames, as positional arguments."""
     parser.add_argument("frames", nargs=count, type=Path, metavar="FRAME", help="RAF, CR2, DNG, LFP, TIFF, PNG or NPY")
 
 
 def add_law(parser: argparse.ArgumentParser) -> None:
-    """--law; empty where it isn't given."""
+    """Add --law; empty by default."""
     parser.add_argument("--law", default="", choices=tuple(LAWS), help="carrier law (default: the camera's)")
 
 
 def add_recipe(parser: argparse.ArgumentParser, *, mask_needed: bool = True) -> None:
-    """--camera, --mask, --law, and what files and numbers go with a frame."""
+    """Add --camera, --mask, --law, and the files and numbers that go with a frame."""
     parser.add_argument(
         "--camera", default="auto", metavar="P", help="camera profile or TOML file (default: by the frame)"
     )
@@ -34,11 +34,11 @@ def add_recipe(parser: argparse.ArgumentParser, *, mask_needed: bool = True) -> 
     parser.add_argument("--calibration", default="", metavar="FILE", help="file written by dappled calibrate")
     parser.add_argument("--white", default="", metavar="FILE", help="white frame")
     parser.add_argument("--dark", default="", metavar="FILE", help="dark frame")
-    parser.add_argument("--cfa", default="", metavar="BGGR", help="colour pattern, row by row, where the file has none")
-    parser.add_argument("--black", type=float, metavar="N", help="black level, where the file doesn't say")
+    parser.add_argument("--cfa", default="", metavar="BGGR", help="colour pattern, row by row, if the file has none")
+    parser.add_argument("--black", type=float, metavar="N", help="black level, if the file doesn't say")
     parser.add_argument("--white-level", type=float, metavar="N", help="level of a full pixel (a 12-bit PNG: 4095)")
-    parser.add_argument("--focal-length", type=float, metavar="MM", help="of the lens, where the file doesn't say")
-    parser.add_argument("--f-number", type=float, metavar="N", help="of the exposure, where the file doesn't say")
+    parser.add_argument("--focal-length", type=float, metavar="MM", help="focal length, if the file doesn't say")
+    parser.add_argument("--f-number", type=float, metavar="N", help="f-number of the exposure, if the file doesn't say")
 
 
 def recipe(arguments: argparse.Namespace) -> Recipe:
@@ -60,13 +60,15 @@ def recipe(arguments: argparse.Namespace) -> Recipe:
 
 
 def add_field(parser: argparse.ArgumentParser, *, ranged: bool = True) -> None:
-    """The light field, and what leads to metres."""
+    """Add the light field; if `ranged`, also --focus and --calibration, which give distances in metres."""
     parser.add_argument("field", type=Path, metavar="LIGHTFIELD",
                         help="decoded light field (.zarr, .npz, .h5), or a folder of n × n pictures")  # fmt: skip
     if ranged:
-        parser.add_argument("--focus", type=metres, metavar="M", help="where the lens was focused, in metres, or inf")
+        parser.add_argument(
+            "--focus", type=metres, metavar="M", help="distance at which the lens was focused, in metres, or inf"
+        )
         parser.add_argument("--calibration", type=Path, metavar="FILE",
-                            help="calibration with targets, as dappled calibrate --target writes it")  # fmt: skip
+                            help="calibration with targets, from dappled calibrate --target")  # fmt: skip
 
 
 def opened_field(arguments: argparse.Namespace) -> OpenedLightField:
@@ -76,13 +78,13 @@ def opened_field(arguments: argparse.Namespace) -> OpenedLightField:
     if calibration is not None:
         tables = calibration_files.tables(calibration)
         if RANGING not in tables:
-            raise opened.OpenError(f"{calibration} knows no distances: make it anew with dappled calibrate --target")
+            raise opened.OpenError(f"{calibration} has no distances: make it again with dappled calibrate --target")
         found = OpenedLightField(opened.with_ranging(found.field, Ranging.from_dict(tables[RANGING])), found.path)
-        found.metres()  # asked for by name: refused where it is for another focal length
+        found.metres()  # the user named it: refuse it if it is for another focal length
     return found
 
 
 def add_between(parser: argparse.ArgumentParser) -> None:
-    """--between."""
+    """Add --between."""
     parser.add_argument("--between", nargs=2, type=float, metavar=("LOW", "HIGH"),
-                        help="disparities to look at, px/view (default: where the scene lies)")  # fmt: skip
+                        help="range of disparities to search, px/view (default: that of the scene)")  # fmt: skip

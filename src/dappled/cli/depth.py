@@ -1,4 +1,4 @@
-"""`dappled depth`: disparities, and distances where a calibration allows, each with its uncertainty."""
+"""`dappled depth`: measure disparities, and distances if a calibration allows, each with its uncertainty."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.cli import decode_arguments
+from dappled.cli import counted, decode_arguments
 from dappled.decode.depth import estimate as depths
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.decode.depth.ranging import DistanceMap
@@ -38,11 +38,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="combined (default), contrast, gradient or stereo")  # fmt: skip
     decode_arguments.add_between(parser)
     parser.add_argument("--window", type=int, default=depths.WINDOW, metavar="PX",
-                        help=f"side of what a pixel is judged by (default: {depths.WINDOW})")  # fmt: skip
+                        help=f"side of the window around a pixel (default: {depths.WINDOW})")  # fmt: skip
     parser.add_argument("--most-sigma", type=float, default=0.1, metavar="SHARE",
-                        help="withhold points with a σ above this share of their distance (default: 0.1)")  # fmt: skip
-    parser.add_argument("--flight", type=Path, metavar="FLIGHT", help="with --frame: points on the map, by its pose")
-    parser.add_argument("--frame", type=int, metavar="N", help="which frame of the flight this is")
+                        help="omit points with a σ above this share of their distance (default: 0.1)")  # fmt: skip
+    parser.add_argument(
+        "--flight", type=Path, metavar="FLIGHT", help="with --frame: place the points on the map, by that frame's pose"
+    )
+    parser.add_argument("--frame", type=int, metavar="N", help="number of this frame in the flight")
     parser.add_argument("--crs", default="", metavar="EPSG:N", help="projection of the points (default: the UTM zone)")
     parser.add_argument("-o", "--output", nargs="+", type=Path, default=[], metavar="OUT", help="files to write")
     parser.add_argument("--json", action="store_true", help="the summary as JSON")
@@ -62,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def summary(found: OpenedLightField, made: DepthMap, distances: DistanceMap | None) -> dict[str, Any]:
-    """What a depth map says in a few numbers; None where nothing is known."""
+    """A depth map in a few numbers; None where nothing is known."""
     told: dict[str, Any] = {
         "method": made.method,
         "known": made.known_share(),
@@ -84,11 +86,11 @@ def summary(found: OpenedLightField, made: DepthMap, distances: DistanceMap | No
 def _why_not(found: OpenedLightField) -> str:
     try:
         found.metres()
-    except DecodeError as error:  # a calibration that is not for this frame
+    except DecodeError as error:  # the calibration is for another frame
         return str(error)
     except OpenError:
         pass
-    return "metres need --focus, or a calibration with targets (--calibration)"
+    return "distances need --focus, or a calibration with targets (--calibration)"
 
 
 def words(told: dict[str, Any]) -> str:
@@ -109,7 +111,9 @@ def words(told: dict[str, Any]) -> str:
     else:
         lines.append(f"relative depth only: {told['no_distances']}")
     if "withheld" in told:
-        lines.append(f"{told['points']} points, {told['withheld']} withheld for their σ ({told['coordinates']})")
+        lines.append(
+            f"{counted(told['points'], 'point')}, {told['withheld']} omitted for their σ ({told['coordinates']})"
+        )
     lines += [f"written: {path}" for path in told.get("written", [])]
     return "\n".join(lines)
 
@@ -141,7 +145,7 @@ def _write(
 
 
 def _whole(path: Path, write: Callable[[Path], None]) -> None:
-    """Under another name, then renamed: a file is there whole, or not at all. Raises OpenError."""
+    """Write under another name, then rename, so that no half-written file is left. Raises OpenError."""
     part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
     try:
         write(part)
@@ -156,12 +160,12 @@ def _points(
     path: Path, found: OpenedLightField, distances: DistanceMap | None, arguments: argparse.Namespace
 ) -> dict[str, Any]:
     if distances is None:
-        found.metres()  # says what is missing
+        found.metres()  # raises with what is missing
         raise OpenError("points need distances")
     station = None
     if arguments.flight is not None:
         if arguments.frame is None:
-            raise OpenError("--flight needs --frame N: which of its frames this is")
+            raise OpenError("--flight needs --frame N: the number of this frame in the flight")
         frames, tags = photographs.recorded(arguments.flight)
         chosen = next((f for f in frames if f.index == arguments.frame), None)
         if chosen is None:
@@ -178,7 +182,7 @@ def _points(
 def _picture(values: NDArray[np.float32], unit: str) -> prints.Bytes:
     known = values[np.isfinite(values)]
     if known.size == 0:
-        raise OpenError("no pixel is known: there is nothing to draw (is the scene without texture?)")
+        raise OpenError("no pixel has a known depth, so there is nothing to draw: the scene may lack texture")
     low, high = (float(x) for x in np.quantile(known, [0.01, 0.99]))
     return prints.with_scale(values, low, high, unit)
 

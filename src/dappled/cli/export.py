@@ -1,4 +1,4 @@
-"""`dappled export`: light fields in the forms that other tools read."""
+"""`dappled export`: write light fields in the formats that other tools read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dappled.products.opened import OpenedLightField
 
 KINDS = {
     "hci": "HCI benchmark folder: a PNG a view, parameters.cfg; with --depth also disp_estimate.pfm",
-    "eslf": "ESLF: one 16-bit PNG, a lenslet a pixel; its size beside it in a .txt",
+    "eslf": "ESLF: one 16-bit PNG, a lenslet a pixel; its size in a .txt beside it",
     "mat": "MATLAB v5 as LFToolbox has it: LF [t, s, v, u, c]",
     "quilt": "quilt PNG for light-field displays; its name tells columns, rows and aspect",
     "h5": "HDF5: slices, views and all", "npz": "NumPy", "zarr": "Zarr",
@@ -21,13 +21,15 @@ KINDS = {
 
 def configure(parser: argparse.ArgumentParser) -> None:
     lines = "\n".join(f"  {name:6} {what}" for name, what in KINDS.items())
-    parser.epilog = f"forms:\n{lines}\nexample: dappled export frame.zarr --as hci -o hci/frame"
+    parser.epilog = f"formats:\n{lines}\nexample: dappled export frame.zarr --as hci -o hci/frame"
     decode_arguments.add_field(parser)
-    parser.add_argument("--as", dest="kind", choices=tuple(KINDS), required=True, help="the form")
+    parser.add_argument("--as", dest="kind", choices=tuple(KINDS), required=True, help="the format")
     parser.add_argument("--depth", action="store_true", help="hci, rerun: with a depth map (combined)")
     parser.add_argument("--lenslet", type=int, default=0, metavar="PX",
                         help=f"eslf: side of a lenslet (LFToolbox: {exports.ESLF_LENSLET_PX})")  # fmt: skip
-    parser.add_argument("--disparity", type=float, default=0.0, metavar="D", help="quilt: what lies in the screen")
+    parser.add_argument(
+        "--disparity", type=float, default=0.0, metavar="D", help="quilt: the disparity that lies in the screen"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="file or folder to write")
 
 
@@ -38,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def write(found: OpenedLightField, kind: str, path: Path, arguments: argparse.Namespace) -> Path:
-    """The path that was written. Raises DappledError."""
+    """Write the light field; returns the path. Raises DappledError."""
     match kind:
         case "hci":
             exports.hci(path, found.field, found.depth() if arguments.depth else None)
@@ -54,6 +56,6 @@ def write(found: OpenedLightField, kind: str, path: Path, arguments: argparse.Na
             exports.rerun(path, found.field, found.refocus(), depth, distances)
         case _:
             if path.suffix != f".{kind}":
-                raise exports.ExportError(f"{path}: --as {kind} writes a .{kind} file; name it so")
+                raise exports.ExportError(f"{path}: --as {kind} writes a .{kind} file; give it that ending")
             light_files.save(path, found.field)
     return path

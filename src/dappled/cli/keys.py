@@ -27,13 +27,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  laptop$  dappled watch tcp://10.0.0.7:5555 --keys laptop.key_secret --server-key vehicle.key"
     )
     actions = Actions.of(parser)
-    make = actions.add("make", "a pair: NAME.key to give away, NAME.key_secret to keep", "dappled keys make laptop")
-    make.add_argument("name", metavar="NAME", help="whose it is: letters, digits, dot, dash, underscore")
-    make.add_argument("-o", "--folder", type=Path, default=HOME, help=f"where to (default: {HOME})")
-    show = actions.add("show", "the public key in a file", "dappled keys show laptop.key")
+    make = actions.add(
+        "make", "make a pair: NAME.key to give away, NAME.key_secret to keep", "dappled keys make laptop"
+    )
+    make.add_argument("name", metavar="NAME", help="name of the owner: letters, digits, dot, dash, underscore")
+    make.add_argument("-o", "--folder", type=Path, default=HOME, help=f"folder to write to (default: {HOME})")
+    show = actions.add("show", "show the public key in a file", "dappled keys show laptop.key")
     show.add_argument("file", type=Path, metavar="FILE", help="NAME.key or NAME.key_secret")
-    token = actions.add("token", "a token for the console", "dappled keys token /etc/dappled/console.token")
-    token.add_argument("file", type=Path, metavar="FILE", help="where to; must not exist yet")
+    token = actions.add("token", "make a token for the console", "dappled keys token /etc/dappled/console.token")
+    token.add_argument("file", type=Path, metavar="FILE", help="file to write; must not exist yet")
     for one in actions.all:
         one.add_argument("--json", action="store_true", help="as JSON")
 
@@ -45,7 +47,7 @@ def _configure_mavlink(parser: argparse.ArgumentParser) -> None:
         "make a key file for a signed link (see mavlink.keys)",
         "dappled mavlink key /etc/dappled/radio.key --passphrase",
     )
-    key.add_argument("file", type=Path, metavar="FILE", help="where to write it; never overwritten")
+    key.add_argument("file", type=Path, metavar="FILE", help="file to write; never overwritten")
     key.add_argument(
         "--passphrase",
         action="store_true",
@@ -79,12 +81,12 @@ def _token(path: Path) -> str:
         raise curve.KeyFileError(f"{path} is there already: choose another name, or move it away") from None
     except OSError as error:
         raise curve.KeyFileError(f"{path} can't be written: {error.strerror}") from None
-    return f"{path}  name it in console.token; whoever knows what is in it may use the console"
+    return f"{path}  name it in console.token; anyone who knows its content may use the console"
 
 
 def _passphrase() -> str:
-    """Asked for on a terminal, else the first line of standard input."""
+    """Ask on a terminal, else read the first line of standard input."""
     text = getpass.getpass("passphrase: ") if sys.stdin.isatty() else sys.stdin.readline().rstrip("\n")
     if not text:
-        raise SigningError("an empty passphrase is no key; type the one that the ground station was given")
+        raise SigningError("the passphrase is empty: type the one that the ground station was given")
     return text

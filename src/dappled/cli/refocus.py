@@ -1,4 +1,4 @@
-"""`dappled refocus`: pictures focused anew (Eq 28 and 29), focal stacks, all in focus, two eyes."""
+"""`dappled refocus`: refocused pictures (Eq 28 and 29), focal stacks, all-in-focus pictures, stereo pairs."""
 
 from __future__ import annotations
 

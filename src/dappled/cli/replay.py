@@ -1,4 +1,4 @@
-"""`dappled replay`: a recorded flight, or a folder of frames with a .tlog, through the same street."""
+"""`dappled replay`: run a recorded flight, or a folder of frames with a .tlog, through the same pipeline."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from dappled.cli import counted
 from dappled.cli.arguments import positive, seconds
 from dappled.cli.terminal import frame_json, frame_line
 from dappled.config import settings as configuration
@@ -47,22 +48,22 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=None,
         type=_rate,
         metavar="RATE",
-        help="1 is as it was, 2 twice as fast, max (default) as fast as it goes",
+        help="1 is as fast as it was recorded, 2 twice as fast, max (default) as fast as possible",
     )
     parser.add_argument("--step", action="store_true", help="wait for Enter before each frame")
-    parser.add_argument("--publish", action=argparse.BooleanOptionalAction, default=False, help="send over ZeroMQ")
+    parser.add_argument("--publish", action=argparse.BooleanOptionalAction, default=False, help="publish over ZeroMQ")
     parser.add_argument("--verify", action="store_true", help="compare every hash; exit 1 on any difference")
     parser.add_argument(
         "--run",
         dest="run_name",
         metavar="NAME",
-        help="keep the results beside those of the flight, by this name (default with another recipe: the time);\n"
+        help="store the results beside those of the flight, under this name (default with another recipe: the time);\n"
         "with --verify: check them",
     )
     parser.add_argument("--camera", metavar="P", help="camera profile or TOML file (default: the flight's)")
     parser.add_argument("--mask", metavar="P", help="mask profile or TOML file, or lenslet (default: the flight's)")
     parser.add_argument(
-        "--telemetry", type=Path, metavar="FILE", help="of a folder of frames (default: the only .tlog in it)"
+        "--telemetry", type=Path, metavar="FILE", help="telemetry of a folder of frames (default: the only .tlog in it)"
     )
     parser.add_argument("--white", metavar="FILE", help="white frame")
     parser.add_argument("--dark", metavar="FILE", help="dark frame")
@@ -71,7 +72,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--start", type=_utc_ns, metavar="UTC", help="time of a folder's first frame, such as 2026-11-21T10:15:03Z"
     )
-    parser.add_argument("--interval", type=seconds, metavar="S", help="between the frames of a folder (default: 1)")
+    parser.add_argument(
+        "--interval", type=seconds, metavar="S", help="time between the frames of a folder (default: 1)"
+    )
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings: endpoints, workers")
     parser.add_argument("--json", action="store_true", help="one JSON object a frame")
 
@@ -80,9 +83,9 @@ def run(arguments: argparse.Namespace) -> int:
     settings = configuration.load(arguments.config)
     is_flight = (arguments.flight / layout.FlightFolder(arguments.flight).ledger.name).is_file()
     if arguments.verify and not is_flight:
-        raise ReplayError(f"{arguments.flight} is no recorded flight: there are no hashes to verify")
+        raise ReplayError(f"{arguments.flight} is not a recorded flight: it has no hashes to verify")
     if arguments.run_name and not is_flight:
-        raise ReplayError(f"{arguments.flight} is no recorded flight: --run names results in a flight's ledger")
+        raise ReplayError(f"{arguments.flight} is not a recorded flight: --run stores results in the ledger of one")
     for option in _OF_FOLDERS if is_flight else ():
         if getattr(arguments, option) is not None:
             what = "a recorded flight has its own frames, times and telemetry"
@@ -98,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
             name = arguments.run_name or datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
             results = stack.enter_context(RunWriter(arguments.flight, Run(name, recipe, names), time.time_ns))
             recipe, keep = results.run.recipe, results.decoded
-            print(f"results stand beside the old ones as run {name}", file=sys.stderr)
+            print(f"storing the results beside the old ones, as run {name}", file=sys.stderr)
         writer = replay.writer(recording, keep)
         decoder = DecodeProcess(recipe) if recipe else None
         if decoder:
@@ -120,8 +123,12 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"different: {text}", file=sys.stderr)
     count = sum(one.frame is not None for one in recording.expected)
     undecoded = sum(one.frame is not None and one.left_undecoded for one in recording.expected)
-    left = f" ({undecoded} were left undecoded in flight)" if undecoded else ""
-    print(f"verified {count} frames: " + (f"{len(problems)} differences" if problems else "all hashes the same") + left)
+    left = f" ({undecoded} left undecoded in flight)" if undecoded else ""
+    print(
+        f"verified {counted(count, 'frame')}: "
+        + (counted(len(problems), "difference") if problems else "all hashes the same")
+        + left
+    )
     return 1 if problems else 0
 
 
@@ -135,7 +142,7 @@ def _play(
     flown: tuple[Names, BodyLatency, configuration.Settings],
     stack: ExitStack,
 ) -> int:
-    """The recording down the street; how many frames came to a bad end."""
+    """Play the recording through the pipeline. Returns how many frames failed."""
     names, latency, recorded = flown
     clock, progress = replay.clock(recording), ReplayProgress.begin()
     telemetry = RecordedTelemetry.flown(recorded, recording.telemetry, recording.horizons, recording.vehicles)
@@ -166,12 +173,12 @@ def _play(
     if publisher:
         counts = {"wished": len(recording.shots), "safe": progress.frames}
         publisher.publish("end", {"utc_ns": clock.utc_ns(), "shots": counts})
-        publisher.stop()  # answers last questions: before the decoder goes
+        publisher.stop()  # answer the last questions while the decoder still runs
     return progress.bad
 
 
 def _changed(arguments: argparse.Namespace) -> bool:
-    """Whether a recipe other than the flight's own is asked for."""
+    """Whether the call names a recipe other than the flight's own."""
     return any(getattr(arguments, name) for name in _GIVEN)
 
 
@@ -206,7 +213,7 @@ def _recording(arguments: argparse.Namespace, is_flight: bool) -> replay.Recorde
 def _as_recorded(
     arguments: argparse.Namespace, facts: Mapping[str, Any], recipe: Recipe | None
 ) -> tuple[Names, BodyLatency, configuration.Settings]:
-    """Names, body latency and settings of the flight; the frames of a folder begin to expose at their times."""
+    """Names, body latency and settings of the flight. The frames of a folder begin to expose at their times."""
     if not facts:
         return recipes.names(recipe), BodyLatency(0.0, 0.0, "given by --start and --interval"), configuration.Settings()
     if "settings" not in facts or "names" not in facts:
@@ -243,7 +250,7 @@ def _pace(arguments: argparse.Namespace) -> replay.Pace | None:
 
 
 def _rate(text: str) -> float | None:
-    """How many times as fast as it was; None for max."""
+    """Parse the factor on the recorded speed; None for max."""
     if text == "max":
         return None
     try:
@@ -256,5 +263,5 @@ def _utc_ns(text: str) -> int:
     try:
         time = datetime.fromisoformat(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no UTC time such as 2026-11-21T10:15:03Z") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is not a UTC time such as 2026-11-21T10:15:03Z") from None
     return round((time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp() * 1e9)

@@ -1,4 +1,4 @@
-"""`dappled run`: the daemon, with real hardware or with everything around it simulated."""
+"""`dappled run`: run the daemon with real hardware, or with everything around it simulated."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, rema
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
 from dappled.daemon.flight_handover import FlightHandover, flights
-from dappled.daemon.health import record as health
 from dappled.daemon.health.systemd import Notifier
 from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
 from dappled.daemon.service import Service
@@ -27,19 +26,21 @@ from dappled.errors import DappledError
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "examples:\n  dappled run --config dappled.toml\n  dappled run --simulate --frames 8"
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings (default: every default)")
-    parser.add_argument("--simulate", action="store_true", help="no hardware: simulated camera and autopilot")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulation (default: 1)")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings file (default: the default settings)")
+    parser.add_argument("--simulate", action="store_true", help="use a simulated camera and autopilot, no hardware")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the simulation (default: 1)")
     parser.add_argument("--for", dest="seconds", type=seconds, metavar="SECONDS", help="end after this time")
     parser.add_argument(
-        "--frames", type=whole, metavar="N", help="end after N frames; with --simulate a ground station asks for them"
+        "--frames", type=whole, metavar="N", help="end after N frames; with --simulate, a ground station asks for them"
     )
-    parser.add_argument("--console", metavar="HOST:PORT", help="serve the operator's console here (as console.bind)")
+    parser.add_argument(
+        "--console", metavar="HOST:PORT", help="serve the operator's console here, as console.bind does"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object a frame")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # until there is a daemon to end in order
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # until there is a daemon that can end in order
     hung_up = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         return _run(arguments)
@@ -68,7 +69,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], Asker] | None) -> int:
-    """Run the daemon, flight after flight, until it is told to end, or has had its frames or its time."""
+    """Run the daemon, flight after flight, until a signal, --frames or --for ends it."""
     manager, camera, tally = Notifier(), CameraRemarks(), Tally()
     frames = FrameLines(as_json=arguments.json)
     asked, hung_up = threading.Event(), threading.Event()
@@ -79,18 +80,18 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
         frames.finished(one)
 
     def fly(flown: Settings, after: FlightHandover) -> bool:
-        """One flight; whether another may follow."""
+        """Run one flight. Returns whether another may follow."""
         service = Service(flown, observer=Observer(finished=finished, camera=camera.changed), after=after)
-        problems = ProblemRemarks(service.health, lambda record: manager.status(health.line(record)))
+        problems = ProblemRemarks(service, manager)
 
         def turn() -> bool:
-            """After each turn of the working loop: whether to end."""
+            """Do what is due after each turn of the working loop. Returns whether to end."""
             if hung_up.is_set():
                 hung_up.clear()
                 _reload(service, arguments, manager)
             if service.healthy():
                 manager.working(time.monotonic_ns())
-            problems.tell()
+            problems.look()
             return asked.is_set() or goal.reached()
 
         with ExitStack() as stack:
@@ -105,22 +106,25 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
                 remark(f"console {service.console_url}")
             goal.begin(lambda: service.requested)
             service.run(turn)
-            problems.tell(now=True)
+            problems.look(now=True)
             manager.working(time.monotonic_ns(), now=True)  # closing one flight and opening the next takes a while
         return not asked.is_set()
 
     with ExitStack() as stack:
         stack.callback(signal.signal, signal.SIGHUP, signal.signal(signal.SIGHUP, lambda *_: hung_up.set()))
-        for number in (signal.SIGINT, signal.SIGTERM):  # until all is closed: a second ^C must not cut that short
+        for number in (
+            signal.SIGINT,
+            signal.SIGTERM,
+        ):  # until everything is closed: a second ^C must not interrupt that
             stack.callback(signal.signal, number, signal.signal(number, lambda *_: asked.set()))
         stack.callback(frames.close)
         flights(settings, fly)
     remark(tally.summary())
-    return 1 if goal.short and not asked.is_set() else 0  # who ends it by a signal has had enough
+    return 1 if goal.short and not asked.is_set() else 0  # a signal is a regular end
 
 
 def _reload(service: Service, arguments: argparse.Namespace, manager: Notifier) -> None:
-    """SIGHUP: read the settings again, take what can change in flight, refuse the rest in words."""
+    """Answer SIGHUP: read the settings again, apply what can change in flight, and say what can't."""
     manager.reloading(time.monotonic_ns())
     try:
         told = service.reload(configuration.load(arguments.config)) if arguments.config else ["there is no --config"]

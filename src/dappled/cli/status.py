@@ -1,4 +1,4 @@
-"""`dappled status`: how the running daemon is, on one screen."""
+"""`dappled status`: show the state of the running daemon on one screen; find the daemon's endpoint on this machine."""
 
 from __future__ import annotations
 
@@ -21,14 +21,16 @@ SERVICE_FOLDER = Path("/run/dappled")  # RuntimeDirectory= of systemd/dappled.se
 
 
 class NotRunningError(DappledError):
-    """Nobody publishes there."""
+    """No daemon publishes at the endpoint."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "example: dappled status --config /etc/dappled/dappled.toml"
     parser.add_argument("endpoint", nargs="?", help="ZeroMQ endpoint of the stream (default: by --config)")
     parser.add_argument("--config", type=Path, metavar="FILE", help="the daemon's settings (default: every default)")
-    parser.add_argument("--timeout", type=seconds, default=3.0, metavar="S", help="wait so long for it (default: 3)")
+    parser.add_argument(
+        "--timeout", type=seconds, default=3.0, metavar="S", help="how long to wait for a record (default: 3)"
+    )
     parser.add_argument("--json", action="store_true", help="the health record as it is published")
 
 
@@ -43,9 +45,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def stream_endpoint(config: Path | None, service: Path = SERVICE_FOLDER) -> str:
-    """Endpoint of the daemon on this machine: as the settings name it, else this user's own, else the service's.
+    """Endpoint of the daemon on this machine: the one in the settings, else this user's own, else the service's.
 
-    Raises ConfigError; WireError where this user may not look into the service's folder.
+    Raises ConfigError, and WireError if this user may not open the service's folder.
     """
     endpoint = settings.load(config).publish.slices
     ours = settings.runtime_folder() / "slices"
@@ -53,13 +55,14 @@ def stream_endpoint(config: Path | None, service: Path = SERVICE_FOLDER) -> str:
         return endpoint
     if not os.access(service, os.X_OK):
         raise WireError(
-            f"{service}: only members of its group may ask the service: sudo usermod -aG dappled $USER, and log in anew"
+            f"{service}: only members of its group may ask the service: "
+            "sudo usermod -aG dappled $USER, then log in again"
         )
     return f"ipc://{service}/slices"
 
 
 def is_listening(endpoint: str) -> bool:
-    """Whether somebody listens on an ipc endpoint; of others nothing is known, and they don't."""
+    """Whether a daemon listens on an ipc endpoint; False for any other endpoint."""
     if not endpoint.startswith("ipc://"):
         return False
     with socket.socket(socket.AF_UNIX) as probe:
@@ -72,7 +75,7 @@ def is_listening(endpoint: str) -> bool:
 
 
 def health(endpoint: str, timeout_s: float) -> Mapping[str, Any]:
-    """The next health record of the daemon there. Raises NotRunningError after `timeout_s`."""
+    """The daemon's next health record. Raises NotRunningError after `timeout_s`."""
     until = time.monotonic() + timeout_s
     with Subscriber(endpoint, topics=("health",)) as subscriber:
         while (left := until - time.monotonic()) > 0:
@@ -80,8 +83,8 @@ def health(endpoint: str, timeout_s: float) -> Mapping[str, Any]:
             if message is not None and message.topic == "health":
                 return message.header
     raise NotRunningError(
-        f"no daemon was heard on {endpoint} for {timeout_s:g} s; is it running (systemctl status dappled), "
-        "and with these settings (--config)?"
+        f"no daemon was heard on {endpoint} for {timeout_s:g} s: check that it runs (systemctl status dappled) "
+        "with these settings (--config)"
     )
 
 
@@ -96,7 +99,7 @@ def screen(told: Mapping[str, Any]) -> str:
         f"link      {link['urls']} open, {link['packets']} packets, {link['positions']} positions",
         *(f"          {_link(one)}" for one in link["each"]),
         f"disk      {free}, {disk['folder']}",
-        f"shots     {_counts(shots, 'wished', 'safe', 'failed', 'pending', 'refused')}",
+        f"shots     {shots['wished']} requested, {_counts(shots, 'safe', 'failed', 'pending', 'refused')}",
     ]
     for stage in told["stages"]:
         if "waiting" in stage:

@@ -1,4 +1,4 @@
-"""What the person who started a daemon reads: a line a frame, what becomes of the camera, each problem once.
+"""Print what a daemon or a replay does: a line for each frame, changes of the camera, each problem once.
 
 On a terminal these are lines; where the log goes to the journal, records with fields: `journalctl -u dappled
 DAPPLED_FRAME=42`.
@@ -17,6 +17,7 @@ from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from dappled.daemon.health.logbook import NewProblems
+from dappled.daemon.health.record import line as status_line
 from dappled.daemon.health.systemd import JournalHandler
 from dappled.daemon.pipeline.pending_shot import PendingShot
 from dappled.daemon.stream import wire
@@ -28,13 +29,13 @@ _PROBLEMS_EVERY_S = 1.0
 
 
 class Say(Protocol):
-    """Says a line; `fields` are what a program would ask the journal for."""
+    """Prints a line; `fields` are the fields of the journal's record."""
 
     def __call__(self, text: str, level: int = ..., **fields: object) -> None: ...
 
 
 def remark(text: str, level: int = logging.INFO, **fields: object) -> None:
-    """A line beside the frames', on standard error or in the journal."""
+    """Print a line on standard error, or in the journal."""
     if _journalled():
         log.log(level, "%s", text, extra={"dappled": fields})
     else:
@@ -43,7 +44,7 @@ def remark(text: str, level: int = logging.INFO, **fields: object) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """The line of a frame, as it was when the frame's story ended."""
+    """The line of a frame, as it was when the shot ended."""
 
     text: str
     level: int
@@ -62,14 +63,14 @@ class FrameLines:
         self._lines.start()
 
     def finished(self, one: PendingShot) -> None:
-        """A shot has come to its end."""
+        """Print the line of a shot that has ended."""
         fields = {"frame": one.shot.index, "state": "safe" if one.frame else "failed", "problem": one.problem}
         level = logging.WARNING if one.problem else logging.INFO
         text = frame_json(one) if self._as_json else frame_line(one)
         self._lines.put(_Line(text, level, {name: value for name, value in fields.items() if value != ""}))
 
     def close(self) -> None:
-        """Print what waits, for a second at most."""
+        """Print what is waiting, for a second at most."""
         self._lines.stop(1.0)
 
     def _print(self, line: _Line) -> None:
@@ -78,19 +79,19 @@ class FrameLines:
             return
         try:
             print(line.text, flush=True)
-        except OSError:  # nobody reads any more; the record is what counts
-            sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # for as long as we live
+        except OSError:  # the reader is gone; the record goes on
+            sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # for the rest of the process
 
 
 class CameraRemarks:
-    """Says what becomes of the camera; that it is busy and is free again goes without saying."""
+    """Prints the camera's state when it changes, except that it is busy."""
 
     def __init__(self, say: Say = remark) -> None:
         self.state = "starting"
         self._say = say
 
     def changed(self, change: StateChanged) -> None:
-        """The camera is in another state."""
+        """Take a change of state."""
         if change.state in ("busy", self.state):
             return
         self.state = change.state
@@ -100,41 +101,55 @@ class CameraRemarks:
         )
 
 
+class HealthSource(Protocol):
+    """A daemon that has a health record."""
+
+    def health(self) -> Mapping[str, Any]:
+        """The record as it is published."""
+
+
+class StatusLine(Protocol):
+    """A service manager that shows one line."""
+
+    def status(self, text: str) -> None:
+        """Show this line."""
+
+
 class ProblemRemarks:
-    """Says each problem once, when it comes up; `told` gets the whole of `health` each second."""
+    """Prints each problem once when it appears, and gives the service manager its status line, each second."""
 
     def __init__(
         self,
-        health: Callable[[], Mapping[str, Any]],
-        told: Callable[[Mapping[str, Any]], None],
+        daemon: HealthSource,
+        manager: StatusLine,
         *,
         say: Say = remark,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._health, self._told, self._say, self._clock_s = health, told, say, clock_s
+        self._daemon, self._manager, self._say, self._clock_s = daemon, manager, say, clock_s
         self._problems = NewProblems()
         self._due_s = clock_s() + _PROBLEMS_EVERY_S
 
-    def tell(self, *, now: bool = False) -> None:
-        """Look whether there is something to say, if it is time to, or at once."""
+    def look(self, *, now: bool = False) -> None:
+        """Read the health record if a second has passed since the last time, or if `now`."""
         if not now and self._clock_s() < self._due_s:
             return
         self._due_s = self._clock_s() + _PROBLEMS_EVERY_S
-        record = self._health()
+        record = self._daemon.health()
         for text in sorted(self._problems.among(record["problems"])):
             self._say(f"problem: {text}", logging.WARNING, problem=text)
-        self._told(record)
+        self._manager.status(status_line(record))
 
 
 def _journalled() -> bool:
     return any(isinstance(one, JournalHandler) for one in logging.getLogger().handlers)
 
 
-_SHORT = {"wish to trigger": "wish", "trigger call": "call", "trigger to file": "file"}
+_SHORT = {"wish to trigger": "request", "trigger call": "call", "trigger to file": "file"}
 
 
 def frame_line(pending: PendingShot) -> str:
-    """Index, trigger source, time, position, attitude, focal length, carriers found, size, milliseconds per stage."""
+    """One line: index, source, time, position, attitude, focal length, carriers, size, milliseconds a stage."""
     cause = pending.shot.cause
     sequence = "" if cause.sequence is None else f" #{cause.sequence}"
     words = [f"{pending.shot.index:06d}", f"{cause.kind}{sequence} from {cause.source}"]
@@ -167,7 +182,7 @@ def frame_line(pending: PendingShot) -> str:
 
 
 def frame_json(pending: PendingShot) -> str:
-    """The same as one JSON object."""
+    """One JSON object: the shot, its frame, tag, carriers and times."""
     facts = {
         "index": pending.shot.index,
         "cause": asdict(pending.shot.cause),

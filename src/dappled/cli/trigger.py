@@ -1,4 +1,4 @@
-"""`dappled trigger`: the ground station's part, over MAVLink."""
+"""`dappled trigger`: ask for photographs over MAVLink, as a ground station does."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--url", default="udpout:127.0.0.1:14550", help="pymavlink connection string (default: %(default)s)"
     )
-    parser.add_argument("--count", type=whole, default=1, metavar="N", help="photographs (default: 1)")
+    parser.add_argument("--count", type=whole, default=1, metavar="N", help="number of photographs (default: 1)")
     parser.add_argument(
-        "--interval", type=seconds, default=0.0, metavar="S", help="between them, at least (default: 0)"
+        "--interval", type=seconds, default=0.0, metavar="S", help="least time between them (default: 0)"
     )
     parser.add_argument(
         "--timeout",
         type=seconds,
         default=60.0,
         metavar="S",
-        help="wait so long for the camera, and for each photograph (default: 60)",
+        help="how long to wait for the camera, and for each photograph (default: 60)",
     )
     parser.add_argument("--key", type=Path, metavar="FILE", help="the link's signing key (dappled mavlink key)")
-    parser.add_argument("--json", action="store_true", help="one JSON object a photograph")
+    parser.add_argument("--json", action="store_true", help="print one JSON object a photograph")
 
 
 def run(arguments: argparse.Namespace) -> int:

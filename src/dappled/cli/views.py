@@ -1,5 +1,4 @@
-"""`dappled views`: what a light field holds, as one picture: its views, its slices (Figs 37 and 43), how far each view
-has moved (Fig 57)."""
+"""`dappled views`: draw views, slices (Figs 37 and 43) or the shift of each view (Fig 57) as one picture."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     decode_arguments.add_field(parser, ranged=False)
     parser.add_argument("--of", choices=("views", "slices", "shifts", "slice-shifts"), default="views",
                         help="views (default), slices at their carriers, or shifts: how far each view has\n"
-                        "moved from the middle; slice-shifts: the same of slices, as the thesis tried")  # fmt: skip
+                        "moved from the middle; slice-shifts: the same for slices, as the thesis tried")  # fmt: skip
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="picture to write")
 
 
@@ -48,18 +47,18 @@ def _views(found: OpenedLightField) -> prints.Bytes:
 
 def _slices(found: OpenedLightField) -> prints.Bytes:
     if len(found.slices) == 0:
-        raise OpenError(f"{found.path} came as views and has no slices")
+        raise OpenError(f"{found.path} was stored as views and has no slices")
     return slice_mosaic(found.slices, found.field.carriers, longest_side=_LONGEST)
 
 
 def _shifts(found: OpenedLightField) -> prints.Bytes:
-    # The views of a noisy masked frame shrink parallax: what is measured here is measured on those without.
+    # Wiener weights shrink the parallax of noisy views, so measure on views without them.
     return _coloured(shifts_from_middle(of_light_field(found.field).stack))
 
 
 def _slice_shifts(found: OpenedLightField) -> prints.Bytes:
     if len(found.slices) == 0:
-        raise OpenError(f"{found.path} came as views and has no slices")
+        raise OpenError(f"{found.path} was stored as views and has no slices")
     stack = found.stack
     orders = {(int(ky), int(kx)): k for k, (ky, kx) in enumerate(found.field.carriers[:, :2])}
     reach = max(max(abs(ky), abs(kx)) for ky, kx in orders)

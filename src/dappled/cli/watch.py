@@ -1,4 +1,4 @@
-"""`dappled watch`: what arrives, gaps asked for again, optionally saved."""
+"""`dappled watch`: print what arrives, ask again for what was lost, and save it on request."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
+from dappled.cli import counted
 from dappled.cli.arguments import seconds, whole
 from dappled.cli.status import stream_endpoint
 from dappled.daemon.pipeline.memory import reuse_large_blocks
@@ -17,8 +18,7 @@ from dappled.daemon.stream.wire import Message
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "example: dappled watch --save slices/ --count 8\n\n"
-        "exits 1 where slices were lost, or fewer came than were asked for"
+        "example: dappled watch --save slices/ --count 8\n\nexits 1 if slices were lost, or fewer arrived than --count"
     )
     parser.add_argument(
         "endpoint",
@@ -27,15 +27,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="ZeroMQ endpoint of the stream (default: the daemon's on this machine)",
     )
     parser.add_argument(
-        "--ask", metavar="ENDPOINT", help="endpoint that answers questions (default: beside an ipc stream)"
+        "--ask", metavar="ENDPOINT", help="endpoint that answers requests (default: beside an ipc stream)"
     )
-    parser.add_argument("--save", type=Path, metavar="DIR", help="keep each frame's header, slices and mosaic here")
-    parser.add_argument("--from-start", action="store_true", help="also what the flight sent before this began")
+    parser.add_argument("--save", type=Path, metavar="DIR", help="save each frame's header, slices and mosaic here")
+    parser.add_argument("--from-start", action="store_true", help="also what the flight sent before now")
     parser.add_argument("--count", type=whole, metavar="N", help="end after the slices of N frames")
     parser.add_argument("--timeout", type=seconds, metavar="S", help="give up after S seconds without a message")
     parser.add_argument("--keys", type=Path, metavar="FILE", help="your NAME.key_secret, for a tcp endpoint")
     parser.add_argument("--server-key", type=Path, metavar="FILE", help="the vehicle's NAME.key")
-    parser.add_argument("--json", action="store_true", help="one JSON object a line")
+    parser.add_argument("--json", action="store_true", help="print one JSON object a line")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -56,8 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
             silence_s=arguments.timeout,
         )
         if not arguments.json:
-            asked_again = f"{subscriber.recovered} of them asked for again"
-            print(f"{seen.frames} frames received, {asked_again}, {subscriber.lost} lost")
+            asked_again = f"{subscriber.recovered} after a repeated request"
+            print(f"{counted(seen.frames, 'frame')} received, {asked_again}, {subscriber.lost} lost")
         return 1 if seen.short_of(arguments.count) or subscriber.lost else 0
 
 

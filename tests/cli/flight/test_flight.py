@@ -53,7 +53,7 @@ def test_a_list_has_a_line_for_each_flight_good_or_bad(
     (bad / "flight.sqlite").write_text("no ledger")
     said = {line.split()[0]: line for line in lines(["list", str(flights)], capsys)}
     still.close()
-    assert said[closed.name].endswith("2026-11-21 10:15  1 frames, 1 failed, 2.0 MB")
+    assert said[closed.name].endswith("2026-11-21 10:15  1 frame, 1 failed, 2.0 MB")
     assert said[still.folder.name].endswith("(open)")
     assert "ledger" in said[bad.name]
 
@@ -90,7 +90,7 @@ def test_every_shot_is_shown_with_what_became_of_it(closed: Path, capsys: pytest
 
 
 def test_check_ends_with_the_verdict(closed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert lines(["check", str(closed)], capsys)[-1].startswith(f"{closed.name}: intact: 1 files, 2.0 MB")
+    assert lines(["check", str(closed)], capsys)[-1].startswith(f"{closed.name}: intact: 1 file, 2.0 MB")
     flip(closed / "frames" / "000000.cr2", 1000)
     said = lines(["check", str(closed)], capsys, code=1)
     assert said[0].startswith("wrong: ")
@@ -104,8 +104,8 @@ def test_report_adds_up(closed: Path, capsys: pytest.CaptureFixture[str]) -> Non
     said = lines(["report", str(closed)], capsys)
     assert said[0] == closed.name
     assert said[-3].split() == ["2", "shots:", "1", "safe,", "1", "failed,", "0", "open"]
-    assert said[-2].split() == ["1", "frames,", "2.0", "MB:", "1", "tagged,", "1", "decoded"]
-    assert said[-1] == "the books balance"
+    assert said[-2].split() == ["1", "frame,", "2.0", "MB:", "1", "tagged,", "1", "decoded"]
+    assert said[-1] == "the counts agree"
     assert main(["flight", "report", str(closed), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["balanced"] is True
@@ -117,14 +117,14 @@ def test_books_that_do_not_balance_are_a_failure(closed: Path, capsys: pytest.Ca
         ledger.execute("DELETE FROM frames")
         ledger.commit()
     said = lines(["report", str(closed)], capsys, code=1)
-    assert said[-1].startswith("THE BOOKS DO NOT BALANCE")
+    assert said[-1].startswith("THE COUNTS DO NOT AGREE")
 
 
 def test_offload_says_what_it_did(closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     disk = tmp_path / "disk"
     said = lines(["offload", str(disk), str(closed)], capsys)
     count = sum(path.is_file() for path in disk.rglob("*"))
-    assert said == [f"{disk / closed.name}: {count} files copied and verified, 0 were there already"]
+    assert said == [f"{disk / closed.name}: {count} files copied and verified, 0 already there"]
     assert main(["flight", "offload", str(disk), str(closed), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["copied"], told["there_already"]) == (0, count)

@@ -73,18 +73,18 @@ def test_a_batch_goes_on_where_it_was_stopped(
 ) -> None:
     output = tmp_path / "out"
     assert main(words(flight, output, "--workers", "2")) == 0
-    assert "2 frames made, 0 were there already" in capsys.readouterr().out
+    assert "2 frames made, 0 already there" in capsys.readouterr().out
     made = hashes(output)
     assert sorted(Path(name).suffix for name in made) == [".kmz", ".kmz", ".npz", ".npz", ".tif", ".tif"]
     assert main(words(flight, output)) == 0
-    assert "0 frames made, 2 were there already" in capsys.readouterr().out
+    assert "0 frames made, 2 already there" in capsys.readouterr().out
     (output / flight.folder.name / "000001.tif").unlink()
     assert main(words(flight, output, "--workers", "1", "--json")) == 0
     (line,) = capsys.readouterr().out.splitlines()
     assert json.loads(line)["frame"] == "frames/000001.dng"
     assert hashes(output) == made  # one worker, the same bytes
     assert main(words(flight, output, "--gsd", "0.1", "--frames", "1")) == 0  # another wish is another job
-    assert "1 frames made" in capsys.readouterr().out
+    assert "1 frame made" in capsys.readouterr().out
     assert hashes(output)[f"{flight.folder.name}/000001.tif"] != made[f"{flight.folder.name}/000001.tif"]
 
 
@@ -108,7 +108,7 @@ def test_a_bad_frame_is_noted_and_the_others_are_made(
     output = tmp_path / "out"
     assert main(words(replace(flight, folder=copy), output, "--workers", "2")) == 1
     said = capsys.readouterr()
-    assert "1 frames made, 0 were there already, 1 could not be made" in said.out
+    assert "1 frame made, 0 already there, 1 failed" in said.out
     assert "000000.dng" in said.err
     globe.check_archive(output / copy.name / "000001.kmz")
     noted = [json.loads(line) for line in (output / "manifest.jsonl").read_text().splitlines()]
@@ -124,7 +124,7 @@ def test_a_bad_flight_is_said_and_the_others_are_made(
     asked = words(flight, tmp_path / "out", "--as", "npz", "--frames", "0", "--workers", "1")
     assert main([asked[0], str(tmp_path), str(tmp_path / "none"), *asked[1:]]) == 1
     said = capsys.readouterr()
-    assert "1 frames made" in said.out
+    assert "1 frame made" in said.out
     lines = said.err.strip().splitlines()
     assert len(lines) == 2
     assert all("is not a flight folder" in line for line in lines)
@@ -139,7 +139,7 @@ def test_a_flight_that_is_named_twice_is_made_once(
     again = tmp_path / "link"
     again.symlink_to(flight.folder)
     assert main([asked[0], str(flight.folder), str(again), *asked[1:]]) == 0
-    assert "1 frames made" in capsys.readouterr().out
+    assert "1 frame made" in capsys.readouterr().out
 
 
 def test_two_flights_of_one_name_are_refused(flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

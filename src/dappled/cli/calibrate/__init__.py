@@ -1,4 +1,4 @@
-"""`dappled calibrate`: fit lattice, mask distance and phases to stopped-down frames."""
+"""`dappled calibrate`: fit lattice, mask distance and phases to stopped-down frames; see `lens` and `target` too."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dappled.cli import decode_arguments
+from dappled.cli import counted, decode_arguments
 from dappled.cli.calibrate import lens, target
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     darkroom.check()
     seen, bad = _views(darkroom, arguments)
     if not seen:
-        raise DarkroomError("no frame is left to calibrate on: each was refused, for the reason above")
+        raise DarkroomError("no frame is left to calibrate with: each was refused, for the reason above")
     camera = darkroom.camera(seen[0].model)
     found = fit_views(darkroom, seen, choose_law=not arguments.law)
     written = calibration_files.save(arguments.output, found)
@@ -74,15 +74,18 @@ def run(arguments: argparse.Namespace) -> int:
         print(report.as_text(found, camera.mask_distance_mm))
         print(f"written to {written[0]} and {written[1]}")
     if not any(law.explains for law in report.law_fits(found, camera.mask_distance_mm)):
-        print(f"dappled calibrate: {found.verdict}: are mask, camera and focal length the right ones?", file=sys.stderr)
+        print(
+            f"dappled calibrate: {found.verdict}: check that mask, camera and focal length are the right ones",
+            file=sys.stderr,
+        )
     if bad:
-        print(f"{bad} of {len(arguments.frames)} frames could not be used", file=sys.stderr)
+        print(f"{bad} of {counted(len(arguments.frames), 'frame')} could not be used", file=sys.stderr)
     return 1 if bad else 0
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationView:
-    """What a calibration frame shows, and of which camera and size it is."""
+    """What a calibration frame shows, with its camera and size."""
 
     shown: FrameLattice
     shape: tuple[int, int]
@@ -90,7 +93,7 @@ class CalibrationView:
 
 
 def _views(darkroom: Darkroom, arguments: argparse.Namespace) -> tuple[list[CalibrationView], int]:
-    """What the good frames show, and how many were bad; those are told on the way."""
+    """What the good frames show, and how many were bad; prints why each was."""
     good: list[CalibrationView] = []
     bad = 0
     paths = arguments.frames

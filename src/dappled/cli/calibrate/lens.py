@@ -1,4 +1,4 @@
-"""`dappled calibrate --lens`: distance, principal point and distortion of the lens, kept in a camera profile."""
+"""`dappled calibrate --lens`: fit distance, principal point and distortion, and write them into a camera profile."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import tomli_w
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from dappled.cli import counted
 from dappled.config import profiles
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
 from dappled.errors import DappledError
@@ -18,17 +19,17 @@ from dappled.products import chessboard
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """--lens and what goes with it."""
+    """Add --lens and --board."""
     group = parser.add_argument_group("lens, for maps")
     group.add_argument("--lens", action="store_true", help="frames show a chessboard: calibrate the lens instead, and\n"
-                       "write a copy of the camera's profile with it (-o FILE.toml)")  # fmt: skip
+                       "write a copy of the camera's profile with the result (-o FILE.toml)")  # fmt: skip
     group.add_argument("--board", default="9x6", metavar="CxR", help="its inner corners (default: 9x6)")
 
 
 def run(recipe: Recipe, frames: list[Path], board: str, output: Path, focal_length_mm: float | None) -> int:
-    """Calibrate from frames, decoded where a mask is named. A frame without the board is named and left out."""
+    """Calibrate from frames, which are decoded if a mask is named. Prints the names of frames without the board."""
     if output.suffix != ".toml":
-        raise DarkroomError(f"{output}: a camera profile ends in .toml; name it so")
+        raise DarkroomError(f"{output}: the name of a camera profile must end in .toml")
     size = _board(board)
     darkroom = Darkroom(recipe)
     seen: list[NDArray[np.float64]] = []
@@ -58,7 +59,7 @@ def run(recipe: Recipe, frames: list[Path], board: str, output: Path, focal_leng
     fit = chessboard.fit(seen, grids, board=size, sensor=profile.sensor(shape), focal_length_mm=length)
     _write(recipe.camera if recipe.camera != "auto" else profile.name, fit.lens, output)
     y, x = fit.lens.principal_point_mm
-    print(f"{fit.boards} boards, residual {fit.residual_um:.2f} µm on the chip")
+    print(f"{counted(fit.boards, 'board')}, residual {fit.residual_um:.2f} µm on the chip")
     print(f"v = {fit.lens.v_mm:.3f} ± {fit.v_sigma_mm:.3f} mm at {length:g} mm, principal point {y:+.3f}, {x:+.3f} mm")
     print("k1, k2, p1, p2, k3 = " + ", ".join(f"{number:.5g}" for number in fit.lens.distortion))
     print(f"written to {output}")
@@ -68,7 +69,7 @@ def run(recipe: Recipe, frames: list[Path], board: str, output: Path, focal_leng
 def _picture(
     darkroom: Darkroom, path: Path, focal_length_mm: float | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], tuple[int, int], str, float | None]:
-    """What is looked at: behind a mask the decoded mean, else the frame itself."""
+    """The picture to search: behind a mask the decoded mean, else the frame itself."""
     if darkroom.recipe.mask:
         made = darkroom.decode(path, focal_length_mm=focal_length_mm, views=False)
         rows, columns = made.light_field.attributes["shape"]
@@ -107,5 +108,5 @@ def _board(text: str) -> tuple[int, int]:
     except ValueError:
         size = 0, 0
     if min(size) < 3:
-        raise DappledError(f"--board {text}: give its inner corners as 9x6, three at least on each side")
+        raise DappledError(f"--board {text}: give its inner corners as 9x6, at least three on each side")
     return size

@@ -1,4 +1,4 @@
-"""`dappled calibrate --target`: where the lens is focused and how far things are, from targets at known distances."""
+"""`dappled calibrate --target`: fit disparity to distance with frames of targets at known distances."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import tomli_w
 from tqdm import tqdm
 
+from dappled.cli import counted
 from dappled.config import profiles
 from dappled.decode.depth.ranging import RANGING, Ranging, Target, fit_targets, target_shift
 from dappled.drivers.raw import calibration_files
@@ -19,7 +20,7 @@ from dappled.products.opened import OpenedLightField
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """--target."""
+    """Add --target."""
     group = parser.add_argument_group("distances")
     group.add_argument("--target", nargs="+", type=float, metavar="M",
                        help="frames at full aperture show a textured target in the middle, at these distances, one a\n"
@@ -27,9 +28,9 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(recipe: Recipe, frames: list[Path], metres: list[float], output: Path, focal_length_mm: float | None) -> int:
-    """Fit the ranging and write it beside the calibration that the frames were decoded with."""
+    """Fit the ranging, and write it with the calibration that the frames were decoded with."""
     if output.suffix != ".toml":
-        raise DarkroomError(f"{output}: a calibration with distances ends in .toml; name it so")
+        raise DarkroomError(f"{output}: the name of a calibration with distances must end in .toml")
     found, targets = from_frames(recipe, frames, metres, focal_length_mm)
     written = _write(recipe, output, found)
     for path, target in zip(frames, targets, strict=True):
@@ -46,9 +47,10 @@ def run(recipe: Recipe, frames: list[Path], metres: list[float], output: Path, f
 def from_frames(
     recipe: Recipe, frames: list[Path], metres: list[float], focal_length_mm: float | None = None
 ) -> tuple[Ranging, list[Target]]:
-    """The ranging that frames of targets show, and what was seen of each. Raises DappledError."""
+    """The ranging that frames of targets show, and what each target showed. Raises DappledError."""
     if len(frames) != len(metres):
-        raise DarkroomError(f"{len(frames)} frames and {len(metres)} distances: give --target a distance a frame")
+        both = f"{counted(len(frames), 'frame')} and {counted(len(metres), 'distance')}"
+        raise DarkroomError(f"{both}: give --target one distance a frame")
     darkroom = Darkroom(recipe)
     targets: list[Target] = []
     stops: set[float | None] = set()

@@ -1,4 +1,4 @@
-"""`dappled flight list|show|check|report|offload|pickup`: recorded flights."""
+"""`dappled flight list|show|check|report|offload|pickup`: work with recorded flights."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         f"  dappled flight check {_FLIGHT}"
     )
     actions = Actions.of(parser)
-    listing = actions.add("list", "all flights in a folder", "dappled flight list ~/flights")
-    show = actions.add("show", "every shot of a flight", f"dappled flight show {_FLIGHT}")
-    intact = actions.add("check", "is every byte intact? exits 1 if not", f"dappled flight check {_FLIGHT}")
+    listing = actions.add("list", "list all flights in a folder", "dappled flight list ~/flights")
+    show = actions.add("show", "show every shot of a flight", f"dappled flight show {_FLIGHT}")
+    intact = actions.add("check", "check that every byte is intact; exits 1 if not", f"dappled flight check {_FLIGHT}")
     report = actions.add(
-        "report", "which wishes became frames; exits 1 if the books don't balance", "dappled flight report"
+        "report", "count which requests became frames; exits 1 if the counts don't agree", "dappled flight report"
     )
     away = actions.add(
         "offload",
@@ -43,10 +43,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "folder", nargs="?", type=Path, metavar="FOLDER", help="flights folder (default: record.directory)"
     )
     away.add_argument("destination", type=Path, metavar="DEST", help="folder that will hold the flight's folder")
-    away.add_argument("--prune", action="store_true", help="refused: no proof yet that DEST is another disk")
+    away.add_argument("--prune", action="store_true", help="refused: dappled can't yet prove that DEST is another disk")
     pickup.configure(bring)
     for one in (show, intact, report, away, bring):
-        one.add_argument("flight", nargs="?", type=Path, metavar="FLIGHT", help="flight folder (default: the last one)")
+        one.add_argument("flight", nargs="?", type=Path, metavar="FLIGHT", help="flight folder (default: the newest)")
     for one in actions.all:
         one.add_argument("--config", type=Path, metavar="FILE", help="settings that say where flights are")
         one.add_argument("--json", action="store_true", help="as JSON")
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _last_flight(flights: Path) -> Path:
-    """The newest flight in a folder. Raises FlightError when there is none."""
+    """The newest flight in a folder. Raises FlightError if there is none."""
     found = index.in_order(flights)
     if not found:
         raise FlightError(f"there is no flight in {flights} yet; name one, or record one with `dappled run`")
@@ -94,10 +94,10 @@ def _check(flight: Path, as_json: bool) -> int:
 
 
 def _report(flight: Path, as_json: bool) -> int:
-    found, books = flight_report.balance(flight), flight_report.by_source(flight)
-    sources = [asdict(one) for one in books]
+    found, by_source = flight_report.balance(flight), flight_report.by_source(flight)
+    sources = [asdict(one) for one in by_source]
     values = {**_plain(found), "sources": sources, "balanced": found.balanced}
-    _said(values, flight_lines.of_report(found, books), as_json)
+    _said(values, flight_lines.of_report(found, by_source), as_json)
     return 0 if found.balanced else 1
 
 
@@ -109,13 +109,13 @@ def _offload(flight: Path, destination: Path, prune: bool, as_json: bool) -> int
 
 
 def _said(values: Any, lines: Iterable[str], as_json: bool) -> int:
-    """The values as JSON, or the lines; an exit code of 0."""
+    """Print the values as JSON, or the lines. Returns exit code 0."""
     for text in (json.dumps(values, indent=2),) if as_json else lines:
         print(text)
     return 0
 
 
 def _plain(value: Any) -> dict[str, Any]:
-    """A record as JSON values; paths become text."""
+    """A record as JSON values, with paths as text."""
     plain: dict[str, Any] = json.loads(json.dumps(asdict(value), default=str))
     return plain

@@ -1,4 +1,4 @@
-"""What the flight verbs say, line by line: from a flight's records to words."""
+"""Turn a flight's records into the lines that `dappled flight` prints."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 
+from dappled.cli import counted
 from dappled.flight import LIVE
 from dappled.flight.check import CheckReport
 from dappled.flight.flight_report import Balance, FlightContents, ListedFlight, ShotLine, SourceReport
@@ -13,25 +14,25 @@ from dappled.flight.offload import Offloaded
 
 
 def of_list(one: ListedFlight) -> str:
-    """A flight of a list: when it began, what is in it, or why that can't be said."""
+    """A flight of a list: when it began and what is in it, or why it can't be read."""
     b = one.balance
     if b is None:
         return f"{one.name}  {one.problem}"
     state = "" if b.closed else "  (open)"
     began = "UTC not known" if b.began_utc_ns is None else _utc(b.began_utc_ns)[:16].replace("T", " ")
-    return f"{one.name}  {began}  {b.frames} frames, {b.failed} failed, {b.size / 1e6:.1f} MB{state}"
+    return f"{one.name}  {began}  {counted(b.frames, 'frame')}, {b.failed} failed, {b.size / 1e6:.1f} MB{state}"
 
 
 def of_flight(found: FlightContents) -> Iterator[str]:
     """A line for each shot, run and stray."""
     yield found.name
     if found.utc_correction_ns is None:
-        yield "UTC was never known in this flight: times count from an unknown moment"
+        yield "UTC was never known in this flight: times count from an unknown start"
     for line in found.lines:
         yield _of_shot(line, found.utc_correction_ns or 0)
     for run, count in found.runs.items():
         if run != LIVE:
-            yield f"   run  {run}: {count} frames decoded again"
+            yield f"   run  {run}: {counted(count, 'frame')} decoded again"
     for stray in found.strays:
         yield f" stray  {stray.name}  {stray.reason}"
 
@@ -58,43 +59,47 @@ def _of_shot(line: ShotLine, utc_correction_ns: int) -> str:
 
 
 def of_check(found: CheckReport) -> Iterator[str]:
-    """What is wrong, what is worth knowing, and the verdict."""
+    """The problems, the notes, and the verdict."""
     yield from (f"wrong: {text}" for text in found.problems)
     yield from (f"note:  {text}" for text in found.notes)
     word = "intact" if found.intact else "NOT INTACT"
     size = f"{found.size / 1e6:.1f} MB"
-    yield f"{found.flight}: {word}: {found.files} files, {size}, {found.telemetry_packets} telemetry packets"
+    packets = counted(found.telemetry_packets, "telemetry packet")
+    yield f"{found.flight}: {word}: {counted(found.files, 'file')}, {size}, {packets}"
 
 
-def of_report(found: Balance, books: Sequence[SourceReport]) -> Iterator[str]:
-    """The books by source, the sums, and whether they balance."""
+def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
+    """The counts by source, their sums, and whether they agree."""
     yield f"{found.flight}{'' if found.closed else ' (still open)'}"
-    yield from (f"  {line}" for line in _table(books))
+    yield from (f"  {line}" for line in _table(sources))
     if found.refused:
-        yield f"  {found.refused:6d} wishes refused, each with its reason (dappled flight show --json: events)"
-    yield f"  {found.wishes:6d} shots: {found.safe} safe, {found.failed} failed, {found.open} open"
-    yield f"  {found.frames:6d} frames, {found.size / 1e6:.1f} MB: {found.tagged} tagged, {found.decoded} decoded"
+        refused = counted(found.refused, "request", 6)
+        yield f"  {refused} refused, each with its reason (dappled flight show --json: events)"
+    yield f"  {counted(found.wishes, 'shot', 6)}: {found.safe} safe, {found.failed} failed, {found.open} open"
+    frames = counted(found.frames, "frame", 6)
+    yield f"  {frames}, {found.size / 1e6:.1f} MB: {found.tagged} tagged, {found.decoded} decoded"
     if found.following:
-        yield f"  {found.following:6d} of the failed were fired, and their files follow: dappled flight pickup"
+        yield f"  {found.following:6d} of the failed have their files at the camera still: dappled flight pickup"
     if found.companions:
-        yield f"  {found.companions:6d} files beside frames, such as the JPEG of a raw frame"
+        yield f"  {counted(found.companions, 'file', 6)} beside frames, such as the JPEG of a raw frame"
     if found.strays:
-        yield f"  {found.strays:6d} files without a shot of their own"
-    yield "the books balance" if found.balanced else "THE BOOKS DO NOT BALANCE: run `dappled flight check`"
+        yield f"  {counted(found.strays, 'file', 6)} without a shot"
+    yield "the counts agree" if found.balanced else "THE COUNTS DO NOT AGREE: run `dappled flight check`"
 
 
-def _table(books: Sequence[SourceReport]) -> Iterator[str]:
-    """A line for each source, below one of headings; nothing for a flight without a wish."""
+def _table(sources: Sequence[SourceReport]) -> Iterator[str]:
+    """Headings and a line for each source; nothing for a flight without a request."""
+    titles = {"wishes": "requests"}
     names = ("wishes", "refused", "shots", "safe", "failed", "open", "tagged", "decoded")
-    if books:
-        yield f"{'source':24}" + "".join(f"{name:>9}" for name in names)
-    for one in books:
+    if sources:
+        yield f"{'source':24}" + "".join(f"{titles.get(name, name):>9}" for name in names)
+    for one in sources:
         yield f"{one.source:24}" + "".join(f"{getattr(one, name):9d}" for name in names)
 
 
 def of_offload(done: Offloaded) -> Iterator[str]:
     """How many files were copied and verified."""
-    yield f"{done.destination}: {done.copied} files copied and verified, {done.there_already} were there already"
+    yield f"{done.destination}: {counted(done.copied, 'file')} copied and verified, {done.there_already} already there"
 
 
 def _utc(utc_ns: int) -> str:

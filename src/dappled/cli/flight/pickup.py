@@ -1,4 +1,4 @@
-"""`dappled flight pickup`: the files that stayed at the camera, brought into the flight."""
+"""`dappled flight pickup`: bring the files that stayed at the camera into the flight."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from dappled.cli import counted
 from dappled.daemon.pipeline import pickup
 from dappled.daemon.pipeline.pickup import Choice, Picked, Proposal
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
 
-HELP = "bring the files that stayed at the camera; exits 1 while shots lack theirs"
+HELP = "bring the files that stayed at the camera; exits 1 while shots lack files"
 EXAMPLES = (
     "dappled flight pickup --from /media/card/DCIM --dry-run",
     "dappled flight pickup ~/flights/20261121T101503Z-0a1b2c3d --from usb: --pair 17=DSCF0042.RAF",
@@ -25,13 +26,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--from", dest="source", required=True, metavar="SOURCE", help="folder, storage, usb: or a libgphoto2 port"
     )
-    parser.add_argument("--offset", type=float, metavar="S", help="the camera's clock minus UTC, where you know it")
+    parser.add_argument("--offset", type=float, metavar="S", help="the camera's clock minus UTC, if you know it")
     parser.add_argument("--any-clock", action="store_true", help="the camera's clock may be off by more than a day")
-    parser.add_argument("--by-order", action="store_true", help="as many files as shots: take them in order")
     parser.add_argument(
-        "--pair", action="append", default=[], type=_pair, metavar="INDEX=NAME", help="this file is of this shot"
+        "--by-order", action="store_true", help="pair files and shots in order, if there are as many of both"
     )
-    parser.add_argument("--dry-run", action="store_true", help="say what would be done, and do nothing")
+    parser.add_argument(
+        "--pair", action="append", default=[], type=_pair, metavar="INDEX=NAME", help="this file belongs to this shot"
+    )
+    parser.add_argument("--dry-run", action="store_true", help="only say what would be done")
 
 
 def run(flight: Path, arguments: argparse.Namespace) -> int:
@@ -60,13 +63,14 @@ def _print(flight: Path, proposal: Proposal, picked: Picked | None) -> None:
     for index in proposal.missing:
         print(f"shot {index:6d}  has no file")
     if proposal.strangers:
-        print(f"{len(proposal.strangers)} files belong to no shot of this flight, the first {proposal.strangers[0]}")
+        count = counted(len(proposal.strangers), "file")
+        print(f"{count} without a shot in this flight, the first {proposal.strangers[0]}")
     for text in picked.zooms if picked else ():
         print(f"zoom:        {text}")
-    done = f"{len(proposal.pairs)} frames {'would be brought' if picked is None else 'brought'}"
-    print(f"{flight.name}: {done}, {proposal.there_already} were there already, {len(proposal.missing)} missing")
+    done = f"{counted(len(proposal.pairs), 'frame')} {'to bring' if picked is None else 'brought'}"
+    print(f"{flight.name}: {done}, {proposal.there_already} already there, {len(proposal.missing)} missing")
     if proposal.doubts:
-        print("settle what is in doubt with --pair INDEX=NAME, --offset S or --by-order; nothing was guessed")
+        print("resolve what is in doubt with --pair INDEX=NAME, --offset S or --by-order; no file was guessed")
 
 
 def _print_json(flight: Path, proposal: Proposal, picked: Picked | None) -> None:

@@ -34,7 +34,7 @@ START_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class SoakPlan:
-    """A soak: how long, how often a wish, how often a fault. `scale` is that of the simulated sensor."""
+    """How long a soak lasts, and how often it requests a frame and makes a fault. `scale`: of the simulated sensor."""
 
     seconds: float = 1800.0
     seed: int = 1
@@ -45,7 +45,7 @@ class SoakPlan:
 
 @dataclass(frozen=True, slots=True)
 class SoakReport:
-    """What came of it. `problems` are sentences, none when all is well; wishes are counted by what the ground heard."""
+    """The result. `problems` are sentences, none if all is well; requests are counted by the answers on the ground."""
 
     asked: int
     accepted: int
@@ -63,7 +63,7 @@ class SoakReport:
 
 
 def soak(plan: SoakPlan, folder: Path, tell: Callable[[str], None] = lambda _: None) -> SoakReport:
-    """Fly the plan in `folder` and settle the account."""
+    """Fly the plan in `folder`, and compare what the ground heard with what was recorded."""
     chance = random.Random(plan.seed)  # noqa: S311  # which fault comes when: no secret
     root = folder / "flights"
     settings = configuration.load(None)
@@ -81,13 +81,13 @@ def soak(plan: SoakPlan, folder: Path, tell: Callable[[str], None] = lambda _: N
         ground = stack.enter_context(GroundClient(simulation.ground_url))
         ground.find_camera(START_S)
         troubles = stack.enter_context(Troubles(simulation, daemon, config, chance))
-        wisher = _Wisher(ground, plan.interval_s, answers)
-        stack.callback(wisher.stop)
-        wisher.start()
+        requester = _Requester(ground, plan.interval_s, answers)
+        stack.callback(requester.stop)
+        requester.start()
         began = time.monotonic()
         end, next_fault = began + plan.seconds, began + SETTLE_S
-        # The daemon dies in the first half only; then it lives itself warm (a minute of telemetry, the heap's largest
-        # need), and is measured.
+        # The daemon dies in the first half only. Then it warms up (a minute of telemetry, the heap at its largest)
+        # and is measured.
         last_life, warm = began + plan.seconds / 2, began + plan.seconds * 2 / 3
         before: Resources | None = None
         while time.monotonic() < end:
@@ -100,7 +100,7 @@ def soak(plan: SoakPlan, folder: Path, tell: Callable[[str], None] = lambda _: N
                 next_fault += plan.fault_every_s * chance.uniform(0.5, 1.5)
                 tell(troubles.strike(daemon_may_die=time.monotonic() < last_life))
         troubles.clear()
-        wisher.stop()
+        requester.stop()
         after = _calm(daemon, 2 * SETTLE_S)
         code = daemon.end()
     problems = [] if code == 0 else [f"the daemon ended with {code}: see {folder / 'daemon.log'}"]
@@ -108,7 +108,7 @@ def soak(plan: SoakPlan, folder: Path, tell: Callable[[str], None] = lambda _: N
 
 
 def _calm(daemon: Supervised, seconds: float) -> Resources:
-    """The daemon's resources once nothing has gone wrong for a while."""
+    """The daemon's resources after some time without a fault."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         time.sleep(0.1)
@@ -125,7 +125,7 @@ def _settle(
     lives: int,
     faults: Counter[str],
 ) -> SoakReport:
-    """Compare what the ground was told with what stands in the flights."""
+    """Compare the answers on the ground with the recorded flights."""
     shots: Counter[int] = Counter()
     safe = failed = flights = 0
     for listed in flight_report.list_flights(root):
@@ -136,7 +136,7 @@ def _settle(
             continue
         safe, failed = safe + listed.balance.safe, failed + listed.balance.failed
         if not listed.balance.balanced or listed.balance.open:
-            problems.append(f"{listed.name}: the books do not balance: {listed.balance}")
+            problems.append(f"{listed.name}: the counts do not agree: {listed.balance}")
         for line in flight_report.show(listed.path).lines:
             shots[line.row.shot.cause.sequence or 0] += 1
             if line.row.state == "failed" and not line.row.reason:
@@ -144,10 +144,10 @@ def _settle(
     results = Counter(answers.values())
     accepted = mavlink.MAV_RESULT_ACCEPTED
     problems += [
-        f"wish {n} was acknowledged and is no shot" for n, r in answers.items() if r == accepted and not shots[n]
+        f"request {n} was acknowledged but is no shot" for n, r in answers.items() if r == accepted and not shots[n]
     ]
-    problems += [f"wish {n} became {count} shots" for n, count in shots.items() if count > 1]
-    problems += [f"shot of wish {n}, which nobody made" for n in shots if n not in answers]
+    problems += [f"request {n} became {count} shots" for n, count in shots.items() if count > 1]
+    problems += [f"a shot of request {n}, which was never sent" for n in shots if n not in answers]
     before, after = resources
     if before is not None and after is not None:
         problems += before.grown(after)
@@ -168,19 +168,19 @@ def _settle(
     )
 
 
-class _Wisher:
-    """Asks for a photograph every `interval_s`, and keeps what was answered: MAV_RESULT, or None."""
+class _Requester:
+    """Requests a photograph every `interval_s`, and keeps the answer: MAV_RESULT, or None."""
 
     def __init__(self, ground: GroundClient, interval_s: float, answers: dict[int, int | None]) -> None:
         self._ground, self._interval_s, self._answers = ground, interval_s, answers
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="wishes", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="requests", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
 
     def stop(self) -> None:
-        """Ask no more; the wish in hand is finished."""
+        """Stop; the current request is finished first."""
         self._stop.set()
         self._thread.join(10.0)
 

@@ -1,4 +1,4 @@
-"""The daemon in a process of its own, restarted when it dies, and what it takes of the machine."""
+"""Run the daemon in a process of its own, restart it when it dies, and measure its resources."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Resources:
     children: int
 
     def told(self) -> dict[str, float]:
-        """As a mapping, for JSON."""
+        """The values as a mapping, for JSON."""
         return asdict(self)
 
     def grown(self, after: Resources) -> list[str]:
-        """A sentence for each thing of which there is more now: 3 files, 2 threads, 10 % and 16 MB are no growth."""
+        """A sentence for each resource that has grown by more than 3 files, 2 threads, or 10 % and 16 MB."""
         said = []
         if after.rss_mb > 1.1 * self.rss_mb + 16:
             said.append(f"memory grew from {self.rss_mb:.0f} to {after.rss_mb:.0f} MB")
@@ -62,7 +62,7 @@ class Supervised:
         return self._process.pid
 
     def keep_alive(self) -> None:
-        """Start it when it doesn't run."""
+        """Start it if it doesn't run."""
         if self._process is None or self._process.poll() is not None:
             self.lives += 1
             with self._log.open("ab") as log:
@@ -79,7 +79,7 @@ class Supervised:
         return children_of(self.pid)
 
     def resources(self) -> Resources:
-        """What it holds now."""
+        """Its resources now."""
         status = Path(f"/proc/{self.pid}/status").read_text(encoding="ascii", errors="replace")
         told = dict(line.split(":", 1) for line in status.splitlines() if ":" in line)
         return Resources(
@@ -95,7 +95,7 @@ class Supervised:
         self._process.send_signal(number)
 
     def end(self) -> int:
-        """SIGTERM, and its exit code. Raises subprocess.TimeoutExpired after 20 s."""
+        """Send SIGTERM; returns the exit code. Raises subprocess.TimeoutExpired after 20 s."""
         assert self._process is not None
         self._process.terminate()
         return self._process.wait(END_S)

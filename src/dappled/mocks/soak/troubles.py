@@ -1,4 +1,4 @@
-"""What goes wrong in a soak: each trouble by name, struck by chance, and cleared."""
+"""Make things go wrong in a soak: faults by name, chosen at random, and cleared again."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HEAR_S = 5.0
 
 
 class Troubles:
-    """Strikes at camera, link, disk, subscribers, console, and processes. Use as a context manager."""
+    """Faults of camera, link, disk, subscribers, console, and processes. Use as a context manager."""
 
     def __init__(self, simulation: Simulation, daemon: Supervised, config: Path, chance: random.Random) -> None:
         """`config` is the daemon's: it names the stream and the console, and is written anew to fill the disk."""
@@ -58,7 +58,7 @@ class Troubles:
         self.clear()
 
     def strike(self, *, daemon_may_die: bool) -> str:
-        """Do one of them, by chance; its name. A full disk is free again by the next one."""
+        """Make one fault, chosen at random. Returns its name. A full disk is free again at the next one."""
         if self._full:
             self._disk()
         names = [*self._known, *(["daemon killed"] if daemon_may_die else [])]
@@ -71,7 +71,7 @@ class Troubles:
         return name
 
     def clear(self) -> None:
-        """End every lasting trouble."""
+        """End every lasting fault."""
         self._simulation.body.fault("clear")
         if self._full:
             self._disk()
@@ -83,7 +83,7 @@ class Troubles:
         self._pages.clear()
 
     def _kill_child(self, name: str) -> None:
-        with suppress(FileNotFoundError, ProcessLookupError):  # it, or the daemon, is just starting or ending
+        with suppress(FileNotFoundError, ProcessLookupError):  # it, or the daemon, is starting or ending
             for pid, line in self._daemon.children().items():
                 if name in line:
                     os.kill(pid, signal.SIGKILL)
@@ -97,7 +97,7 @@ class Troubles:
                     out.sendto(self._chance.randbytes(self._chance.randint(1, 280)), (host, int(port)))
 
     def _disk(self) -> None:
-        """All space is asked to stay free, or again none; a running daemon takes it by SIGHUP."""
+        """Require more free space than there is, or none again; a running daemon reads it on SIGHUP."""
         self._full = not self._full
         wanted = 10_000_000 if self._full else 500
         changed = re.sub(r"min_free_mb = \d+", f"min_free_mb = {wanted}", self._settings)
@@ -106,7 +106,7 @@ class Troubles:
             self._daemon.signal(signal.SIGHUP)
 
     def _page(self) -> None:
-        """A page that asks for events and never reads them."""
+        """Open a page that requests events and never reads them."""
         host, _, port = self._console.partition(":")
         with suppress(OSError):  # the console may be starting
             page = socket.create_connection((host, int(port)), 2.0)
@@ -116,7 +116,7 @@ class Troubles:
             self._pages.pop(0).close()
 
     def _watch(self, then: signal.Signals) -> None:
-        """A subscriber that connects, hears something, and then hangs or dies."""
+        """Start a subscriber that connects, receives something, and then hangs or dies."""
         if len(self._watchers) >= 4:
             _end(self._watchers.pop(0))
         command = [sys.executable, "-m", "dappled", "watch", self._stream, "--timeout", "600"]
