@@ -21,7 +21,7 @@ def test_a_pair_is_made_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert main(["keys", "show", made["public"]]) == 0
     assert capsys.readouterr().out.strip() == own.public.decode()
     assert main(["keys", "make", "vehicle", "-o", str(tmp_path)]) == 1
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
 
 
 def test_a_token_is_made_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import rawpy
 
-from dappled.daemon.stream import wire
 from dappled.flight import LedgerReader, check, flight_report
+from tests.schemas import schema
 from tests.system.conftest import FRAMES, Flown, dappled, flip
 
 
@@ -55,7 +55,7 @@ def test_the_subscriber_has_what_the_ledger_says(flown: Flown) -> None:
     assert len(saved) == FRAMES
     for file in saved:
         header = json.loads(file.read_text())
-        jsonschema.validate(header, wire.schema("slices"))
+        jsonschema.validate(header, schema("slices"))
         slices = np.load(file.with_suffix(".npy"))
         result = results[header["frame"]]
         assert result is not None

@@ -11,7 +11,7 @@ import jsonschema
 import numpy as np
 import pytest
 
-from dappled.daemon.stream import wire
+from tests.schemas import schema
 from tests.system.conftest import dappled
 
 
@@ -53,7 +53,7 @@ def test_replay_publishes_its_slices_with_the_flight_s_pose(
     finally:
         watch.kill()
     header = json.loads((tmp_path / "000000.json").read_text())
-    jsonschema.validate(header, wire.schema("slices"))
+    jsonschema.validate(header, schema("slices"))
     assert header["mask"] == "lenslet"
     assert header["pose"]["source"] == "interpolated"
     assert header["pose"]["latitude_deg"] == pytest.approx(-35.36, abs=0.01)

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from dappled.cli import main
-from dappled.daemon.stream import wire
 from dappled.daemon.stream.subscriber import Subscriber
 from dappled.mocks.simulation import free_port
+from tests.schemas import schema
 from tests.system.conftest import dappled
 
 
@@ -102,7 +102,7 @@ def test_depth_comes_where_it_is_switched_on(tmp_path: Path, sockets: Path) -> N
         with Subscriber(endpoint, topics=["depth"]) as subscriber:
             message = subscriber.receive(90)
         assert message is not None
-        jsonschema.validate(message.header, wire.schema("depth"))
+        jsonschema.validate(message.header, schema("depth"))
         arrays = message.arrays()
         known = np.isfinite(arrays["disparity"])
         assert arrays["disparity"].shape == arrays["sigma"].shape

@@ -15,10 +15,10 @@ from dappled.daemon.health import record as health
 from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.shutter import ShutterStatistics
-from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.drivers.mavlink import LinkStatistics, SigningStatistics
 from dappled.workers import Worker
+from tests.schemas import schema
 
 WELL = Settings(
     mask=MaskSettings("mask-1"),
@@ -57,7 +57,7 @@ def test_well(tmp_path: Path) -> None:
     found = record(tmp_path)
     assert found["problems"] == []
     envelope = {"schema": "dappled/health", "version": 1, "flight": "f", "seq": 0, "dropped": 0}
-    jsonschema.validate({**envelope, **found}, wire.schema("health"))
+    jsonschema.validate({**envelope, **found}, schema("health"))
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from dappled.daemon.pipeline.tagger import tag
 from dappled.daemon.stream import wire
 from dappled.flight import Cause, Frame, Shot
 from tests.daemon.fakes import eventually, no_pose
+from tests.schemas import schema
 
 
 class FakeMaker:
@@ -92,7 +93,7 @@ def test_a_message_as_the_schema_says(bench: Bench) -> None:
     assert topic == "depth"
     envelope = {"schema": "dappled/depth", "version": 1, "flight": "f", "seq": 0, "dropped": 0}
     header = {**envelope, **facts}
-    jsonschema.validate(header, wire.schema("depth"))
+    jsonschema.validate(header, schema("depth"))
     arrays = wire.Message("depth", header, body).arrays()
     assert [arrays[name].shape for name in ("disparity", "sigma")] == [(2, 3), (2, 3)]
     assert bench.maker.asked == [("frames/3.dng", "gradient")]

@@ -11,10 +11,11 @@ import pytest
 
 from dappled.clock import SystemClock
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
-from dappled.daemon.stream import answers, wire
+from dappled.daemon.stream import answers
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.wire import Message, WireError
 from tests.daemon.fakes import FakeDecoder, Rig, eventually, rig
+from tests.schemas import schema
 
 
 @pytest.fixture
@@ -44,7 +45,7 @@ def test_a_frame_and_its_slices_are_had_again(flown: Rig) -> None:
     assert (slices.topic, slices.header["slices_sha256"]) == ("slices", "0" * 64)
     assert len(slices.body) == 16
     envelope = {"schema": "dappled/frame", "version": 1, "flight": "f", "seq": None, "dropped": 0}
-    jsonschema.validate({**envelope, **frame.header}, wire.schema("frame"))
+    jsonschema.validate({**envelope, **frame.header}, schema("frame"))
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,7 @@ from dappled.daemon.stream.curve import KeyFileError
 from dappled.daemon.stream.publisher import UNREAD_STACKS, Publisher, Reply
 from dappled.daemon.stream.subscriber import AsyncSubscriber, Subscriber, subscribe
 from dappled.daemon.stream.wire import Message, WireError
+from tests.schemas import schema
 
 STACK = np.arange(24, dtype=np.complex64).reshape(2, 3, 4)
 
@@ -174,7 +175,7 @@ def test_a_bad_question_gets_one_sentence(started: Publisher, endpoint: str, que
     assert dealer.poll(5000)
     answer = wire.decode(dealer.recv_multipart())
     assert answer.topic == "error"
-    jsonschema.validate(answer.header, wire.schema("error"))
+    jsonschema.validate(answer.header, schema("error"))
     assert started.statistics().refused == 1
     context.destroy(linger=0)
 

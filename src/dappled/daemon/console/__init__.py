@@ -1,4 +1,4 @@
-"""The operator's console: one page, served by a process of its own that is fed by the publisher's sockets.
+"""The operator's console: one page, served by a process of its own that subscribes to the stream.
 
-A page that loads the processor, a browser that stops reading, a crash in here: none of it touches the capture.
+A page that loads the processor, a browser that stops reading, or a crash of this process does not affect the capture.
 """

@@ -1,4 +1,4 @@
-"""One connection of a browser, bounded in time and in number, also for those who never ask or never read."""
+"""Limit the connections of browsers in time and number, also those that send no request or read no answer."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any, cast
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-CONNECTIONS = 64  # above it one that asks for nothing goes
+CONNECTIONS = 64  # with more, an idle one is closed
 PER_ADDRESS = 24  # a browser opens at most six; some machines have a few pages open, and a virtual globe
 REQUEST_S = 10.0  # from the connection, or the last answer, to a whole request
-UNREAD_S = 30.0  # for a page that does not read what it is sent
-_USER_TIMEOUT_MS = 20_000  # for a peer that is gone without a word: a phone out of the Wi-Fi's reach
+UNREAD_S = 30.0  # for a page that does not read
+_USER_TIMEOUT_MS = 20_000  # for a peer that has vanished, such as a phone out of the Wi-Fi's range
 
 
 class Connection(H11Protocol):
-    """uvicorn's connection with an end: of waiting for a request, of waiting for a reader, and of one address' share.
+    """uvicorn's connection with limits: time for a request, time for a reader, and connections for one address.
 
-    Where there are too many, the oldest that asks for nothing goes first, so that silent ones lock nobody out.
+    Where there are too many, the oldest idle one is closed, so that idle ones can't keep others out.
     """
 
     request_s = REQUEST_S
@@ -62,7 +62,7 @@ class Connection(H11Protocol):
 
     @property
     def idle(self) -> bool:
-        """Whether no whole request has come that waits for its answer."""
+        """Whether no complete request waits for its answer."""
         return self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
 
     def _expect(self) -> None:
@@ -75,13 +75,13 @@ class Connection(H11Protocol):
             self._end()
 
     def _end(self) -> None:
-        """Close it in order: a browser that kept it for later sees that, and opens another."""
+        """Close in order: a browser that kept the connection notices, and opens another."""
         self._forget()
         self.connections.discard(self)
         self.transport.close()
 
     def _cut(self) -> None:
-        """End it at once, with what was not read."""
+        """Abort, with the data that was not read."""
         self._end()
         self.transport.abort()
 

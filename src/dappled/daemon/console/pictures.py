@@ -1,4 +1,4 @@
-"""Pictures of one frame for the page, made from its slices alone: what a browser can show, in 8 bits."""
+"""Make 8-bit pictures of one frame from its slices, for the page."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dappled.decode.lightfield.refocus import shift_and_add
 
 Grey = NDArray[np.uint8]
 Colour = NDArray[np.uint8]
-MOSAIC_PX = 2560  # of a views' mosaic; every WebGL2 takes 2048, phones of the last ten years 4096
+MOSAIC_PX = 2560  # of the mosaic of views; every WebGL2 supports 2048, phones of the last ten years 4096
 _DEPTH_STOPS = np.array(  # dark violet to yellow, even in lightness: after viridis
     [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=np.float64
 )
@@ -45,12 +45,12 @@ def small(image: NDArray[np.floating], longest_side: int) -> NDArray[np.float32]
 
 
 def shown(image: NDArray[np.floating]) -> Grey:
-    """A linear image for the eye: from 0 to its 99.5th percentile, sRGB."""
+    """A linear image as sRGB bytes, from 0 to its 99.5th percentile."""
     return encoded(image / level(image))
 
 
 def level(image: NDArray[np.floating]) -> float:
-    """What is shown as white."""
+    """The value that is shown as white."""
     return max(float(np.quantile(image, 0.995)), 1e-9)
 
 
@@ -121,14 +121,14 @@ def refocused(mosaic: Mosaic, disparity: float) -> Grey:
 
 
 def depth_colours(disparity: NDArray[np.float32], sigma: NDArray[np.float32] | None) -> Colour:
-    """uint8 (h, w, 3): near to far from yellow to violet; grey where it is not known (NaN, or σ above a quarter of
+    """uint8 (h, w, 3): near to far from yellow to violet; grey where unknown (NaN, or σ above a quarter of
     the range)."""
     known = np.isfinite(disparity)
     if sigma is not None:
         known &= np.isfinite(sigma)
     if not known.any():
         return np.full((*disparity.shape, 3), _UNKNOWN, dtype=np.uint8)
-    inner = np.zeros_like(known)  # at the picture's rim disparities are worth little
+    inner = np.zeros_like(known)  # disparities at the picture's edge are unreliable
     inner[
         known.shape[0] // 10 : -(known.shape[0] // 10) or None, known.shape[1] // 10 : -(known.shape[1] // 10) or None
     ] = 1
@@ -170,7 +170,7 @@ def _pooled(band: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.flo
 
 
 def _lay(out: NDArray[np.float32], tile: NDArray[np.floating], top: int, left: int) -> None:
-    """Put a tile down where it lies on the picture; the larger value stays."""
+    """Copy a tile to its place on the picture; where there is a larger value, keep it."""
     bottom, right = min(top + tile.shape[0], out.shape[0]), min(left + tile.shape[1], out.shape[1])
     y, x = max(top, 0), max(left, 0)
     if y < bottom and x < right:

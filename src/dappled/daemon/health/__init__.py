@@ -1,1 +1,1 @@
-"""How the daemon and its machine are: health record, checks before flight, status text, metrics."""
+"""The state of the daemon and its machine: health record, checks before a flight, log, status text, metrics."""

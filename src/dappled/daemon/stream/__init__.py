@@ -1,1 +1,1 @@
-"""What is published over ZeroMQ, and the subscriber at the other end."""
+"""The stream over ZeroMQ: publisher, answers to questions, and the subscriber at the other end."""

@@ -1,4 +1,4 @@
-"""CURVE keys on disk, and who may subscribe with which: for tcp endpoints that more than this machine can reach.
+"""Make and read CURVE keys, and judge subscribers by them: for tcp endpoints that other machines can reach.
 
 The files are those of ZeroMQ itself (ZPL, as pyzmq's `zmq.auth` reads and writes): NAME.key holds a public key and may
 be given away, NAME.key_secret both and stays here. Keys are 40 characters of Z85.
@@ -38,7 +38,7 @@ class Keys:
 
 @dataclass(frozen=True, slots=True)
 class ServerKeys:
-    """What a publisher needs: its own pair, and the public keys that may connect, each with its owner's name."""
+    """A publisher's own pair, and the public keys that may connect, each with its owner's name."""
 
     own: Keys
     allowed: Mapping[bytes, str]
@@ -46,7 +46,7 @@ class ServerKeys:
 
 @dataclass(frozen=True, slots=True)
 class ClientKeys:
-    """What a subscriber needs: its own pair, and the publisher's public key."""
+    """A subscriber's own pair, and the publisher's public key."""
 
     own: Keys
     server: bytes
@@ -58,7 +58,9 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
     Raises KeyFileError.
     """
     if not _NAME.fullmatch(name):
-        raise KeyFileError(f"{name!r} is no name for a key: letters, digits, dot, dash and underscore, 64 at most")
+        raise KeyFileError(
+            f"{name!r} can't be the name of a key: use letters, digits, dot, dash and underscore, 64 at most"
+        )
     public, secret = zmq.curve_keypair()
     paths = folder / f"{name}.key", folder / f"{name}.key_secret"
     head = "# A ZeroMQ CURVE key made by dappled; {}\nmetadata\ncurve\n"
@@ -74,7 +76,7 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
         for path, text, mode in zip(reversed(paths), reversed(texts), (0o600, 0o644), strict=True):
             write_new(path, text, mode)
     except FileExistsError as error:
-        raise KeyFileError(f"{error.filename} is there already: choose another name, or move it away") from None
+        raise KeyFileError(f"{error.filename} exists already: choose another name, or move it away") from None
     except OSError as error:
         raise KeyFileError(f"{error.filename or folder} can't be written: {error.strerror}") from None
     return paths
@@ -94,7 +96,7 @@ def read_private(path: Path, what: str) -> str:
         facts = path.stat()
         text = path.read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "it is no text"
+        why = error.strerror if isinstance(error, OSError) else "it is not text"
         raise KeyFileError(f"{path} can't be read as {what}: {why}") from None
     if stat.S_IMODE(facts.st_mode) & 0o077:
         raise KeyFileError(f"{path} can be read by others than its owner: chmod 600 {path}")
@@ -114,21 +116,21 @@ def load_public(path: Path) -> bytes:
     try:
         text = path.read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "it is no text"
+        why = error.strerror if isinstance(error, OSError) else "it is not text"
         raise KeyFileError(f"{path} can't be read as a public key: {why}") from None
     return _key(text, "public", path)
 
 
 def load_allowed(folder: Path) -> dict[bytes, str]:
     """The public keys of a folder's *.key files by key, named by file. Raises KeyFileError where it is empty, holds a
-    file that is no key, or could be added to by anybody."""
+    file that is not a key, or can be written by any user."""
     try:
         mode = folder.stat().st_mode
         files = sorted(folder.glob("*.key"))
     except OSError as error:
         raise KeyFileError(f"{folder} can't be read as a folder of clients' keys: {error.strerror}") from None
     if mode & 0o002:
-        raise KeyFileError(f"anybody can write to {folder}, so anybody could let himself in: chmod o-w {folder}")
+        raise KeyFileError(f"{folder} can be written by any user, who could add a key: chmod o-w {folder}")
     if not files:
         raise KeyFileError(f"{folder} holds no NAME.key: put the public key of each subscriber there")
     return {load_public(path): path.stem for path in files}
@@ -139,12 +141,14 @@ def server(own: str, allowed: str) -> ServerKeys | None:
     if not own and not allowed:
         return None
     if not own or not allowed:
-        raise KeyFileError("publish.keys and publish.clients go together: your own secret key, and who may subscribe")
+        raise KeyFileError(
+            "publish.keys and publish.clients go together: your secret key, and the folder of subscribers' keys"
+        )
     return ServerKeys(load_own(Path(own)), load_allowed(Path(allowed)))
 
 
 def judge(request: Sequence[bytes], allowed: Mapping[bytes, str]) -> tuple[list[bytes], str | None]:
-    """The answer to one ZAP request (RFC 27), and the name of who was let in, None for nobody."""
+    """The answer to one ZAP request (RFC 27), and the name of the key's owner, None when it is refused."""
     version, number = request[0], request[1]
     name = None
     if version == b"1.0" and len(request) == 7 and request[5] == b"CURVE" and len(request[6]) == 32:
@@ -156,7 +160,7 @@ def judge(request: Sequence[bytes], allowed: Mapping[bytes, str]) -> tuple[list[
 def _key(text: str, which: str, path: Path) -> bytes:
     found = re.search(_KEY.format(which), text, re.MULTILINE)
     if found is None:
-        raise KeyFileError(f"{path} holds no {which} key: dappled keys make writes such files")
+        raise KeyFileError(f"{path} holds no {which} key: make one with `dappled keys make`")
     key = found[1].encode()
     if not _is_key(key):
         raise KeyFileError(f"{path}: its {which} key is not 40 characters of Z85")

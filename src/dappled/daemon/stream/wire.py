@@ -10,7 +10,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any, Protocol
 
 import numpy as np
@@ -237,10 +236,3 @@ def parse_question(payload: Sequence[bytes]) -> dict[str, Any]:
 
 def _refuse_constant(text: str) -> object:
     raise ValueError(text)  # NaN and Infinity
-
-
-def schema(topic: str) -> dict[str, Any]:
-    """The JSON Schema of a topic's header."""
-    text = (resources.files("dappled.daemon.stream") / "schemas" / f"{topic}.json").read_text(encoding="utf-8")
-    loaded: dict[str, Any] = json.loads(text)
-    return loaded

@@ -1,4 +1,4 @@
-// Numbers and small elements as a person reads them. What is not known is a dash.
+// Format numbers, and make small elements. An unknown value is a dash.
 export const dash = "–";
 
 export function fixed(value, digits, unit = "") {

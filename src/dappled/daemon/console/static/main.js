@@ -1,4 +1,4 @@
-// The console: events in, a page out. All state lives here; the other modules draw.
+// Show the daemon's events on the page. All state is here; the other modules draw.
 import { dash, element, fixed, mark, rows, utc } from "./format.js";
 import { FieldMap } from "./map.js";
 import { Stage } from "./stage.js";
@@ -22,7 +22,7 @@ const handlers = {
 };
 
 function began(start) {
-  if (flight && flight !== start.flight) location.reload();   // another flight: nothing of the old one holds
+  if (flight && flight !== start.flight) location.reload();   // another flight: start again
   flight = start.flight;
   $("flight").textContent = [start.flight, start.camera, start.mask || "no mask"].join("  ·  ");
 }
@@ -58,7 +58,7 @@ function showCounters(health) {
   const publish = stages.publish ?? { sent: {}, dropped: {} };
   const dropped = Object.values(publish.dropped).reduce((sum, n) => sum + n, 0);
   rows($("counters"), [
-    ["wished", shots.wished],
+    ["requested", shots.wished],
     ["safe on disk", shots.safe],
     ["under way", shots.pending],
     ["failed", shots.failed, shots.failed > 0],
@@ -137,7 +137,7 @@ function tick() {
   if (lost) {
     $("verdict").dataset.state = "lost";
     $("verdict-word").textContent = ended ? "Ended" : "No contact";
-    $("verdict-text").textContent = ended ? "the daemon said so" : `the last word is ${Math.round(age / 1000)} s old`;
+    $("verdict-text").textContent = ended ? "the flight has ended" : `last heard ${Math.round(age / 1000)} s ago`;
   }
 }
 
@@ -148,8 +148,8 @@ async function post(path, body) {
       if (answer.status === 401) login();
       return await answer.json();
     } catch (error) {
-      if (attempt >= 1) return { ok: false, error: "the vehicle can't be reached; look at the counters before you ask again" };
-    }   // once more, with the same number: the daemon takes it for one wish
+      if (attempt >= 1) return { ok: false, error: "the vehicle can't be reached; check the counters before you try again" };
+    }   // again with the same number: the daemon takes both for one request
   }
 }
 
@@ -188,13 +188,13 @@ $("login-form").addEventListener("submit", async (event) => {
 let stream = null;
 async function connect() {
   stream?.close();
-  const given = new URLSearchParams(location.hash.slice(1)).get("token");   // after the #, so that no log ever holds it
+  const given = new URLSearchParams(location.hash.slice(1)).get("token");   // after the #, so that it is in no log
   if (given) {
     history.replaceState(null, "", location.pathname);
     await post("/api/login", { token: given });
   }
   let status = 0;
-  try { status = (await fetch("/api/state")).status; } catch { /* not there: tried again below */ }
+  try { status = (await fetch("/api/state")).status; } catch { /* no connection: tried again below */ }
   if (status === 401) { login(); return; }
   if (status !== 200) { setTimeout(connect, 1500); return; }
   stream = new EventSource("/api/events");

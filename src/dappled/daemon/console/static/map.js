@@ -1,4 +1,4 @@
-// Track, footprints and the frames themselves on a canvas, in metres around the first place seen. No tiles, no network.
+// Draw track, footprints and frames on a canvas, in metres around the first position. No tiles, no network.
 const METRES = 111319.49;
 
 export class FieldMap {
@@ -14,7 +14,7 @@ export class FieldMap {
     this.background = null;
     this.following = true;
     this.centre = [0, 0];     // metres east, north
-    this.scale = 4;           // CSS pixels a metre
+    this.scale = 4;           // CSS pixels per metre
     this.asked = false;
     this.listen();
     new ResizeObserver(() => this.redraw()).observe(canvas);

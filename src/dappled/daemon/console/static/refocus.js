@@ -1,6 +1,6 @@
 // The views of one frame as a texture, moved and averaged on the graphics card. The same sum is made in NumPy by
 // dappled.daemon.console.pictures.refocused; a test compares the two.
-const MOST_VIEWS = 32;   // an axis
+const MOST_VIEWS = 32;   // along each axis
 const VERTEX = `#version 300 es
 void main() {
   vec2 corner = vec2(float((gl_VertexID << 1) & 2), float(gl_VertexID & 2));

@@ -1,4 +1,4 @@
-// One frame, seen as refocused picture, views, slices, spectrum or depth.
+// Show one frame as refocused picture, views, slices, spectrum or depth.
 import { element, fixed, svg } from "./format.js";
 import { Refocus, sharpest } from "./refocus.js";
 
@@ -11,12 +11,12 @@ export class Stage {
     this.frame = null;     // {tag, slices, thumb, depth}
     this.layout = null;
     this.bitmap = null;
-    this.turn = 0;         // of loading: an older one that comes late is thrown away
+    this.turn = 0;         // number of the request: an older answer that comes late is ignored
     try {
       this.refocus = new Refocus($("gl"));
       $("gl").addEventListener("webglcontextlost", (event) => { event.preventDefault(); this.refocus = null; this.load(); });
     } catch {
-      this.refocus = null;   // the server makes the picture then
+      this.refocus = null;   // the server makes the picture instead
     }
     for (const name of TABS) $(`tab-${name}`).addEventListener("click", () => this.choose(name));
     document.querySelector(".tabs").addEventListener("keydown", (event) => this.arrow(event));
@@ -66,7 +66,7 @@ export class Stage {
     this.knob();
   }
 
-  // The slider is there when there is something to focus.
+  // Show the slider only for a frame with views.
   knob() {
     $("focus").toggleAttribute("data-off", this.tab !== "refocus" || !this.layout);
   }
@@ -75,7 +75,7 @@ export class Stage {
     const turn = ++this.turn, { frame, tab } = this;
     if (!frame) return;
     const index = frame.tag.frame, base = `/api/frames/${index}/`;
-    $("which").textContent = `frame ${index} …`;   // loading: what is seen is the one before
+    $("which").textContent = `frame ${index} …`;   // loading: the frame before is still shown
     $("empty").textContent = `Waiting for the picture of frame ${index}.`;
     try {
       if (tab === "refocus") await this.loadViews(base, turn);
@@ -86,7 +86,7 @@ export class Stage {
     if (turn === this.turn) $("which").textContent = `frame ${index}`;
   }
 
-  // Without views there is still the picture that all of them share.
+  // Without views, show the mean picture.
   async fall(base, turn, why) {
     if (this.tab === "refocus") {
       this.layout = this.bitmap = null;
@@ -123,7 +123,7 @@ export class Stage {
       this.refocus.show(layout, bitmap);
       show($("picture"), false);
       show($("gl"), true);
-      $("caption").textContent = `${layout.row_steps.length} × ${layout.column_steps.length} views of ${layout.tile[1]} × ${layout.tile[0]} px, phases from the ${layout.source}. Tap where it should be sharp.`;
+      $("caption").textContent = `${layout.row_steps.length} × ${layout.column_steps.length} views of ${layout.tile[1]} × ${layout.tile[0]} px, phases from the ${layout.source}. Tap a place to focus on it.`;
     } else {
       show($("gl"), false);
       $("caption").textContent = `${layout.row_steps.length} × ${layout.column_steps.length} views, phases from the ${layout.source}. This browser has no WebGL2: the vehicle makes the picture.`;
@@ -157,7 +157,7 @@ export class Stage {
     else this.ask(disparity);
   }
 
-  // Without WebGL: one picture at a time, the newest wish next.
+  // Without WebGL: one picture at a time, then the newest position of the slider.
   async ask(disparity) {
     this.wanted = disparity;
     if (this.asking) return;
@@ -197,8 +197,8 @@ export class Stage {
     $("caption").replaceChildren();
     if (kind === "slices" && facts) this.labels(paper, facts);
     else if (kind === "spectrum" && facts) this.carriers(paper, facts);
-    else if (kind === "views") $("caption").textContent = "Each view through its own part of the aperture, on one scale.";
-    else if (kind === "depth") $("caption").textContent = "Violet is small, yellow large disparity; grey is not known.";
+    else if (kind === "views") $("caption").textContent = "Each view comes through its own part of the aperture. All have the same brightness scale.";
+    else if (kind === "depth") $("caption").textContent = "Violet: small disparity. Yellow: large disparity. Grey: unknown.";
   }
 
   labels(paper, facts) {
@@ -213,7 +213,7 @@ export class Stage {
       paper.append(text);
     }
     show(paper, true);
-    $("caption").textContent = `${facts.shape[0]} slices of ${facts.shape[2]} × ${facts.shape[1]} px by their orders (ky, kx), each on its own scale; the other half is their mirror.`;
+    $("caption").textContent = `${facts.shape[0]} slices of ${facts.shape[2]} × ${facts.shape[1]} px by their orders (ky, kx), each on its own scale; the other half plane holds their conjugates.`;
   }
 
   carriers(paper, facts) {
@@ -221,7 +221,7 @@ export class Stage {
     paper.setAttribute("viewBox", `0 0 ${wide} 1000`);
     const at = (fy, fx) => [(0.5 + fx) * wide, (0.5 + fy) * 1000];
     const predicted = facts.predicted?.length ? facts.predicted : facts.carriers.map((row) => ({ at: row, seen: null }));
-    const halves = (ky, kx) => (ky || kx ? [1, -1] : [1]);   // the mean is its own mirror
+    const halves = (ky, kx) => (ky || kx ? [1, -1] : [1]);   // order (0, 0) has no conjugate
     for (const [ky, kx, fy, fx] of facts.carriers) for (const sign of halves(ky, kx)) {
       const [x, y] = at(sign * fy, sign * fx);
       paper.append(svg("rect", { x: x - size[1] / 2, y: y - size[0] / 2, width: size[1], height: size[0], fill: "none", stroke: "#ff6a5e", "stroke-width": 1.2, opacity: 0.75 }));
@@ -252,7 +252,7 @@ function key(path, colour, text) {
   return element("span", { class: "key" }, picture, text);
 }
 
-// An SVG element has no `hidden` of its own: the attribute does for both.
+// An SVG element has no `hidden` property; the attribute works for both.
 function show(one, visible) {
   one.toggleAttribute("hidden", !visible);
 }
