@@ -19,7 +19,7 @@ import tomli_w
 from PIL import Image
 
 from dappled.config import settings as configuration
-from dappled.daemon.camera_protocol.ground_client import GroundClient, GroundError
+from dappled.daemon.camera_protocol.ground_client import GroundClient, GroundStationError
 from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.mocks.simulation import Simulation, World
 from tests.simulated import lytro
@@ -180,7 +180,7 @@ def shooting(client: GroundClient) -> Iterator[None]:
 
     def shoot() -> None:
         while not ended.wait(3.0):
-            with suppress(GroundError):  # the daemon may be busy; the next one will do
+            with suppress(GroundStationError):  # the daemon may be busy; the next one will do
                 client.capture(1, timeout_s=20.0)
 
     thread = threading.Thread(target=shoot, daemon=True)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from dappled.daemon.camera_protocol.ground_client import GroundClient, GroundError
+from dappled.daemon.camera_protocol.ground_client import GroundClient, GroundStationError
 from dappled.daemon.navigation.clocks import BootClock
 from dappled.decode.geometry import turn_rad
 from dappled.mocks.autopilot.autopilot import Autopilot, BootTime
@@ -43,7 +43,7 @@ def test_the_client_reads_what_the_camera_is_and_asks_again_for_a_lost_report(ca
 
 
 def test_nobody_there_is_said_in_one_sentence() -> None:
-    with GroundClient("udpin:127.0.0.1:0") as client, pytest.raises(GroundError, match="no camera was heard"):
+    with GroundClient("udpin:127.0.0.1:0") as client, pytest.raises(GroundStationError, match="no camera was heard"):
         client.find_camera(0.2)
 
 

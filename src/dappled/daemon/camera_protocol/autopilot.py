@@ -44,7 +44,7 @@ class OwnAutopilot:
         self._requests.heard(message.get_msgId())
 
     def ask(self) -> None:
-        """Send what is due by now: requests for the time, and for streams that come too slowly."""
+        """Send what is due by now: requests for the time, and for streams that arrive too slowly."""
         autopilot = self._identity.autopilot()
         if autopilot is not None:
             system, link = autopilot

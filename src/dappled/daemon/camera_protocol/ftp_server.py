@@ -1,6 +1,6 @@
-"""MAVLink FTP (FILE_TRANSFER_PROTOCOL, message 110), to read a few small files from memory. Nothing can be written.
+"""Serve a few small files from memory over MAVLink FTP (FILE_TRANSFER_PROTOCOL, message 110), read-only.
 
-The payload (mavlink.io, "File Transfer Protocol"): sequence u16, session, opcode, size, opcode that is answered,
+The payload (mavlink.io, "File Transfer Protocol"): sequence u16, session, opcode, size, the answered opcode,
 burst complete, padding (u8 each), offset u32, 239 bytes of data.
 """
 
@@ -17,7 +17,7 @@ from dappled.drivers.mavlink import Message, mavlink
 DATA_BYTES = 239
 SESSIONS = 8
 IDLE_NS = 60 * 10**9
-BURST = 32  # packets of one burst: 7.5 kB, which a radio's buffer takes
+BURST = 32  # packets of one burst: 7.5 kB, which fits a radio's buffer
 _HEADER = struct.Struct("<HBBBBBxI")
 _PAYLOAD_BYTES = 251
 _ADDRESS = re.compile(r"^\[;comp=\d+\]")
@@ -58,7 +58,10 @@ class _Answered:
 
 
 class FtpServer:
-    """Serves what `files()` gives: names without folders to bytes. Eight files may be open, each for a minute idle."""
+    """Serves the files of `files()`, a mapping of names without folders to bytes.
+
+    At most eight files are open; one that is idle for a minute is closed.
+    """
 
     def __init__(self, files: Callable[[], Mapping[str, bytes]]) -> None:
         self._files = files
@@ -69,11 +72,11 @@ class FtpServer:
         """What to send back for a FILE_TRANSFER_PROTOCOL message. Time is monotonic."""
         client: _Client = (message.get_srcSystem(), message.get_srcComponent())
         request = _parse(bytes(message.payload))
-        if request is None or request.opcode >= _ACK:  # an answer is nothing to be answered
+        if request is None or request.opcode >= _ACK:  # an answer needs no answer
             return []
         self._sessions = {at: one for at, one in self._sessions.items() if now_ns - one.used_ns < IDLE_NS}
         known = self._last.get((client, request.session))
-        if known is not None and known.request == request and self._lives(known.opened):
+        if known is not None and known.request == request and self._is_valid(known.opened):
             return known.messages
         replies = self._act(request, client, now_ns)
         messages = [
@@ -87,8 +90,8 @@ class FtpServer:
             self._last.pop(next(iter(self._last)))
         return messages
 
-    def _lives(self, session: _Session | None) -> bool:
-        """Whether an answer that opened this session is still true. An answer that opened none is."""
+    def _is_valid(self, session: _Session | None) -> bool:
+        """Whether an answer that opened this session is still valid. An answer that opened none is valid."""
         return session is None or any(session is one for one in self._sessions.values())
 
     def _act(self, request: _Request, client: _Client, now_ns: int) -> list[_Reply]:
@@ -131,7 +134,7 @@ class FtpServer:
             return [_refusal(_NOT_FOUND)]
         if len(self._sessions) >= SESSIONS:
             return [_refusal(_NO_SESSIONS)]
-        # The server names a session, says the protocol; MAVProxy, as ArduPilot, has named it already.
+        # By the protocol the server numbers a session; MAVProxy, like ArduPilot, has numbered it already.
         free = next(at for at in (request.session, *range(SESSIONS)) if at not in self._sessions)
         self._sessions[free] = _Session(client, data, now_ns)
         return [_Reply(session=free, data=struct.pack("<I", len(data)))]
@@ -212,5 +215,5 @@ def _name(data: bytes) -> str:
 
 
 def _crc32(data: bytes) -> int:
-    """CRC-32 as the peers make it: started from 0 and without the last inversion."""
+    """CRC-32 as the peers compute it: started from 0 and without the final inversion."""
     return ~zlib.crc32(data, 0xFFFFFFFF) & 0xFFFFFFFF

@@ -1,4 +1,4 @@
-"""The ground station's part: find the camera, ask for photographs, hear how each one ended."""
+"""Act as a ground station: find the camera, request photographs, and report how each one ended."""
 
 from __future__ import annotations
 
@@ -19,14 +19,17 @@ _ASK_AGAIN_S = 3.0
 _KEPT = 1000
 
 
-class GroundError(DappledError):
+class GroundStationError(DappledError):
     """The camera could not be reached: one sentence."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How one asked-for photograph ended. `index` and `captured` (the message 263) are None where none was reported;
-    `reason` is a sentence for a photograph that wasn't had. `ack_ms`: from asking to the acknowledgement."""
+    """How one requested photograph ended.
+
+    `index` and `captured` (message 263) are None where none was reported; `reason` is a sentence for a photograph that
+    failed. `ack_ms`: from the request to the acknowledgement.
+    """
 
     sequence: int
     index: int | None
@@ -39,7 +42,7 @@ class Outcome:
 class GroundClient:
     """One ground station on one link (a pymavlink connection string). Use as a context manager.
 
-    It sends heartbeats, each second, while open. `key_file` signs the link; the signing time is kept beside it. Raises
+    It sends a heartbeat each second while open. `key_file` signs the link; the signing time is kept beside it. Raises
     LinkError from `__enter__`, SigningError for a key that can't be used.
     """
 
@@ -59,7 +62,7 @@ class GroundClient:
         self._camera: tuple[int, int] | None = None
         self._stop = threading.Event()
         self._heart = threading.Thread(target=self._beat, name="ground heartbeat", daemon=True)
-        self._sequence = time.time_ns() // 10**8 % 2**23  # another than that of a run just before; exact as a float
+        self._sequence = time.time_ns() // 10**8 % 2**23  # differs from a run just before; exact as a float
 
     def __enter__(self) -> GroundClient:
         self._links.start(self)
@@ -77,22 +80,24 @@ class GroundClient:
         return self._links.port(0)
 
     def find_camera(self, timeout_s: float = 10.0) -> tuple[int, int]:
-        """(system id, component id) of the first camera whose heartbeat is heard. Raises GroundError."""
+        """(system id, component id) of the first camera whose heartbeat is heard. Raises GroundStationError."""
         with self._changed:
             if not self._changed.wait_for(lambda: self._camera is not None, timeout_s):
                 url = self._links.statistics()[0].url
-                raise GroundError(f"no camera was heard on {url} for {timeout_s:g} s; is the daemon running there?")
+                raise GroundStationError(
+                    f"no camera was heard on {url} for {timeout_s:g} s; is the daemon running there?"
+                )
             assert self._camera is not None
             return self._camera
 
     def request(self, message_id: int, parameter: float = 0.0, timeout_s: float = 2.0) -> Message | None:
-        """One message of the camera, by MAV_CMD_REQUEST_MESSAGE; None where it didn't come."""
+        """One message of the camera, by MAV_CMD_REQUEST_MESSAGE; None where it didn't arrive."""
         with self._listening() as heard:
             self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, float(message_id), parameter)
             return heard(lambda m: m.get_msgId() == message_id, timeout_s)
 
     def command(self, name: int, *parameters: float) -> tuple[int | None, float | None]:
-        """Send a command until it is acknowledged (4 times, each 0.5 s): (MAV_RESULT, milliseconds), or Nones."""
+        """Send a command until it is acknowledged (4 times, 0.5 s each): (MAV_RESULT, milliseconds), or Nones."""
         system, component = self.find_camera()
         padded = (*parameters, *[0.0] * (7 - len(parameters)))
         with self._listening() as heard:
@@ -105,7 +110,7 @@ class GroundClient:
         return None, None
 
     def send_command(self, message: Message) -> None:
-        """One COMMAND_LONG goes out; here a ground station of other manners would begin."""
+        """Send one COMMAND_LONG. A simulated ground station with another way of sending overrides this."""
         self._links.send(message)
 
     def capture(
@@ -116,11 +121,13 @@ class GroundClient:
         timeout_s: float = 60.0,
         on_outcome: Callable[[Outcome], None] = lambda _: None,
     ) -> list[Outcome]:
-        """Ask for `count` photographs, each after the last one ended, at least `interval_s` apart."""
+        """Request `count` photographs, each after the last one ended, at least `interval_s` apart."""
         outcomes: list[Outcome] = []
         status = self.request(mavlink.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS)
         if status is None:
-            raise GroundError("the camera answers no request for its capture status: which image is new can't be told")
+            raise GroundStationError(
+                "the camera doesn't report its capture status, so a new image can't be recognised; does it run dappled?"
+            )
         expected = int(status.image_count)
         for _ in range(count):
             began = time.monotonic()
@@ -157,7 +164,7 @@ class GroundClient:
                 self.command(
                     mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED, float(expected)
                 )
-        return Outcome(sequence, None, False, f"nothing was heard of it for {timeout_s:g} s", ack_ms, None)
+        return Outcome(sequence, None, False, f"the camera reported nothing about it for {timeout_s:g} s", ack_ms, None)
 
     def _mine(self, message: Message) -> bool:
         return message.target_system in (0, self._links.system_id) and message.target_component in (
@@ -195,7 +202,7 @@ class GroundClient:
 
 
 class _Listening:
-    """From `with` on, no message is missed: those kept so far are known, newer ones are searched."""
+    """A context in which no message is missed: it searches those that arrived since `with`."""
 
     def __init__(self, changed: threading.Condition, heard: deque[Message]) -> None:
         self._changed = changed
@@ -211,9 +218,9 @@ class _Listening:
         self._keep.clear()
 
     def _wait(self, wanted: Callable[[Message], bool], timeout_s: float) -> Message | None:
-        def news() -> Iterator[Message]:
+        def newer() -> Iterator[Message]:
             return (m for m in self._heard if id(m) not in self._known and wanted(m))
 
         with self._changed:
-            self._changed.wait_for(lambda: next(news(), None) is not None, timeout_s)
-            return next(news(), None)
+            self._changed.wait_for(lambda: next(newer(), None) is not None, timeout_s)
+            return next(newer(), None)

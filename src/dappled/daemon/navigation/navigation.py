@@ -270,9 +270,9 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) ->
     """The pose at an instant, from `packets` packets.
 
     Position: cubic Hermite with the reported velocities. Attitude and gimbal: slerp. With one sample only, that one,
-    marked "nearest". Sigmas: time (exposure and clocks) × speed and × turn rate, with the age of a single sample; what
-    interpolation leaves in doubt; the receiver's accuracy (without one the position's sigmas are None); the attitude's
-    own, as the autopilot tells it, else `attitude_sigma_rad`.
+    marked "nearest". Sigmas: time (exposure and clocks) × speed and × turn rate, with the age of a single sample; the
+    uncertainty of the interpolation; the receiver's accuracy (without one the position's sigmas are None); the
+    attitude's own, as the autopilot reports it, else `attitude_sigma_rad`.
     """
     sigma_s = math.hypot(at.sigma_ns, HALF_MS_NS / math.sqrt(3)) / 1e9
     attitude, attitude_sigma, attitude_covariance = _attitude(at, sigma_s, attitude_sigma_rad)
@@ -317,13 +317,13 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) ->
 
 
 def unknown_pose(utc_ns: int, packets: int) -> Pose:
-    """A pose of which nothing is known."""
+    """A pose without any telemetry."""
     return Pose("none", utc_ns, None, None, None, None, None, None, None, None, None, None, packets)
 
 
 def position_at(samples: Sequence[PositionSample], boot_ns: int) -> tuple[PositionSample, float, float]:
-    """The sample that would stand at `boot_ns`, from one or two; and how many metres (1 σ) two leave it in doubt,
-    horizontally and vertically."""
+    """The position at `boot_ns` from one or two samples, and its interpolation error (1 σ, metres), horizontal and
+    vertical."""
     a = samples[0]
     if len(samples) == 1:
         return a, 0.0, 0.0
@@ -355,7 +355,7 @@ def position_at(samples: Sequence[PositionSample], boot_ns: int) -> tuple[Positi
 
 
 def attitude_at(samples: Sequence[AttitudeSample], boot_ns: int) -> tuple[Quaternion, float]:
-    """The attitude at `boot_ns`, from one or two samples; and how far (1 σ, radians) two leave it in doubt."""
+    """The attitude at `boot_ns` from one or two samples, and its interpolation error (1 σ, radians)."""
     a = samples[0]
     if len(samples) == 1:
         return a.attitude, 0.0
@@ -371,7 +371,7 @@ def attitude_at(samples: Sequence[AttitudeSample], boot_ns: int) -> tuple[Quater
 
 
 def _attitude(at: Around, sigma_s: float, own_rad: float) -> tuple[Quaternion | None, float | None, Symmetric | None]:
-    """Attitude, σ of the whole turn, and the covariance where the body's rates are known."""
+    """Attitude, σ of the whole rotation, and the covariance where the body's rates are known."""
     samples = at.attitudes
     if not samples:
         return None, None, None
@@ -392,13 +392,14 @@ def _attitude(at: Around, sigma_s: float, own_rad: float) -> tuple[Quaternion | 
 
 
 def _symmetric(way: Vector3, sigma_s: float, own: Vector3) -> Symmetric:
-    """The covariance of what moves along `way` (per second) for a time known to `sigma_s`, with its own variances."""
+    """The covariance of a quantity that moves along `way` (per second), for a time known to `sigma_s`, plus its own
+    variances."""
     x, y, z = (part * sigma_s for part in way)
     return x * x + own[0], x * y, x * z, y * y + own[1], y * z, z * z + own[2]
 
 
 def _gimbal(at: Around, vehicle: Quaternion | None) -> tuple[Quaternion | None, str | None]:
-    """The head's attitude to north-east-down; None where it follows the vehicle, whose heading is not known."""
+    """The head's attitude to north-east-down; None where it follows a vehicle of unknown heading."""
     if not at.gimbals:
         return None, None
     a, b = at.gimbals[0], at.gimbals[-1]

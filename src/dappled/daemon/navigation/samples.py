@@ -1,4 +1,7 @@
-"""What single telemetry messages say of the vehicle, as samples. Messages that say nothing give None."""
+"""Turn single telemetry messages into samples of position, attitude, receiver and gimbal.
+
+A message without a value gives None.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,8 @@ from dataclasses import dataclass
 from dappled.decode.geometry import Quaternion, Vector3, from_euler, normalised
 from dappled.drivers.mavlink import Message, mavlink
 
-HALF_MS_NS = 500_000  # time_boot_ms is cut to whole milliseconds: its middle is meant
-GIMBAL_COMPONENTS = frozenset({1, 154, 171, 172, 173, 174, 175})  # an autopilot speaks for a gimbal without MAVLink
+HALF_MS_NS = 500_000  # time_boot_ms is cut to whole milliseconds: the middle is used
+GIMBAL_COMPONENTS = frozenset({1, 154, 171, 172, 173, 174, 175})  # an autopilot reports for a gimbal without MAVLink
 _EARTH = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
 _VEHICLE = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
 _LOCK = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK
@@ -32,7 +35,7 @@ class PositionSample:
 @dataclass(frozen=True, slots=True)
 class AttitudeSample:
     """One ATTITUDE_QUATERNION, ATTITUDE or ATTITUDE_QUATERNION_COV. Rates are of the body, None where the autopilot
-    gave none; `sigma_rad` is the whole turn's, None where it doesn't tell."""
+    gave none; `sigma_rad` is of the whole rotation, None where it isn't given."""
 
     number: int
     stamp_ns: int
@@ -44,7 +47,7 @@ class AttitudeSample:
 
 @dataclass(frozen=True, slots=True)
 class GnssSample:
-    """One GPS_RAW_INT; what the receiver doesn't tell is None. Accuracies are one sigma."""
+    """One GPS_RAW_INT; what the receiver doesn't report is None. Accuracies are one sigma."""
 
     number: int
     stamp_ns: int
@@ -61,7 +64,7 @@ class GnssSample:
 class GimbalSample:
     """One GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION: the head against the horizon.
 
-    `boot_ns` is on the clock of `component`: 1 is the autopilot's, others have their own, which began anew `epoch`
+    `boot_ns` is on the clock of `component`: 1 is the autopilot's, others have their own, which restarted `epoch`
     times. `follows_vehicle`: yaw counts from the vehicle's nose, not from north.
     """
 
@@ -134,7 +137,7 @@ def gnss(number: int, stamp_ns: int, message: Message) -> GnssSample:
 
 
 def gimbal(number: int, stamp_ns: int, message: Message, epoch: int = 0) -> GimbalSample | None:
-    """A gimbal's attitude; None where it is none. Roll and pitch are against the horizon in both messages."""
+    """A gimbal's attitude; None where it isn't valid. Roll and pitch are against the horizon in both messages."""
     kind = message.get_type()
     if kind == "MOUNT_ORIENTATION":
         angles = (math.radians(angle) for angle in (message.roll, message.pitch, message.yaw))

@@ -1,4 +1,4 @@
-"""From the vehicle's recorded pose to the camera's: lever arm, mount, and the angles that other programs read.
+"""Derive the camera's pose from the vehicle's recorded one: lever arm, mount, and angles as other programs use them.
 
 A mount is the 3 × 3 matrix from camera axes (right, down, forward through the lens) to body axes (forward, right,
 down); its columns say where each camera axis points on the vehicle.
@@ -26,7 +26,7 @@ _GEODETIC, _GEOCENTRIC = "EPSG:4979", "EPSG:4978"  # both on WGS 84, heights abo
 
 @dataclass(frozen=True, slots=True)
 class Angles:
-    """Yaw, pitch and roll in degrees, turned in this order; yaw from 0 to 360."""
+    """Yaw, pitch and roll in degrees, applied in this order; yaw from 0 to 360."""
 
     yaw_deg: float
     pitch_deg: float
@@ -54,7 +54,7 @@ class CameraPose:
 
 
 def mount(values: tuple[float, ...]) -> Matrix:
-    """A mount from nine numbers, row by row. Raises DappledError for what is no rotation (to 1e-3)."""
+    """A mount from nine numbers, row by row. Raises DappledError where they are not a rotation (to 1e-3)."""
     matrix = np.array(values, dtype=np.float64).reshape(-1)
     if matrix.shape == (9,):
         square: Matrix = matrix.reshape(3, 3)
@@ -76,8 +76,8 @@ def of(
     """The camera's pose; None where the vehicle's position is not known.
 
     `lever_m` goes from the antenna (the autopilot's position) to the perspective centre, in body axes, metres.
-    `on_gimbal`: the camera hangs on the gimbal, whose recorded attitude counts, and the mount turns camera axes into
-    those of its head. `undulation_m` is how high mean sea level stands above the ellipsoid there.
+    `on_gimbal`: the camera hangs on the gimbal, whose recorded attitude is used, and the mount turns camera axes into
+    those of its head. `undulation_m` is the height of mean sea level above the ellipsoid there.
     """
     if pose.latitude_rad is None or pose.longitude_rad is None or pose.altitude_msl_m is None:
         return None
@@ -85,7 +85,7 @@ def of(
     height, applied = pose.height_above_home_m, not any(lever_m)
     if pose.attitude is not None and any(lever_m):
         # Eq 1, corrected: X_camera = X_antenna + R(ned → ecef) · R(body → ned) · lever. Only the lever is turned.
-        # (Without the geoid mean sea level stands for the ellipsoid: at 50 m between them that is 1e-5 of the lever.)
+        # (Without the geoid, sea level is used for the ellipsoid: at 50 m between them the error is 1e-5 of the lever.)
         ned = matrix_of(pose.attitude) @ np.array(lever_m)
         base = undulation_m or 0.0
         place = to_ecef(latitude, longitude, altitude + base) + ned_to_ecef(latitude, longitude) @ ned

@@ -1,10 +1,9 @@
-"""What the camera sees: angles from the lens, its pointing, and where the optical axis meets the ground. Pure."""
+"""The camera's field of view: angles from the lens, its attitude, and where the optical axis meets the ground."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from dappled.decode.geometry.pose import Pose, Quaternion, Vector3
 
@@ -12,28 +11,21 @@ EARTH_RADIUS_M = 6_371_000.0
 _SHALLOW = 0.05  # below 3° under the horizon the ground is too far for a flat one
 
 
-@dataclass(frozen=True, slots=True)
-class FieldOfView:
-    """Unknown is None. Angles in radians, across the image's width and height; `attitude` (w, x, y, z) turns a frame
-    that looks along x, with y to the image's right, to north-east-down; `ground` is (latitude, longitude, altitude
-    above sea level in metres) of the image's centre on the plane of the take-off place."""
-
-    width_rad: float | None = None
-    height_rad: float | None = None
-    attitude: Quaternion | None = None
-    ground: tuple[float, float, float] | None = None
-
-
 def angle_rad(size_mm: float | None, focal_length_mm: float | None) -> float | None:
-    """The angle that a side of the sensor sees at infinity: 2 atan(size / 2f)."""
+    """The angle of view along a side of the sensor, focused at infinity: 2 atan(size / 2f)."""
     if not size_mm or not focal_length_mm:
         return None
     return 2 * math.atan(size_mm / (2 * focal_length_mm))
 
 
 def look(pose: Pose | None, mount: Sequence[float]) -> tuple[Quaternion | None, tuple[float, float, float] | None]:
-    """Attitude of the camera and its ground point, from the vehicle's pose. `mount`: camera axes (right, down,
-    forward) to body axes (forward, right, down), nine numbers row by row."""
+    """Attitude of the camera and its ground point, from the vehicle's pose; None where unknown.
+
+    `mount`: camera axes (right, down, forward) to body axes (forward, right, down), nine numbers row by row. The
+    attitude (w, x, y, z) turns a frame that looks along x, with y to the image's right, to north-east-down. The ground
+    point is (latitude, longitude, altitude above sea level in metres) of the image's centre on the plane of the
+    take-off place.
+    """
     if pose is None or pose.attitude is None:
         return None, None
     right, down, forward = (_turned(pose.attitude, (mount[at], mount[3 + at], mount[6 + at])) for at in range(3))
@@ -55,7 +47,7 @@ def look(pose: Pose | None, mount: Sequence[float]) -> tuple[Quaternion | None, 
 
 
 def _turned(q: Quaternion, v: Vector3) -> Vector3:
-    """v turned by q (w, x, y, z)."""
+    """v rotated by q (w, x, y, z)."""
     w, x, y, z = q
     vx, vy, vz = v
     tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
@@ -67,7 +59,7 @@ def _turned(q: Quaternion, v: Vector3) -> Vector3:
 
 
 def _quaternion(axes: tuple[Vector3, Vector3, Vector3]) -> Quaternion:
-    """The turn whose matrix has these columns (Shepperd: the largest of four decides, so nothing cancels)."""
+    """The rotation whose matrix has these columns (Shepperd: the largest of four decides, so nothing cancels)."""
     (m00, m10, m20), (m01, m11, m21), (m02, m12, m22) = axes
     fours = (1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22)
     largest = max(range(4), key=fours.__getitem__)

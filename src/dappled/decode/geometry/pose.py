@@ -15,7 +15,7 @@ _WGS84_E2 = 6.69437999014e-3
 
 @dataclass(frozen=True, slots=True)
 class Gnss:
-    """What the receiver last said of itself before the exposure (GPS_RAW_INT). Accuracies are one sigma as it tells.
+    """The receiver's last report before the exposure (GPS_RAW_INT). Accuracies are one sigma, as it reports them.
 
     `fix_type` is MAVLink's GPS_FIX_TYPE: 3 is 3D, 5 RTK float, 6 RTK fixed. `age_ms` counts up to the exposure.
     """
@@ -35,12 +35,13 @@ class Pose:
     """Position and attitude of the vehicle at mid-exposure, and how well each is known.
 
     `attitude` is the unit quaternion (w, x, y, z) from body (forward, right, down) to north-east-down. Sigmas are one
-    standard deviation; `position_sigma_m` is horizontal, as a distance. `source` says how the pose was had:
-    "interpolated", "nearest" (no sample on one side: marked, not hidden) or "none". `age_ms` is the time from
-    mid-exposure to the nearest position sample. `telemetry_packets` is how many packets of telemetry.tlog were taken
-    into account: a replay stops there too. `gimbal_attitude` is that of a gimbal's head (forward, right, down) to
+    standard deviation; `position_sigma_m` is horizontal, as a distance. `source` says where the pose comes
+    from: "interpolated", "nearest" (no sample on one side) or "none". `age_ms` is the time from
+    mid-exposure to the nearest position sample. `telemetry_packets` is how many packets of telemetry.tlog were
+    used: a replay stops there too. `gimbal_attitude` is that of a gimbal's head (forward, right, down) to
     north-east-down, where one reports it; `gimbal_source` names its message. Covariances: the position's in
-    north-east-down, the attitude's in body axes (forward, right, down); what an unknown time adds lies along the way.
+    north-east-down, the attitude's in body axes (forward, right, down); an uncertain time adds to them along the
+    motion.
     """
 
     source: Literal["interpolated", "nearest", "none"]
@@ -76,7 +77,7 @@ def hermite(ends: tuple[float, float], slopes: tuple[float, float], span_s: floa
 
 
 def slerp(a: Quaternion, b: Quaternion, share: float) -> Quaternion:
-    """The unit quaternion at `share` of the shorter turn from `a` to `b` (both unit)."""
+    """The unit quaternion at `share` of the shorter rotation from `a` to `b` (both unit)."""
     dot = sum(x * y for x, y in zip(a, b, strict=True))
     if dot < 0:
         b, dot = (-b[0], -b[1], -b[2], -b[3]), -dot
@@ -89,7 +90,7 @@ def slerp(a: Quaternion, b: Quaternion, share: float) -> Quaternion:
 
 
 def normalised(*parts: float) -> Quaternion:
-    """Four numbers as a unit quaternion. Raises ValueError where they are none (zero length, not finite)."""
+    """Four numbers as a unit quaternion. Raises ValueError for zero length or numbers that are not finite."""
     w, x, y, z = parts
     length = math.sqrt(w * w + x * x + y * y + z * z)
     if not (math.isfinite(length) and length > 1e-6):
@@ -98,9 +99,9 @@ def normalised(*parts: float) -> Quaternion:
 
 
 def hermite_doubt(moved: float, slopes: tuple[float, float], span_s: float, share: float) -> float:
-    """How far (1 σ) `hermite` may miss at `share` of a way `moved`, with these slopes at its ends.
+    """The error (1 σ) of `hermite` at `share` of a distance `moved`, with these slopes at its ends.
 
-    A way that disagrees with its slopes' mean was not wholly told by them: half of the difference, in the middle.
+    Half of the difference between the distance and the mean of its slopes, in the middle.
     """
     return 0.5 * abs(moved - 0.5 * (slopes[0] + slopes[1]) * span_s) * (4 * share * (1 - share)) ** 2
 
@@ -108,8 +109,8 @@ def hermite_doubt(moved: float, slopes: tuple[float, float], span_s: float, shar
 def slerp_doubt(
     ends: tuple[Quaternion, Quaternion], rates: tuple[Vector3, Vector3], span_s: float, share: float
 ) -> float:
-    """Radians (1 σ) by which `slerp` may miss at `share`: the cubic that also has the body's rates (rad/s) at the ends,
-    less the even turn."""
+    """The error of `slerp` at `share` (1 σ, radians): the cubic that also has the body's rates (rad/s) at the ends,
+    less the even rotation."""
     even = rotation_vector(multiply(conjugate(ends[0]), ends[1]))
     u = share
     begin, end = u**3 - 2 * u**2 + u, u**3 - u**2
@@ -118,7 +119,7 @@ def slerp_doubt(
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """The turn `b`, then the turn `a`, of vectors."""
+    """The rotation `b` followed by the rotation `a`."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return (
@@ -130,7 +131,7 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def conjugate(q: Quaternion) -> Quaternion:
-    """The turn back."""
+    """The inverse rotation of a unit quaternion."""
     return q[0], -q[1], -q[2], -q[3]
 
 
@@ -143,7 +144,7 @@ def rotation_vector(q: Quaternion) -> Vector3:
 
 
 def turned_by_heading(q: Quaternion, vehicle: Quaternion) -> Quaternion:
-    """`q`, whose yaw counts from the vehicle's nose, to north: turned about the vertical by the vehicle's heading."""
+    """`q`, whose yaw counts from the vehicle's nose, relative to north: rotated about the vertical by the heading."""
     w, x, y, z = vehicle
     half = 0.5 * math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return multiply((math.cos(half), 0.0, 0.0, math.sin(half)), q)

@@ -16,7 +16,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 
-from dappled.daemon.camera_protocol.ground_client import ACK_TRIES, GroundClient, GroundError, Outcome
+from dappled.daemon.camera_protocol.ground_client import ACK_TRIES, GroundClient, GroundStationError, Outcome
 from dappled.drivers.mavlink import LinkError, Message, mavlink
 
 MANNERS = {
@@ -104,7 +104,7 @@ def main(arguments: list[str] | None = None) -> int:
                 timeout_s=wanted.timeout,
                 on_outcome=lambda outcome: print(_line(outcome), flush=True),  # noqa: T201 (a process that prints)
             )
-    except (GroundError, LinkError) as error:
+    except (GroundStationError, LinkError) as error:
         print(f"ground station: {error}", file=sys.stderr)  # noqa: T201 (as above)
         return 1
     return 0 if all(outcome.ok for outcome in outcomes) else 1
