@@ -357,8 +357,8 @@ class MavlinkLinks:
         return [thread.name for thread in self._threads if not thread.is_alive()]
 
     def _send_on(self, link: Link, message: Message) -> bool:
-        channel, sink = link.channel, self._sink
-        if channel is None or sink is None:
+        channel = link.channel
+        if channel is None or self._sink is None:
             link.packets_unsent += 1
             return False
         raw = link.packed(message, self.system_id, self.component_id)
@@ -372,32 +372,23 @@ class MavlinkLinks:
             link.packets_unsent += 1
             return False
         link.packets_out += 1
-        self._deliver(sink, link, stamp_us, raw, message, sent=True)
+        self._deliver(link, stamp_us, Framed(raw, message), sent=True)
         return True
 
-    def _deliver(
-        self,
-        sink: PacketSink,
-        link: Link,
-        stamp_us: int,
-        raw: bytes,
-        message: Message,
-        *,
-        sent: bool,
-        trusted: bool = True,
-    ) -> None:
-        number: int | None = None
+    def _deliver(self, link: Link, stamp_us: int, packet: Framed, *, sent: bool, trusted: bool = True) -> None:
+        sink, number = self._sink, None
+        assert sink is not None, "packets come and go after `start`"
         try:
-            number = sink.log_packet(stamp_us, raw)
+            number = sink.log_packet(stamp_us, packet.raw)
         except Exception:  # a full disk must not stop the commands of a flying machine
             if link.packets_unlogged == 0:
                 log.exception("A MAVLink packet could not be written to the telemetry log")
             link.packets_unlogged += 1
         try:
-            sink.on_packet(Packet(number, stamp_us, link.number, message, raw, sent, trusted))
+            sink.on_packet(Packet(number, stamp_us, link.number, packet.message, packet.raw, sent, trusted))
         except Exception:  # one unforeseen packet must not end the link
             link.failures += 1
-            log.exception("A MAVLink packet (%s) could not be handled", message.get_type())
+            log.exception("A MAVLink packet (%s) could not be handled", packet.message.get_type())
 
     # --- the receiving threads
 
@@ -441,7 +432,6 @@ class MavlinkLinks:
         return bool(ready & ~select.POLLOUT)
 
     def _received(self, link: Link, stamp_us: int, framed: Framed) -> None:
-        assert self._sink is not None, "the threads begin in `start`"
         with self._order:
             message = framed.message
             trusted = True
@@ -455,7 +445,7 @@ class MavlinkLinks:
             link.last_heard_monotonic_ns = self._clock.monotonic_ns()
             link.heard_1 |= framed.version == 1
             link.heard_2 |= framed.version == 2
-            self._deliver(self._sink, link, stamp_us, framed.raw, message, sent=False, trusted=trusted)
+            self._deliver(link, stamp_us, framed, sent=False, trusted=trusted)
 
     def _reopen(self, link: Link) -> None:
         with self._order:
