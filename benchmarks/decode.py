@@ -29,10 +29,11 @@ from dappled.decode.decoder import MaskDecoder
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield.aperture import Aperture, transfer
 from dappled.decode.lightfield.views import from_slices
+from dappled.decode.spectrum import Lineariser, Plane, Slices
 from dappled.decode.spectrum import plane as planes
-from dappled.decode.spectrum.lineariser import Lineariser, Plane, lineariser
+from dappled.decode.spectrum.lineariser import lineariser
 from dappled.decode.spectrum.plane import coloured, local_colours
-from dappled.decode.spectrum.slices import Slices, extract
+from dappled.decode.spectrum.slices import extract
 from dappled.decode.spectrum.transform import SpectrumBuffers, noise_rms, padded_shape, transform
 
 SHAPE = (2776, 3688)

@@ -19,10 +19,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # the painted scenes are the
 
 from tests.decode.scenes import boards, paint
 
-from dappled.decode.depth import estimate, evidence
-from dappled.decode.depth.depth_map import DepthMap
+from dappled.decode.depth import DepthMap, estimate, evidence
+from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.fourier_refocus import Spectrum4D
-from dappled.decode.lightfield.light_field import ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
 
 ROUNDS, WORKERS = 5, 2

@@ -118,3 +118,9 @@ def _see(
         picture[where] += cover * (value - picture[where])
         truth[where] = np.where(np.asarray(cover) > 0.5, flat + by * y0 + bx * x0, truth[where])
     return picture, truth
+
+
+def cameras(views: np.ndarray) -> ViewStack:
+    """Views (V, U, h, w(, 3)) of cameras side by side: further to the right, near things are further left."""
+    v, u = views.shape[:2]
+    return ViewStack(np.asarray(views, dtype=np.float32), -centred(v), -centred(u))

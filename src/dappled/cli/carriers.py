@@ -16,10 +16,10 @@ from dappled.cli import counted, decode_arguments
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
 from dappled.decode.decoder import CarriersFrom, doubt
+from dappled.decode.optics import Carrier, Lattice, Mask, Order
 from dappled.decode.optics.carrier_tables import crossed_orders, lattice_rotation
-from dappled.decode.optics.carriers import Carrier, Lattice, Mask, Order
+from dappled.decode.spectrum import Plane
 from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
-from dappled.decode.spectrum.lineariser import Plane
 from dappled.decode.spectrum.peaks import Measured, measure
 from dappled.decode.spectrum.pictures import LOOKS, Look, around, spectrum_boxes
 from dappled.decode.spectrum.transform import padded_shape, transform

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 
 from dappled.cli.arguments import metres
-from dappled.decode.depth.ranging import RANGING, Ranging
-from dappled.decode.optics.carriers import LAWS
+from dappled.decode.depth import RANGING, Ranging
+from dappled.decode.optics import LAWS
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.products import opened

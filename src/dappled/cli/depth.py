@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.cli import counted, decode_arguments
+from dappled.decode import DecodeError
+from dappled.decode.depth import DepthMap, DistanceMap
 from dappled.decode.depth import estimate as depths
-from dappled.decode.depth.depth_map import DepthMap
-from dappled.decode.depth.ranging import DistanceMap
-from dappled.decode.errors import DecodeError
 from dappled.flight import layout
 from dappled.products.exports import exports, point_cloud, prints
 from dappled.products.maps import photographs

@@ -10,7 +10,8 @@ import numpy as np
 from dappled.cli import decode_arguments
 from dappled.decode.depth.evidence import of_light_field
 from dappled.decode.depth.stereo import shifts_from_middle
-from dappled.decode.lightfield.light_field import ViewStack, slice_mosaic
+from dappled.decode.lightfield import ViewStack
+from dappled.decode.lightfield.light_field import slice_mosaic
 from dappled.products.exports import prints
 from dappled.products.opened import OpenedLightField, OpenError
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled.config.schema import ConfigError, TomlSource, build, read_toml, setting
-from dappled.decode.optics.carriers import LAWS, Mask, Sensor
+from dappled.decode.optics import LAWS, Mask, Sensor
 
 LENSLET = "lenslet"  # not a profile: the lattice is found in the frame itself
 

@@ -15,7 +15,7 @@ from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol.parameters import OwnParameter
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.pending_shot import Names
-from dappled.decode.optics.carriers import LAWS
+from dappled.decode.optics import LAWS
 from dappled.errors import DappledError, sentence
 
 log = logging.getLogger(__name__)

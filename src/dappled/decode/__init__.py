@@ -1,1 +1,7 @@
-"""Mathematics on arrays: masks, carriers, slices, views. No files, no sockets, no clock, no hardware."""
+"""Mathematics on arrays: masks, carriers, slices, views, depth. No files, no sockets, no clock, no hardware."""
+
+from __future__ import annotations
+
+from dappled.decode.errors import DecodeError, NoLattice
+
+__all__ = ["DecodeError", "NoLattice"]

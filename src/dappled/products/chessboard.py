@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config.profiles import Lens
-from dappled.decode.optics.carriers import Sensor
+from dappled.decode.optics import Sensor
 from dappled.errors import DappledError
 from dappled.products.extras import need
 from dappled.products.maps import eye

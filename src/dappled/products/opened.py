@@ -21,14 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config import profiles
+from dappled.decode import DecodeError
+from dappled.decode.depth import RANGING, DepthMap, DistanceMap, Ranging
 from dappled.decode.depth import estimate as depths
 from dappled.decode.depth import evidence as evidences
-from dappled.decode.depth.depth_map import DepthMap
 from dappled.decode.depth.evidence import Evidence
-from dappled.decode.depth.ranging import RANGING, DistanceMap, Ranging
-from dappled.decode.errors import DecodeError
+from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield import refocus as refocusing
-from dappled.decode.lightfield.light_field import LightField, ViewStack
 from dappled.decode.lightfield.refocus import FocalPlane, StereoPair, eyes
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.drivers.raw.recipe import of_flight

@@ -13,6 +13,7 @@ from dappled.decode.depth.ranging import Ranging, Target, fit_targets, target_sh
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.light_field import ViewStack, centred
 from dappled.decode.optics import lenses
+from tests.decode.optics.equations import object_distance
 
 STACK = ViewStack(np.zeros((5, 5, 8, 10), np.float32), centred(5), centred(5), sensor_px_per_disparity=32.0)
 LENS = Ranging.of_lens(50.0, 7.4, 0.01)
@@ -29,7 +30,7 @@ def test_it_is_equation_5(distance_m: float, focus_m: float) -> None:
     ranging = Ranging.of_lens(50.0, 7.4, 0.01, focus_m)
     shift_mm = (ranging.gain_px_m / distance_m + ranging.offset_px) * 0.01
     sensor_mm = lenses.image_distance_mm(50.0, focus_m)
-    found = lenses.object_distance(50.0, sensor_mm, shift_mm, 50.0 / 7.4, sigma_h_mm=1e-6)
+    found = object_distance(50.0, sensor_mm, shift_mm, 50.0 / 7.4, sigma_h_mm=1e-6)
     assert found.distance_m == pytest.approx(distance_m, rel=1e-6)
     exact = replace(ranging, gain_sigma_share=0.0)
     made = exact.distances(depth_map(ranging.disparity(distance_m, STACK), 1e-4 / 32), STACK)

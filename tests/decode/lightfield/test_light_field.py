@@ -7,6 +7,7 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.aperture import Aperture
 from dappled.decode.lightfield.light_field import LightField, ViewStack, needs_parallax, slice_mosaic
 from dappled.decode.optics.carriers import Mask
+from tests.decode.scenes import cameras
 
 
 def light_field(views: np.ndarray, *, lenslet: bool = False, offsets: np.ndarray | None = None) -> LightField:
@@ -31,11 +32,11 @@ def test_steps_count_views_in_columns() -> None:
 def test_lenslets_turn_the_aperture_round() -> None:
     field = light_field(np.zeros((3, 3, 4, 6)), lenslet=True)
     np.testing.assert_allclose(ViewStack.of(field).column_steps, [1, 0, -1])
-    np.testing.assert_allclose(ViewStack.from_cameras(field.views).column_steps, [1, 0, -1])
+    np.testing.assert_allclose(cameras(field.views).column_steps, [1, 0, -1])
 
 
 def test_colours_become_grey() -> None:
-    stack = ViewStack.from_cameras(np.random.default_rng(0).random((3, 3, 4, 6, 3)))
+    stack = cameras(np.random.default_rng(0).random((3, 3, 4, 6, 3)))
     assert stack.colour
     np.testing.assert_allclose(stack.grey().views, stack.views.mean(axis=4), rtol=1e-6)
     assert stack.middle().shape == (4, 6, 3)
@@ -48,7 +49,7 @@ def test_what_is_no_stack_is_told() -> None:
         (lambda: ViewStack.of(light_field(np.zeros((3, 3, 4, 6)), offsets=turned)), "rows and columns"),
         (lambda: ViewStack(np.zeros((3, 3, 4), np.float32), np.zeros(3), np.zeros(3)), "must be"),
         (lambda: ViewStack(np.zeros((3, 3, 4, 5), np.float32), np.zeros(2), np.zeros(3)), "places"),
-        (lambda: needs_parallax(ViewStack.from_cameras(np.zeros((1, 1, 4, 4))), "depth"), "several places"),
+        (lambda: needs_parallax(cameras(np.zeros((1, 1, 4, 4))), "depth"), "several places"),
     ):
         with pytest.raises(DecodeError, match=words):
             make()

@@ -12,7 +12,7 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import refocus
 from dappled.decode.lightfield.light_field import ViewStack, centred
 from dappled.decode.lightfield.refocus import all_in_focus, anaglyph, eyes, focal_stack, shift_and_add, side_by_side
-from tests.decode.scenes import Board, paint
+from tests.decode.scenes import Board, cameras, paint
 
 INNER = (slice(8, -8), slice(8, -8))
 
@@ -64,24 +64,18 @@ def test_alpha_is_equation_29(alpha: float) -> None:
         for u in (-1, 0, 1):
             at = [v * (1 - 1 / alpha) + y / alpha + 31.5, u * (1 - 1 / alpha) + x / alpha + 31.5]
             total += ndimage.map_coordinates(views[v + 1, u + 1], at, order=5, mode="nearest")
-    made = refocus.by_alpha(ViewStack.from_cameras(views), alpha, magnify=True)
+    same_size = refocus.shift_and_add(cameras(views), refocus.disparity_of_alpha(alpha))
+    made = refocus.magnified(same_size, alpha)
     known = np.isfinite(made)
     assert known[INNER].mean() > (0.4 if alpha < 1 else 0.99)
     assert np.abs(made - total / 9)[INNER][known[INNER]].max() < 0.02
-    same_size = refocus.by_alpha(ViewStack.from_cameras(views), alpha)
     assert psnr(same_size, refocus.shift_and_add(stack, 1 / alpha - 1)) > 100
-
-
-@given(st.floats(0.05, 20))
-@settings(deadline=None)
-def test_alpha_and_disparity_are_one(alpha: float) -> None:
-    assert refocus.alpha_of_disparity(refocus.disparity_of_alpha(alpha)) == pytest.approx(alpha, rel=1e-9)
 
 
 @pytest.mark.parametrize("alpha", [0.0, -1.0, math.nan, math.inf])
 def test_an_alpha_that_is_no_plane_is_told(alpha: float) -> None:
     with pytest.raises(DecodeError, match="is no image plane"):
-        refocus.by_alpha(ramps(0), alpha)
+        refocus.disparity_of_alpha(alpha)
 
 
 def test_colours_are_refocused_each() -> None:
@@ -138,7 +132,6 @@ def test_a_smaller_aperture_blurs_less() -> None:
         (lambda s: refocus.shift_and_add(s, 0, weights=np.zeros((5, 5))), "not all 0"),
         (lambda s: refocus.shift_and_add(s, 0, weights=np.ones((4, 5))), r"weights of shape \(4, 5\)"),
         (lambda s: refocus.along(s, np.zeros((3, 3))), r"the surface is \(3, 3\)"),
-        (lambda s: refocus.alpha_of_disparity(-1.0), "no α brings"),
     ],
 )
 def test_nonsense_is_told(call, words: str) -> None:  # type: ignore[no-untyped-def]  # several signatures
@@ -185,7 +178,7 @@ def column_of_spot(picture: np.ndarray) -> float:
 def test_near_things_are_further_right_for_the_left_eye(turned: bool) -> None:
     stack, _ = paint([Board(0.0, contrast=0.0, mean=0.2), Board(1.0, half=(8, 8), contrast=0.0, mean=0.9)], (48, 64), 5)
     if turned:
-        stack = ViewStack.from_cameras(stack.views[::-1, ::-1])
+        stack = cameras(stack.views[::-1, ::-1])
     pair = eyes(stack, separation=0.8)
     assert column_of_spot(pair.left) > column_of_spot(pair.right) + 0.3
     both = anaglyph(pair)

@@ -14,6 +14,7 @@ from dappled.decode.optics import laser_bench
 from dappled.decode.optics.carriers import Mask
 from dappled.decode.optics.film import MaskImage, film_of
 from tests.decode import thesis_tables as thesis
+from tests.decode.optics.equations import near_field, spots
 
 BENCH = (laser_bench.THESIS_WAVELENGTH_NM, laser_bench.THESIS_DISTANCE_M)
 PITCH = (1 / 113.8, 1 / 113.8)
@@ -56,7 +57,7 @@ def test_a_propagated_mask_lands_its_spots_on_table_7(intensity: bool) -> None:
     values = image.transmittance(slice(None), slice(None))
     field = (np.sqrt(values) if intensity else values) * laser_bench.beam(values.shape, PITCH, 2.0)
     screen = laser_bench.far_screen(field, PITCH, *BENCH, samples=1024)
-    seen = laser_bench.spots(screen, separation_mm=1.5)
+    seen = spots(screen, separation_mm=1.5)
     expected = np.array([(0.0, 0.0), *_corners(*thesis.TABLE_7)])
     places = np.array([(s.x_mm, s.y_mm) for s in seen[:9]])
     apart = np.hypot(*(expected[:, None] - places[None]).transpose(2, 0, 1))
@@ -84,7 +85,7 @@ def test_near_field_leaves_the_contrast_that_eq_30_says() -> None:
     frequency = periods / (n * pitch)
     wave = 1 + 0.2 * np.cos(2 * np.pi * periods * np.arange(n) / n)
     field = np.repeat(wave[None], n, axis=0)
-    behind = np.abs(laser_bench.near_field(field, (pitch, pitch), 550, 1.01e-3)) ** 2
+    behind = np.abs(near_field(field, (pitch, pitch), 550, 1.01e-3)) ** 2
     kept = np.abs(np.fft.fft(behind[0]))[periods] / np.abs(np.fft.fft(wave**2))[periods]
     assert kept == pytest.approx(abs(math.cos(math.pi * 550e-6 * 1.01 * frequency**2)), rel=1e-3)
 
@@ -93,7 +94,7 @@ def test_sampling_conditions_are_checked() -> None:
     with pytest.raises(DecodeError, match=r"too wide for 0\.01 m"):
         laser_bench.far_screen(np.ones((600, 600)), PITCH, 532, 0.01)
     with pytest.raises(DecodeError, match="too far for 64 samples"):
-        laser_bench.near_field(np.ones((64, 64)), PITCH, 532, 0.5)
+        near_field(np.ones((64, 64)), PITCH, 532, 0.5)
     with pytest.raises(DecodeError, match=r"wavelength = 0\.000532 nm"):
         laser_bench.bench_scale(532e-6, 0.5)
 

@@ -14,6 +14,7 @@ from dappled.decode.optics import laser_bench
 from dappled.decode.optics.carriers import Mask
 from dappled.decode.optics.film import MaskImage, film_of
 from dappled.products.exports import mask_files
+from tests.decode.optics.equations import spots
 
 
 @pytest.mark.parametrize("name", ["mask.png", "mask.tif"])
@@ -36,7 +37,7 @@ def test_a_written_mask_propagated_lands_on_table_7(tmp_path: Path, name: str) -
     values, density = mask_files.read(tmp_path / name)
     pitch = 1 / density[0], 1 / density[1]
     field = (1 - values.astype(np.float64)) * laser_bench.beam((700, 700), pitch, 2.0)
-    seen = laser_bench.spots(laser_bench.far_screen(field, pitch, 532, 0.5842, samples=1024), separation_mm=1.5)
+    seen = spots(laser_bench.far_screen(field, pitch, 532, 0.5842, samples=1024), separation_mm=1.5)
     expected = [(0.0, 0.0), *((a * r, b * r) for r in (3.54, 7.07) for a in (1, -1) for b in (1, -1))]
     assert len(seen) >= 9
     for x, y in expected:

@@ -14,8 +14,7 @@ from dappled.cli import counted, decode_arguments
 from dappled.cli.calibrate import lens, target
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
-from dappled.decode.calibration import report
-from dappled.decode.calibration.calibration import Calibration
+from dappled.decode.calibration import Calibration, report
 from dappled.decode.calibration.fit import CalibrationFrame, from_lattices, lattice_of
 from dappled.decode.calibration.lattice_fit import FrameLattice
 from dappled.drivers.raw import calibration_files

@@ -12,7 +12,8 @@ from tqdm import tqdm
 
 from dappled.cli import counted
 from dappled.config import profiles
-from dappled.decode.depth.ranging import RANGING, Ranging, Target, fit_targets, target_shift
+from dappled.decode.depth import RANGING, Ranging
+from dappled.decode.depth.ranging import Target, fit_targets, target_shift
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
 from dappled.products import opened

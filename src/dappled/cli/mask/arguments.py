@@ -10,8 +10,7 @@ from dappled.cli.arguments import whole
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.config.schema import ConfigError
-from dappled.decode.optics import lenses
-from dappled.decode.optics.carriers import Mask, Sensor
+from dappled.decode.optics import Mask, Sensor, lenses
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,7 @@ from tqdm import tqdm
 from dappled.config import profiles
 from dappled.config.profiles import MaskProfile
 from dappled.config.schema import ConfigError
-from dappled.decode.optics import film
-from dappled.decode.optics.carriers import Mask
+from dappled.decode.optics import Mask, film
 from dappled.decode.optics.film import FILMS, Film, MaskImage, period_on
 from dappled.decode.optics.lenses import within
 from dappled.products.exports import mask_files

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import fft
 
-from dappled.decode.lightfield.light_field import ViewStack
+from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
 
 Grey = NDArray[np.uint8]

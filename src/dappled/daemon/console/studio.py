@@ -17,9 +17,10 @@ from dappled.daemon.stream.wire import Message
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.geometry import footprint
 from dappled.decode.geometry.footprint import OrientedFrame, RectifiedFrame
-from dappled.decode.lightfield.light_field import LightField, ViewStack, slice_mosaic
-from dappled.decode.optics.carriers import Carrier, Lattice
-from dappled.decode.spectrum.slices import Slices
+from dappled.decode.lightfield import LightField, ViewStack
+from dappled.decode.lightfield.light_field import slice_mosaic
+from dappled.decode.optics import Carrier, Lattice
+from dappled.decode.spectrum import Slices
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError
 

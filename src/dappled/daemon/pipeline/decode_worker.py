@@ -18,11 +18,10 @@ from PIL import Image
 from dappled.daemon.pipeline.decode_process import NICENESS, serve
 from dappled.daemon.pipeline.memory import DECODER_GOES, goes_first
 from dappled.daemon.stream import wire
-from dappled.decode.depth import estimate, evidence
-from dappled.decode.depth.depth_map import DepthMap
-from dappled.decode.depth.ranging import RANGING, Ranging
-from dappled.decode.errors import DecodeError
-from dappled.decode.lightfield.light_field import LightField, ViewStack, slice_mosaic
+from dappled.decode import DecodeError
+from dappled.decode.depth import RANGING, DepthMap, Ranging, estimate, evidence
+from dappled.decode.lightfield import LightField, ViewStack
+from dappled.decode.lightfield.light_field import slice_mosaic
 from dappled.drivers.camera import Blob
 from dappled.drivers.child_process import end_with_parent
 from dappled.drivers.process_channel import ChannelMessage

@@ -1,1 +1,7 @@
-"""The light field, its views, and pictures focused anew."""
+"""Light field, aperture and views; refocusing, focal stacks, stereo pairs."""
+
+from __future__ import annotations
+
+from dappled.decode.lightfield.light_field import LightField, ViewStack
+
+__all__ = ["LightField", "ViewStack"]

@@ -96,15 +96,6 @@ class ViewStack:
             sensor_px_per_disparity=None if cameras else count * column_px,
         )
 
-    @classmethod
-    def from_cameras(cls, views: NDArray[np.floating[Any]]) -> ViewStack:
-        """Views (V, U, h, w(, 3)) of cameras side by side, rows first, as in light fields of HCI and LFToolbox.
-
-        Further to the right, near things are further to the left.
-        """
-        v, u = views.shape[:2]
-        return cls(np.asarray(views, dtype=np.float32), -centred(v), -centred(u))
-
     @property
     def reach(self) -> float:
         """The largest step: so many pixels does the outermost view move for a disparity of 1."""

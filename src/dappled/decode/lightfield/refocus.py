@@ -30,28 +30,6 @@ def disparity_of_alpha(alpha: float) -> float:
     return 1 / alpha - 1
 
 
-def alpha_of_disparity(disparity: float) -> float:
-    """The inverse. Raises DecodeError for disparities of −1 and below, which no α reaches."""
-    if not disparity > -1:
-        raise DecodeError(
-            f"no α brings a disparity of {disparity:g} into focus: it must be above −1; use the disparity"
-        )
-    return 1 / (1 + disparity)
-
-
-def by_alpha(
-    stack: ViewStack, alpha: float, *, magnify: bool = False, weights: NDArray[np.floating] | None = None,
-    workers: int = 1,
-) -> Image:  # fmt: skip
-    """Eq 29 at α, float32 (h, w(, 3)), the mean of the views instead of their sum.
-
-    Eq 29's x/α makes the picture α times as large. That is done with `magnify`, cut to the views' size (pixels beyond
-    the views are NaN); without it the image plane is sampled α times as coarsely, and all α show the same scene.
-    """
-    made = shift_and_add(stack, disparity_of_alpha(alpha), weights=weights, workers=workers)
-    return magnified(made, alpha) if magnify else made
-
-
 def shift_and_add(
     stack: ViewStack, disparity: float, *, weights: NDArray[np.floating] | None = None, workers: int = 1
 ) -> Image:

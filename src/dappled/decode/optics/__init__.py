@@ -1,1 +1,7 @@
-"""Lenses, masks, carrier laws, film, laser bench, mask and survey design, carrier tables."""
+"""Lenses, masks and their carriers, film, laser bench, mask and survey design."""
+
+from __future__ import annotations
+
+from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Order, Sensor
+
+__all__ = ["LAWS", "Carrier", "Lattice", "Mask", "Order", "Sensor"]

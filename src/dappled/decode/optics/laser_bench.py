@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import fft
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics.carriers import Mask
@@ -114,70 +114,12 @@ def far_screen(
     return Screen(np.abs(spread * gain) ** 2, (area_mm2 / (size * pitch_mm[0]), area_mm2 / (size * pitch_mm[1])))
 
 
-def near_field(
-    field: NDArray[np.complexfloating] | NDArray[np.floating],
-    pitch_mm: tuple[float, float],
-    wavelength_nm: float,
-    distance_m: float,
-) -> NDArray[np.complex128]:
-    """Fresnel diffraction by the transfer function H(p, q) = exp(−iπλz(p² + q²)) (Eq 19), for mask to sensor.
-
-    `field` (H, W) is taken as periodic; the result has its pitch. H is sampled properly while λ·z ≤ N·pitch². Raises
-    DecodeError where it is not: use `far_screen`.
-    """
-    area_mm2 = bench_scale(wavelength_nm, distance_m) * 1e6
-    for count, pitch in zip(field.shape, pitch_mm, strict=True):
-        within("pitch of the mask", pitch, "mm", 1e-6, 10)
-        if area_mm2 > count * pitch**2:
-            raise DecodeError(
-                f"{distance_m:g} m is too far for {count} samples of {pitch:g} mm: the transfer function needs "
-                f"λz ≤ samples × pitch² = {count * pitch**2:.4g} mm², this is {area_mm2:.4g}"
-            )
-    q, p = (fft.fftfreq(n, pitch) for n, pitch in zip(field.shape, pitch_mm, strict=True))
-    transfer = np.exp(-1j * np.pi * area_mm2 * (q[:, None] ** 2 + p**2))
-    result: NDArray[np.complex128] = fft.ifft2(fft.fft2(field.astype(np.complex128)) * transfer)
-    return result
-
-
 def beam(shape: tuple[int, int], pitch_mm: tuple[float, float], diameter_mm: float) -> NDArray[np.float64]:
     """(h, w) amplitude of a round Gaussian beam, `diameter_mm` where its intensity is 1/e²."""
     within("beam diameter", diameter_mm, "mm", 1e-3, 100)
     y, x = ((np.arange(n) - n // 2) * pitch for n, pitch in zip(shape, pitch_mm, strict=True))
     amplitude: NDArray[np.float64] = np.exp(-(y[:, None] ** 2 + x**2) / (diameter_mm / 2) ** 2)
     return amplitude
-
-
-@dataclass(frozen=True, slots=True)
-class Spot:
-    """A spot of light: its centre of gravity in mm from the axis, and its peak as a share of the brightest."""
-
-    x_mm: float
-    y_mm: float
-    strength: float
-
-
-def spots(screen: Screen, *, separation_mm: float = 1.0, faintest: float = 1e-4) -> list[Spot]:
-    """The spots on a screen, the brightest first: local maxima that are alone within `separation_mm` (a square's side).
-
-    The place is the centre of gravity of the brighter half around the peak. Nothing of the mask is assumed.
-    """
-    reach = [max(1, round(separation_mm / 2 / pitch)) for pitch in screen.pitch_mm]
-    smooth = ndimage.uniform_filter(screen.intensity, [max(1, r // 4) for r in reach])
-    highest = ndimage.maximum_filter(smooth, [2 * r + 1 for r in reach], mode="constant")
-    brightest = float(smooth.max())
-    found = []
-    height, width = smooth.shape
-    for row, column in np.argwhere((smooth == highest) & (smooth > faintest * brightest)).tolist():
-        top, left = max(0, row - reach[0]), max(0, column - reach[1])
-        box = smooth[top : min(height, row + reach[0] + 1), left : min(width, column + reach[1] + 1)]
-        weight = np.clip(box - 0.5 * smooth[row, column], 0, None)
-        y, x = np.mgrid[top : top + box.shape[0], left : left + box.shape[1]]
-        x_mm, y_mm = screen.at_mm(float((weight * y).sum() / weight.sum()), float((weight * x).sum() / weight.sum()))
-        found.append(Spot(x_mm, y_mm, float(smooth[row, column]) / brightest))
-    return sorted(found, key=lambda spot: -spot.strength)
-
-
-# --- what a person measured --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,15 +36,10 @@ class FoundLattice:
     predicted: int
 
     @property
-    def pitch_px(self) -> tuple[float, float]:
-        """Distances between neighbouring rows of lenslets (or mask lines): 1/|(1, 0)| and 1/|(0, 1)|, in pixels."""
-        return 1 / math.hypot(*self.lattice.ky), 1 / math.hypot(*self.lattice.kx)
-
-    @property
     def spacing_px(self) -> tuple[float, float]:
         """Lengths of the two shortest steps from a lenslet's centre to the next, in pixels, by rows first.
 
-        The same as `pitch_px` on a square lattice, 2/√3 times as much on a hexagonal one.
+        On a square lattice the distances between rows of lenslets, on a hexagonal one 2/√3 times as much.
         """
         lengths = np.hypot(*np.linalg.inv(self.lattice.matrix()))
         return float(lengths[0]), float(lengths[1])

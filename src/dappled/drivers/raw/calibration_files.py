@@ -11,8 +11,8 @@ import numpy as np
 import tomli_w
 
 from dappled.config.schema import ConfigError, read_toml
-from dappled.decode.calibration.calibration import Calibration
-from dappled.decode.errors import DecodeError
+from dappled.decode import DecodeError
+from dappled.decode.calibration import Calibration
 
 _TEXT = "calibration_toml"
 

@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
-from dappled.decode.calibration.calibration import Calibration
+from dappled.decode import DecodeError
+from dappled.decode.calibration import Calibration
 from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
-from dappled.decode.depth.ranging import RANGING
-from dappled.decode.errors import DecodeError
+from dappled.decode.depth import RANGING
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
-from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield import LightField
+from dappled.decode.spectrum import LinearRows, Plane
 from dappled.decode.spectrum import plane as planes
-from dappled.decode.spectrum.lineariser import LinearRows, Plane, check_shape, lineariser
+from dappled.decode.spectrum.lineariser import check_shape, lineariser
 from dappled.decode.spectrum.plane import Places, coloured, find_defects, local_colours, mended, spread
 from dappled.decode.spectrum.transform import Source
 from dappled.drivers.raw import calibration_files, reading

@@ -14,7 +14,7 @@ import numpy as np
 
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
-from dappled.decode.errors import DecodeError
+from dappled.decode import DecodeError
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError

@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Order, Sensor
+from dappled.decode.optics import LAWS, Lattice, Mask, Order, Sensor
 from dappled.mocks.autopilot.path import TruePose
 
 Floats = NDArray[np.float32]

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.optics.carriers import Lattice, Mask, Sensor
+from dappled.decode.optics import Lattice, Mask, Sensor
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.scene import dng, lens, synthesis
 from dappled.mocks.scene.bench import RealViews, WhiteCard, boards

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from dappled.decode.optics.carriers import Lattice, Order
+from dappled.decode.optics import Lattice, Order
 
 MARGIN = 24  # view samples outside the frame on each side
 FADE = 22  # of which so many fade

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import io
 
-from dappled.decode.depth.depth_map import DepthMap
-from dappled.decode.depth.ranging import DistanceMap
-from dappled.decode.lightfield.light_field import LightField, ViewStack
+from dappled.decode.depth import DepthMap, DistanceMap
+from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
 from dappled.errors import DappledError
 from dappled.products.exports import point_cloud, prints

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield import LightField
 from dappled.errors import DappledError
 from dappled.flight import durable
 

@@ -12,8 +12,8 @@ import pyproj
 from numpy.typing import NDArray
 
 from dappled.config import profiles
-from dappled.decode.depth.ranging import DistanceMap
-from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.depth import DistanceMap
+from dappled.decode.lightfield import LightField
 from dappled.errors import DappledError
 from dappled.products.extras import need
 from dappled.products.maps.earth import Projection, utm

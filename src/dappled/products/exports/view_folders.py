@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from dappled.decode.lightfield.light_field import CAMERAS, LightField, centred
+from dappled.decode.lightfield import LightField
+from dappled.decode.lightfield.light_field import CAMERAS, centred
 from dappled.errors import DappledError
 
 _ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg")

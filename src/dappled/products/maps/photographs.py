@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dappled.config.profiles import CameraProfile, Lens
 from dappled.decode.geometry import Pose, camera_pose
 from dappled.decode.geometry.camera_pose import CameraPose, Matrix
-from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield import LightField
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
 from dappled.flight import Frame, LedgerReader, Tag, layout
