@@ -65,7 +65,7 @@ def test_all_is_well() -> None:
         ("Decoding", "caution", "kept, not decoded", {"decode": {"mask": "", "calibration": "", "running": False}}),
         ("Decoding", "caution", "off", {"decode": {"mask": "m", "calibration": "", "running": False}}),
         ("Decoding", "caution", "not calibrated", {"decode": {"mask": "m", "calibration": "", "running": True}}),
-        ("Decoding", "caution", "2 frames are only in", {"stages": [{"name": "decode", "dropped": 2}]}),
+        ("Decoding", "caution", "fell behind by 2 frames, kept", {"stages": [{"name": "decode", "dropped": 2}]}),
         ("Service", "no-go", "capture ended: restart dappled", {"dead": ["capture"]}),
         ("Clock", "caution", "not known yet", {"utc_known": False}),
     ],

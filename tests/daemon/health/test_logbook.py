@@ -73,5 +73,7 @@ def test_a_problem_is_new_once_though_its_numbers_change() -> None:
     assert (new.among(["409 MB left"]), bool(new)) == (["409 MB left"], True)
     assert new.among(["408 MB left", "no camera"]) == ["no camera"]
     assert new.among(["407 MB left", "no camera"], again=True) == ["407 MB left", "no camera"]
+    assert new.among(["decode fell behind by 1 frame"]) == ["decode fell behind by 1 frame"]
+    assert new.among(["decode fell behind by 2 frames"]) == []
     assert (new.among([]), bool(new)) == ([], False)
     assert new.among(["409 MB left"]) == ["409 MB left"]

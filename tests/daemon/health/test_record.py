@@ -80,7 +80,7 @@ def test_well(tmp_path: Path) -> None:
         ({"settings": replace(WELL, record=RecordSettings(warn_free_mb=10_000_000))}, "the disk is filling up"),
         ({"dead": ["mavlink 0"]}, "the mavlink 0 thread has ended: restart dappled"),
         ({"dead": ["capture"]}, "the capture thread has ended: restart dappled"),
-        ({"items": 3}, "decode fell behind: 2 frames are only in the record"),
+        ({"items": 3}, "decode fell behind by 2 frames, kept in the record"),
     ],
 )
 def test_one_problem_one_sentence(tmp_path: Path, changes: dict[str, Any], words: str) -> None:

@@ -117,7 +117,7 @@ def _decoding(health: Mapping[str, Any]) -> Check:
     left = sum(stage["dropped"] for stage in health["stages"] if stage["name"] == "decode")
     if left:
         return Check(
-            "Decoding", "caution", f"fell behind: {left} frame{' is' if left == 1 else 's are'} only in the record"
+            "Decoding", "caution", f"fell behind by {left} frame{'' if left == 1 else 's'}, kept in the record"
         )
     if not decode["calibration"]:
         return Check(

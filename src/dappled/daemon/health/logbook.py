@@ -17,7 +17,7 @@ from dappled.errors import sentence
 Level = Literal["info", "warning"]
 LOW_PERCENT = 25
 _LOW_WORDS = ("low", "empty", "exhausted", "critical")
-_NUMBER = re.compile(r"\d+")
+_NUMBER = re.compile(r"\d+( frames?\b)?")  # "1 frame" and "2 frames" are one kind
 
 
 @dataclass(frozen=True, slots=True)

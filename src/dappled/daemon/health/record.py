@@ -75,10 +75,7 @@ def record(
     stages = [asdict(stage.statistics()) for stage in pipeline.stages]
     for stage in stages:
         if stage["dropped"]:
-            lost = stage["dropped"]
-            problems.append(
-                f"{stage['name']} fell behind: {lost} frame{' is' if lost == 1 else 's are'} only in the record"
-            )
+            problems.append(f"{stage['name']} fell behind by {_frames(stage['dropped'])}, kept in the record")
     return {
         "utc_ns": utc_ns,
         "camera": {"state": pipeline.camera_state, "reason": pipeline.camera_reason},
@@ -122,6 +119,10 @@ def _silence(link: LinkStatistics) -> str:
         f"nothing with a valid signature was heard for 5 s ({signing.unsigned_refused} packets were unsigned, "
         f"{signing.forged} forged, {signing.replayed} too old); give both ends the same key"
     )
+
+
+def _frames(count: int) -> str:
+    return "1 frame" if count == 1 else f"{count} frames"
 
 
 def _counters(link: LinkStatistics) -> dict[str, Any]:
