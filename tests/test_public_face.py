@@ -18,6 +18,35 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "api.md"
 PUBLIC = ("dappled", "dappled.drivers", "dappled.errors", "dappled.testing", "dappled.typing")
 
+TYPED = """
+import dappled
+from dappled.errors import DappledError
+from dappled.typing import Message, OpenedLightField
+
+
+def handle(message: Message) -> None:
+    print(message.topic, message.arrays())
+
+
+async def listen() -> None:
+    async for message in dappled.subscribe("ipc:///run/dappled/slices", topics=["slices"]):
+        handle(message)
+
+
+def main(camera: dappled.Camera) -> str:
+    camera.fire(1)
+    try:
+        found = dappled.open("frame.zarr")
+    except DappledError:
+        return dappled.__version__
+    if isinstance(found, OpenedLightField):
+        print(found.refocus(alpha=1.0).shape)
+    stream = dappled.subscribe("tcp://10.0.0.7:5555", keys="laptop.key_secret", server_key="vehicle.key")
+    for message in stream:
+        handle(message)
+    return f"{stream.lost} lost"
+"""
+
 
 def test_dir_shows_the_face_alone() -> None:
     assert dir(dappled) == ["Camera", "__version__", "open", "subscribe"]
@@ -41,6 +70,15 @@ def test_every_public_name_is_there_and_in_the_page(module: str) -> None:
     for name in found.__all__:
         assert getattr(found, name) is not None
         assert re.search(rf"`[^`]*\b{name}\b[^`]*`", page), name
+
+
+@pytest.mark.slow
+def test_a_typed_program_passes_mypy_strict(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(TYPED, encoding="utf-8")
+    words = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path / "cache"), str(program)]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=110, check=False)
+    assert "no issues found" in done.stdout, done.stdout + done.stderr
 
 
 def imported(code: str) -> Iterator[str]:
