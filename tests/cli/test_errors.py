@@ -14,7 +14,7 @@ from dappled import cli
 from dappled.errors import DappledError
 
 INTERNAL = {  # caught where they arise, and told as another error or as an event
-    "dappled.drivers.process_channel.ChannelError",
+    "dappled.drivers.child_process.ChannelError",
     "dappled.drivers.gphoto2.protocol.SessionError",
     "dappled.mocks.body.ptp.MalformedPacketError",
 }

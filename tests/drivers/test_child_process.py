@@ -9,14 +9,14 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from dappled.drivers.camera import CameraError
-from dappled.drivers.child_process import RestartBudget, end_child, start_child
-from dappled.drivers.process_channel import ChannelError, ProcessChannel
+from dappled.drivers.child_process import ChannelError, ProcessChannel, RestartBudget, end_child, start_child
 from dappled.drivers.wired.ptp_source import PtpSource
 
 
@@ -110,3 +110,39 @@ def test_the_restart_budget_allows_its_limit_in_any_window() -> None:
     assert budget.wait_ns(60 * second) == 0
     budget.spend(60 * second)
     assert budget.wait_ns(61 * second) == 9 * second
+
+
+# --- messages
+
+
+Ends = tuple[ProcessChannel, ProcessChannel]
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    here, there = ProcessChannel.pair()
+    other = ProcessChannel(there)
+    yield here, other
+    here.close()
+    other.close()
+
+
+def test_nothing_to_receive_is_none(ends: Ends) -> None:
+    assert ends[0].receive(0.0) is None
+
+
+def test_the_end_of_the_other_end_is_reported(ends: Ends) -> None:
+    ends[1].close()
+    with pytest.raises(ChannelError, match="ended"):
+        ends[0].receive(5.0)
+    with pytest.raises(ChannelError, match="gone"):
+        ends[0].send({"do": "ping"})
+
+
+def test_a_full_channel_does_not_block(ends: Ends) -> None:
+    def fill() -> None:
+        for number in range(100_000):
+            ends[0].send({"do": "fire", "shot": number})
+
+    with pytest.raises(ChannelError, match="no more"):
+        fill()

@@ -27,7 +27,7 @@ from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher, Reply
 from dappled.daemon.stream.wire import Message
 from dappled.decode.geometry import camera_pose
-from dappled.drivers.process_channel import ChannelError, ProcessChannel
+from dappled.drivers.child_process import ChannelError, ProcessChannel
 from tests import globe
 
 STACK = (np.random.default_rng(1).random((2, 30, 40)) + 0.1).astype(np.complex64)

@@ -19,11 +19,10 @@ import pytest
 
 from dappled.drivers import usb_bus
 from dappled.drivers.camera import Arrival, CameraError, Companion, Fired, ShotFailed, StateChanged
-from dappled.drivers.child_process import RestartBudget
+from dappled.drivers.child_process import ProcessChannel, RestartBudget
 from dappled.drivers.gphoto2.client import GPhoto2Camera, Spawn, open_camera, spawn_process
 from dappled.drivers.gphoto2.messages import Carryover
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
-from dappled.drivers.process_channel import ProcessChannel
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from dappled.mocks.body.eos450d import thumbnail
 from dappled.testing import (

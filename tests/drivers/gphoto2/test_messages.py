@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dappled.drivers.camera import Arrival, Blob, CameraEvent, Fired, Identity, ShotFailed, StateChanged
+from dappled.drivers.child_process import ChannelError, ChannelMessage, ProcessChannel
 from dappled.drivers.gphoto2.messages import event_message, message_event
-from dappled.drivers.process_channel import ChannelError, ChannelMessage, ProcessChannel
 
 Ends = tuple[ProcessChannel, ProcessChannel]
 

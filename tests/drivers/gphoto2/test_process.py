@@ -21,6 +21,7 @@ from dappled.drivers.camera import (
     ShotFailed,
     StateChanged,
 )
+from dappled.drivers.child_process import ChannelError, ProcessChannel
 from dappled.drivers.gphoto2.messages import message_event
 from dappled.drivers.gphoto2.process import CameraLoop
 from dappled.drivers.gphoto2.protocol import (
@@ -36,7 +37,6 @@ from dappled.drivers.gphoto2.protocol import (
     SessionError,
 )
 from dappled.drivers.gphoto2.settings import GPhoto2Settings
-from dappled.drivers.process_channel import ChannelError, ProcessChannel
 from dappled.testing import content, of_shots
 
 FOLDER = "/store/DCIM/100CANON"

@@ -25,7 +25,7 @@ from dappled.daemon.console.process import DaemonChannel
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import systemd
 from dappled.daemon.pipeline.memory import CONSOLE_GOES, goes_first, reuse_large_blocks
-from dappled.drivers.process_channel import ProcessChannel
+from dappled.drivers.child_process import ProcessChannel
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
 

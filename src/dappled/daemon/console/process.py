@@ -24,7 +24,7 @@ from dappled.daemon.pipeline.repeats import CaptureRequest
 from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
 from dappled.daemon.stream.curve import read_private
 from dappled.daemon.stream.sockets import is_loopback
-from dappled.drivers.process_channel import ChannelError, ProcessChannel
+from dappled.drivers.child_process import ChannelError, ProcessChannel
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
 

@@ -19,8 +19,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
-from dappled.drivers.child_process import RestartBudget
-from dappled.drivers.process_channel import ChannelError, ChannelMessage, ProcessChannel
+from dappled.drivers.child_process import ChannelError, ChannelMessage, ProcessChannel, RestartBudget
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import Result

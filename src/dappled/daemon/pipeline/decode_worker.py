@@ -23,8 +23,7 @@ from dappled.decode.depth import RANGING, DepthMap, Ranging, estimate, evidence
 from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield.light_field import slice_mosaic
 from dappled.drivers.camera import Blob
-from dappled.drivers.child_process import end_with_parent
-from dappled.drivers.process_channel import ChannelMessage
+from dappled.drivers.child_process import ChannelMessage, end_with_parent
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import sentence
 

@@ -32,10 +32,9 @@ from dappled.drivers.camera import (
     StateChanged,
     check_change,
 )
-from dappled.drivers.child_process import RestartBudget, end_child, start_child
+from dappled.drivers.child_process import ChannelError, ProcessChannel, RestartBudget, end_child, start_child
 from dappled.drivers.gphoto2.messages import LATE_LIMIT, Carryover, message_event
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
-from dappled.drivers.process_channel import ChannelError, ProcessChannel
 
 _PING_S = 1.0
 _STOP_S = 1.2

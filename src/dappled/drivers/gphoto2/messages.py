@@ -25,7 +25,7 @@ from dappled.drivers.camera import (
     ShotFailed,
     StateChanged,
 )
-from dappled.drivers.process_channel import ChannelError, ChannelMessage, ProcessChannel
+from dappled.drivers.child_process import ChannelError, ChannelMessage, ProcessChannel
 
 LATE_LIMIT = 16
 """How many late shots and files are remembered."""

@@ -21,7 +21,7 @@ from typing import Any, cast
 from dappled.clock import Clock, SystemClock
 from dappled.drivers.attribution import true_name
 from dappled.drivers.camera import Arrival, BodyState, SettingName, SettingsChanged, ShotFailed, StateChanged
-from dappled.drivers.child_process import die_with_parent, raise_priority
+from dappled.drivers.child_process import ChannelError, ProcessChannel, die_with_parent, raise_priority
 from dappled.drivers.gphoto2.messages import Carryover, EventSender
 from dappled.drivers.gphoto2.protocol import (
     AbsentError,
@@ -37,7 +37,6 @@ from dappled.drivers.gphoto2.protocol import (
 from dappled.drivers.gphoto2.session import open_session
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
 from dappled.drivers.gphoto2.state import CameraState
-from dappled.drivers.process_channel import ChannelError, ProcessChannel
 
 _POLL_BUSY_S = 0.005
 _POLL_IDLE_S = 0.3

@@ -15,10 +15,16 @@ from collections.abc import Mapping
 from typing import Any
 
 from dappled.drivers.camera import Blob, CameraError
-from dappled.drivers.child_process import die_with_parent, end_child, start_child
+from dappled.drivers.child_process import (
+    ChannelError,
+    ChannelMessage,
+    ProcessChannel,
+    die_with_parent,
+    end_child,
+    start_child,
+)
 from dappled.drivers.gphoto2.protocol import CameraFile, Session, SessionError
 from dappled.drivers.gphoto2.settings import GPhoto2Settings
-from dappled.drivers.process_channel import ChannelError, ChannelMessage, ProcessChannel
 from dappled.drivers.wired.sources import SUFFIXES, FoundFile
 
 _ANSWER_S = 60.0
