@@ -47,7 +47,7 @@ ViewsFrom = Literal["calibration", "frame", "white", "none"]
 _DOUBTED = 0.04  # of a carrier's frequency: a mask at its stated place is never so far off
 _ROTATION = 0.04  # of a carrier's frequency: the search without a calibration allows for 2.3°
 _UNKNOWN: Mapping[str, Any] = {"transfers": None, "aperture": None}
-_LEAST_THROUGH = 0.1  # a carrier of which the aperture leaves less doesn't tell the mask's transfer
+_LEAST_THROUGH = 0.1  # of a carrier: where the aperture leaves less, the mask's transfer can't be measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +56,8 @@ class DecodeReport:
 
     `predicted` are the half plane's carriers on the sensor as predicted, (0, 0) first, `measured` what was seen near
     each (None: nothing there), `used` those that the slices were cut at. `carriers_from`: "measured" in this frame;
-    "calibrated": predicted by the calibration, as too little was to be seen; "predicted": by the law alone; "found":
-    a lattice that nobody had named. `views_from`: whose phases and transfer made the views. `noise_rms` is the
+    "calibrated": predicted by the calibration, as too few were seen; "predicted": by the law alone; "found": an
+    unknown lattice found in the frame. `views_from`: whose phases and transfer made the views. `noise_rms` is the
     plane's white noise, 1.0 = sensor white.
     """
 
@@ -75,12 +75,12 @@ class DecodeReport:
 
     @property
     def doubt(self) -> str | None:
-        """What is strange about the carriers that were measured, in a sentence."""
+        """What is unusual about the measured carriers, in a sentence; None where nothing is."""
         return doubt(self.used, self.predicted) if self.carriers_from == "measured" else None
 
 
 def doubt(used: Sequence[Carrier], predicted: Sequence[Carrier]) -> str | None:
-    """Carriers of a mask that seems not to be where it is said to be, in a sentence; None for those near enough."""
+    """A sentence where carriers are too far from their prediction for a mask at its stated place; else None."""
     off = stretch(used, predicted)
     if abs(off) <= _DOUBTED:
         return None
@@ -102,7 +102,7 @@ def light_field(
     report: DecodeReport,
     facts: Mapping[str, Any],
 ) -> LightField:
-    """The light field's value, its attributes the facts and what the report says in numbers and words."""
+    """The light field, with the facts and the numbers and words of the report as its attributes."""
     rows = np.array([(c.ky, c.kx, c.fy, c.fx) for c in slices.carriers], dtype=np.float64)
     attributes = {
         "shape": [int(side) for side in shape],
@@ -117,7 +117,7 @@ def light_field(
 
 
 class Decoder(Protocol):
-    """What decodes the planes of one camera."""
+    """A decoder of the planes of one camera."""
 
     def decode(
         self, plane: Source, *, focal_length_mm: float | None = None, f_number: float | None = None
@@ -135,8 +135,8 @@ class MaskDecoder:
     """Decodes frames from behind a printed mask.
 
     The carriers are predicted by the calibration, or else by the law from `mask_distance_mm`. Where enough of them
-    are to be seen near the prediction, the frame's own lattice is used. `focal_sigma_mm` is what the focal length is
-    known to (half of the EXIF rounding): it widens the search. `size` of the slices in bins of the padded transform;
+    are seen near the prediction, the frame's own lattice is used. `focal_sigma_mm` is the error of the focal length
+    (half of the EXIF rounding), which widens the search. `size` of the slices in bins of the padded transform;
     None: as large as the spacing allows. Views need a calibration, or a frame that shows its carriers; else only the
     slices are there, and `views` has the shape (0, 0, h, w). `colours` says that the planes are colour mosaics.
     `taper` apodises the bands, see `slices.extract`. `buffers` are reused from frame to frame.
@@ -208,11 +208,11 @@ class MaskDecoder:
             slices = extract(spectrum, used, size, taper=self.taper, workers=self.workers)
             noise = noise_rms(spectrum)
         if views:
-            made, offsets, views_from, told = self.views(
+            made, offsets, views_from, known = self.views(
                 slices, lattice, carriers_from, focal_length_mm=focal_length_mm, f_number=f_number, noise_rms=noise
             )
         else:
-            made, offsets, views_from, told = *no_views(slices), "none", _UNKNOWN
+            made, offsets, views_from, known = *no_views(slices), "none", _UNKNOWN
         report = DecodeReport(tuple(predicted), tuple(measured), tuple(used), carriers_from, views_from, noise)
         facts: dict[str, Any] = {
             "law": self.law,
@@ -220,16 +220,16 @@ class MaskDecoder:
             "f_number": f_number,
             "mask_distance_mm": self._distance(focal_length_mm),
             "calibrated": self.calibration is not None,
-            **told,
+            **known,
         }
         return light_field(slices, made, offsets, shape=plane.shape, report=report, facts=facts), report
 
     def transform(self, plane: Source, focal_length_mm: float) -> Spectrum:
-        """The spectrum as far out as this focal length's slices and searches need it."""
+        """The spectrum up to the largest frequency that slices and searches need at this focal length."""
         return transform(plane, workers=self.workers, largest_fx=self.largest_fx(focal_length_mm))
 
     def largest_fx(self, focal_length_mm: float) -> float:
-        """The largest frequency along columns that slices and searches ask for, in cycles/pixel."""
+        """The largest frequency along columns that slices and searches need, in cycles/pixel."""
         predicted = self.predict(focal_length_mm)
         wide = padded_shape(self.sensor.shape)[1]
         turned = 0.0 if self.calibration is not None else _ROTATION
@@ -245,7 +245,7 @@ class MaskDecoder:
     def locate(
         self, spectrum: Spectrum, focal_length_mm: float, predicted: Sequence[Carrier]
     ) -> tuple[Lattice, list[Measured | None], CarriersFrom]:
-        """The lattice to use, what was seen near each predicted carrier, and which of the two it came from."""
+        """The lattice to use, what was measured near each predicted carrier, and where the lattice came from."""
         lattice = self.lattice_at(focal_length_mm)
         measured = measure(spectrum, predicted, self._radii(predicted, focal_length_mm))
         least = STRONGER if self.calibration is not None else STRONG
@@ -330,7 +330,7 @@ class MaskDecoder:
             views_from = "frame"
         else:
             return *none, "none", _UNKNOWN
-        keep &= np.abs(transfers) > 1e-3  # a carrier that the mask doesn't make tells nothing
+        keep &= np.abs(transfers) > 1e-3  # a carrier that the mask doesn't make carries no information
         views, offsets = from_slices(
             slices.values if keep.all() else slices.values[keep],
             [order for order, usable in zip(orders, keep, strict=True) if usable],

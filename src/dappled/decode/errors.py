@@ -1,4 +1,4 @@
-"""What the decoder says when it can't."""
+"""Errors of decoding."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ class DecodeError(DappledError, ValueError):
     """A frame can't be decoded as asked; one clear sentence: what, where, what to do."""
 
 
-class NoLattice(DecodeError):  # noqa: N818 - said as a finding: the frame is fine, there is no lattice in it
+class NoLattice(DecodeError):  # noqa: N818  # a finding, not a fault: the frame is fine, but has no lattice in it
     """The spectrum of a frame shows no lattice of carriers."""

@@ -22,13 +22,15 @@ from dappled.decode.spectrum.slices import Slices, extract
 from dappled.decode.spectrum.transform import Source, Spectrum, SpectrumBuffers, noise_rms, transform
 
 _MOST_VIEWS = 15  # per axis
-MOSAIC_ROLLOFF = 0.3  # cycles/pixel: the chroma of a Bayer mosaic stands around 0.5, and what a pixel tells ends there
-_DARKEST = 0.05  # of the white frame's brightest view: what is less lit isn't divided up further
+MOSAIC_ROLLOFF = (
+    0.3  # cycles/pixel: the chroma of a Bayer mosaic stands around 0.5, where the information of a pixel ends
+)
+_DARKEST = 0.05  # of the white frame's brightest view: darker parts are not brightened further
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class White:
-    """What a white frame tells: its lattice, the lenslets' origin (cycles at the frame's centre), its views."""
+    """What a white frame shows: its lattice, the lenslets' origin (cycles at the frame's centre), its views."""
 
     found: FoundLattice
     origin: tuple[float, float]
@@ -40,7 +42,7 @@ class LensletDecoder:
     """Decodes lenslet frames. With a white frame the lattice, its origin and the vignetting of the views are the
     white frame's; without one each frame's own lattice is found anew (half a second on ten megapixels).
 
-    `rolloff` in cycles/pixel (`MOSAIC_ROLLOFF` for colour mosaics) holds the noise and chroma of far carriers down.
+    `rolloff` in cycles/pixel (`MOSAIC_ROLLOFF` for colour mosaics) reduces the noise and chroma of far carriers.
     `views_per_axis` odd; None: as many as the seen orders carry, no more than the pixels under a lenslet, and 15.
     """
 

@@ -1,4 +1,4 @@
-"""Work shared out over threads so that the result is the same for any number of them."""
+"""Share work over threads so that the result is the same for any number of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def each(work: Callable[[Part], None], parts: Iterable[Part], workers: int) -> N
 
 
 def share(start: Callable[[], Callable[[Part], None]], parts: Iterable[Part], workers: int) -> None:
-    """As `each`; every thread calls `start` once for a `work` of its own, so that `work` may hold scratch memory."""
+    """As `each`, but every thread calls `start` once for its own `work`, which may hold scratch memory."""
     waiting = list(parts)
     if workers <= 1 or len(waiting) < 2:
         work = start()

@@ -1,4 +1,4 @@
-"""A calibration as a value: what the frames of each focal length showed, and the lattice at any other."""
+"""Calibrations: what the frames of each focal length showed, and the lattice at any focal length."""
 
 from __future__ import annotations
 

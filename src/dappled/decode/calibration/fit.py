@@ -1,7 +1,7 @@
-"""What a masked camera turned out to be: lattice, mask distance, phases and transfer, fitted to stopped-down frames.
+"""Calibrate a masked camera: lattice, mask distance, phases and transfer, fitted to stopped-down frames.
 
 At a mask's ideal frequency and full aperture the carriers of anything flat average out, so calibration takes frames
-at a small aperture, where every carrier stands; the frame's f-number says how much of it the aperture took away.
+at a small aperture, where every carrier shows; the aperture's share of it is known from the frame's f-number.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def from_lattices(
     aperture: Aperture | None = None,
     choose_law: bool = False,
 ) -> Calibration:
-    """`calibrate` from what was seen in each frame, which is little to keep."""
+    """`calibrate` from the lattices of the frames, which take little memory."""
     aperture = aperture or Aperture(mask.views_per_axis)
     steps = [(shown.focal_length_mm, steps_bins(shown.lattice, sensor)) for shown in lattices]
     verdict = judge(steps, sensor=sensor, mask=mask, stated_mm=mask_distance_mm, asked=law)
@@ -104,7 +104,7 @@ def from_lattices(
 def lattice_of(
     frame: CalibrationFrame, sensor: Sensor, mask: Mask, law: str, mask_distance_mm: float, *, workers: int = 1
 ) -> FrameLattice:
-    """What a frame shows. Raises DecodeError where it shows too little."""
+    """The lattice that a frame shows. Raises DecodeError where it shows too few carriers."""
     return frame_lattice(
         frame.plane,
         focal_length_mm=frame.focal_length_mm,

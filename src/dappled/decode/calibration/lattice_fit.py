@@ -19,8 +19,8 @@ from dappled.decode.spectrum.peaks import FARTHER, Measured, fit, measure, resid
 from dappled.decode.spectrum.slices import extract
 from dappled.decode.spectrum.transform import Spectrum, transform
 
-_ALIKE_BINS = 0.5  # rms from their lattice: what lies farther off are peaks of the scene
-_ENOUGH = 0.6  # of a mask's carriers: a prediction near which so many stand is the right one
+_ALIKE_BINS = 0.5  # rms from their lattice: peaks farther off belong to the scene
+_ENOUGH = 0.6  # of a mask's carriers: a prediction with so many peaks near it is the right one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +81,7 @@ def frame_lattice(
 def _located(
     spectrum: Spectrum, *, sensor: Sensor, mask: Mask, law: str, mask_distance_mm: float, focal_length_mm: float
 ) -> tuple[Lattice, list[tuple[Carrier, Measured]]]:
-    """The lattice that most of the mask's carriers stand on, and those; the law's own prediction is asked first."""
+    """The lattice that most of the mask's carriers stand on, and those; the law's own prediction is tried first."""
     best: tuple[Lattice, list[tuple[Carrier, Measured]]] | None = None
     most = 0.0
     first = ""

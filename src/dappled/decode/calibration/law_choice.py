@@ -1,7 +1,7 @@
-"""Which law explains where a mask's carriers lie over focal lengths, with which constants; or that neither does.
+"""Choose the law that explains where a mask's carriers lie over focal lengths, and fit its constants; or neither.
 
 Each focal length gives two numbers: the lattice's steps along rows and columns, as lengths on the chip. Each law is
-fitted to them by least squares, and judged by what it leaves of all carriers, in bins of the frame's DFT.
+fitted to them by least squares, and judged by its residual over all carriers, in bins of the frame's DFT.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from scipy import optimize
 
 from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Sensor
 
-EXPLAINED_BINS = 2.0  # rms: what a law may leave (the thesis' own readings scatter by 0 to 2)
+EXPLAINED_BINS = 2.0  # rms: the residual that a law may leave (the thesis' own readings scatter by 0 to 2)
 PLAUSIBLE = 0.35  # relative: a mask distance further from the stated one is not believed
 _PRINTED = 0.05  # relative: a print is no further off its frequency
-_FOR_PUPIL = 3  # focal lengths that it takes to fit a law's second constant, too
+_FOR_PUPIL = 3  # focal lengths needed to fit a law's second constant, too
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ def judge(
     stated_mm: float,
     asked: str,
 ) -> LawVerdict:
-    """The verdict on what was seen: focal lengths in mm with `steps_bins`. `asked` wins where nothing tells more."""
+    """Fit all laws to focal lengths in mm with `steps_bins`. `asked` is chosen where the frames don't decide."""
     lengths = np.array([length for length, _ in seen])
     steps = np.array([step for _, step in seen])
     fits = tuple(

@@ -1,4 +1,4 @@
-"""What a calibration found, as the thesis tells it: expected, measured, offset and distance (Tables 12, 13, 15, 16)."""
+"""Report a calibration as the thesis does: expected, measured, offset and distance (Tables 12, 13, 15, 16)."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ def pupils_mm(found: Calibration, mask_distance_mm: float) -> list[tuple[float, 
 
     v = d / (1 − f_sensor/f_m); None where the carriers lie beyond the mask's own frequency, as no pupil explains.
     """
-    told: list[tuple[float, float | None]] = []
+    found_mm: list[tuple[float, float | None]] = []
     for fit in found.fits:
         own = np.array(steps_bins(LAWS["geometric"](found.mask, found.sensor, 0.0, 1.0), found.sensor))
         alpha = 1 - float(np.mean(np.array(steps_bins(fit.lattice, found.sensor)) / own))
-        told.append((fit.focal_length_mm, mask_distance_mm / alpha if alpha > 0 else None))
-    return told
+        found_mm.append((fit.focal_length_mm, mask_distance_mm / alpha if alpha > 0 else None))
+    return found_mm
 
 
 def as_values(found: Calibration, mask_distance_mm: float) -> dict[str, Any]:

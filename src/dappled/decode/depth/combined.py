@@ -1,9 +1,8 @@
-"""Depth from all that is known: contrast, photo-consistency of clean views, and what the neighbours say.
+"""Estimate depth from contrast, photo-consistency of clean views, and neighbouring pixels together.
 
-All of it is counted as a log-likelihood, so it can be added. Refocus contrast bears noise, and fattens near things by
-half a window; photo-consistency keeps edges where they are, and needs clean views. Semi-global matching decides where
-both are weak. The disparity and its error are then read off the measurements alone: neighbours choose the peak, they
-don't move it.
+Each is a log-likelihood, so they can be added. Refocus contrast tolerates noise, and enlarges near objects by half a
+window. Photo-consistency keeps edges where they are, and needs clean views. Semi-global matching decides where both
+are weak. Disparity and error then come from the measurements alone: neighbours select the peak and do not move it.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ from dappled.decode.lightfield.light_field import Image, ViewStack
 from dappled.decode.threads import each
 
 _CLEAN, _NOISY = 2.0, 200.0  # contrast's share beside photo-consistency, by noise over texture and its square
-_MOST_CLEAN = 0.3  # a larger share means noisy views: contrast needs its whole window then
+_MOST_CLEAN = 0.3  # with a larger share views are noisy, and contrast needs its whole window
 _SMALL, _LARGE = 4.0, 30.0  # P1 and P2, in units of the log-likelihood
-_NEGLIGIBLE = 0.005  # a share that changes nothing is not worth its transforms
+_NEGLIGIBLE = 0.005  # a smaller share of contrast would not change the result
 _OUTLIER = 30.0  # variances: a view that differs by more sees something else
 _SAMPLE = 160  # px a side: as much of the middle tells how well views agree
 _NARROW = 5  # px: the window of contrast beside photo-consistency
@@ -66,7 +65,7 @@ def _by_contrast(evidence: Evidence, search: Search) -> _Seen:
 
 
 def _by_both(evidence: Evidence, search: Search) -> _Seen:
-    """Photo-consistency, and contrast with the share that the views' noise leaves it."""
+    """Photo-consistency, and contrast with a share that depends on the noise of the views."""
     disparities, stack = search.disparities(), evidence.stack
     variance = _disagreement(stack, disparities, search.workers)
     # Where noise is as strong as texture, one view can't be compared with another: contrast takes over.

@@ -1,9 +1,9 @@
-"""Depth from refocus contrast: at the right disparity, what all views say adds up to the sharpest picture.
+"""Estimate depth from refocus contrast: at the right disparity, the views add up to the sharpest picture.
 
 Shearing is a phase in the spectrum, so one inverse FFT a disparity is enough. With Q and W of `evidence`, and
 φ_j = exp(2πi D f·step_j), the most probable picture at disparity D is Z/G, Z = Σ_j φ_j Q_j, G = Σ_jk φ_j* W_jk φ_k.
 What it explains of the measurements is |Z|²/G, counted in variances of the noise. For plain views that is the energy of
-Eq 29's picture; for noisy slices each order weighs as much as it knows.
+Eq 29's picture; for noisy slices each order has the weight of its information.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dappled.decode.lightfield.light_field import centred
 from dappled.decode.threads import each, spans
 
 Volume = NDArray[np.float32]
-_COARSEST = 0.04  # cycles/pixel: what is slower than this says nothing about depth, and outshines what does
+_COARSEST = 0.04  # cycles/pixel: coarser detail carries no depth, and outweighs the detail that does
 _PAD = 16  # px
 _CHUNK = 6  # disparities whose spectra are in memory at once
 _LEAST_WEIGHT = 1e-3  # of the whole: frequencies at which nothing was measured

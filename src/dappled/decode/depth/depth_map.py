@@ -1,4 +1,4 @@
-"""A depth map as a value, and how the peak of a likelihood becomes a disparity with its uncertainty."""
+"""Depth maps, and the estimate of disparity and its uncertainty from the peak of a likelihood."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from dappled.decode.errors import DecodeError
 
 Volume = NDArray[np.float32]
 Map = NDArray[np.float32]
-# Measured on simulated masked frames (SNR 100 and 50): what scatters more than the noise alone, and what the window's
-# edge adds as the picture moves across it, on even surfaces; and what a window that sees two of them is off by.
+# Measured on simulated masked frames (SNR 100 and 50): the scatter beyond that of noise, the error that the window's
+# edge adds on even surfaces as the picture moves across it, and the error of a window that covers two surfaces.
 _SCATTER = 1.1
 _EDGE, _EDGE_SHARE = 0.0005, 0.0005  # px/view, and of the disparity
 _SEAM = 2.0  # of the disparities' spread under the window
@@ -27,7 +27,7 @@ class DepthMap:
     """Disparities float32 (h, w) of the middle view's pixels with their standard errors; both NaN where unknown.
 
     In pixels from view to view, 0 at the focus, larger for what is nearer. `confidence` (h, w), 0 to 1: how far the
-    answer stands out from all others that were looked at.
+    best disparity exceeds all others that were tried.
     """
 
     disparity: Map
@@ -47,8 +47,10 @@ class DepthMap:
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Which disparities are looked at, from `low` to `high`, `step` apart, and the window (px a side) that a pixel is
-    judged by. Windows are boxes smoothed once more: their effective size is `window`."""
+    """The disparities to try, from `low` to `high`, `step` apart, and the window (px a side) of each pixel's estimate.
+
+    Windows are boxes smoothed once more: their effective size is `window`.
+    """
 
     low: float
     high: float
@@ -57,7 +59,7 @@ class Search:
     workers: int = 1
 
     def __post_init__(self) -> None:
-        """Raises DecodeError for a range or a window that is none."""
+        """Raises DecodeError for an empty range or an unusable window."""
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high and self.step > 0):
             raise DecodeError(f"disparities from {self.low:g} to {self.high:g} by {self.step:g} are no range")
         if (self.high - self.low) / self.step > _MOST_DISPARITIES:
@@ -121,7 +123,7 @@ def peaked(likelihood: Volume, disparities: NDArray[np.float64], start: NDArray[
 
 
 def confidence(likelihood: Volume, best: Map, samples: float) -> Map:
-    """0 to 1: by how much the best likelihood exceeds the mean over all disparities, against what chance does.
+    """0 to 1: by how much the best likelihood exceeds the mean over all disparities, compared with chance.
 
     The likelihood of `samples` independent samples of noise alone scatters by √(samples/2).
     """
@@ -133,8 +135,8 @@ def confidence(likelihood: Volume, best: Map, samples: float) -> Map:
 def seams(disparity: Map, variance: Map, window: int) -> Map:
     """(h, w): the rms by which disparities (NaN: unknown) bend under a window, beyond what their `variance` explains.
 
-    A window across the seam of two surfaces sees both, and its answer may be either's, or lie between. On a plane,
-    however it leans, this is 0.
+    A window across the seam of two surfaces covers both, and its disparity may be that of either, or lie between. On a
+    plane, however it is tilted, this is 0.
     """
     wide = math.sqrt((box(window) ** 2 - 1) / 6)  # a box used twice has the variance of two
     known = np.isfinite(disparity)
@@ -161,10 +163,10 @@ def judged(
     most_sigma: float = 0.25,
     bias: float = 0.0,
 ) -> DepthMap:
-    """The map: standard errors from curvatures of the likelihood, unknown where these or the confidence won't do.
+    """The map: standard errors from curvatures of the likelihood, unknown where these or the confidence are too low.
 
-    At seams within the window (px a side) the error is larger, but the disparity known all the same. `spread` is
-    variance over information, from `windowed`; `bias` what a method is known to be off by, in px/view.
+    At seams within the window (px a side) the error is larger, but the disparity is still known. `spread` is
+    variance over information, from `windowed`; `bias` the known systematic error of a method, in px/view.
     """
     with np.errstate(divide="ignore"):
         noise = np.float32(_SCATTER**2 * spread) / curvature

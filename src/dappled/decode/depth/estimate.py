@@ -1,8 +1,8 @@
-"""Depth from views: one interface over several methods, each pixel with its uncertainty, or unknown.
+"""Estimate depth from views by one of several methods, each pixel with its uncertainty, or unknown.
 
 `contrast` asks which refocused picture explains the measurements best (bears noise), `gradient` solves a least-squares
-problem (fast for small disparities), `stereo` matches pairs of views with OpenCV (clean views), `combined` joins
-contrast, photo-consistency and what the neighbours say.
+problem (fast for small disparities), `stereo` matches pairs of views with OpenCV (clean views), `combined` combines
+contrast, photo-consistency and neighbouring pixels.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def estimate(
     evidence: Evidence, method: str = "combined", *, between: tuple[float, float] | None = None, window: int = WINDOW,
     workers: int = 1,
 ) -> DepthMap:  # fmt: skip
-    """The depth map by one of `METHODS`, at disparities `between` two (None: where a coarse look finds the scene).
+    """The depth map by one of `METHODS`, at disparities `between` two (None: where a coarse search finds the scene).
 
-    Raises DecodeError for an unknown method or a range that is none.
+    Raises DecodeError for an unknown method or a empty range.
     """
     if method not in METHODS:
         raise DecodeError(f"unknown depth method {method!r}; known are {', '.join(METHODS)}")

@@ -1,9 +1,9 @@
-"""What a frame says about its light field, with how well it says so: what depth is estimated from.
+"""Evidence for depth: what a frame measures of its light field, and with which noise.
 
 Everything measured is linear in the light field: B = K·L + noise of variance n, L being the views that a perfect
-camera had seen. Of plain views K is the identity. Of a masked frame B are its slices over their transfers: angular
+camera would see. Of plain views K is the identity. Of a masked frame B are its slices over their transfers: angular
 Fourier coefficients. The views of a noisy masked frame must not be used in their place: they are drawn towards their
-mean where the noise is strong, and parallax shrinks with them.
+mean where the noise is strong, and their parallax shrinks.
 
 For any shear of the light field the best picture and its likelihood follow from two things only: the back-projected
 views Q = Kᵀ B/n and the weights W = Kᵀ K/n.

@@ -1,4 +1,4 @@
-"""Depth from gradients (after Dansereau and Bruton 2004): a linear least-squares problem at every pixel.
+"""Estimate depth from gradients (after Dansereau and Bruton 2004): a linear least-squares problem at every pixel.
 
 Around a shear D₀ a view is L_j(p) = I(p − D₀·s_j) − δ·s_j·∇I(p − D₀·s_j). With e_j what the measured view has beyond
 the first term, W the views' weights and g_j = s_j·∇I_j, the least squares of a window are δ = −Σ gᵀWe / Σ gᵀWg. It
@@ -21,7 +21,7 @@ from dappled.decode.threads import each
 
 _SMOOTH_PX = 0.8  # sigma: finer detail is not linear over the shifts
 _VALID = 1.0  # px that the outermost view may be from the shear
-_CLEAR = 4.0  # times what noise alone would tell
+_CLEAR = 4.0  # times the information of noise alone
 _BIAS = 0.03  # px/view: what linear slopes are off by, measured on masked frames and painted boards
 _TINY = 1e-20
 _DERIVATIVE = np.array([3, -32, 168, -672, 0, 672, -168, 32, -3]) / 840  # to the 8th order
@@ -35,7 +35,7 @@ def depth(evidence: Evidence, search: Search) -> DepthMap:
     spacing = 2 * _VALID / max(stack.reach, 1e-9)
     count = max(1, math.ceil((search.high - search.low) / spacing))
     shears = search.low + (np.arange(count) + 0.5) * (search.high - search.low) / count
-    # What all views have in common is the picture's business: an error of it must not look like parallax.
+    # What all views have in common belongs to the picture: an error of it must not look like parallax.
     common = evidence.weights.sum(axis=1)
     weights = evidence.weights - np.outer(common, common) / max(float(common.sum()), _TINY)
     best = np.empty(0, dtype=np.float32)
@@ -51,7 +51,7 @@ def depth(evidence: Evidence, search: Search) -> DepthMap:
         found = np.stack([np.float32(shear) + delta, information, residual, far.astype(np.float32)])
         best = found if number == 0 else np.where(residual < best[2], found, best)
     disparity, information, far = best[0], best[1], best[3]
-    # Noise has gradients too: what they alone would seem to tell.
+    # Noise has gradients too: the information that they alone would seem to carry.
     by_chance = _information_of_noise(evidence, stack) * float(box(search.window)) ** 2
     sure = 1 - np.exp(-((information / np.float32(_CLEAR * max(by_chance, _TINY))) ** 2))
     inside = (far == 0) & (np.abs(disparity - shears.mean()) <= (search.high - search.low) / 2 + spacing / 2)

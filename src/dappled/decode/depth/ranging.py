@@ -1,4 +1,4 @@
-"""From disparity to metres and back (Eq 5), by focus and focal length or by targets at known distances.
+"""Convert disparity to metres and back (Eq 5), by focus and focal length or by targets at known distances.
 
 A point at Z moves over the sensor by S = gain/Z + offset pixels (columns) from one end of the aperture to the other:
 by Eq 5, gain = A·f/pitch and offset = −gain/(distance in focus), A the aperture's side, f the lens' distance from the
@@ -41,7 +41,7 @@ class Ranging:
     focal_length_mm: float | None = None
 
     def __post_init__(self) -> None:
-        """Raises DecodeError for numbers that are no lens."""
+        """Raises DecodeError for numbers that no lens has."""
         if not (math.isfinite(self.gain_px_m) and self.gain_px_m > 0 and math.isfinite(self.offset_px)):
             raise DecodeError(f"a gain of {self.gain_px_m:g} px·m and an offset of {self.offset_px:g} px are no lens")
 
@@ -83,13 +83,13 @@ class Ranging:
         return 2 * abs(focal_length_mm - ours) / ours
 
     def disparity(self, distance_m: float, stack: ViewStack) -> float:
-        """The disparity of what is so far away, inf allowed. Raises DecodeError for a distance of 0 or less."""
+        """The disparity of an object at this distance, inf allowed. Raises DecodeError for a distance of 0 or less."""
         if not distance_m > 0:
-            raise DecodeError(f"a distance of {distance_m:g} m is none: it must be above 0")
+            raise DecodeError(f"the distance is {distance_m:g} m: it must be above 0")
         return (self.gain_px_m / distance_m + self.offset_px) / _scale(stack)
 
     def distances(self, depth: DepthMap, stack: ViewStack) -> DistanceMap:
-        """The map in metres. Unknown where the disparity is, and where it can't be told from infinity's."""
+        """The map in metres. Unknown where the disparity is, and where it could be that of infinity."""
         beyond = depth.disparity * np.float32(_scale(stack)) - np.float32(self.offset_px)
         error = depth.sigma * np.float32(_scale(stack))
         with np.errstate(invalid="ignore", divide="ignore"):

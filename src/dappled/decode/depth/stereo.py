@@ -1,7 +1,7 @@
-"""Depth by stereo correspondence (OpenCV's semi-global block matching) between the middle view and outer ones.
+"""Estimate depth by stereo correspondence (OpenCV's semi-global block matching) between the middle view and outer ones.
 
-Views are enlarged, as a disparity of light-field views is often a fraction of a pixel and the matcher's answers are
-sixteenths. It is the method of the thesis, on views; it needs clean ones.
+Views are enlarged, as a disparity of light-field views is often a fraction of a pixel and the matcher resolves
+sixteenths. This is the method of the thesis, on views. It needs clean views.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def _prepared(cv2: Any, view: Image, enlarge: int, low: float, high: float) -> N
 
 
 def _matched(cv2: Any, left: NDArray[np.uint8], right: NDArray[np.uint8], low: float, high: float) -> Image:
-    """Pixels that the second picture's points lie further left, NaN where none was found."""
+    """How many pixels further left the points of the second picture lie, NaN where none was found."""
     first = math.floor(low) - 1
     count = -(-(math.ceil(high) + 2 - first) // _SIXTEENTHS) * _SIXTEENTHS
     if count > min(_WIDEST, left.shape[1] // 2):
@@ -108,7 +108,7 @@ def _matched(cv2: Any, left: NDArray[np.uint8], right: NDArray[np.uint8], low: f
         minDisparity=first, numDisparities=count, blockSize=_BLOCK, P1=8 * _BLOCK**2, P2=32 * _BLOCK**2,
         disp12MaxDiff=2, uniquenessRatio=5, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
-    # The matcher knows nothing within `count` of the edge: the picture goes on there as it ends.
+    # The matcher finds nothing within `count` of the edge, so the picture is continued there.
     pad = count + abs(first) + _BLOCK
     wide = [cv2.copyMakeBorder(p, 0, 0, pad, pad, cv2.BORDER_REPLICATE) for p in (left, right)]
     found = matcher.compute(*wide)[:, pad:-pad]

@@ -32,11 +32,11 @@ from dappled.decode.optics.carriers import Lattice, Order
 Shape = Literal["beams", "filled", "round"]
 _PARTS = 15  # of a cell's side, where a circle cuts through cells
 ROUNDING = 0.05  # relative: f-numbers are off by no more (nominal f/22 is 22.6, f/3.5 is 3.56)
-_NOMINAL_SIGMA = 0.02  # relative: how far an f-number is believed
+_NOMINAL_SIGMA = 0.02  # relative: the error of an f-number
 _TEXTURE = 1.5e-3  # of the mean: what the scene adds to the mean of a slice
 _EVIDENCE = 9.0  # squared deviations: less doesn't tell one shape from another (beams from filled cells never at κ = 1)
 SHAPES: tuple[Shape, ...] = ("beams", "filled", "round")
-_AGREEMENT = 6.0  # times their own error: means further from any aperture's are some other aperture's
+_AGREEMENT = 6.0  # times their own error: means further from those of any aperture are not fitted
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +145,7 @@ def relative_transfer(slices: NDArray[np.complex64]) -> NDArray[np.complex128]:
 def origin_of(orders: Sequence[Order], phases: NDArray[np.complex128]) -> tuple[tuple[float, float], float]:
     """(x0, rms phase residual) for complex transfers (K,) that may be negative: phase_k = 2π k·x0, or that plus π.
 
-    Each weighs by its magnitude. Which of the four origins half a period apart is meant is told by the sign of (0, 1)
+    Each weighs by its magnitude. Which of the four origins half a period apart is meant follows from the sign of (0, 1)
     and (1, 0), or else of the innermost orders: those are positive.
     """
     k = np.asarray(orders, dtype=np.float64)
@@ -194,7 +194,7 @@ def used_aperture(
 ) -> UsedAperture:
     """The aperture of a frame from its slices complex64 (K, h, w), DC first, and their known transfers T_k (K,).
 
-    The most probable κ near `nominal_kappa`. The nominal one where the means tell nothing or fit no aperture.
+    The most probable κ near `nominal_kappa`. The nominal one where the means carry no information or fit no aperture.
     """
     nominal = UsedAperture(nominal_kappa, _NOMINAL_SIGMA * nominal_kappa, False, aperture)
     means = mean_of_slices(slices)

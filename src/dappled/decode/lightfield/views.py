@@ -25,7 +25,7 @@ from dappled.decode.optics.carriers import Carrier, Order
 Views = NDArray[np.float32]
 _SHARED = 1e3  # variance of what all views share, over that of what one view has alone
 _MODEL_ERROR = 0.45  # over the root of a slice's shorter side: the frame's end rings in a share of each slice
-_COLOURED = 0.3  # of a band's finest detail is taken for chroma; all of it would take parallax for chroma, too
+_COLOURED = 0.3  # of a band's finest detail is counted as chroma; all of it would count parallax as chroma, too
 _SMALLEST_NOISE = 1e-9  # relative variance of a coefficient: float32 and its transforms
 
 
@@ -78,7 +78,7 @@ def view_variance(
     for k in range(1, len(slices)):
         alone = slices[k][inner] / transfers[k] - common[k] * dc
         power = float(np.mean(alone.real**2 + alone.imag**2)) - noise_variance[k] / abs(transfers[k]) ** 2
-        weight = abs(transfers[k]) ** 2  # a strong carrier knows better
+        weight = abs(transfers[k]) ** 2  # a strong carrier is known better
         total += weight * max(power, 0.0)
         share += weight * max(float(own[k]), 1e-3 * one)
     floor = 1e-6 * float(np.mean(dc.real**2))

@@ -1,4 +1,4 @@
-"""Tables of predicted carriers over focal lengths (Tables 11, 14), and what an installed mask adds to a law.
+"""Tabulate predicted carriers over focal lengths (Tables 11, 14), with what an installed mask adds to a law.
 
 An installed mask is turned, makes crossed orders that its pattern does not ask for, and loses contrast on the way to
 the sensor.

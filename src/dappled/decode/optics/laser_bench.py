@@ -1,4 +1,4 @@
-"""The laser bench: where a mask's impulses land (Eq 14 to 23, Tables 4 to 9), and the picture that they make.
+"""Predict the laser bench: where a mask's impulses land (Eq 14 to 23, Tables 4 to 9), and the picture they make.
 
 A mask g(x, y) in a plane wave has the Fourier transform G(p, q), impulses at p, q in cycles a metre. At distance z and
 wavelength λ an impulse lands at x = p·λ·z, y = q·λ·z (Eq 18).
@@ -124,7 +124,7 @@ def beam(shape: tuple[int, int], pitch_mm: tuple[float, float], diameter_mm: flo
 
 @dataclass(frozen=True, slots=True)
 class BenchVerdict:
-    """What a measured pattern says of a printed mask.
+    """The result of comparing a measured pattern with a printed mask.
 
     `kind` is "as designed", "scaled" or "not this mask". `frequency_scale` is measured over expected distance of the
     spots (so the periods on film are 1 / `frequency_scale` of the design's), None where nothing fits. `rms_mm` is left

@@ -1,6 +1,6 @@
-"""Which mask, and where, for a sensor, a lens and an altitude; or the sentence why none does it.
+"""Design a mask and its place for a sensor, a lens and an altitude, or say in a sentence why there is none.
 
-Both laws are answered, each by its own rules (`DESIGNS`, by the law's name):
+Both laws are supported, each by its own rules (`DESIGNS`, by the law's name):
   - `geometric`: N = 2p + 1 views are separated at f_m = v / (d·A), A the aperture's diameter, so the ideal f-number
     of a mask is f_m·d, whatever the lens. Three conditions bound d from below: the slices stay under the sensor's
     Nyquist frequency, the film draws the highest harmonic with two pixels, and diffraction stays at

@@ -57,7 +57,7 @@ class FoundLattice:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A bin that stands above its surroundings: position in bins (sub-bin), and by how many nats."""
+    """A bin that exceeds its surroundings: its position in bins (sub-bin), and by how many nats it does."""
 
     row: float
     column: float
@@ -65,7 +65,7 @@ class Candidate:
 
 
 def find_lattice(spectrum: Spectrum) -> FoundLattice:
-    """The lattice of carriers in a whole spectrum, untold. Raises NoLattice, with a sentence, where there is none."""
+    """Find the lattice of carriers in a whole spectrum without a prediction. Raises NoLattice where there is none."""
     found = candidates(spectrum)
     strongest = [c for c in found if not _artefact(c, spectrum)][:_CANDIDATES]
     if len(strongest) < 3:
@@ -143,7 +143,7 @@ def reduced(basis: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _vote(points: NDArray[np.float64], weights: NDArray[np.float64], spectrum: Spectrum) -> NDArray[np.float64]:
-    """The pair of peaks whose lattice explains the others best, against what a lattice so dense explains by chance."""
+    """The pair of peaks whose lattice explains the others best, relative to chance for a lattice of its density."""
     stretch = np.array([1.0, spectrum.padded[0] / spectrum.padded[1]])  # bins to one scale on both axes
     best, best_score = None, 0.0
     # Differences belong to the lattice too, and find it where its shortest vectors are hidden.
@@ -191,7 +191,7 @@ def _half_plane(lattice: Lattice, limit: float = 0.5, most: int = 4000) -> list[
 
 
 def _believable(verified: list[tuple[Carrier, Measured]], predicted: int) -> bool:
-    """More than chance: the innermost points must nearly all be there, or a good share of all."""
+    """Whether more than chance: nearly all of the innermost points must show a peak, or a good share of all points."""
     inner = [c for c, _ in verified if abs(c.ky) <= 2 and abs(c.kx) <= 2]
     return len(inner) >= 6 or len(verified) > 0.25 * predicted + 3
 

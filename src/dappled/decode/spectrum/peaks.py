@@ -16,7 +16,7 @@ PROMINENCE_NATS = 2.5  # of log magnitude above the median around; the highest o
 _FEWEST_WITHOUT_OUTLIERS = 6  # peaks that a fit needs once outliers are left out
 _ENOUGH = 4  # peaks of a half plane, in both directions, before a frame's own lattice is believed
 STRONG = 0.02  # of the mean; at the ideal aperture parallax alone leaves up to a thousandth
-STRONGER = 0.1  # what it takes against a calibration: weak peaks are pulled aside by parallax
+STRONGER = 0.1  # needed to override a calibration: parallax shifts weak peaks
 FARTHER = 0.12  # of a carrier's frequency: 2° of rotation and, under the fd law, 10 % of the mask's distance
 _ALIKE_BINS = 0.5  # rms from their lattice
 _STRICTLY_ALIKE_BINS = 0.1  # of a lattice that was searched for far and wide
@@ -52,10 +52,10 @@ def measure(
     *,
     prominence_nats: float = PROMINENCE_NATS,
 ) -> list[Measured | None]:
-    """What stands within `radius_bins` (one, or one per carrier) of each carrier; None where nothing does.
+    """The peak within `radius_bins` (one value, or one per carrier) of each carrier; None where there is none.
 
     Under a Hann window; the position by the window's own formula, exact for one sinusoid. Bins are the padded
-    transform's. The carrier (0, 0) is the mean, always there.
+    transform's. The carrier (0, 0) is the mean, which is always found.
     """
     radii = [float(radius_bins)] * len(carriers) if isinstance(radius_bins, int | float) else list(radius_bins)
     found: list[Measured | None] = []
@@ -76,7 +76,7 @@ def measure(
 def _measure_one(spectrum: Spectrum, fy: float, fx: float, radius: float, prominence: float) -> Measured | None:
     row, column = spectrum.bins(fy, fx)
     reach = math.ceil(radius)
-    around = max(reach, 6)  # the surroundings that a peak must stand above
+    around = max(reach, 6)  # the surroundings that a peak must exceed
     top, left = round(row) - around, round(column) - around
     if left + 2 * around + 2 > spectrum.columns and spectrum.columns < spectrum.padded[1] // 2 + 1:
         return None
@@ -182,7 +182,7 @@ def lattice_from(matrix: NDArray[np.float64]) -> Lattice:
 def own_lattice(
     spectrum: Spectrum, predicted: Sequence[Carrier], measured: Sequence[Measured | None], least: float
 ) -> Lattice | None:
-    """The lattice that this frame's own peaks show, or None where they are too few, too weak or not on a lattice."""
+    """The lattice of this frame's own peaks, or None where they are too few, too weak or not on a lattice."""
     pairs = _believed(predicted, measured, least)
     for radius in (3.0, 2.0):
         if len(pairs) < _ENOUGH or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in pairs]) < 2:
@@ -200,10 +200,10 @@ def own_lattice(
 
 
 def farther_lattice(spectrum: Spectrum, predicted: Sequence[Carrier]) -> Lattice | None:
-    """The lattice of a mask that doesn't stand where it was said to, or None.
+    """The lattice of a mask that is not at its stated distance, or None.
 
-    The innermost carriers are looked for up to `FARTHER` from their prediction. As such wide searches meet more of the
-    scene, the lattice must explain two thirds of the mask's carriers, and these stand closely on it.
+    The innermost carriers are looked for up to `FARTHER` from their prediction. As such wide searches find more of the
+    scene, the lattice must explain two thirds of the mask's carriers, and these must lie closely on it.
     """
     high, wide = spectrum.padded
     others = [c for c in predicted if (c.ky, c.kx) != (0, 0)]
@@ -230,7 +230,7 @@ def _believed(
 
 
 def stretch(used: Sequence[Carrier], predicted: Sequence[Carrier]) -> float:
-    """How much farther from the middle carriers stand than those of the same orders were predicted, as a share."""
+    """How much farther out carriers lie than predicted ones of the same orders, as a share."""
     said = {(c.ky, c.kx): math.hypot(c.fy, c.fx) for c in predicted}
     both = [(math.hypot(c.fy, c.fx), said[c.ky, c.kx]) for c in used if (c.ky, c.kx) in said]
     whole = sum(there for _, there in both)

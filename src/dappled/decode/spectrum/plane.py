@@ -175,7 +175,7 @@ def local_colours(
     """(len(colours), rows, columns): local means of colours, over the mean of the reference colours', 1 for grey.
 
     The cells are `cell_px` on a side and stand for the whole frame: a lenslet, or half a mask period. Finer chroma is
-    not told apart from other carriers' bands.
+    indistinguishable from other carriers' bands.
     """
     pattern = np.asarray(cfa, dtype=np.intp)
     a, b = pattern.shape

@@ -1,4 +1,4 @@
-"""Transform a frame: one real FFT in single precision, padded to a fast length, every bin of it at hand.
+"""Transform a frame: one real FFT in single precision, padded to a fast length, with access to every bin.
 
 Rows are transformed while they are made linear, then columns. The result lies in tiles that fit the cache.
 """
