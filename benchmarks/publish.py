@@ -168,8 +168,8 @@ def hung(root: Path, rounds: int) -> dict[str, float]:
     wishes: dict[str, list[float]] = {"alone": [], "crowd": []}
     alive: set[int] = set()
     most = index = 0
-    lone = Publisher(f"ipc://{root}/lone", "", answer=_no_answer, flight="lone")
-    lone.start()
+    lone = Publisher(f"ipc://{root}/lone", "")
+    lone.start("lone", _no_answer)
     with publisher(root) as one, crowd(root, one) as readers:
         for sleeper in readers[:HUNG]:
             os.kill(sleeper.pid or 0, signal.SIGSTOP)
@@ -257,7 +257,7 @@ def latency(root: Path, frames: int) -> dict[str, float]:
     """A simulated flight: from "safe on disk" to "received by a subscriber", less the decode; and what a subscriber
     that was killed and started again has at the end."""
     from dappled.config import settings as configuration  # noqa: PLC0415  # the subscribers' processes load none of it
-    from dappled.daemon.pipeline.pending_shot import Observer  # noqa: PLC0415  # as above
+    from dappled.daemon.pipeline.capture import Observer  # noqa: PLC0415  # as above
     from dappled.daemon.pipeline.repeats import CaptureRequest  # noqa: PLC0415  # as above
     from dappled.daemon.service import Service  # noqa: PLC0415  # as above
     from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # as above
@@ -269,8 +269,16 @@ def latency(root: Path, frames: int) -> dict[str, float]:
             publish=PublishSettings(slices=ears.endpoint),
         )
     )
+
+    class Reports(Observer):
+        def settled(self, index: int, ok: bool) -> None:
+            ears.settled(index, ok)
+
+        def finished(self, pending: Any) -> None:
+            ears.finished(pending)
+
     with Simulation(World(seed=2), settings, root) as simulated:
-        service = Service(simulated, observer=Observer(finished=ears.finished, settled=ears.settled))
+        service = Service(simulated, observer=Reports())
         service.start()
         threads = [threading.Thread(target=work) for work in (service.run, ears.listen, ears.listen_die_and_come_back)]
         for thread in threads:
@@ -309,8 +317,8 @@ def _no_answer(_: object, reply: Callable[[Message], None]) -> None:
 def publisher(root: Path) -> Iterator[Publisher]:
     """A publisher on `root`/s with the settings' high-water mark."""
     mark = PublishSettings().high_water_mark
-    one = Publisher(f"ipc://{root}/s", "", answer=_no_answer, flight="benchmark", high_water_mark=mark)
-    one.start()
+    one = Publisher(f"ipc://{root}/s", "", high_water_mark=mark)
+    one.start("benchmark", _no_answer)
     try:
         yield one
     finally:

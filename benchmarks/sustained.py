@@ -25,10 +25,11 @@ from pathlib import Path
 from dappled.clock import SystemClock
 from dappled.daemon.navigation import BodyLatency, ExposureTime
 from dappled.daemon.navigation.navigation import unknown_pose
+from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
 from dappled.daemon.pipeline.decode_process import DecodedFrame
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
-from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.decode.geometry import Pose
 from dappled.drivers.camera import (
@@ -85,7 +86,7 @@ class SteadyCamera:
     def stop(self) -> None: ...
 
 
-class SlowDeveloper:
+class SlowDecoder:
     """Takes its time over every frame; gives as much as 13 slices of a small frame."""
 
     def __init__(self, seconds: float) -> None:
@@ -100,25 +101,44 @@ class SlowDeveloper:
 
 @dataclass(frozen=True)
 class Sink:
-    """Notes each shot in the flight and hands it to the pipeline."""
+    """Notes each shot in the flight and hands it to the camera."""
 
     flight: recording.Recording
-    writer: LedgerWriter
-    pipeline: Pipeline
+    shots: PendingShots
 
     def obstacle(self) -> None:
         """There is none."""
 
     def note(self, shot: Shot) -> None:
         self.flight.journal.note(shot)
-        self.writer.requested(shot)
-        self.pipeline.expect(shot)
 
     def fire(self, shot: Shot) -> None:
-        self.pipeline.fire(shot.index)
+        self.shots.fire(shot)
 
     def refused(self, request: CaptureRequest, reason: str) -> None:
         raise AssertionError(reason)
+
+
+class NoPoses:
+    """A PoseSource without telemetry."""
+
+    def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
+        return exposure, unknown_pose(exposure.utc_ns, 0)
+
+
+class Ends(Observer):
+    """Passes the end of each shot to the shutter and counts it."""
+
+    def __init__(self, shutter: Shutter) -> None:
+        self.shutter, self.over = shutter, threading.Semaphore(0)
+        self.record_ms: list[float] = []
+
+    def settled(self, index: int, ok: bool) -> None:
+        self.shutter.settled(index, ok)
+
+    def finished(self, pending: PendingShot) -> None:
+        self.record_ms.append(pending.ms.get("record", 0.0))
+        self.over.release()
 
 
 def main() -> None:
@@ -145,32 +165,23 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
     neither decoded nor noted as not decoded. Memory: the growth from the second quarter to the last."""
     clock, wishes_ms = SystemClock(), []
     flight = recording.begin(root, clock.utc_ns, {})
-    writer, record_ms, over = LedgerWriter(flight, clock), [], threading.Semaphore(0)
-
-    def finished(pending: PendingShot) -> None:
-        record_ms.append(pending.ms.get("record", 0.0))
-        over.release()
-
-    def pose(index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
-        return exposure, unknown_pose(exposure.utc_ns, 0)
-
-    def settled(index: int, ok: bool) -> None:
-        shutters[0].settled(index, ok)
-
-    shutters: list[Shutter] = []
+    camera = SteadyCamera(size)
+    shots = PendingShots(camera)
+    shutter = Shutter(Sink(flight, shots), clock, next_index=0, capacity=1000)
+    ends = Ends(shutter)
     pipeline = Pipeline(
-        camera=SteadyCamera(size),
-        writer=writer,
-        poses=pose,
-        decoder=SlowDeveloper(decode_s),
+        camera,
+        shots,
+        LedgerWriter(flight, clock),
+        NoPoses(),
+        decoder=SlowDecoder(decode_s),
         publisher=None,
         latency=BodyLatency(60.0, 15.0, "benchmark"),
         names=Names("benchmark", "mask", "geometric"),
-        observer=Observer(settled=settled, finished=finished),
+        observer=ends,
         decode_queue=QUEUE,
     )
 
-    shutters.append(Shutter(Sink(flight, writer, pipeline), clock, next_index=0, capacity=1000))
     memory = Memory()
     pipeline.start()
     count = round(seconds * rate)
@@ -178,17 +189,17 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
     for number in range(count):
         time.sleep(max(0.0, start + number / rate - time.monotonic()))
         began = time.perf_counter()
-        shutters[0].request(CaptureRequest("benchmark", "console", number))
+        shutter.request(CaptureRequest("benchmark", "console", number))
         wishes_ms.append((time.perf_counter() - began) * 1e3)
         memory.look()
     behind_s = time.monotonic() - start - (count - 1) / rate
     for _ in range(count):
-        over.acquire(timeout=60 + decode_s * (QUEUE + 2))
+        ends.over.acquire(timeout=60 + decode_s * (QUEUE + 2))
     pipeline.stop(10.0)
     flight.close()
     return {
         **_account(flight.folder.path, count),
-        **_times(wishes_ms, record_ms),
+        **_times(wishes_ms, ends.record_ms),
         "behind_s": behind_s,
         **memory.growth(),
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from typing import Literal
 
 import pytest
@@ -51,17 +50,6 @@ def test_one_bad_item_does_not_end_the_stage() -> None:
         stage.put(number)
     assert stage.stop(5)
     assert (seen, failed, stage.statistics().failed) == ([0, 2], [(1, "one")], 1)
-
-
-def test_wait_idle_waits_for_the_item_in_hand() -> None:
-    gate = threading.Event()
-    stage = Worker[int]("test", lambda _: (gate.wait(5), None)[1], capacity=1)
-    stage.start()
-    stage.put(1)
-    assert not stage.wait_idle(0.05)
-    gate.set()
-    assert stage.wait_idle(5)
-    assert stage.stop(5)
 
 
 def test_a_stopped_stage_takes_nothing_more() -> None:

@@ -1,4 +1,4 @@
-"""The street's crossings: bounded queues with a stated policy when full, and a thread that works each one off."""
+"""Threads with a start, a stop and a health: `Loop` runs one function, `Worker` works off a bounded queue."""
 
 from __future__ import annotations
 
@@ -29,11 +29,36 @@ class Statistics:
     failed: int
 
 
-class Worker(Generic[Item]):
+class Loop:
+    """One daemon thread that calls `run` once; `run` returns soon after `stopping` is set."""
+
+    def __init__(self, name: str, run: Callable[[], None]) -> None:
+        self.name = name
+        self.stopping = threading.Event()
+        self._thread = threading.Thread(target=run, name=name, daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self, timeout_s: float) -> bool:
+        """Set `stopping` and wait for the thread, unless it calls this itself. Whether it has ended, or never began."""
+        self.stopping.set()
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
+            self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def dead_threads(self) -> list[str]:
+        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
+        begun = self._thread.ident is not None
+        return [self.name] if begun and not self._thread.is_alive() and not self.stopping.is_set() else []
+
+
+class Worker(Loop, Generic[Item]):
     """One thread that does `work` on each item, in order, behind a bounded queue.
 
-    `refuse`: a full queue turns the new item away. `drop oldest`: it loses its oldest. Either way `on_drop` is told.
-    An exception in `work` ends that item only: it is counted, and `on_failure` is told.
+    Policy of a full queue: `refuse` turns the new item away, `drop oldest` removes its oldest item. Either way
+    `on_drop` gets the item. An exception in `work` ends that item only: it is counted, and `on_failure` is called.
     """
 
     def __init__(
@@ -46,7 +71,7 @@ class Worker(Generic[Item]):
         on_drop: Callable[[Item], None] | None = None,
         on_failure: Callable[[Item, Exception], None] | None = None,
     ) -> None:
-        self.name = name
+        super().__init__(name, self._run)
         self._work = work
         self._capacity = capacity
         self._policy = policy
@@ -55,23 +80,13 @@ class Worker(Generic[Item]):
         self._items: deque[Item] = deque()
         self._changed = threading.Condition()
         self._busy = False
-        self._closed = False
         self._accepted = self._dropped = self._done = self._failed = 0
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-
-    def start(self) -> None:
-        """Begin to work."""
-        self._thread.start()
-
-    def dead_threads(self) -> list[str]:
-        """The thread's name where it has ended without being asked to: never, unless there is a bug."""
-        return [] if self._closed or self._thread.is_alive() else [self.name]
 
     def put(self, item: Item) -> bool:
-        """Hand over an item; False when it was turned away. Never waits."""
+        """Queue an item; False when it was turned away. Never waits."""
         lost: Item | None = None
         with self._changed:
-            taken = not self._closed
+            taken = not self.stopping.is_set()
             if taken and len(self._items) >= self._capacity:
                 if self._policy == "drop oldest":
                     lost = self._items.popleft()
@@ -86,26 +101,23 @@ class Worker(Generic[Item]):
             self._call(self._on_drop, item if lost is None else lost)
         return taken
 
-    def wait_idle(self, timeout_s: float) -> bool:
-        """Whether nothing waits and nothing is in hand, at the latest after `timeout_s`."""
-        with self._changed:
-            return self._changed.wait_for(lambda: not self._items and not self._busy, timeout_s)
-
     def stop(self, timeout_s: float) -> bool:
-        """Take no more, work off what waits, end the thread. False when that took longer than `timeout_s`: then what
-        still waits is dropped, and the thread ends after the item in hand."""
+        """Take no more items, work off those that wait, end the thread.
+
+        False when that took longer than `timeout_s`: then what still waits is dropped, and the thread ends after the
+        item in hand.
+        """
         with self._changed:
-            self._closed = True
+            self.stopping.set()
             self._changed.notify_all()
-        if self._thread.is_alive():
-            self._thread.join(timeout_s)
+        ended = super().stop(timeout_s)
         with self._changed:
             left = list(self._items)
             self._items.clear()
             self._dropped += len(left)
         for item in left:
             self._call(self._on_drop, item)
-        return not self._thread.is_alive()
+        return ended
 
     def statistics(self) -> Statistics:
         """Counters, taken together."""
@@ -125,14 +137,14 @@ class Worker(Generic[Item]):
             with self._changed:
                 self._busy = False
                 self._changed.notify_all()
-                self._changed.wait_for(lambda: self._items or self._closed)
+                self._changed.wait_for(lambda: self._items or self.stopping.is_set())
                 if not self._items:
                     return
                 item = self._items.popleft()
                 self._busy = True
             try:
                 self._work(item)
-            except Exception as error:  # noqa: BLE001  # one bad item must not end the stage; it is counted and told
+            except Exception as error:  # noqa: BLE001  # one bad item must not end the worker; it is counted
                 report(log, self.name, error)
                 with self._changed:
                     self._failed += 1
@@ -141,9 +153,9 @@ class Worker(Generic[Item]):
                 with self._changed:
                     self._done += 1
 
-    def _call(self, told: Callable[..., None] | None, *facts: object) -> None:
+    def _call(self, receiver: Callable[..., None] | None, *facts: object) -> None:
         try:
-            if told:
-                told(*facts)
-        except Exception as error:  # noqa: BLE001  # nor must whoever is told
-            report(log, f"{self.name}: telling it", error)
+            if receiver:
+                receiver(*facts)
+        except Exception as error:  # noqa: BLE001  # nor must a receiver
+            report(log, f"{self.name}: reporting an item", error)

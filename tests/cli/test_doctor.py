@@ -95,8 +95,8 @@ def test_bodies_that_come_and_go_are_told(monkeypatch: pytest.MonkeyPatch, capfd
 def running(tmp_path: Path) -> Iterator[Callable[[dict[str, Any]], Path]]:
     """A daemon as far as its health is heard; gives settings that lead to it."""
     endpoint = f"ipc://{tmp_path}/s"
-    publisher = Publisher(endpoint, f"ipc://{tmp_path}/a", answer=lambda _request, _reply: None, high_water_mark=8)
-    publisher.start("20261121T101503Z-1a2b3c4d")
+    publisher = Publisher(endpoint, f"ipc://{tmp_path}/a", high_water_mark=8)
+    publisher.start("20261121T101503Z-1a2b3c4d", lambda _request, _reply: None)
     ended = threading.Event()
     speakers: list[threading.Thread] = []
 

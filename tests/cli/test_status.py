@@ -23,8 +23,8 @@ from tests.daemon.health.test_metrics import HEALTH
 def stream(tmp_path: Path) -> Iterator[str]:
     """A publisher that says the same health again and again."""
     endpoint = f"ipc://{tmp_path}/s"
-    publisher = Publisher(endpoint, f"ipc://{tmp_path}/a", answer=lambda _request, _reply: None, high_water_mark=8)
-    publisher.start("20261121T101503Z-1a2b3c4d")
+    publisher = Publisher(endpoint, f"ipc://{tmp_path}/a", high_water_mark=8)
+    publisher.start("20261121T101503Z-1a2b3c4d", lambda _request, _reply: None)
     ended = threading.Event()
 
     def say() -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, frame_line
 from dappled.daemon.health import systemd
-from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.daemon.pipeline.capture import PendingShot
 from dappled.drivers.camera import BodyState, StateChanged
 from tests.daemon.health.test_metrics import HEALTH
 from tests.daemon.health.test_systemd import read

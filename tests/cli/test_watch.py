@@ -19,8 +19,8 @@ from tests.daemon.stream.test_watch import slices
 def stream(tmp_path: Path) -> Iterator[str]:
     """A publisher that sends frame after frame."""
     endpoint = f"ipc://{tmp_path}/s"
-    publisher = Publisher(endpoint, f"ipc://{tmp_path}/a", answer=lambda _request, _reply: None, high_water_mark=8)
-    publisher.start("20261121T101503Z-1a2b3c4d")
+    publisher = Publisher(endpoint, f"ipc://{tmp_path}/a", high_water_mark=8)
+    publisher.start("20261121T101503Z-1a2b3c4d", lambda _request, _reply: None)
     ended = threading.Event()
 
     def send() -> None:

@@ -12,11 +12,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dappled.clock import RecordedClock, SystemClock
-from dappled.daemon.navigation import BodyLatency
+from dappled.daemon.navigation import BodyLatency, ExposureTime
+from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
 from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcessError
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
-from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
 from dappled.decode.geometry import Pose
 from dappled.drivers.camera import (
@@ -140,6 +141,7 @@ class Rig:
     flight: recording.Recording
     camera: FakeCamera
     pipeline: Pipeline
+    pending: PendingShots
     shutter: Shutter
     decoder: FakeDecoder | None
     shots: list[PendingShot] = field(default_factory=list)
@@ -161,6 +163,27 @@ class Rig:
 
     def events(self) -> list[str]:
         return [f"{event.kind}: {event.text}" for event in self.flight.ledger.events()]
+
+
+class CallingObserver(Observer):
+    """Calls what it is given."""
+
+    def __init__(
+        self,
+        settled: Callable[[int, bool], object] = lambda index, ok: None,
+        tagged: Callable[[PendingShot], object] = lambda pending: None,
+        finished: Callable[[PendingShot], object] = lambda pending: None,
+    ) -> None:
+        self._settled, self._tagged, self._finished = settled, tagged, finished
+
+    def settled(self, index: int, ok: bool) -> None:
+        self._settled(index, ok)
+
+    def tagged(self, pending: PendingShot) -> None:
+        self._tagged(pending)
+
+    def finished(self, pending: PendingShot) -> None:
+        self._finished(pending)
 
 
 class FakeSink:
@@ -193,25 +216,29 @@ class FakeSink:
 
 @dataclass(frozen=True)
 class FlightSink:
-    """A ShotSink that notes shots in a flight and hands them to a pipeline."""
+    """A ShotSink that notes shots in a flight and hands them to a camera."""
 
     flight: recording.Recording
-    writer: LedgerWriter
-    pipeline: Pipeline
+    shots: PendingShots
 
     def obstacle(self) -> None:
         """There is none."""
 
     def note(self, shot: Shot) -> None:
         self.flight.journal.note(shot)
-        self.writer.requested(shot)
-        self.pipeline.expect(shot)
 
     def fire(self, shot: Shot) -> None:
-        self.pipeline.fire(shot.index)
+        self.shots.fire(shot)
 
     def refused(self, request: CaptureRequest, reason: str) -> None:
         """Only the sender hears it."""
+
+
+class NoPoses:
+    """A PoseSource that knows no pose."""
+
+    def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
+        return exposure, no_pose(exposure.utc_ns)
 
 
 def eventually(condition: Callable[[], object], what: str) -> None:
@@ -243,15 +270,17 @@ def rig(
         made[0].settled.append((index, ok))
         made[0].shutter.settled(index, ok)
 
+    pending_shots = PendingShots(camera)
     pipeline = Pipeline(
-        camera=camera,
-        writer=writer,
-        poses=lambda index, exposure: (exposure, no_pose(exposure.utc_ns)),
+        camera,
+        pending_shots,
+        writer,
+        NoPoses(),
         decoder=decoder,
         publisher=None,
         latency=BodyLatency(60.0, 15.0, "test"),
         names=Names("test", "mask", "geometric"),
-        observer=Observer(
+        observer=CallingObserver(
             settled,
             lambda pending: made[0].tagged.append(pending.shot.index),
             lambda pending: made[0].shots.append(pending),  # noqa: PLW0108  # a test may take the list away
@@ -260,8 +289,8 @@ def rig(
     )
     now_ns = clock.utc_ns()  # it stands still, so that a slow machine makes no new wish of a retry
     steady = RecordedClock(now_ns, now_ns - clock.monotonic_ns())
-    shutter = Shutter(FlightSink(flight, writer, pipeline), steady, next_index=flight.next_index, capacity=1000)
-    made.append(Rig(flight, camera, pipeline, shutter, decoder))
+    shutter = Shutter(FlightSink(flight, pending_shots), steady, next_index=flight.next_index, capacity=1000)
+    made.append(Rig(flight, camera, pipeline, pending_shots, shutter, decoder))
     pipeline.start()
     try:
         yield made[0]

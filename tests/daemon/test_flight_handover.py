@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 
@@ -12,9 +12,9 @@ from dappled.config import profiles
 from dappled.config.settings import CameraSettings, DecodeSettings, MaskSettings, Settings
 from dappled.daemon import flight_handover
 from dappled.daemon.camera_protocol.parameters import Parameters
-from dappled.daemon.flight_handover import BY_BODY, NONE, FlightHandover
+from dappled.daemon.flight_handover import BY_BODY, CHANGES_IN_FLIGHT, NONE, FlightHandover, LiveSettings
 from dappled.daemon.pipeline import recipes
-from dappled.daemon.pipeline.pending_shot import Names
+from dappled.daemon.pipeline.recipes import Names
 from dappled.drivers.camera import CameraError, Setting, SettingName
 from dappled.errors import DappledError
 
@@ -34,7 +34,9 @@ class NoBody:
 
 
 def knobs(settings: Settings, after: FlightHandover | None, ask: Callable[[Settings, str], None]) -> Parameters:
-    return Parameters(NoBody(), flight_handover.parameters(recipes.called(settings), after, lambda: settings, ask))
+    return Parameters(
+        NoBody(), flight_handover.parameters(recipes.called(settings), after, LiveSettings(settings), ask)
+    )
 
 
 def test_each_shipped_mask_each_law_and_no_mask_can_be_chosen() -> None:
@@ -98,7 +100,7 @@ def test_what_is_refused_is_not_shown() -> None:
 
 def test_where_no_flight_can_follow_they_are_to_be_read() -> None:
     found = Parameters(
-        NoBody(), flight_handover.parameters(Names("auto", "", ""), None, lambda: CONFIGURED, lambda *_: None)
+        NoBody(), flight_handover.parameters(Names("auto", "", ""), None, LiveSettings(CONFIGURED), lambda *_: None)
     )
     assert [(knob.name, knob.value, knob.choices) for knob in found.all()] == [
         ("LF_MASK", NONE, ()),
@@ -162,3 +164,34 @@ def test_what_goes_wrong_in_flight_or_at_the_first_start_is_not_repeated(began: 
     with pytest.raises(DappledError, match="disk is gone"):
         flight_handover.flights(CONFIGURED, fly)
     assert len(flown) == 1
+
+
+def test_what_is_safe_is_taken_and_the_rest_waits() -> None:
+    now = Settings()
+    wanted = replace(
+        now,
+        record=replace(now.record, min_free_mb=900, directory="/elsewhere"),
+        camera=replace(now.camera, driver="other"),
+    )
+    settings = LiveSettings(now)
+    told = settings.reload(wanted)
+    merged = settings.now
+    assert merged.record.min_free_mb == 900
+    assert merged.record.directory == now.record.directory
+    assert merged.camera == now.camera
+    assert told == [
+        "camera.driver stays 'gphoto2': 'other' takes a restart",
+        "record.directory stays '~/flights': '/elsewhere' takes a restart",
+        "record.min_free_mb is 900 now (was 500)",
+    ]
+
+
+def test_the_same_settings_change_nothing() -> None:
+    settings = LiveSettings(Settings())
+    assert (settings.reload(Settings()), settings.now) == ([], Settings())
+
+
+def test_the_safe_keys_exist() -> None:
+    tables = {table.name: {key.name for key in fields(getattr(Settings(), table.name))} for table in fields(Settings)}
+    for table, key in CHANGES_IN_FLIGHT:
+        assert key in tables[table]

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from dappled.daemon.navigation import BodyLatency, Telemetry, clocks
-from dappled.daemon.pipeline import tagger
-from dappled.daemon.pipeline.tagger import FrameSettings
+from dappled.daemon.pipeline import tagging
+from dappled.daemon.pipeline.tagging import FrameSettings
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import Message, PacketParser, mavlink
 from dappled.flight import Cause, LedgerReader, Result, Shot, recording
@@ -60,7 +60,7 @@ def fly(flights: Path, packets: Packets, exposures_s: list[float]) -> Path:
         with held(b"frame %d" % index) as blob:
             frame = begun.recorder.record(index, "IMG.DNG", blob, arrived_utc_ns=START_NS + called_ns + 10**8)
         exposure, pose = telemetry.locate(clocks.mid_exposure(START_NS + called_ns, LATENCY, None))
-        begun.ledger.add_tag(tagger.tag(frame, exposure, FrameSettings(), camera="test", mask="mask", pose=pose))
+        begun.ledger.add_tag(tagging.tag(frame, exposure, FrameSettings(), camera="test", mask="mask", pose=pose))
         begun.ledger.add_result(Result(index, "0" * 64, 1, 1, "geometric", "calibrated"))
 
     for t_s, message in packets:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -12,17 +13,19 @@ import pytest
 
 from dappled.config import settings as configuration
 from dappled.config.settings import MaskSettings, PoseSettings, PublishSettings, RecordSettings, Settings
-from dappled.daemon import flight_parts
 from dappled.daemon import service as module
+from dappled.daemon.camera_protocol import camera_status
 from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.navigation import UtcCorrection
-from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
+from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
-from dappled.daemon.service import Service
+from dappled.daemon.service import AGAIN_NS, PeriodicTask, Service
 from dappled.drivers.camera import CameraError, Setting, SettingsChanged
 from dappled.errors import DappledError
-from dappled.flight import FlightError, LedgerReader, check, layout
-from tests.daemon.fakes import FakeCamera, eventually, good
+from dappled.flight import LedgerReader, check
+from tests.daemon.fakes import CallingObserver, FakeCamera, eventually, good
+
+S = 10**9
 
 
 @pytest.fixture
@@ -46,7 +49,7 @@ def settings(tmp_path: Path) -> Iterator[Settings]:
 
 
 def started(settings: Settings, shots: list[PendingShot]) -> Service:
-    service = Service(settings, observer=Observer(finished=shots.append))
+    service = Service(settings, observer=CallingObserver(finished=shots.append))
     service.start()
     eventually(lambda: service.health()["camera"]["state"] == "ready", "the camera is ready")
     return service
@@ -68,7 +71,7 @@ def test_a_wish_goes_to_the_end_and_can_be_looked_up_in_the_next_flight(camera: 
     assert check.check(service.folder).intact
     assert camera.stopped
     after = started(settings, shots)
-    found = after._parts.lookup(0)
+    found = after._control.lookup(0)
     assert found is not None
     assert (found.ok, found.url) == (True, "frames/000000.dng")
     assert after.request(CaptureRequest("test", "console", 1)).index == 1
@@ -83,8 +86,8 @@ def test_an_old_flight_that_was_moved_away_is_unknown(camera: FakeCamera, settin
     first.stop()
     second = started(settings, shots)
     first.folder.rename(first.folder.parent.parent / "moved")
-    assert second._parts.lookup(0) is None
-    assert second._parts.lookup(99) is None
+    assert second._control.lookup(0) is None
+    assert second._control.lookup(99) is None
     second.stop()
 
 
@@ -93,13 +96,13 @@ def test_a_disk_that_can_t_be_asked_refuses_in_words(
 ) -> None:
     service = started(settings, [])
 
-    def refuse(_: Path) -> int:
-        raise FlightError("cannot ask for the free space of the disk")
-
     with monkeypatch.context() as broken:
-        broken.setattr(layout, "free_bytes", refuse)
+        broken.setattr(camera_status, "disk_storage", lambda _: None)
         decision = service.request(CaptureRequest("test", "console", 1))
-    assert (decision.outcome, decision.reason) == ("refused", "cannot ask for the free space of the disk")
+    assert (decision.outcome, decision.reason) == (
+        "refused",
+        f"the disk of {service.folder} can't be read: is it still mounted?",
+    )
     service.stop()
     assert not camera.fired
 
@@ -111,7 +114,7 @@ def test_a_start_that_fails_late_leaves_nothing(
         raise DappledError("not today")
 
     with monkeypatch.context() as broken:
-        broken.setattr(flight_parts, "Component", refuse)
+        broken.setattr(module, "Component", refuse)
         service = Service(settings)
         with pytest.raises(DappledError, match="not today"):
             service.start()
@@ -148,7 +151,7 @@ def test_a_believed_clock_that_the_satellites_contradict_is_a_problem(camera: Fa
     service = started(replace(settings, record=replace(settings.record, utc="system")), [])
     try:
         assert "clock" not in "".join(service.health()["problems"])
-        service._parts.navigation.utc.look(UtcCorrection(-3600 * 10**9, 10**7, "SYSTEM_TIME"))
+        service._navigation.utc.look(UtcCorrection(-3600 * 10**9, 10**7, "SYSTEM_TIME"))
         assert "this machine's clock is 3600 s fast" in "".join(service.health()["problems"])
     finally:
         service.stop()
@@ -163,12 +166,12 @@ def test_a_lens_that_was_zoomed_between_two_frames_is_told(
         service.request(CaptureRequest("test", "console", 1))
         eventually(lambda: shots, "the shot's end")
         (pending,) = shots
-        component, said = service._parts.component, list[str]()
+        component, said = service._component, list[str]()
         assert pending.tag is not None
         monkeypatch.setattr(component, "say", lambda text, *_: said.append(text))
         for length_mm in (35.0, None, 35.0, 55.0):
             pending.tag = replace(pending.tag, focal_length_mm=length_mm)
-            service._parts.herald._tagged(pending)
+            service._events.tagged(pending)
         assert said == ["image 0 was zoomed from 35 to 55 mm: is it calibrated?"]
     finally:
         service.stop()
@@ -187,10 +190,10 @@ def test_a_battery_that_runs_empty_is_told_until_there_is_another(camera: FakeCa
 
 def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, settings: Settings) -> None:
     after, shots = FlightHandover(settings), list[PendingShot]()
-    service = Service(settings, observer=Observer(finished=shots.append), after=after)
+    service = Service(settings, observer=CallingObserver(finished=shots.append), after=after)
     service.start()
     eventually(lambda: service.health()["camera"]["state"] == "ready", "the camera is ready")
-    parameters = service._parts.component._parameters._parameters
+    parameters = service._component._parameters._parameters
     camera.script = lambda _: []
     assert service.request(CaptureRequest("test", "console", 1)).index == 0
     with pytest.raises(CameraError, match="1 shots are under way"):
@@ -199,15 +202,15 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
         assert not isinstance(event, Exception)
         camera.say(event)
     eventually(lambda: shots, "the shot's end")
-    service._parts.shutter.start_interval(CaptureRequest("test", "console", 2), 3600, 0)
+    service._shutter.start_interval(CaptureRequest("test", "console", 2), 3600, 0)
     camera.script = good
     with pytest.raises(CameraError, match="stop the interval first"):
         parameters.change("LF_MASK", "mask-3")
-    service._parts.shutter.stop_interval()
+    service._shutter.stop_interval()
     for event in good(1):
         assert not isinstance(event, Exception)
         camera.say(event)
-    eventually(lambda: service._parts.shutter.statistics().pending == 0, "the interval's shot's end")
+    eventually(lambda: service._shutter.statistics().pending == 0, "the interval's shot's end")
     assert parameters.change("LF_MASK", "mask-3")
     assert "next flight begins" in str(service.request(CaptureRequest("test", "console", 3)).reason)
     service.run()  # ends by itself
@@ -222,10 +225,49 @@ def test_a_viewer_s_thread_that_dies_is_told_and_ends_no_flight(
     service = started(settings, [])
     try:
         with monkeypatch.context() as broken:
-            broken.setattr(service._parts.answers, "dead_threads", lambda: ["answers"])
+            broken.setattr(service._answers, "dead_threads", lambda: ["answers"])
             assert "the answers thread has ended: restart dappled" in service.health()["problems"]
             assert service.healthy()
-            broken.setattr(service._parts.pipeline, "dead_threads", lambda: ["capture"])
+            broken.setattr(service._pipeline, "dead_threads", lambda: ["capture"])
             assert not service.healthy()
     finally:
         service.stop()
+
+
+def test_every_turn_or_at_its_own_pace() -> None:
+    done: list[str] = []
+    tasks = [
+        PeriodicTask("each", lambda: done.append("each")),
+        PeriodicTask("slow", lambda: done.append("slow"), every_ns=S),
+    ]
+    for now_ns in (5 * S, 5 * S + 1, 6 * S - 1, 6 * S):
+        for task in tasks:
+            task.turn(now_ns)
+    assert (done.count("each"), done.count("slow")) == (4, 2)
+
+
+@pytest.mark.parametrize("error", [DappledError("the disk is full"), RuntimeError("a bug")])
+def test_one_that_fails_is_tried_again_and_told_once(error: Exception, caplog: pytest.LogCaptureFixture) -> None:
+    tries: list[int] = []
+    broken = True
+
+    def do() -> None:
+        tries.append(1)
+        if broken:
+            raise error
+
+    task = PeriodicTask("events", do)
+    with caplog.at_level(logging.WARNING):
+        for now_ns in (S, S + 1, S + AGAIN_NS - 1, S + AGAIN_NS, S + 2 * AGAIN_NS):
+            task.turn(now_ns)
+    assert len(tries) == 3
+    assert len(caplog.records) == 1
+    assert str(error) in task.problem
+    broken = False
+    task.turn(10 * S)
+    task.turn(10 * S)
+    assert (len(tries), task.problem) == (5, "")
+    broken = True
+    with caplog.at_level(logging.WARNING):
+        task.turn(11 * S)
+    assert len(caplog.records) == 2

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.stop_condition import StopCondition, Tally
 from dappled.flight import Frame
 from tests.flight.makers import shot

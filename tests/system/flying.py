@@ -12,10 +12,11 @@ from typing import Any
 from dappled.config import settings as configuration
 from dappled.config.schema import TomlSource
 from dappled.config.settings import Settings
-from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
+from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision
 from dappled.daemon.service import Service
 from dappled.flight import LedgerReader, check, flight_report
+from tests.daemon.fakes import CallingObserver
 
 DEADLINE_S = 30.0
 
@@ -80,7 +81,7 @@ def flying(settings: Settings) -> Iterator[Flying]:
     settled: list[tuple[int, bool]] = []
     service = Service(
         settings,
-        observer=Observer(finished=shots.append, settled=lambda index, ok: settled.append((index, ok))),
+        observer=CallingObserver(finished=shots.append, settled=lambda index, ok: settled.append((index, ok))),
     )
     service.start()
     folder = service.folder

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from dappled.config.settings import CameraSettings, PublishSettings
-from dappled.daemon import reload
 from dappled.daemon.console import access, connection, feed
+from dappled.daemon.flight_handover import CHANGES_IN_FLIGHT
 from dappled.daemon.pipeline import repeats
 from tests.system.documents import ROOT, Stage, commands, stage
 
@@ -66,7 +66,7 @@ NUMBERS = {
     "operating.md": [
         f"a millisecond instead of {CameraSettings().latency_sigma_ms:g}",
         "what can change in flight ("
-        + ", ".join(f"`{table}.{key}`" for table, key in sorted(reload.SAFE, reverse=True))
+        + ", ".join(f"`{table}.{key}`" for table, key in sorted(CHANGES_IN_FLIGHT, reverse=True))
         + ")",
     ],
     "wire.md": [f"`publish.high_water_mark` messages ({PublishSettings().high_water_mark})"],

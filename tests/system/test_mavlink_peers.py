@@ -36,7 +36,7 @@ class Camera:
 
     def iso(self) -> str:
         """As the body has it."""
-        settings = self.flying.service._parts.pipeline._capture._camera.settings()
+        settings = self.flying.service._shots._camera.settings()
         return next(one.value for one in settings if one.name == "iso")
 
     def shots(self) -> dict[str, int]:

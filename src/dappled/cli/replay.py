@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,13 +17,14 @@ from dappled.cli.terminal import frame_json, frame_line
 from dappled.config import settings as configuration
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline import recipes
+from dappled.daemon.pipeline.capture import PendingShot, PendingShots
 from dappled.daemon.pipeline.decode_process import DecodeProcess
-from dappled.daemon.pipeline.flight_writer import ReplayVerifier
-from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
 from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.replay import replay, runs
 from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayProgress
 from dappled.daemon.replay.runs import Run, RunWriter
+from dappled.daemon.replay.verifier import ReplayVerifier
 from dappled.daemon.stream import curve, wire
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher
@@ -102,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
             results = stack.enter_context(RunWriter(arguments.flight, Run(name, recipe, names), time.time_ns))
             recipe, keep = results.run.recipe, results.decoded
             print(f"storing the results beside the old ones, as run {name}", file=sys.stderr)
-        writer = replay.writer(recording, keep)
+        writer = replay.verifier(recording, keep)
         decoder = DecodeProcess(recipe) if recipe else None
         if decoder:
             stack.callback(decoder.close)
@@ -132,6 +133,19 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if problems else 0
 
 
+class PrintedProgress(ReplayProgress):
+    """Prints a line for each shot that has ended."""
+
+    def __init__(self, line: Callable[[PendingShot], str]) -> None:
+        super().__init__()
+        self._line = line
+
+    def finished(self, pending: PendingShot) -> None:
+        """See Observer."""
+        print(self._line(pending), flush=True)
+        super().finished(pending)
+
+
 def _play(
     arguments: argparse.Namespace,
     settings: configuration.Settings,
@@ -144,32 +158,31 @@ def _play(
 ) -> int:
     """Play the recording through the pipeline. Returns how many frames failed."""
     names, latency, recorded = flown
-    clock, progress = replay.clock(recording), ReplayProgress.begin()
+    clock, progress = replay.clock(recording), PrintedProgress(frame_json if arguments.json else frame_line)
     telemetry = RecordedTelemetry.flown(recorded, recording.telemetry, recording.horizons, recording.vehicles)
-
-    def finished(one: PendingShot) -> None:
-        print(frame_json(one) if arguments.json else frame_line(one), flush=True)
-        progress.note(one)
 
     publisher = _publisher(settings, writer, decoder, stack) if arguments.publish else None
     if publisher:
         header = wire.start_header(settings.publish, clock.utc_ns(), camera=names.camera, mask=names.mask)
         publisher.publish("start", header)
     identity = Identity("dappled", "recording", "", str(arguments.flight))
+    camera = ReplayCamera(recording.files, identity, clock)
+    shots = PendingShots(camera)
     pipeline = Pipeline(
-        camera=ReplayCamera(recording.files, identity, clock),
-        writer=writer,
-        poses=telemetry.pose,
+        camera,
+        shots,
+        writer,
+        telemetry,
         decoder=decoder,
         publisher=publisher,
         latency=latency,
         names=names,
-        observer=Observer(finished=finished),
+        observer=progress,
         decode_queue=1000,
     )
     pipeline.start()
     stack.callback(pipeline.stop, 5.0)
-    replay.play(recording, pipeline, progress, time=clock, pace=_pace(arguments))
+    replay.play(recording, shots, progress, time=clock, pace=_pace(arguments))
     if publisher:
         counts = {"wished": len(recording.shots), "safe": progress.frames}
         publisher.publish("end", {"utc_ns": clock.utc_ns(), "shots": counts})
@@ -231,14 +244,13 @@ def _publisher(
     publisher = Publisher(
         settings.publish.slices,
         settings.publish.ask,
-        answer=answers.answer,
         high_water_mark=settings.publish.high_water_mark,
         keys=curve.server(settings.publish.keys, settings.publish.clients),
         mode=int(settings.publish.socket_mode, 8),
     )
     answers.start()
     stack.callback(answers.stop)
-    publisher.start(writer.root.absolute().name)
+    publisher.start(writer.root.absolute().name, answers.answer)
     stack.callback(publisher.stop)
     return publisher
 

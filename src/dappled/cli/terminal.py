@@ -19,7 +19,7 @@ from typing import Any, Protocol
 from dappled.daemon.health.logbook import NewProblems
 from dappled.daemon.health.record import line as status_line
 from dappled.daemon.health.systemd import JournalHandler
-from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.stream import wire
 from dappled.drivers.camera import StateChanged
 from dappled.workers import Worker

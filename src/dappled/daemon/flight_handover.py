@@ -1,34 +1,64 @@
-"""From one flight to the next without a restart: another mask or carrier law, set by a ground station.
+"""Change settings while the daemon runs: some at once, after SIGHUP; mask and carrier law with the next flight.
 
-What frames are decoded by belongs to a flight: its record, its replay and every product of it have one recipe. So
-another choice ends the flight in order, between two frames, and begins the next one with it.
+What frames are decoded by belongs to a flight: its record, its replay and every product of it have one recipe. So a
+ground station's choice of another one ends the flight in order, between two frames, and begins the next one with it.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 
 from dappled.config import profiles
 from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol.parameters import OwnParameter
 from dappled.daemon.pipeline import recipes
-from dappled.daemon.pipeline.pending_shot import Names
+from dappled.daemon.pipeline.recipes import Names
 from dappled.decode.optics import LAWS
 from dappled.errors import DappledError, sentence
 
 log = logging.getLogger(__name__)
 NONE = "none"  # no mask: frames are kept, not decoded
-BY_BODY = "by body"  # no law is named, and the body tells which one it is with its first frame
+BY_BODY = "by body"  # no law is named: the first frame shows which body it is, and so which law
+# Settings that are read each time they are used, and that change no record that has begun.
+CHANGES_IN_FLIGHT = frozenset({("pose", "wait_ms"), ("record", "min_free_mb")})
+
+
+class LiveSettings:
+    """The settings in force: `now`."""
+
+    def __init__(self, now: Settings) -> None:
+        self.now = now
+
+    def reload(self, wanted: Settings) -> list[str]:
+        """Take over what may change in flight. Returns a sentence for each difference: taken, or refused."""
+        changes: list[str] = []
+        tables = {}
+        for table in fields(Settings):
+            old, new = getattr(self.now, table.name), getattr(wanted, table.name)
+            taken = {}
+            for key in fields(old):
+                before, after = getattr(old, key.name), getattr(new, key.name)
+                if before == after:
+                    continue
+                name = f"{table.name}.{key.name}"
+                if (table.name, key.name) in CHANGES_IN_FLIGHT:
+                    taken[key.name] = after
+                    changes.append(f"{name} is {after!r} now (was {before!r})")
+                else:
+                    changes.append(f"{name} stays {before!r}: {after!r} takes a restart")
+            tables[table.name] = replace(old, **taken)
+        self.now = Settings(**tables)
+        return changes
 
 
 class FlightHandover:
-    """What the next flight will be flown with, once that is asked for.
+    """What the next flight will be flown with, once a ground station has set it.
 
-    `configured` are the settings that a person wrote: a calibration is of their mask and law, and counts with these
-    alone. `next` is written by the thread that is asked, and read by the one that ends the flight. `began`: the flight
-    before it was opened whole. Raises DappledError when the named camera profile isn't right.
+    `configured` are the settings of the file: their calibration holds for their mask and law only. `next` is written
+    by the thread that serves the ground station, and read by the one that ends the flight. `began`: the flight before
+    it was opened completely. Raises DappledError when the named camera profile isn't right.
     """
 
     def __init__(self, configured: Settings) -> None:
@@ -67,17 +97,17 @@ class FlightHandover:
 
 
 def words(names: Names) -> tuple[str, str]:
-    """What LF_MASK and LF_LAW say of a flight whose frames are called so."""
+    """LF_MASK and LF_LAW of a flight with these names."""
     return names.mask or NONE, names.law or BY_BODY
 
 
 def parameters(
-    flown: Names, after: FlightHandover | None, now: Callable[[], Settings], ask: Callable[[Settings, str], None]
+    flown: Names, after: FlightHandover | None, settings: LiveSettings, ask: Callable[[Settings, str], None]
 ) -> tuple[OwnParameter, OwnParameter]:
-    """LF_MASK and LF_LAW of a flight, to be read only where nothing can come `after` it.
+    """LF_MASK and LF_LAW of a flight; read-only where no flight can come `after` it.
 
-    `ask` takes the next flight's settings, made from those of `now`, and a sentence; a CameraError from it says why
-    not at once. Once it has taken them, they say what is to come: this flight takes no frame any more.
+    `ask` takes the next flight's settings and a sentence; it raises CameraError where that must wait. Once it has
+    taken them, the parameters show those of the next flight: this one takes no more frames.
     """
     mask, law = words(flown)
     if after is None:
@@ -85,12 +115,12 @@ def parameters(
 
     def change_mask(word: str) -> None:
         nonlocal mask
-        ask(after.with_mask(after.next or now(), word), f"mask {word}")
+        ask(after.with_mask(after.next or settings.now, word), f"mask {word}")
         mask = word
 
     def change_law(word: str) -> None:
         nonlocal law
-        ask(after.with_law(after.next or now(), word), f"carrier law {word}")
+        ask(after.with_law(after.next or settings.now, word), f"carrier law {word}")
         law = word
 
     return (
@@ -100,11 +130,11 @@ def parameters(
 
 
 def flights(settings: Settings, fly: Callable[[Settings, FlightHandover], bool]) -> None:
-    """One flight after the other, until one ends that nothing follows.
+    """Fly one flight after the other, until no further one was asked for.
 
-    `fly` takes a flight from its start to its end; False: it was told to end, whatever was to follow. A next flight
-    that can't begin is told in the log, and the settings before it are flown again. Raises what the first one raises,
-    and what goes wrong in flight.
+    `fly` runs a flight from its start to its end; False: the daemon was stopped, and no flight follows. Where a next
+    flight can't begin, that is logged, and one with the settings before it is begun. Raises what the first flight
+    raises, and what goes wrong in flight.
     """
     before: Settings | None = None
     now = settings

@@ -1,50 +1,79 @@
-"""The daemon of a live flight: the order in which its parts start and stop, and the loop that looks after them."""
+"""Build a live flight from its parts, start and stop them in order, and run the loop that looks after them.
+
+Parts know only parts that are built before them. Commands go down: component → shutter → FlightControl → PendingShots →
+camera. Events go down too: pipeline → ShotEvents → component, shutter, logbook. `start` reads in that order.
+"""
 
 from __future__ import annotations
 
 import logging
+import shutil
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, cast
 
+import dappled
 from dappled.clock import Clock, SystemClock
+from dappled.config import settings as configuration
+from dappled.config.schema import ConfigError
 from dappled.config.settings import Settings
-from dappled.daemon import links, live_record
+from dappled.daemon import flight_handover
+from dappled.daemon.camera_protocol.component import Component
+from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters
 from dappled.daemon.console import process as console_process
-from dappled.daemon.flight_handover import FlightHandover
-from dappled.daemon.flight_parts import FlightParts
+from dappled.daemon.flight_control import FlightControl
+from dappled.daemon.flight_handover import FlightHandover, LiveSettings
 from dappled.daemon.health import record as health
 from dappled.daemon.health.logbook import Logbook
+from dappled.daemon.health.status_text import Alarms
+from dappled.daemon.navigation import BodyLatency, Navigation
 from dappled.daemon.navigation.clocks import utc_known
-from dappled.daemon.periodic_tasks import PeriodicTask
 from dappled.daemon.pipeline import recipes
-from dappled.daemon.pipeline.pending_shot import Names, Observer
-from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision
-from dappled.daemon.reload import merge
+from dappled.daemon.pipeline.capture import Observer, PendingShots
+from dappled.daemon.pipeline.decode_process import DecodeProcess
+from dappled.daemon.pipeline.flight_writer import LedgerWriter
+from dappled.daemon.pipeline.live_depth import LiveDepth
+from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.recipes import Names
+from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
+from dappled.daemon.shot_events import ShotEvents
 from dappled.daemon.stream import curve, wire
-from dappled.daemon.stream.publisher import Publisher, Reply
-from dappled.drivers.camera import Camera
-from dappled.drivers.mavlink import Packet
+from dappled.daemon.stream.answers import Answers
+from dappled.daemon.stream.publisher import Publisher
+from dappled.drivers.camera import Camera, CameraError
+from dappled.drivers.mavlink import MavlinkLinks, Packet, Signing, Unsigned, open_signing
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot
-from dappled.errors import DappledError, report
+from dappled.errors import DappledError, report, sentence
+from dappled.flight import Recording
+from dappled.flight import recording as flights
 
 log = logging.getLogger(__name__)
 HEALTH_NS = 10**9
-LOOK_S = 0.02
-STOP_S = 5.0
+AGAIN_NS = 10**9
+SIGNING_TIME_FILE = ".mavlink-signing"
+_LOOK_S = 0.02
+_STOP_S = 5.0
+
+
+class HasThreads(Protocol):
+    """A part with threads."""
+
+    def dead_threads(self) -> list[str]:
+        """The threads that have ended without having been stopped."""
 
 
 class Service:
     """One flight, from `start` to `stop`. `run` is the working loop between them.
 
-    `observer` are told what the street does; `after` takes what the next flight is to be flown with, where there may
-    be one. Raises DappledError from `start` when a part can't be had; what was opened is closed again. A camera that
-    isn't there, a link without an autopilot and a recipe without a mask are no such failures: the daemon says so and
-    goes on.
+    `observer` follows the pipeline; `after` takes what the next flight is to be flown with, where there may be one.
+    `start` raises DappledError when a part can't be had, and closes what it has opened. A camera that isn't there, a
+    link without an autopilot and a recipe without a mask are no such failures: health reports them.
     """
 
     def __init__(
@@ -55,116 +84,171 @@ class Service:
         clock: Clock | None = None,
         after: FlightHandover | None = None,
     ) -> None:
-        self.settings = settings
+        self.console_url = ""
+        self._settings = LiveSettings(settings)
         self._outside, self._after = observer or Observer(), after
         self._clock = clock or SystemClock()
         self._began_monotonic_ns = self._clock.monotonic_ns()
         self._logbook = Logbook(self._clock.utc_ns)
+        self._alarms = Alarms()
         self._stack = ExitStack()
         self._stopping = threading.Event()
-        self._started = False
-        self.console_url = ""
 
-    # what starts, and in the reverse order stops
+    # start, and in the reverse order stop
 
     def start(self) -> None:
         """Open everything. Order: what may refuse first, the flight folder after it, the camera last."""
+        settings = self._settings.now
         with ExitStack() as stack:
-            names, recipe = recipes.recipe(self.settings)
-            camera = open_camera(self.settings.camera)
-            if isinstance(camera, UsesAutopilot):
-                camera.use_autopilot(self._order)
-            door = console_process.open_listener(self.settings, stack)
-            self._open_sockets(door.private if door else "", stack)
-            kept = self._begin_recording(camera, names, recipe, stack)
-            self._begin_parts(names, stack)
-            self._links.start(self)
+            names, recipe = recipes.recipe(settings)
+            camera = open_camera(settings.camera)
+            door = console_process.open_listener(settings, stack)
+            self._publisher = _open_publisher(settings, door.private if door else "")
+            stack.callback(self._publisher.stop)
+            self._links = _configured_links(settings, self._clock)
+            self._links.open()
+            stack.callback(self._links.stop)
+            recipe = self._begin_recording(names, recipe, stack)
+            self._build(camera, names, recipe)
+            self._start_parts(names, stack)
             if door:
                 self.console_url = door.url
-                console_process.start(door, self.settings, stack, recipe=kept, act=self._act, logbook=self._logbook)
-            self._started = True
+                act = partial(console_process.answer, shutter=self._shutter, logbook=self._logbook)
+                console_process.start(door, settings, stack, recipe=recipe, act=act, logbook=self._logbook)
             self._stack = stack.pop_all()
         for text in self._recording.recovered:
             log.warning("earlier flight: %s", text)
 
-    def _open_sockets(self, private: str, stack: ExitStack) -> None:
-        publish = self.settings.publish
-        self._publisher = Publisher(
-            publish.slices,
-            publish.ask,
-            answer=self._answer,
-            high_water_mark=publish.high_water_mark,
-            keys=curve.server(publish.keys, publish.clients),
-            mode=int(publish.socket_mode, 8),
-            private=private,
-        )
-        stack.callback(self._publisher.stop)
-        self._links = links.configured(self.settings, self._clock)
-        self._links.open()
-        stack.callback(self._links.stop)
-
-    def _begin_recording(self, camera: Camera, names: Names, recipe: Recipe | None, stack: ExitStack) -> Recipe | None:
-        """The flight folder, and the parts that work on it. Returns the recipe as the flight keeps it."""
-        known = utc_known(self.settings.record.utc, self._clock.utc_ns())
-        self._recording = live_record.begin(
-            self.settings, self._clock.utc_ns, names, decodes=recipe is not None, utc_known=known
-        )
-        stack.callback(self._remove_litter)
-        stack.callback(live_record.close, self._recording)
+    def _begin_recording(self, names: Names, recipe: Recipe | None, stack: ExitStack) -> Recipe | None:
+        """Begin the flight folder. Returns the recipe with the copies of its files that the flight keeps."""
+        settings, clock = self._settings.now, self._clock
+        self._utc_known = utc_known(settings.record.utc, clock.utc_ns())
+        facts = {
+            "software": {"dappled": dappled.__version__, **recipes.versions()},
+            "settings": configuration.to_tables(settings),
+            "names": asdict(names),
+            "decode_in_flight": recipe is not None,
+        }
+        directory = Path(settings.record.directory)
+        self._recording = flights.begin(directory, clock.utc_ns, facts, utc_known=self._utc_known)
+        stack.push(lambda kind, *_: _remove_empty(self._recording) if kind else None)
+        stack.callback(_close, self._recording)
         stack.callback(self._links.stop)  # before the recording closes: packets are logged there
-        kept = None if recipe is None else live_record.keep_inputs(self._recording, recipe)
-        self._parts = FlightParts(
-            lambda: self.settings,
-            self._clock,
-            self._recording,
-            camera=camera,
-            names=names,
-            recipe=kept,
-            links=self._links,
-            publisher=self._publisher,
-            logbook=self._logbook,
-            outside=self._outside,
-            utc_known=known,
-            after=self._after,
-            end=self.ask_to_stop,
-        )
-        self._chores = self._make_chores()
+        if recipe is None:
+            return None
+        kept = recipes.keep(recipe, self._recording.folder.path)
+        self._recording.note_inputs(recipes.FOLDER)
         return kept
 
-    def _begin_parts(self, names: Names, stack: ExitStack) -> None:
-        """The end of the street first: whatever is handed on finds somebody at work. What begins badly is stopped
-        too."""
-        parts = self._parts
-        if parts.decoder is not None:
-            stack.callback(parts.decoder.close)
-            parts.decoder.begin_warm_up()
-        stack.callback(parts.answers.stop)
-        parts.answers.start()
-        self._publisher.start(self._recording.folder.name)
-        header = wire.start_header(self.settings.publish, self._clock.utc_ns(), camera=names.camera, mask=names.mask)
-        self._publisher.publish("start", header)
-        stack.callback(self._say_end)
-        if parts.depth is not None:
-            stack.callback(parts.depth.stop)
-            parts.depth.start()
-        stack.callback(parts.pipeline.stop, STOP_S)
-        parts.pipeline.start()
-        stack.callback(parts.shutter.stop)
-        parts.shutter.start()
+    def _build(self, camera: Camera, names: Names, recipe: Recipe | None) -> None:
+        """Build the parts, each from parts built before it. None of them runs yet."""
+        settings, clock, recording = self._settings.now, self._clock, self._recording
+        self._shots = shots = PendingShots(camera)
+        self._writer = writer = LedgerWriter(recording, clock)
+        self._navigation = Navigation(lambda: self._settings.now, clock, recording, utc_known=self._utc_known)
+        self._control = FlightControl(
+            self._settings,
+            clock,
+            recording,
+            shots=shots,
+            writer=writer,
+            navigation=self._navigation,
+            links=self._links,
+            alarms=self._alarms,
+            handover=self._after,
+        )
+        self._shutter = Shutter(
+            self._control, clock, next_index=recording.next_index, capacity=settings.camera.max_pending
+        )
+        self._component = Component(
+            self._links,
+            self._shutter,
+            clock,
+            self._parameters(camera, names, decodes=recipe is not None),
+            self._control,
+            feedback_is_shot=settings.mavlink.feedback_is_shot,
+        )
+        if isinstance(camera, UsesAutopilot):
+            camera.use_autopilot(self._component.command_autopilot)
+        self._decoder = None if recipe is None else DecodeProcess(recipe)
+        self._depth = None
+        if recipe is not None and settings.decode.depth:
+            self._depth = LiveDepth(
+                DecodeProcess(recipe),
+                writer,
+                shots,
+                self._publisher,
+                method=settings.decode.depth,
+                interval_s=settings.decode.depth_interval_s,
+                on_nearest=self._control.send_distance if settings.decode.depth_to_autopilot else None,
+            )
+        self._events = ShotEvents(
+            settings,
+            recording,
+            self._control,
+            shutter=self._shutter,
+            component=self._component,
+            logbook=self._logbook,
+            depth=self._depth,
+            outside=self._outside,
+            utc_ns=self._navigation.utc.utc_ns,
+        )
+        self._pipeline = Pipeline(
+            camera,
+            shots,
+            writer,
+            self._navigation,
+            decoder=self._decoder,
+            publisher=self._publisher,
+            latency=BodyLatency.of(settings.camera),
+            names=names,
+            observer=self._events,
+            decode_queue=settings.decode.queue,
+            preview_interval_s=settings.publish.preview_interval_s,
+        )
+        self._answers = Answers(writer, self._decoder, shots.wait_decoded)
+        self._vital: tuple[HasThreads, ...] = (self._pipeline, self._links, self._shutter)
+        self._tasks = self._periodic_tasks()
 
-    def _say_end(self) -> None:
+    def _parameters(self, camera: Camera, names: Names, *, decodes: bool) -> Parameters:
+        """What a ground station may set: the body's settings, decoding in flight, the next flight's mask and law."""
+        control = self._control
+        decoding = OwnParameter(
+            "LF_DECODE", "Decode in flight", control.decoding, ("on", "off"), control.set_decoding if decodes else None
+        )
+        mask_and_law = flight_handover.parameters(names, self._after, self._settings, self._hand_over)
+        return Parameters(camera, (decoding, *mask_and_law))
+
+    def _start_parts(self, names: Names, stack: ExitStack) -> None:
+        """Start the last stage first, so that each item finds its receiver. A part that fails is stopped too."""
+        if self._decoder is not None:
+            stack.callback(self._decoder.close)
+            self._decoder.begin_warm_up()
+        stack.callback(self._answers.stop)
+        self._answers.start()
+        self._publisher.start(self._recording.folder.name, self._answers.answer)
+        publish = self._settings.now.publish
+        start = wire.start_header(publish, self._clock.utc_ns(), camera=names.camera, mask=names.mask)
+        self._publisher.publish("start", start)
+        stack.callback(self._publish_end)
+        if self._depth is not None:
+            stack.callback(self._depth.stop)
+            self._depth.start()
+        stack.callback(self._pipeline.stop, _STOP_S)
+        self._pipeline.start()
+        stack.callback(self._shutter.stop)
+        self._shutter.start()
+        self._links.start(self)
+
+    def _publish_end(self) -> None:
         try:
-            self._parts.writer.write_later()
+            self._writer.write_later()
         except DappledError as error:
             report(log, "events", error)
-        now = self._parts.shutter.statistics()
+        now = self._shutter.statistics()
         counts = {"wished": now.shots, "safe": now.succeeded, "failed": now.failed, "open": now.pending}
         self._publisher.publish("end", {"utc_ns": self._clock.utc_ns(), "shots": counts})
-        self._publisher.stop()  # answers last questions: before the decoder goes
-
-    def _remove_litter(self) -> None:
-        if not self._started:
-            live_record.remove_litter(self._recording.folder)
+        self._publisher.stop()  # answers the last questions, for which the decoder is still there
 
     def ask_to_stop(self) -> None:
         """End `run` soon; safe in a signal handler."""
@@ -175,68 +259,76 @@ class Service:
         self._stopping.set()
         self._stack.close()
 
-    # what is looked after
+    # the working loop
 
-    def _make_chores(self) -> list[PeriodicTask]:
-        """What the working loop does, in this order. Without the loop there is no heartbeat."""
-        parts = self._parts
-        chores = [
-            PeriodicTask("events", parts.writer.write_later),
-            PeriodicTask("health", self._tell_health, every_ns=HEALTH_NS),
+    def _periodic_tasks(self) -> list[PeriodicTask]:
+        """The tasks of the working loop, in order. Without the loop there is no heartbeat."""
+        tasks = [
+            PeriodicTask("events", self._writer.write_later),
+            PeriodicTask("health", self._publish_health, every_ns=HEALTH_NS),
         ]
-        if not self.settings.mavlink.url:
-            return chores
+        if not self._settings.now.mavlink.url:
+            return tasks
         return [
-            PeriodicTask("MAVLink", parts.component.tick),
-            PeriodicTask("vehicle", lambda: parts.navigation.belongs_to(parts.component.vehicle)),
-            *chores,
-            PeriodicTask("UTC", parts.navigation.look_for_utc, every_ns=HEALTH_NS),
+            PeriodicTask("MAVLink", self._tick),
+            PeriodicTask("vehicle", lambda: self._navigation.belongs_to(self._component.vehicle)),
+            *tasks,
+            PeriodicTask("UTC", self._navigation.look_for_utc, every_ns=HEALTH_NS),
         ]
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
-        """The working loop: heartbeats, health; until `stop` is asked for, or `until()` says so."""
+        """Send heartbeats and health until `ask_to_stop` or `stop` is called, or `until()` is true."""
         while not self._stopping.is_set() and not until():
             self.step()
-            self._stopping.wait(LOOK_S)
+            self._stopping.wait(_LOOK_S)
 
     def step(self) -> None:
-        """One turn of the working loop."""
-        for chore in self._chores:
-            chore.turn(self._clock.monotonic_ns())
+        """Do once what is due."""
+        for task in self._tasks:
+            task.turn(self._clock.monotonic_ns())
+
+    def _tick(self) -> None:
+        self._control.well = self.healthy()
+        self._component.tick()
+
+    def _publish_health(self) -> None:
+        record = self.health()
+        self._publisher.publish("health", record)
+        for text, severity in self._alarms.lines(record["problems"], again=self._component.audience_has_grown()):
+            self._component.say(text, severity)
 
     def healthy(self) -> bool:
-        """Whether everything works that photographs are taken and kept with."""
-        return self._parts.healthy()
+        """Whether everything runs that photographs are taken and kept with. Viewers' parts don't count."""
+        return not any(part.dead_threads() for part in self._vital)
 
     def health(self) -> dict[str, Any]:
         """The state of everything, as published."""
-        parts, navigation = self._parts, self._parts.navigation
-        doubts = (parts.component.doubt(), navigation.utc.doubt(), parts.herald.doubt())
+        navigation = self._navigation
+        viewers: list[HasThreads] = [
+            self._publisher,
+            self._answers,
+            *([self._depth] if self._depth is not None else []),
+        ]
+        doubts = (self._component.doubt(), navigation.utc.doubt(), self._events.doubt)
         return health.record(
-            self.settings,
+            self._settings.now,
             utc_ns=self._clock.utc_ns(),
             monotonic_ns=self._clock.monotonic_ns(),
             began_monotonic_ns=self._began_monotonic_ns,
-            pipeline=parts.pipeline,
-            shutter=parts.shutter.statistics(),
+            shots=self._shots,
+            stages=self._pipeline.statistics(),
+            shutter=self._shutter.statistics(),
             links=self._links.statistics(),
             telemetry=navigation.telemetry.statistics(),
             publisher=self._publisher.statistics(),
             folder=self.folder,
             clock=navigation.telemetry.boot_clock(),
             vehicle=navigation.pose_now(),
-            decoding=parts.decoder is not None,
+            decoding=self._decoder is not None,
             utc_known=navigation.utc.known,
-            dead_threads=parts.dead_threads(),
-            doubts=[text for text in (*doubts, *(chore.problem for chore in self._chores)) if text],
+            dead_threads=[name for part in (*self._vital, *viewers) for name in part.dead_threads()],
+            doubts=[text for text in (*doubts, *(task.problem for task in self._tasks)) if text],
         )
-
-    def _tell_health(self) -> None:
-        record = self.health()
-        self._publisher.publish("health", record)
-        component = self._parts.component
-        for text, severity in self._parts.alarms.lines(record["problems"], again=component.audience_has_grown()):
-            component.say(text, severity)
 
     # what others may look at, and ask for
 
@@ -247,38 +339,119 @@ class Service:
 
     @property
     def utc_learnt(self) -> bool:
-        """Whether the autopilot has told UTC to a machine that didn't know it."""
-        return self._parts.navigation.utc.learnt is not None
+        """Whether the autopilot has given UTC to a machine that didn't know it."""
+        return self._navigation.utc.learnt is not None
 
     @property
     def requested(self) -> int:
         """Shots so far."""
-        return self._parts.shutter.statistics().shots
+        return self._shutter.statistics().shots
 
     def request(self, request: CaptureRequest) -> ShotDecision:
-        """A wish from this side of the links: a console, or a test."""
-        return self._parts.shutter.request(request)
+        """Take a capture request that did not come over a link: from a console, or a test."""
+        return self._shutter.request(request)
 
     def reload(self, wanted: Settings) -> list[str]:
-        """Take from these settings what can change in flight; a sentence for each change, taken or refused."""
-        self.settings, told = merge(self.settings, wanted)
-        return told
+        """See LiveSettings.reload."""
+        return self._settings.reload(wanted)
 
-    # what comes in by the doors that are open before the parts are made; nothing is heard there until `start` has them
-
-    def _act(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        return console_process.answer(request, self._parts.shutter, self._logbook)
-
-    def _answer(self, request: Mapping[str, Any], reply: Reply) -> None:
-        self._parts.answers.answer(request, reply)
-
-    def log_packet(self, stamp_us: int, raw: bytes) -> int:
-        """See `PacketSink`."""
+    def log_packet(self, stamp_us: int, raw: bytes) -> int | None:
+        """See PacketSink."""
         return self._recording.telemetry.append(stamp_us, raw)
 
     def on_packet(self, packet: Packet) -> None:
-        """See `PacketSink`."""
-        self._parts.on_packet(packet)
+        """See PacketSink: first to the poses, so that a command finds the pose of its own packet."""
+        self._navigation.on_packet(packet)
+        self._component.on_packet(packet)
 
-    def _order(self, number: int, parameters: Sequence[float]) -> str | None:
-        return self._parts.component.command_autopilot(number, parameters)
+    def _hand_over(self, following: Settings, text: str) -> None:
+        """End this flight between two frames; the next one is flown with `following`.
+
+        Raises CameraError where that would cut something short.
+        """
+        assert self._after is not None
+        now = self._shutter.statistics()
+        if now.interval_s is not None:
+            raise CameraError(f"{text} would begin another flight: stop the interval first")
+        if now.pending:
+            raise CameraError(f"{text} would begin another flight: {now.pending} shots are under way, ask again")
+        self._after.next = following
+        self._writer.later("next flight", f"{text} from there on, by the ground station")
+        self.ask_to_stop()
+
+
+class PeriodicTask:
+    """A task of the working loop: done in every turn, or every `every_ns`.
+
+    A task that fails is tried again a second later. The log has the first failure after a success only. Times are
+    monotonic.
+    """
+
+    def __init__(self, name: str, do: Callable[[], object], *, every_ns: int = 0) -> None:
+        self.name = name
+        self.problem = ""
+        self._do, self._every_ns = do, every_ns
+        self._due_ns = 0
+
+    def turn(self, now_ns: int) -> None:
+        """Do it if it is due."""
+        if now_ns < self._due_ns:
+            return
+        try:
+            self._do()
+        except Exception as error:  # noqa: BLE001  # a disk that refuses, or a bug in one task: the flight goes on
+            if not self.problem:
+                report(log, self.name, error)
+            self.problem = f"{self.name}: {sentence(error)}"
+            self._due_ns = now_ns + AGAIN_NS
+        else:
+            self.problem = ""
+            self._due_ns = now_ns + self._every_ns
+
+
+def _open_publisher(settings: Settings, private: str) -> Publisher:
+    publish = settings.publish
+    return Publisher(
+        publish.slices,
+        publish.ask,
+        high_water_mark=publish.high_water_mark,
+        keys=curve.server(publish.keys, publish.clients),
+        mode=int(publish.socket_mode, 8),
+        private=private,
+    )
+
+
+def _configured_links(settings: Settings, clock: Clock) -> MavlinkLinks:
+    """All MAVLink links of the settings, not open yet. Raises ConfigError, LinkError, SigningError."""
+    wanted = settings.mavlink
+    return MavlinkLinks(
+        wanted.url,
+        system_id=wanted.system_id,
+        component_id=wanted.component_id,
+        clock=clock,
+        signing=_signing(settings, clock),
+    )
+
+
+def _signing(settings: Settings, clock: Clock) -> Signing | None:
+    keys, links = settings.mavlink.keys, len(settings.mavlink.url)
+    if len(keys) not in (0, 1, links):
+        raise ConfigError(
+            f'[mavlink] keys names {len(keys)} files for {links} links; name one for each link ("" for none), or one'
+        )
+    each = keys * links if len(keys) == 1 else keys or ("",) * links
+    files = [Path(key) if key else None for key in each]
+    time_file = Path(settings.record.directory) / SIGNING_TIME_FILE
+    return open_signing(files, time_file, clock, cast(Unsigned, settings.mavlink.unsigned))
+
+
+def _close(recording: Recording) -> None:
+    for text in recording.close():
+        log.warning("%s", text)
+
+
+def _remove_empty(recording: Recording) -> None:
+    """After a start that failed: remove the flight's folder if no shot stands in it."""
+    journal = recording.folder.journal
+    if journal.exists() and journal.stat().st_size == 0:
+        shutil.rmtree(recording.folder.path, ignore_errors=True)

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.daemon.pipeline.capture import PendingShot
 
 
 class Asker(Protocol):

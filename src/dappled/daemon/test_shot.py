@@ -14,7 +14,7 @@ from pathlib import Path
 
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import clocks
-from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
+from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import Service
 from dappled.errors import DappledError
@@ -53,31 +53,44 @@ def daemon(settings: Settings, sockets: Path, record: Path) -> Iterator[TestShot
         publish=replace(settings.publish, slices=f"ipc://{sockets}/s", ask=f"ipc://{sockets}/a"),
         console=replace(settings.console, bind=""),
     )
-    shots: list[PendingShot] = []
-    ended = threading.Condition()
-
-    def finished(pending: PendingShot) -> None:
-        with ended:
-            shots.append(pending)
-            ended.notify_all()
-
-    service = Service(ours, observer=Observer(finished=finished))
+    ended = EndedShots()
+    service = Service(ours, observer=ended)
     service.start()
     loop = threading.Thread(target=service.run, name="test shot")
     loop.start()
     try:
-        yield TestShot(service, shots, ended)
+        yield TestShot(service, ended)
     finally:
         service.ask_to_stop()
         loop.join(5)
         service.stop()
 
 
+class EndedShots(Observer):
+    """Keeps the shots that have ended."""
+
+    def __init__(self) -> None:
+        self._shots: dict[int, PendingShot] = {}
+        self._changed = threading.Condition()
+
+    def finished(self, pending: PendingShot) -> None:
+        """See Observer."""
+        with self._changed:
+            self._shots[pending.shot.index] = pending
+            self._changed.notify_all()
+
+    def wait_for(self, index: int, timeout_s: float) -> PendingShot | None:
+        """The shot once it has ended; None if that takes longer than `timeout_s`."""
+        with self._changed:
+            self._changed.wait_for(lambda: index in self._shots, timeout_s)
+            return self._shots.get(index)
+
+
 class TestShot:
     """A running daemon to take shots with."""
 
-    def __init__(self, service: Service, shots: list[PendingShot], ended: threading.Condition) -> None:
-        self._service, self._shots, self._ended = service, shots, ended
+    def __init__(self, service: Service, ended: EndedShots) -> None:
+        self._service, self._ended = service, ended
         self._requests = 0
 
     @property
@@ -102,12 +115,10 @@ class TestShot:
         decision = self._service.request(CaptureRequest("doctor", "test shot", self._requests, acknowledged=False))
         if decision.index is None or not decision.accepted:
             raise TestShotError(f"the shot was refused: {decision.reason}")
-        until = time.monotonic() + timeout_s
-        with self._ended:
-            while not (found := [one for one in self._shots if one.shot.index == decision.index]):
-                if not self._ended.wait(until - time.monotonic()):
-                    raise TestShotError(f"the shot did not end within {timeout_s:g} s")
-        return found[0]
+        pending = self._ended.wait_for(decision.index, timeout_s)
+        if pending is None:
+            raise TestShotError(f"the shot did not end within {timeout_s:g} s")
+        return pending
 
 
 def latency(pending: PendingShot) -> Latency:

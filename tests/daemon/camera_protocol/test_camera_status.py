@@ -10,7 +10,7 @@ import pytest
 from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol import camera_status
 from dappled.daemon.camera_protocol.camera_status import distance_message, sensor_orientation
-from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.daemon.pipeline.capture import PendingShot
 from dappled.drivers.camera import Identity
 from dappled.drivers.mavlink import mavlink
 from dappled.flight import Cause, ImageIndex, Shot

@@ -96,8 +96,8 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
             reply(Message("slices", *slices(request["frame"])))
 
     endpoint = f"ipc://{tmp_path}/s"
-    publisher = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer, capacity=1000)
-    publisher.start()
+    publisher = Publisher(endpoint, endpoint + ".ask", capacity=1000)
+    publisher.start("f", answer)
     here, there = ProcessChannel.pair()
     studio = Studio(None, camera_pose.NADIR.ravel().tolist())
     feed = Feed(endpoint, endpoint + ".ask", Hub(), studio)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from dappled.daemon.health.logbook import Logbook, NewProblems, battery_doubt, of_shot
-from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.daemon.pipeline.capture import PendingShot
 from dappled.drivers.camera import Setting
 from dappled.flight import Cause, Frame, Shot
 

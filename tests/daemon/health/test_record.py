@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
 import jsonschema
@@ -13,11 +12,13 @@ import pytest
 from dappled.config.settings import MaskSettings, MavlinkSettings, RecordSettings, Settings
 from dappled.daemon.health import record as health
 from dappled.daemon.navigation import Telemetry
-from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.stream.publisher import PublisherStatistics
+from dappled.drivers.camera import BodyState
 from dappled.drivers.mavlink import LinkStatistics, SigningStatistics
 from dappled.workers import Worker
+from tests.daemon.fakes import FakeCamera
 from tests.schemas import schema
 
 WELL = Settings(
@@ -35,13 +36,15 @@ def record(
     stage: Worker[int] = Worker("decode", lambda _: None, capacity=1)
     for number in range(more.pop("items", 0)):
         stage.put(number)
-    pipeline = SimpleNamespace(camera_state=state, camera_reason=more.pop("reason", ""), stages=(stage,))
+    shots = PendingShots(FakeCamera())
+    shots.state, shots.reason = cast(BodyState, state), more.pop("reason", "")
     return health.record(
         settings,
         utc_ns=1,
         monotonic_ns=101 * S,
         began_monotonic_ns=more.pop("began", 90 * S),
-        pipeline=cast(Pipeline, pipeline),
+        shots=shots,
+        stages=[stage.statistics()],
         shutter=ShutterStatistics(3, 2, 1, 0, 0, 2, 0, 2, None),
         links=[link],
         telemetry=Telemetry().statistics(),

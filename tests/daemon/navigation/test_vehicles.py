@@ -17,8 +17,9 @@ from dappled.config.settings import MavlinkSettings, PoseSettings, PublishSettin
 from dappled.daemon import service as module
 from dappled.daemon.camera_protocol import autopilot
 from dappled.daemon.camera_protocol.autopilot import SystemIdentity
-from dappled.daemon.navigation import ExposureTime, Navigation, Telemetry, recorded_vehicles
-from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
+from dappled.daemon.navigation.clocks import ExposureTime
+from dappled.daemon.navigation.navigation import Navigation, Telemetry, recorded_vehicles
+from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import RecordedTelemetry
@@ -27,7 +28,7 @@ from dappled.drivers.mavlink import Message, mavlink
 from dappled.errors import DappledError
 from dappled.flight import digest, recording
 from tests.daemon.camera_protocol.rig import Peer
-from tests.daemon.fakes import FakeCamera, eventually
+from tests.daemon.fakes import CallingObserver, FakeCamera, eventually
 
 OURS, THEIRS = 1, 2
 PLACES_DEG = {OURS: 47, THEIRS: 10}
@@ -134,7 +135,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Settin
 
 def test_the_daemon_tags_with_the_place_of_its_own_vehicle(settings: Settings) -> None:
     shots: list[PendingShot] = []
-    service = Service(settings, observer=Observer(finished=shots.append))
+    service = Service(settings, observer=CallingObserver(finished=shots.append))
     service.start()
     loop = threading.Thread(target=service.run)
     loop.start()
@@ -152,7 +153,7 @@ def test_the_daemon_tags_with_the_place_of_its_own_vehicle(settings: Settings) -
     speaking = threading.Thread(target=speak)
     speaking.start()
     try:
-        eventually(lambda: service._parts.component.vehicle, "it is decided whose camera this is")
+        eventually(lambda: service._component.vehicle, "it is decided whose camera this is")
         eventually(lambda: (service.health()["vehicle"] or {}).get("latitude_deg") == pytest.approx(47), "our place")
         service.request(CaptureRequest("test", "console", 1))
         eventually(lambda: shots, "the shot's end")

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import mmap
 import threading
-from typing import Any
+from typing import Any, cast
 
 import jsonschema
 import numpy as np
 import pytest
 
 from dappled.daemon.navigation import ExposureTime
+from dappled.daemon.pipeline.capture import PendingShot, PendingShots
 from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcessError, FrameDepth
+from dappled.daemon.pipeline.flight_writer import FlightWriter
 from dappled.daemon.pipeline.live_depth import LiveDepth
-from dappled.daemon.pipeline.pending_shot import PendingShot
-from dappled.daemon.pipeline.tagger import FrameSettings as Shown
-from dappled.daemon.pipeline.tagger import tag
+from dappled.daemon.pipeline.tagging import FrameSettings as Shown
+from dappled.daemon.pipeline.tagging import tag
 from dappled.daemon.stream import wire
+from dappled.daemon.stream.publisher import Publisher
 from dappled.flight import Cause, Frame, Shot
-from tests.daemon.fakes import eventually, no_pose
+from tests.daemon.fakes import FakeCamera, eventually, no_pose
 from tests.schemas import schema
 
 
@@ -68,13 +70,20 @@ class Bench:
         self.nearest: list[tuple[float, float]] = []
         self.depth = LiveDepth(
             self.maker,
+            cast(FlightWriter, self),
+            PendingShots(FakeCamera()),
+            cast(Publisher, self),
             method="gradient",
             interval_s=interval_s,
-            path=lambda one: one.frame.name if one.frame else "",
-            publish=lambda topic, facts, body: self.published.append((topic, dict(facts), body)),
-            tell=self.nearest.append,
+            on_nearest=self.nearest.append,
             clock=lambda: self.now_s,
         )
+
+    def path(self, frame: Frame) -> str:
+        return frame.name
+
+    def publish(self, topic: str, facts: dict[str, Any], body: Any) -> None:
+        self.published.append((topic, dict(facts), body))
 
 
 @pytest.fixture

@@ -196,7 +196,7 @@ def test_a_frame_that_does_not_decode_is_told_and_the_next_does(tmp_path: Path) 
 def test_frames_are_told_as_left_undecoded_where_that_was_switched_off(tmp_path: Path) -> None:
     with rig(tmp_path) as one:
         for number, decoding in enumerate((True, False, True)):
-            one.pipeline.decoding = decoding
+            one.pending.decoding = decoding
             one.request(number)
             pending = one.ended(number)
             assert ((pending.decoded is not None), pending.problem) == (decoding, "")

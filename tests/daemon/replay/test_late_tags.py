@@ -17,13 +17,13 @@ from dappled.cli import main
 from dappled.config import settings as configuration
 from dappled.config.settings import MavlinkSettings, PoseSettings, PublishSettings, RecordSettings, Settings
 from dappled.daemon import service as module
-from dappled.daemon.pipeline.pending_shot import Observer, PendingShot
+from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import Service
 from dappled.drivers.mavlink import mavlink
 from dappled.flight import FlightsLock, LedgerReader, check, layout, recovery
 from tests.daemon.camera_protocol.rig import Peer
-from tests.daemon.fakes import FakeCamera, eventually
+from tests.daemon.fakes import CallingObserver, FakeCamera, eventually
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Settin
 def killed(settings: Settings, tmp_path: Path) -> Path:
     """What stands on the disk when a daemon is killed: one frame tagged, one safe and waiting for its pose."""
     shots: list[PendingShot] = []
-    service = Service(settings, observer=Observer(finished=shots.append))
+    service = Service(settings, observer=CallingObserver(finished=shots.append))
     service.start()
     loop = threading.Thread(target=service.run)
     loop.start()
@@ -64,7 +64,7 @@ def killed(settings: Settings, tmp_path: Path) -> Path:
             return bool(until)
 
         try:
-            eventually(lambda: heard(service._parts.component.vehicle), "whose camera this is")
+            eventually(lambda: heard(service._component.vehicle), "whose camera this is")
             eventually(lambda: heard(service.health()["vehicle"]), "a position")
             service.request(CaptureRequest("test", "console", 1))
             eventually(lambda: heard(shots), "the first shot's end")

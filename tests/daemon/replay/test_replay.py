@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import threading
 from pathlib import Path
 
 import pytest
 
 from dappled.daemon.navigation import BodyLatency
-from dappled.daemon.pipeline.pending_shot import Names, Observer, PendingShot
+from dappled.daemon.pipeline.capture import PendingShot, PendingShots
 from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayProgress
 from dappled.drivers.camera import Arrival, CameraEvent, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.replay import ReplayCamera
 from dappled.flight import Cause, FlightError, Shot
-from tests.daemon.fakes import FakeDecoder, failed, fired, good, rig
+from tests.daemon.fakes import FakeCamera, FakeDecoder, failed, fired, good, rig
 
 
 def record(flights: Path) -> Path:
@@ -31,32 +31,36 @@ def record(flights: Path) -> Path:
 def again(flight: Path, pace: replay.Pace | None = None) -> list[str]:
     """The verdict of a replay."""
     recording = replay.of_flight(flight)
-    writer = replay.writer(recording)
-    progress = ReplayProgress.begin()
+    verifier = replay.verifier(recording)
     ended: list[PendingShot] = []
 
-    def finished(pending: PendingShot) -> None:
-        ended.append(pending)
-        progress.note(pending)
+    class Progress(ReplayProgress):
+        def finished(self, pending: PendingShot) -> None:
+            ended.append(pending)
+            super().finished(pending)
 
+    progress = Progress()
+    camera = ReplayCamera(recording.files, Identity("dappled", "recording", "", ""))
+    shots = PendingShots(camera)
     pipeline = Pipeline(
-        camera=ReplayCamera(recording.files, Identity("dappled", "recording", "", "")),
-        writer=writer,
-        poses=RecordedTelemetry(recording.telemetry, recording.horizons, wait_s=0.0).pose,
+        camera,
+        shots,
+        verifier,
+        RecordedTelemetry(recording.telemetry, recording.horizons, wait_s=0.0),
         decoder=FakeDecoder(),
         publisher=None,
         latency=BodyLatency(60.0, 15.0, "test"),
         names=Names("test", "mask", "geometric"),
-        observer=Observer(finished=finished),
+        observer=progress,
         decode_queue=100,
     )
     pipeline.start()
     try:
-        replay.play(recording, pipeline, progress, time=replay.clock(recording), pace=pace, timeout_s=20)
+        replay.play(recording, shots, progress, time=replay.clock(recording), pace=pace, timeout_s=20)
     finally:
         pipeline.stop(5)
     assert len(ended) == len(recording.shots)
-    return [text for text in writer.verdict() if "unreadable" not in text]  # the fake's frames are no raw files
+    return [text for text in verifier.verdict() if "unreadable" not in text]  # the fake's frames are no raw files
 
 
 def test_the_same_flight_gives_the_same(tmp_path: Path) -> None:
@@ -167,11 +171,11 @@ def test_a_shot_that_never_ends_is_given_up(tmp_path: Path) -> None:
     flight = record(tmp_path)
     recording = replay.of_flight(flight)
 
-    class Deaf:
-        def expect(self, shot: Shot) -> None: ...
+    class Deaf(PendingShots):
+        def fire(self, shot: Shot) -> None:
+            """Never happens."""
 
-        def fire(self, index: int) -> None: ...
-
-    deaf = ReplayProgress(threading.Semaphore(0))
     with pytest.raises(ReplayError, match="did not come to an end"):
-        replay.play(recording, Deaf(), deaf, time=replay.clock(recording), pace=None, timeout_s=0.01)  # type: ignore[arg-type]  # a street that does nothing
+        replay.play(
+            recording, Deaf(FakeCamera()), ReplayProgress(), time=replay.clock(recording), pace=None, timeout_s=0.01
+        )

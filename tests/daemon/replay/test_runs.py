@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled.daemon.pipeline.pending_shot import Names
+from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.replay import runs
 from dappled.daemon.replay.runs import Run, RunWriter
 from dappled.drivers.raw.darkroom import Recipe

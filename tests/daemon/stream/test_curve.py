@@ -96,10 +96,8 @@ def test_any_file_is_a_key_or_an_error(tmp_path_factory: pytest.TempPathFactory,
 def test_only_those_on_the_list_get_in(keys: tuple[ServerKeys, ClientKeys, ClientKeys]) -> None:
     server, friend, stranger = keys
     endpoint, ask = (f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}" for _ in range(2))
-    one = Publisher(
-        endpoint, ask, flight="f", answer=lambda _, reply: reply(Message("error", {"error": "x"})), keys=server
-    )
-    one.start()
+    one = Publisher(endpoint, ask, keys=server)
+    one.start("f", lambda _, reply: reply(Message("error", {"error": "x"})))
     stop = threading.Event()
 
     def send() -> None:
@@ -133,15 +131,8 @@ def test_only_those_on_the_list_get_in(keys: tuple[ServerKeys, ClientKeys, Clien
 
 def test_the_daemon_s_own_door_needs_no_key(keys: tuple[ServerKeys, ClientKeys, ClientKeys], tmp_path: Path) -> None:
     private = f"ipc://{tmp_path}/own"
-    one = Publisher(
-        f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}",
-        "",
-        flight="f",
-        answer=lambda request, reply: reply(Message("frame", dict(request))),
-        keys=keys[0],
-        private=private,
-    )
-    one.start()
+    one = Publisher(f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}", "", keys=keys[0], private=private)
+    one.start("f", lambda request, reply: reply(Message("frame", dict(request))))
     with Subscriber(private, f"{private}.ask", topics=[]) as subscriber:
         subscriber.ask({"get": "frame", "frame": 5})
         message = subscriber.receive(20)

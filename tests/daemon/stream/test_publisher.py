@@ -44,8 +44,8 @@ def endpoint(tmp_path: Path) -> str:
 
 @pytest.fixture
 def started(endpoint: str) -> Iterator[Publisher]:
-    one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=no_answer)
-    one.start()
+    one = Publisher(endpoint, endpoint + ".ask")
+    one.start("f", no_answer)
     yield one
     one.stop(0.2)
 
@@ -89,13 +89,13 @@ def test_seq_counts_each_topic_by_itself(started: Publisher, endpoint: str) -> N
 
 
 def test_a_full_queue_drops_previews_before_slices_and_never_frames(endpoint: str) -> None:
-    one = Publisher(endpoint, "", flight="f", answer=no_answer, capacity=3)
+    one = Publisher(endpoint, "", capacity=3)
     for topic in ("preview", "slices", "frame", "slices", "frame", "end"):  # not started: all of it waits
         one.publish(topic, {"frame": 0, "utc_ns": 0}, b"x")
     statistics = one.statistics()
     assert {topic: count for topic, count in statistics.dropped.items() if count} == {"slices": 2, "preview": 1}
     assert statistics.waiting == 3
-    one.start()
+    one.start("f", no_answer)
     one.stop(0.2)
 
 
@@ -107,8 +107,8 @@ def test_a_lost_message_is_asked_for_and_had(endpoint: str) -> None:
         facts = {"frame": request["frame"], "arrays": [wire.describe_array("slices", STACK, "1")]}
         threading.Thread(target=reply, args=[Message("slices", facts, STACK.tobytes())]).start()
 
-    one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer, capacity=100)
-    one.start()
+    one = Publisher(endpoint, endpoint + ".ask", capacity=100)
+    one.start("f", answer)
     with Subscriber(endpoint, endpoint + ".ask") as subscriber:
         connected(one, subscriber)
         one.publish("slices", {"frame": 40, "arrays": []}, b"")
@@ -130,8 +130,8 @@ def test_a_late_subscriber_gets_what_it_asks_for_also_at_the_end(endpoint: str) 
         facts = {"frame": request["frame"], "arrays": [wire.describe_array("slices", STACK, "1")]}
         reply(Message("slices", facts, STACK.tobytes()))
 
-    one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer, capacity=100)
-    one.start()
+    one = Publisher(endpoint, endpoint + ".ask", capacity=100)
+    one.start("f", answer)
     for frame in (40, 41, 42):
         one.publish("slices", {"frame": frame, "arrays": []}, b"")
     eventually(lambda: one.statistics().sent["slices"] == 3, "all are out before anybody listens")
@@ -225,8 +225,8 @@ def test_a_reader_of_slices_that_stops_keeps_four(endpoint: str, before: int) ->
     """Whatever was read before it stopped: that decides how far ZeroMQ has counted."""
     bodies = Bodies()
     mark = PublishSettings().high_water_mark
-    one = Publisher(endpoint, "", flight="f", answer=no_answer, high_water_mark=mark)
-    one.start()
+    one = Publisher(endpoint, "", high_water_mark=mark)
+    one.start("f", no_answer)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     deaf = context.socket(zmq.SUB)
     deaf.setsockopt(zmq.RCVHWM, 1)
@@ -254,8 +254,8 @@ def test_a_reader_of_slices_that_stops_keeps_four(endpoint: str, before: int) ->
 def test_readers_that_stop_at_different_times_keep_eight_of_all_together(endpoint: str) -> None:
     """Then slices are dropped, and counted, until somebody reads or is gone; what is small goes on."""
     bodies = Bodies()
-    one = Publisher(endpoint, "", flight="f", answer=no_answer, high_water_mark=PublishSettings().high_water_mark)
-    one.start()
+    one = Publisher(endpoint, "", high_water_mark=PublishSettings().high_water_mark)
+    one.start("f", no_answer)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     readers = [context.socket(zmq.SUB) for _ in range(4)]
     with Subscriber(endpoint) as subscriber:
@@ -321,8 +321,8 @@ def rooms() -> set[int]:
 def test_what_follows_a_large_message_at_once_is_not_lost(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("_PATIENCE_S", "_LARGE_PATIENCE_S"):  # a machine may be slow
         monkeypatch.setattr(publisher, name, 10.0)
-    one = Publisher(endpoint, "", flight="f", answer=no_answer, capacity=100, high_water_mark=1)
-    one.start()
+    one = Publisher(endpoint, "", capacity=100, high_water_mark=1)
+    one.start("f", no_answer)
     rounds, rest = 10, ("preview", "depth", "frame", "health")
     got: list[str] = []
     with Subscriber(endpoint) as subscriber:
@@ -342,8 +342,8 @@ def test_what_follows_a_large_message_at_once_is_not_lost(endpoint: str, monkeyp
 
 def test_large_messages_wait_while_a_frame_is_made_safe(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(publisher, "_GIVE_WAY_S", 60.0)  # a machine may be slow
-    one = Publisher(endpoint, "", flight="f", answer=no_answer)
-    one.start()
+    one = Publisher(endpoint, "")
+    one.start("f", no_answer)
     with Subscriber(endpoint) as subscriber:
         connected(one, subscriber)
         with one.giving_way():
@@ -356,8 +356,8 @@ def test_large_messages_wait_while_a_frame_is_made_safe(endpoint: str, monkeypat
 
 
 def test_a_disk_that_never_ends_holds_up_no_message_for_long(endpoint: str) -> None:
-    one = Publisher(endpoint, "", flight="f", answer=no_answer)
-    one.start()
+    one = Publisher(endpoint, "")
+    one.start("f", no_answer)
     with Subscriber(endpoint) as subscriber, one.giving_way():
         connected(one, subscriber)
         one.publish("slices", {"frame": 0, "arrays": []}, bytes(1 << 20))
@@ -371,8 +371,8 @@ def test_askers_that_never_read_keep_four_answers_of_all_together(endpoint: str)
     def answer(request: Mapping[str, Any], reply: Reply) -> None:
         reply(Message("slices", {"frame": request["frame"], "arrays": []}, bodies.make()))
 
-    one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer)
-    one.start()
+    one = Publisher(endpoint, endpoint + ".ask")
+    one.start("f", answer)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     askers = [context.socket(zmq.DEALER) for _ in range(10)]
     for asker in askers:
@@ -399,8 +399,8 @@ def test_an_answer_that_cannot_be_sent_is_no_loss_of_the_stream(endpoint: str) -
     def answer(_: Mapping[str, Any], reply: Reply) -> None:
         reply(Message("slices", {"frame": float("nan")}))
 
-    one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer)
-    one.start()
+    one = Publisher(endpoint, endpoint + ".ask")
+    one.start("f", answer)
     with Subscriber(endpoint, endpoint + ".ask", topics=[]) as subscriber:
         subscriber.ask({"get": "slices", "frame": 1})
         assert "can't be sent" in receive(subscriber, "error").header["error"]
@@ -433,8 +433,8 @@ def test_asyncio_recovers_what_was_lost(endpoint: str) -> None:
                     got.append(message.header["frame"])
             return got, subscriber.gaps, subscriber.recovered
 
-    one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer, capacity=100)
-    one.start()
+    one = Publisher(endpoint, endpoint + ".ask", capacity=100)
+    one.start("f", answer)
     one.publish("slices", {"frame": 40, "arrays": []}, b"")
     eventually(lambda: one.statistics().sent["slices"] == 1, "it is out before anybody listens")
     got, gaps, recovered = asyncio.run(frames())
@@ -484,8 +484,8 @@ def test_a_subscription_asks_for_what_was_sent_before(endpoint: str) -> None:
     def answer(request: Mapping[str, Any], reply: Reply) -> None:
         reply(Message("slices", {"frame": request["frame"], "arrays": []}, b""))
 
-    one = Publisher(endpoint, endpoint + ".ask", flight="f", answer=answer, capacity=100)
-    one.start()
+    one = Publisher(endpoint, endpoint + ".ask", capacity=100)
+    one.start("f", answer)
     one.publish("slices", {"frame": 40, "arrays": []}, b"")
     eventually(lambda: one.statistics().sent["slices"] == 1, "it is out before anybody listens")
     stream = subscribe(endpoint, from_start=True)
@@ -518,9 +518,9 @@ def test_a_subscription_needs_both_key_files() -> None:
 
 def test_a_thread_that_ended_by_itself_is_told(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Publisher, "_run", lambda _: None)
-    one = Publisher(endpoint, "", flight="f", answer=no_answer)
+    one = Publisher(endpoint, "")
     assert one.dead_threads() == []
-    one.start()
+    one.start("f", no_answer)
     eventually(lambda: one.dead_threads() == ["publisher"], "it is told")
     one.stop(0.0)
     assert one.dead_threads() == []
@@ -528,7 +528,7 @@ def test_a_thread_that_ended_by_itself_is_told(endpoint: str, monkeypatch: pytes
 
 def test_an_endpoint_in_use_is_refused_and_stays_whole(started: Publisher, endpoint: str) -> None:
     with pytest.raises(WireError, match="in use by another program"):
-        Publisher(endpoint, "", flight="g", answer=no_answer)
+        Publisher(endpoint, "")
     with Subscriber(endpoint) as subscriber:
         connected(started, subscriber)
 
@@ -538,7 +538,7 @@ def test_a_tcp_port_in_use_is_refused() -> None:
         socket.create_server(("127.0.0.1", 0)) as taken,
         pytest.raises(WireError, match="in use by another program"),
     ):
-        Publisher(f"tcp://127.0.0.1:{taken.getsockname()[1]}", "", flight="g", answer=no_answer)
+        Publisher(f"tcp://127.0.0.1:{taken.getsockname()[1]}", "")
 
 
 @given(st.lists(st.binary(max_size=64), max_size=4))

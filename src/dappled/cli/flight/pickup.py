@@ -10,8 +10,8 @@ from pathlib import Path
 from tqdm import tqdm
 
 from dappled.cli import counted
-from dappled.daemon.pipeline import pickup
-from dappled.daemon.pipeline.pickup import Choice, Picked, Proposal
+from dappled.daemon.replay import pickup
+from dappled.daemon.replay.pickup import Choice, Picked, Proposal
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
 

@@ -15,7 +15,7 @@ from dappled.clock import Clock
 from dappled.config import profiles
 from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol.parameters import DEFINITION_PATH, Definition, Parameters, camera_definition
-from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.decode.geometry import Pose, field_of_view
 from dappled.drivers.camera import Identity

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from dappled.daemon.pipeline.pending_shot import PendingShot
+from dappled.daemon.pipeline.capture import PendingShot
 from dappled.drivers.camera import Setting
 from dappled.errors import sentence
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import BootClock, TelemetryStatistics
-from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
@@ -18,6 +18,7 @@ from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import LinkStatistics
 from dappled.errors import DappledError
 from dappled.flight import layout
+from dappled.workers import Statistics
 
 SILENT_NS = 5 * 10**9
 
@@ -28,7 +29,8 @@ def record(
     utc_ns: int,
     monotonic_ns: int,
     began_monotonic_ns: int,
-    pipeline: Pipeline,
+    shots: PendingShots,
+    stages: Sequence[Statistics],
     shutter: ShutterStatistics,
     links: Sequence[LinkStatistics],
     telemetry: TelemetryStatistics,
@@ -46,8 +48,8 @@ def record(
     `doubts` are further problems, found by other parts. `dead_threads` have ended without being asked to.
     """
     problems = [f"the {name} thread has ended: restart dappled" for name in dead_threads]
-    if pipeline.camera_state not in ("starting", "ready", "busy"):
-        problems.append(camera_sentence(pipeline))
+    if shots.state not in ("starting", "ready", "busy"):
+        problems.append(shots.camera_sentence())
     if not settings.mavlink.url:
         problems.append("no MAVLink link is configured: frames are tagged without poses")
     silent = 0
@@ -72,13 +74,13 @@ def record(
         )
     if not settings.mask.profile:
         problems.append("no mask is configured: frames are kept, not decoded (set mask.profile)")
-    stages = [asdict(stage.statistics()) for stage in pipeline.stages]
-    for stage in stages:
+    queues = [asdict(stage) for stage in stages]
+    for stage in queues:
         if stage["dropped"]:
             problems.append(f"{stage['name']} fell behind by {_frames(stage['dropped'])}, kept in the record")
     return {
         "utc_ns": utc_ns,
-        "camera": {"state": pipeline.camera_state, "reason": pipeline.camera_reason},
+        "camera": {"state": shots.state, "reason": shots.reason},
         "link": {
             "urls": len(links),
             "silent": silent,
@@ -94,7 +96,7 @@ def record(
             "pending": shutter.pending,
             "refused": shutter.refused,
         },
-        "stages": [*stages, _publish(publisher)],
+        "stages": [*queues, _publish(publisher)],
         "problems": problems,
         "dead": list(dead_threads),
         "utc_known": utc_known,
@@ -169,25 +171,6 @@ def line(health: Mapping[str, Any]) -> str:
     shots, problems = health["shots"], health["problems"]
     counts = f"camera {health['camera']['state']}, {shots['safe']} of {shots['wished']} frames safe"
     return f"{counts}; {'; '.join(problems)}" if problems else f"{counts}; all is well"
-
-
-def camera_sentence(pipeline: Pipeline) -> str:
-    """The camera's state and its reason: "the camera is absent: …"."""
-    reason = f": {pipeline.camera_reason}" if pipeline.camera_reason else ""
-    return f"the camera is {pipeline.camera_state}{reason}"
-
-
-def obstacle(pipeline: Pipeline, folder: Path, min_free_mb: int) -> str | None:
-    """Why no shot can be taken now; None if one can."""
-    if pipeline.camera_state not in ("ready", "busy"):
-        return camera_sentence(pipeline)
-    try:
-        free = layout.free_bytes(folder)
-    except DappledError as error:
-        return str(error)
-    if free < min_free_mb * 1_000_000:
-        return f"the disk is nearly full: {free // 1_000_000} MB left, record.min_free_mb is more"
-    return None
 
 
 def _free(folder: Path) -> int | None:

@@ -1,4 +1,4 @@
-"""The camera's side of the street: its events in order, each file made safe, each shot without one given up."""
+"""Follow each shot from its request to its safe frame: the shots under way, and the camera's events in order."""
 
 from __future__ import annotations
 
@@ -7,9 +7,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
 
-from dappled.daemon.pipeline.pending_shot import FlightWriter, Observer, PendingShot
-from dappled.daemon.pipeline.pending_shots import PendingShots
+from dappled.daemon.navigation import ExposureTime
+from dappled.daemon.pipeline.decode_process import DecodedFrame
+from dappled.daemon.pipeline.flight_writer import FlightWriter
+from dappled.decode.geometry import Pose
 from dappled.drivers.camera import (
     Arrival,
     BodyState,
@@ -23,79 +27,267 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.errors import report, sentence
+from dappled.flight import Frame, Shot, Tag
+from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
+GIVEN_UP = 16  # failed shots that a late file can still belong to
+FOLLOWING = 4096  # the same for shots whose file stays at the camera; `geotag` tags the frames of older ones
 _LOOK_S = 0.1
 _LAST_EVENTS_S = 1.0
 
 
-class Capture:
-    """One thread that pulls the camera's events. `hand_on` takes the stories that are ready to be tagged: their frame
-    is safe, or its file stays at the camera."""
+@dataclass(slots=True)
+class PendingShot:
+    """One shot on its way through the pipeline; each stage fills in what it finds. `ms` holds times in milliseconds.
 
-    def __init__(
-        self,
-        camera: Camera,
-        writer: FlightWriter,
-        shots: PendingShots,
-        observer: Observer,
-        hand_on: Callable[[PendingShot], object],
-    ) -> None:
-        self._camera, self._writer, self._shots, self._observer = camera, writer, shots, observer
-        self._hand_on = hand_on
-        self._unfired: deque[ShotFailed] = deque()
-        self._stopping, self._give_up_at = threading.Event(), 0.0
-        self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
+    `over`: its observers know that it is finished. `entered`: its row is in the ledger. `follows` says, for a shot
+    whose file stays at the camera, how it will come; `where` is then when and where it was exposed, as far as that is
+    known without the file.
+    """
+
+    shot: Shot
+    fired: Fired | None = None
+    frame: Frame | None = None
+    tag: Tag | None = None
+    decoded: DecodedFrame | None = None
+    problem: str = ""
+    doubt: str = ""
+    follows: str = ""
+    where: tuple[ExposureTime, Pose] | None = None
+    ms: dict[str, float] = field(default_factory=dict)
+    over: bool = False
+    entered: bool = False
+
+    @property
+    def open(self) -> bool:
+        """Whether its file is still expected."""
+        return self.frame is None and not self.follows
+
+
+class Observer:
+    """Follows what the pipeline does. Each method does nothing here; subclasses override what they need.
+
+    An exception from a method is logged, and the pipeline goes on.
+    """
+
+    def settled(self, index: int, ok: bool) -> None:
+        """A shot is safe (`ok`) or failed."""
+
+    def tagged(self, pending: PendingShot) -> None:
+        """A shot's tag is known, or there will be none."""
+
+    def finished(self, pending: PendingShot) -> None:
+        """Nothing more is expected of a shot. Called once for each."""
+
+    def camera_changed(self, change: StateChanged) -> None:
+        """The camera's state changed."""
+
+    def settings_changed(self, change: SettingsChanged) -> None:
+        """The camera's settings changed."""
+
+
+class PendingShots:
+    """The shots under way at one camera, and the state of that camera. Any thread may ask, add and remove.
+
+    A shot that failed, or whose file stays at the camera, is kept for a while after its end: its file may still come.
+    `decoding`: whether safe frames are decoded in flight.
+    """
+
+    def __init__(self, camera: Camera) -> None:
         self.state: BodyState = "starting"
         self.reason = ""
+        self.decoding = True
+        self._camera = camera
+        self._unfired: deque[ShotFailed] = deque()
+        self._changed = threading.Condition()
+        self._in_hand: dict[int, PendingShot] = {}
+        self._given_up: dict[int, PendingShot] = {}
+        self._following: dict[int, PendingShot] = {}
 
-    def dead_threads(self) -> list[str]:
-        """The thread's name where it has ended without being asked to: never, unless there is a bug."""
-        return [] if self._stopping.is_set() or self._thread.is_alive() else [self._thread.name]
+    def fire(self, shot: Shot) -> None:
+        """Hand a noted shot to the camera. Never raises: a shot that the driver refuses has failed."""
+        with self._changed:
+            self._in_hand[shot.index] = PendingShot(shot)
+        try:
+            self._camera.fire(shot.index)
+        except Exception as error:  # noqa: BLE001  # any driver's; the shot is noted and must come to an end
+            reason = f"the camera driver did not take the shot: {sentence(error)}"
+            self._unfired.append(ShotFailed(shot.index, reason, time.monotonic_ns()))
+
+    def unfired(self) -> ShotFailed | None:
+        """The next shot that the driver refused."""
+        return self._unfired.popleft() if self._unfired else None
+
+    def in_hand(self, index: int) -> PendingShot | None:
+        """A shot that has not come to its end; None for any other."""
+        return self._in_hand.get(index)
+
+    def of_file(self, index: int) -> PendingShot | None:
+        """The shot that a file belongs to, also where the shot ended without the file."""
+        with self._changed:
+            return self._in_hand.get(index) or self._given_up.get(index) or self._following.get(index)
+
+    def open(self) -> list[int]:
+        """The shots whose files are expected."""
+        with self._changed:
+            return [index for index, pending in self._in_hand.items() if pending.open]
+
+    def untagged(self, index: int) -> bool:
+        """Whether a shot is under way and not tagged yet."""
+        pending = self._in_hand.get(index)
+        return pending is not None and pending.tag is None
+
+    def wait_decoded(self, timeout_s: float = 5.0) -> bool:
+        """Wait until no tagged frame is to be decoded. False if that takes longer than `timeout_s`."""
+        with self._changed:
+            return self._changed.wait_for(lambda: all(one.tag is None for one in self._in_hand.values()), timeout_s)
+
+    def camera_sentence(self) -> str:
+        """The camera's state and its reason: "the camera is absent: …"."""
+        return f"the camera is {self.state}" + (f": {self.reason}" if self.reason else "")
+
+    def add(self, pending: PendingShot) -> None:
+        """Take in a shot whose file came after its end."""
+        with self._changed:
+            self._in_hand[pending.shot.index] = pending
+
+    def remove(self, pending: PendingShot) -> bool:
+        """A shot has come to its end; False where its observers know that already."""
+        with self._changed:
+            if self._in_hand.get(pending.shot.index) is pending:
+                del self._in_hand[pending.shot.index]
+                self._changed.notify_all()
+            over, pending.over = pending.over, True
+        return not over
+
+    def keep_failed(self, pending: PendingShot) -> None:
+        """Know a failed shot's file for a while longer."""
+        self._keep(self._given_up, pending, GIVEN_UP)
+
+    def keep_following(self, pending: PendingShot) -> None:
+        """Know the file of a shot that stays at the camera."""
+        self._keep(self._following, pending, FOLLOWING)
+
+    def file_came(self, index: int) -> tuple[bool, bool]:
+        """A file is safe: whether it was to follow, and whether its shot had failed."""
+        with self._changed:
+            return self._following.pop(index, None) is not None, self._given_up.pop(index, None) is not None
+
+    def _keep(self, where: dict[int, PendingShot], pending: PendingShot, most: int) -> None:
+        with self._changed:
+            where[pending.shot.index] = pending
+            while len(where) > most:
+                del where[min(where)]
+
+
+class ShotEnds:
+    """End each shot once, write down what is remarkable, and call the observer."""
+
+    def __init__(self, shots: PendingShots, writer: FlightWriter, observer: Observer) -> None:
+        self.shots, self.writer, self.observer = shots, writer, observer
+
+    def fail(self, pending: PendingShot, reason: str) -> None:
+        """A shot ends without a frame; see `GIVEN_UP`."""
+        pending.problem = reason
+        self.shots.keep_failed(pending)
+        self.tell(self.observer.settled, pending.shot.index, False)
+        self.tell(self.observer.tagged, pending)
+        self.finish(pending)
+
+    def follow(self, pending: PendingShot, reason: str) -> None:
+        """A shot's file stays at the camera for now."""
+        pending.follows = reason
+        self.shots.keep_following(pending)
+        self.tell(self.observer.settled, pending.shot.index, False)
+
+    def safe(self, pending: PendingShot, frame: Frame, name: str) -> PendingShot:
+        """A shot's file is safe. Returns the shot that goes on with it.
+
+        For a file that was to follow that is a second PendingShot, whose end is not reported again.
+        """
+        if pending.follows:
+            pending = PendingShot(pending.shot, pending.fired, ms=pending.ms, over=True, entered=pending.entered)
+            self.shots.add(pending)
+        pending.frame = frame
+        followed, failed = self.shots.file_came(frame.index)
+        if followed:
+            self.note("followed", f"its file has come: {name}", frame.index)
+        elif failed:
+            self.note("late", f"its file came after all; it had failed: {pending.problem}", frame.index)
+            pending.problem = ""
+            self.shots.add(pending)
+        return pending
+
+    def leave(self, pending: PendingShot, what: str, why: str) -> None:
+        """A safe frame is not processed further."""
+        pending.problem = f"{what}: {why}"
+        self.note(what, why, pending.shot.index)
+        self.finish(pending)
+
+    def finish(self, pending: PendingShot) -> None:
+        """Nothing more is expected of a shot."""
+        if self.shots.remove(pending):
+            self.tell(self.observer.finished, pending)
+
+    def note(self, kind: str, text: str, index: int) -> None:
+        """Write an event into the record. The pipeline goes on where that fails."""
+        self.tell(self.writer.event, kind, text, index)
+
+    def tell(self, receiver: Callable[..., Any], *facts: object) -> None:
+        """Call `receiver`; log its exception instead of raising it."""
+        try:
+            receiver(*facts)
+        except Exception as error:  # noqa: BLE001  # no observer may stop the pipeline
+            report(log, "pipeline", error)
+
+
+class Capture:
+    """Pull the camera's events in one thread: make each file safe, and give up each shot without one.
+
+    `on_done` takes the shots that are ready to be tagged: their frame is safe, or its file stays at the camera.
+    """
+
+    def __init__(self, camera: Camera, ends: ShotEnds, on_done: Callable[[PendingShot], object]) -> None:
+        self._camera, self._ends, self._on_done = camera, ends, on_done
+        self._shots, self._writer, self._observer = ends.shots, ends.writer, ends.observer
+        self._give_up_at = 0.0
+        self._loop = Loop("capture", self._run)
+        self.dead_threads = self._loop.dead_threads
 
     def start(self) -> None:
-        """Begin: the camera first."""
+        """Start the camera, then the thread."""
         self._camera.start()
-        self._thread.start()
-
-    def fire(self, index: int) -> None:
-        """Hand an expected shot to the camera. Never raises: a shot that the driver won't take has failed."""
-        try:
-            self._camera.fire(index)
-        except Exception as error:  # noqa: BLE001  # any driver's; the shot is written down already and must come to an end
-            reason = f"the camera driver did not take the shot: {sentence(error)}"
-            self._unfired.append(ShotFailed(index, reason, time.monotonic_ns()))
+        self._loop.start()
 
     def stop(self, timeout_s: float) -> None:
-        """Wait for what is with the camera, at most `timeout_s`; let go of it. Shots without a file have failed."""
+        """Wait at most `timeout_s` for what is with the camera, then release it. Shots without a file have failed."""
         self._give_up_at = time.monotonic() + timeout_s
-        self._stopping.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout_s + 1)
-        self._shots.tell(self._camera.stop)
-        if not self._thread.is_alive():
+        ended = self._loop.stop(timeout_s + 1)
+        self._ends.tell(self._camera.stop)
+        if ended:
             self._last_events()
 
     def _run(self) -> None:
-        while not self._stopping.is_set() or self._worth_waiting():
+        while not self._loop.stopping.is_set() or self._worth_waiting():
             self._take(_LOOK_S)
 
     def _worth_waiting(self) -> bool:
-        return time.monotonic() < self._give_up_at and bool(self._shots.waiting())
+        return time.monotonic() < self._give_up_at and bool(self._shots.open())
 
     def _last_events(self) -> None:
-        """What came while the camera was let go of; then every shot that is still open has failed."""
+        """Take what came while the camera was released; then every shot that is still open has failed."""
         until = time.monotonic() + _LAST_EVENTS_S
         while time.monotonic() < until and self._take(0.0):
             pass
-        for index in self._shots.waiting():
+        for index in self._shots.open():
             self._handle(ShotFailed(index, "the flight ended before its file came", time.monotonic_ns()))
 
     def _take(self, timeout_s: float) -> bool:
         """Pull one event and act on it; False where none came in time."""
         try:
-            event = self._unfired.popleft() if self._unfired else self._camera.next_event(timeout_s)
-        except Exception as error:  # noqa: BLE001  # any driver's; the capture goes on, at a pace that leaves others their time
+            event = self._shots.unfired() or self._camera.next_event(timeout_s)
+        except Exception as error:  # noqa: BLE001  # any driver's; go on, slowly enough for other threads
             report(log, "the camera driver", error)
             time.sleep(_LOOK_S)
             return True
@@ -119,17 +311,25 @@ class Capture:
             elif isinstance(event, Deferred):
                 self._deferred(event)
             elif isinstance(event, SettingsChanged):
-                self._shots.tell(self._observer.settings, event)
+                self._ends.tell(self._observer.settings_changed, event)
         except Exception as error:  # noqa: BLE001  # one event that goes wrong must not end the capture
             report(log, "capture", error)
 
     def _state_changed(self, change: StateChanged) -> None:
-        self.state, self.reason = change.state, change.reason
-        if not self._stopping.is_set():
-            self._shots.tell(self._observer.camera, change)
+        self._shots.state, self._shots.reason = change.state, change.reason
+        if not self._loop.stopping.is_set():
+            self._ends.tell(self._observer.camera_changed, change)
+
+    def _enter(self, index: int | None) -> None:
+        """Write a shot's row before its first event. Raises FlightError; the next event tries again."""
+        pending = None if index is None else self._shots.of_file(index)
+        if pending is not None and not pending.entered:
+            self._writer.requested(pending.shot)
+            pending.entered = True
 
     def _fired(self, event: Fired) -> None:
-        self._writer.fired(event)  # raises for a second time, or one after the file: the first word counts
+        self._enter(event.shot)
+        self._writer.fired(event)  # raises for a second time, or one after the file: the first report counts
         if pending := self._shots.in_hand(event.shot):
             pending.fired = event
             pending.ms["wish to trigger"] = (event.called_monotonic_ns - pending.shot.wished_monotonic_ns) / 1e6
@@ -138,54 +338,55 @@ class Capture:
     def _shot_failed(self, index: int, reason: str) -> None:
         pending = self._shots.in_hand(index)
         if pending is not None and pending.frame is not None:
-            self._shots.note("contradiction", f"its file is safe, and then the driver says: {reason}", index)
+            self._ends.note("contradiction", f"its file is safe, and then the driver says: {reason}", index)
             return
         try:
+            self._enter(index)
             self._writer.failed(index, reason)
         finally:
             if pending is not None:
-                self._shots.fail(pending, reason)
+                self._ends.fail(pending, reason)
 
     def _arrived(self, arrival: Arrival) -> None:
         began = time.monotonic_ns()
-        index = arrival.shot
-        pending = None if index is None else self._shots.of_file(index)
+        pending = None if arrival.shot is None else self._shots.of_file(arrival.shot)
         try:
-            frame = self._writer.record(index, arrival.name, arrival.blob)
+            self._enter(arrival.shot)
+            frame = self._writer.record(arrival.shot, arrival.name, arrival.blob)
         except Exception as error:
             # The recorder has noted it as far as the disk lets it. A second file doesn't undo the first one.
             if pending is not None and pending.frame is None and not pending.over:
-                self._shots.fail(pending, sentence(error))
+                self._ends.fail(pending, sentence(error))
             raise
         finally:
             arrival.blob.close()
-        self._shots.tell(self._camera.release, arrival)
+        self._ends.tell(self._camera.release, arrival)
         if pending is None or pending.frame is not None:
             return
-        pending = self._shots.safe(pending, frame)
+        pending = self._ends.safe(pending, frame, arrival.name)
         if doubt := arrival.facts.get("doubt"):
             pending.doubt = str(doubt)
-            self._shots.note("doubt", pending.doubt, frame.index)
+            self._ends.note("doubt", pending.doubt, frame.index)
         if pending.fired:
             pending.ms["trigger to file"] = (arrival.monotonic_ns - pending.fired.returned_monotonic_ns) / 1e6
         pending.ms["record"] = (time.monotonic_ns() - began) / 1e6
-        self._shots.welcome(pending, frame.index, arrival.name)
-        self._shots.tell(self._observer.settled, frame.index, True)
-        self._hand_on(pending)
+        self._ends.tell(self._observer.settled, frame.index, True)
+        self._on_done(pending)
 
     def _accompanied(self, companion: Companion) -> None:
         try:
             self._writer.companion(companion.shot, companion.name, companion.blob)
         finally:
             companion.blob.close()
-        self._shots.tell(self._camera.release, companion)
+        self._ends.tell(self._camera.release, companion)
 
     def _deferred(self, event: Deferred) -> None:
-        """The end of a shot whose file comes later: where it was exposed can be told now."""
+        """The end of a shot whose file comes later: where it was exposed can be reported now."""
         try:
+            self._enter(event.shot)
             self._writer.follows(event.shot, event.reason)
         finally:
             pending = self._shots.in_hand(event.shot)
             if pending is not None and pending.frame is None:
-                self._shots.follow(pending, event.reason)
-                self._hand_on(pending)
+                self._ends.follow(pending, event.reason)
+                self._on_done(pending)

@@ -1,7 +1,7 @@
-"""The one-way street: camera events → record → tag → decode → publish, the same for a live flight and a replay.
+"""Run the stages of a flight: camera events → record → tag → decode → publish, the same live and in a replay.
 
-Each crossing is a bounded queue (see `stages`). What differs between a flight and a replay is handed in: the camera,
-the book that is written or compared, where poses come from.
+Between two stages stands a bounded queue (see `workers`). What differs between a flight and a replay is handed in: the
+camera, the writer that records or compares, and the source of poses.
 """
 
 from __future__ import annotations
@@ -10,30 +10,31 @@ import time
 from collections.abc import Callable
 
 from dappled.daemon.navigation import BodyLatency
-from dappled.daemon.pipeline.capture import Capture
-from dappled.daemon.pipeline.decode_process import FrameDecoder
-from dappled.daemon.pipeline.decoding import Decoding
-from dappled.daemon.pipeline.pending_shot import FlightWriter, Names, Observer, PendingShot, PoseSource
-from dappled.daemon.pipeline.pending_shots import PendingShots
-from dappled.daemon.pipeline.tagging import Tagging
+from dappled.daemon.pipeline.capture import Capture, Observer, PendingShot, PendingShots, ShotEnds
+from dappled.daemon.pipeline.decode_process import DecodedFrame, FrameDecoder
+from dappled.daemon.pipeline.flight_writer import FlightWriter
+from dappled.daemon.pipeline.recipes import Names
+from dappled.daemon.pipeline.tagging import PoseSource, Tagging
+from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher
-from dappled.drivers.camera import BodyState, Camera
+from dappled.drivers.camera import Camera
 from dappled.errors import sentence
-from dappled.flight import Shot
-from dappled.workers import Worker
+from dappled.flight import Tag
+from dappled.workers import Statistics, Worker
 
 _TAG_QUEUE = 1000
 
 
 class Pipeline:
-    """Runs the stages. `decoder` None: frames are recorded and tagged, and decoded later."""
+    """Runs the stages over the shots of `shots`. `decoder` None: frames are recorded and tagged, and decoded later."""
 
     def __init__(
         self,
-        *,
         camera: Camera,
+        shots: PendingShots,
         writer: FlightWriter,
         poses: PoseSource,
+        *,
         decoder: FrameDecoder | None,
         publisher: Publisher | None,
         latency: BodyLatency,
@@ -42,20 +43,10 @@ class Pipeline:
         decode_queue: int,
         preview_interval_s: float = 0.0,
     ) -> None:
-        self._decodes = decoder is not None
-        self.decoding = self._decodes  # off: frames are recorded and tagged, and decoded on the ground
-        self._shots = PendingShots(writer, observer)
-        tagging = Tagging(
-            writer,
-            self._shots,
-            observer,
-            publisher,
-            poses=poses,
-            latency=latency,
-            names=names,
-            hand_on=self._tagged,
-        )
-        decoding = decoder and Decoding(writer, self._shots, decoder, publisher, preview_interval_s)
+        self._shots, self._decodes = shots, decoder is not None
+        self._ends = ShotEnds(shots, writer, observer)
+        tagging = Tagging(self._ends, poses, publisher, latency=latency, names=names, on_done=self._tagged)
+        decoding = decoder and Decoding(self._ends, decoder, publisher, preview_interval_s)
         self._tag: Worker[PendingShot] = Worker(
             "tag",
             tagging.work,
@@ -65,67 +56,83 @@ class Pipeline:
         )
         self._decode: Worker[PendingShot] = Worker(
             "decode",
-            decoding.work if decoding else self._shots.finish,
+            decoding.work if decoding else self._ends.finish,
             capacity=decode_queue,
-            on_failure=lambda pending, error: self._shots.leave(pending, "not decoded", sentence(error)),
+            on_failure=lambda pending, error: self._ends.leave(pending, "not decoded", sentence(error)),
             on_drop=self._dropped("not decoded"),
         )
-        self._capture = Capture(camera, writer, self._shots, observer, self._tag.put)
-        self.stages = (self._tag, self._decode)
+        self._capture = Capture(camera, self._ends, self._tag.put)
 
     def start(self) -> None:
-        """Begin: the camera last, so that whatever it tells finds somebody at work."""
-        for stage in self.stages:
-            stage.start()
+        """Start the last stage first and the camera last, so that each event finds its stage running."""
+        self._tag.start()
+        self._decode.start()
         self._capture.start()
 
     def stop(self, timeout_s: float) -> None:
-        """Finish what is in hand, at most `timeout_s`; let go of the camera. What is left stays in the record, and a
+        """Finish what is in hand, at most `timeout_s`, and release the camera. What is left stays in the record, and a
         shot without a file has failed."""
         until = time.monotonic() + timeout_s
         self._capture.stop(timeout_s)
-        for stage in self.stages:
+        for stage in (self._tag, self._decode):
             stage.stop(max(1.0, until - time.monotonic()))
 
-    def expect(self, shot: Shot) -> None:
-        """A shot was wished for and written down; `fire` follows."""
-        self._shots.expect(shot)
-
-    def fire(self, index: int) -> None:
-        """Hand an expected shot to the camera. Never raises: a shot that the driver won't take has failed."""
-        self._capture.fire(index)
-
-    @property
-    def camera_state(self) -> BodyState:
-        """The camera's state, as it told last."""
-        return self._capture.state
-
-    @property
-    def camera_reason(self) -> str:
-        """Why it is in that state; "" where there is nothing to say."""
-        return self._capture.reason
-
     def dead_threads(self) -> list[str]:
-        """Which of the street's threads have ended without being asked to: none, unless there is a bug."""
-        return [name for part in (self._capture, *self.stages) for name in part.dead_threads()]
+        """The threads that have ended without having been stopped: none, unless there is a bug."""
+        return [name for part in (self._capture, self._tag, self._decode) for name in part.dead_threads()]
 
-    def decoding_idle(self, timeout_s: float = 5.0) -> bool:
-        """Whether no frame waits to be decoded, at the latest after `timeout_s`."""
-        return self._decode.wait_idle(timeout_s)
-
-    def in_hand(self, index: int) -> bool:
-        """Whether a shot is still on its way down the street, and not tagged yet."""
-        pending = self._shots.in_hand(index)
-        return pending is not None and pending.tag is None
+    def statistics(self) -> tuple[Statistics, ...]:
+        """Counters of each stage's queue."""
+        return self._tag.statistics(), self._decode.statistics()
 
     def _tagged(self, pending: PendingShot) -> None:
-        if self.decoding:
+        if self._shots.decoding:
             self._decode.put(pending)
         else:
             if self._decodes:
-                self._shots.note("not decoded", "decoding was switched off", pending.shot.index)
-            self._shots.finish(pending)
+                self._ends.note("not decoded", "decoding was switched off", pending.shot.index)
+            self._ends.finish(pending)
 
     def _dropped(self, what: str) -> Callable[[PendingShot], None]:
         why = "the queue was full, or the flight ended; the frame is in the record"
-        return lambda pending: self._shots.leave(pending, what, why)
+        return lambda pending: self._ends.leave(pending, what, why)
+
+
+class Decoding:
+    """Decode one shot's frame after the other, in one thread, and publish its slices.
+
+    At most one preview is published in `preview_interval_s`.
+    """
+
+    def __init__(
+        self, ends: ShotEnds, decoder: FrameDecoder, publisher: Publisher | None, preview_interval_s: float
+    ) -> None:
+        self._ends, self._decoder, self._publisher = ends, decoder, publisher
+        self._preview_interval_s, self._last_preview_s = preview_interval_s, -1e9
+
+    def work(self, pending: PendingShot) -> None:
+        """Decode a tagged frame, record the result, publish it, and end the shot. Raises DecodeProcessError."""
+        frame, tag = pending.frame, pending.tag
+        assert frame is not None
+        assert tag is not None
+        began = time.monotonic_ns()
+        writer = self._ends.writer
+        decoded = self._decoder.develop(writer.path(frame), tag.focal_length_mm, tag.f_number)
+        pending.decoded = decoded
+        writer.decoded(decoded.result(frame.index, (time.monotonic_ns() - began) / 1e6))
+        pending.ms["decode"] = (time.monotonic_ns() - began) / 1e6
+        began = time.monotonic_ns()
+        self._publish(tag, decoded)
+        pending.ms["publish"] = (time.monotonic_ns() - began) / 1e6
+        self._ends.finish(pending)
+
+    def _publish(self, tag: Tag, decoded: DecodedFrame) -> None:
+        if self._publisher is None:
+            return
+        self._publisher.publish("slices", wire.slices_header(tag, decoded), decoded.body)
+        now_s = time.monotonic()
+        if decoded.preview and now_s - self._last_preview_s >= self._preview_interval_s:
+            self._last_preview_s = now_s
+            facts = wire.frame_facts(tag, decoded.law)
+            size = {"width": decoded.preview_size[0], "height": decoded.preview_size[1]}
+            self._publisher.publish("preview", {**facts, "media_type": "image/jpeg", **size}, decoded.preview)

@@ -7,21 +7,29 @@ originals have changed.
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
 from dappled.config import profiles
 from dappled.config.settings import Settings
-from dappled.daemon.pipeline.pending_shot import Names
 from dappled.drivers.raw.darkroom import Darkroom, Recipe, camera_name
 from dappled.drivers.raw.recipe import FILES, FOLDER, of_flight
 from dappled.errors import DappledError
 from dappled.flight import durable
 
-__all__ = ["FOLDER", "called", "keep", "names", "of_flight", "recipe", "versions"]
+__all__ = ["FOLDER", "Names", "called", "keep", "names", "of_flight", "recipe", "versions"]
 _LIBRARIES = ("numpy", "scipy", "rawpy", "pyzmq", "pymavlink", "gphoto2", "pillow", "tifffile")
+
+
+@dataclass(frozen=True, slots=True)
+class Names:
+    """What headers and tags call camera, mask and carrier law. `camera` "auto" takes the model that the frame names."""
+
+    camera: str
+    mask: str
+    law: str
 
 
 def recipe(settings: Settings) -> tuple[Names, Recipe | None]:

@@ -12,6 +12,7 @@ from dappled.clock import Clock
 from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
 from dappled.errors import report
 from dappled.flight import Cause, FlightError, Shot
+from dappled.workers import Loop
 
 __all__ = ["CaptureRequest", "ShotDecision", "Shutter", "ShutterStatistics"]
 
@@ -97,11 +98,12 @@ class Shutter:
         self._requests = self._shots = self._duplicates = self._refused = self._succeeded = self._failed = 0
         self._wake = threading.Event()
         self._stopped = False
-        self._thread = threading.Thread(target=self._run, name="shutter intervals", daemon=True)
+        self._loop = Loop("shutter intervals", self._run)
+        self.dead_threads = self._loop.dead_threads
 
     def start(self) -> None:
         """Begin to serve intervals. Single shots need no thread."""
-        self._thread.start()
+        self._loop.start()
 
     def stop(self) -> None:
         """End intervals and refuse from now on."""
@@ -109,12 +111,7 @@ class Shutter:
             self._stopped = True
             self._interval = None
         self._wake.set()
-        if self._thread.is_alive() and self._thread is not threading.current_thread():
-            self._thread.join(2.0)
-
-    def dead_threads(self) -> list[str]:
-        """The thread's name where it has ended without being asked to: never, unless there is a bug."""
-        return [] if self._stopped or self._thread.is_alive() else [self._thread.name]
+        self._loop.stop(2.0)
 
     def request(self, request: CaptureRequest) -> ShotDecision:
         """One message that asks for one shot."""

@@ -1,101 +1,161 @@
-"""The tag stage: when and where a frame was exposed, from its file, its trigger call and the telemetry."""
+"""Tag a frame: when and where it was exposed, from its file, its trigger call and the telemetry."""
 
 from __future__ import annotations
 
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Protocol, Self
 
 from dappled.daemon.navigation import BodyLatency, CameraClock, ExposureTime, clocks
-from dappled.daemon.pipeline import tagger
-from dappled.daemon.pipeline.pending_shot import FlightWriter, Names, Observer, PendingShot, PoseSource
-from dappled.daemon.pipeline.pending_shots import PendingShots
-from dappled.daemon.pipeline.tagger import Zoom
+from dappled.daemon.pipeline.capture import PendingShot, ShotEnds
+from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.stream.publisher import Publisher
 from dappled.daemon.stream.wire import frame_header
+from dappled.decode.geometry import Pose
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
+from dappled.drivers.raw.raw_file import ExposureSettings
 from dappled.errors import DappledError
-from dappled.flight import Frame
+from dappled.flight import Frame, Tag
 
 log = logging.getLogger(__name__)
 
 
+class PoseSource(Protocol):
+    """Poses of a flight: live navigation, or recorded telemetry."""
+
+    def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
+        """The exposure as it is known better, and its pose. `exposure` is as expected. Waits a limited time."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSettings:
+    """What the file says of the exposure; None where it doesn't. `taken` is the camera's own time (see EXIF)."""
+
+    focal_length_mm: float | None = None
+    f_number: float | None = None
+    exposure_s: float | None = None
+    iso: float | None = None
+    model: str = ""
+    taken: str | None = None
+
+    @classmethod
+    def of(cls, facts: ExposureSettings) -> Self:
+        """From a file's metadata."""
+        return cls(facts.focal_length_mm, facts.f_number, facts.exposure_s, facts.iso, facts.model or "", facts.taken)
+
+
+class Zoom:
+    """The focal length from frame to frame. A change in flight moves every carrier."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, float] | None = None
+
+    def look(self, index: int, focal_length_mm: float | None) -> str | None:
+        """A sentence where a frame's focal length differs from that of the last frame that has one."""
+        if focal_length_mm is None:
+            return None
+        before, self._last = self._last, (index, focal_length_mm)
+        if before is None or before[1] == focal_length_mm:
+            return None
+        return f"the focal length is {focal_length_mm:g} mm; it was {before[1]:g} mm at frame {before[0]}"
+
+
+def tag(frame: Frame, exposure: ExposureTime, settings: FrameSettings, *, camera: str, mask: str, pose: Pose) -> Tag:
+    """All that is known of a frame, in one record."""
+    return Tag(
+        index=frame.index,
+        utc_ns=exposure.utc_ns,
+        utc_sigma_ns=exposure.sigma_ns,
+        time_source=exposure.source,
+        focal_length_mm=settings.focal_length_mm,
+        f_number=settings.f_number,
+        exposure_s=settings.exposure_s,
+        iso=settings.iso,
+        camera=camera,
+        mask=mask,
+        frame_sha256=frame.sha256,
+        pose=pose,
+    )
+
+
 class Tagging:
-    """Tags one story after the other, in one thread. `hand_on` takes those with a frame, tagged and published."""
+    """Tag one shot after the other, in one thread. `on_done` takes those with a frame, tagged and published."""
 
     def __init__(
         self,
-        writer: FlightWriter,
-        shots: PendingShots,
-        observer: Observer,
+        ends: ShotEnds,
+        poses: PoseSource,
         publisher: Publisher | None,
         *,
-        poses: PoseSource,
         latency: BodyLatency,
         names: Names,
-        hand_on: Callable[[PendingShot], object],
+        on_done: Callable[[PendingShot], object],
     ) -> None:
-        self._writer, self._shots, self._observer, self._publisher = writer, shots, observer, publisher
-        self._poses, self._latency, self._names, self._hand_on = poses, latency, names, hand_on
+        self._ends, self._poses, self._publisher = ends, poses, publisher
+        self._latency, self._names, self._on_done = latency, names, on_done
         self._zoom = Zoom()
         self._camera_clock = CameraClock()
 
     def work(self, pending: PendingShot) -> None:
-        """Tag a story's frame. Where its file stays at the camera, tell where it was exposed, and end it."""
+        """Tag a shot's frame. Where its file stays at the camera, report where it was exposed, and end it."""
         if pending.frame is None:
-            pending.where = self._poses(pending.shot.index, self._expected(pending, tagger.FrameSettings()))
-            self._shots.tell(self._observer.tagged, pending)
-            self._shots.finish(pending)
+            pending.where = self._poses.pose(pending.shot.index, self._expected(pending, FrameSettings()))
+            self._ends.tell(self._ends.observer.tagged, pending)
+            self._ends.finish(pending)
             return
         self._tag(pending, pending.frame)
-        self._hand_on(pending)
+        self._on_done(pending)
 
     def failed(self, pending: PendingShot, why: str) -> None:
         """A frame that can't be tagged."""
-        self._shots.tell(self._observer.tagged, pending)
-        self._shots.leave(pending, "not tagged", why)
+        self._ends.tell(self._ends.observer.tagged, pending)
+        self._ends.leave(pending, "not tagged", why)
 
     def _tag(self, pending: PendingShot, frame: Frame) -> None:
         began = time.monotonic_ns()
         settings = self._settings(frame)
         if zoomed := self._zoom.look(frame.index, settings.focal_length_mm):
             log.warning("zoom: %s", zoomed)
-            self._shots.note("zoom", zoomed, frame.index)
-        exposure, pose = self._poses(frame.index, self._expected(pending, settings))
-        # A file that may be another shot's would teach another shot's time.
-        if pending.fired and not pending.doubt and (told := clocks.camera_time(settings.taken)):
-            self._camera_clock = self._camera_clock.learnt(*told, exposure)
+            self._ends.note("zoom", zoomed, frame.index)
+        exposure, pose = self._poses.pose(frame.index, self._expected(pending, settings))
+        # The time of a file that may belong to another shot says nothing about the camera's clock.
+        if pending.fired and not pending.doubt and (shown := clocks.camera_time(settings.taken)):
+            self._camera_clock = self._camera_clock.learnt(*shown, exposure)
         if pending.doubt:
             exposure = replace(exposure, source=f"{exposure.source}; in doubt: {pending.doubt}")
         camera = camera_name(self._names.camera, settings.model)
-        pending.tag = tagger.tag(frame, exposure, settings, camera=camera, mask=self._names.mask, pose=pose)
-        self._writer.tagged(pending.tag)
+        pending.tag = tag(frame, exposure, settings, camera=camera, mask=self._names.mask, pose=pose)
+        self._ends.writer.tagged(pending.tag)
         pending.ms["tag"] = (time.monotonic_ns() - began) / 1e6
-        self._shots.tell(self._observer.tagged, pending)
+        self._ends.tell(self._ends.observer.tagged, pending)
         if self._publisher:
             self._publisher.publish("frame", frame_header(pending.tag, frame, self._names.law or None))
 
-    def _settings(self, frame: Frame) -> tagger.FrameSettings:
+    def _settings(self, frame: Frame) -> FrameSettings:
         try:
-            return tagger.FrameSettings.of(reading.read_metadata(self._writer.path(frame)))
+            return FrameSettings.of(reading.read_metadata(self._ends.writer.path(frame)))
         except DappledError as error:
-            self._shots.note("unreadable", str(error), frame.index)
-            return tagger.FrameSettings()
+            self._ends.note("unreadable", str(error), frame.index)
+            return FrameSettings()
 
-    def _expected(self, pending: PendingShot, settings: tagger.FrameSettings) -> ExposureTime:
-        """When the frame was exposed, as far as trigger call and file tell: by the trigger call and the body's latency;
-        by the camera's own clock, where the driver never said when it fired; else by the wish."""
+    def _expected(self, pending: PendingShot, settings: FrameSettings) -> ExposureTime:
+        """When the frame was exposed, as far as trigger call and file say.
+
+        By the trigger call and the body's latency; by the camera's own clock, where the driver did not report when it
+        fired; else by the request.
+        """
         shot = pending.shot
         if pending.fired is not None:
             called_utc_ns = clocks.called_utc_ns(shot, pending.fired.called_monotonic_ns)
             return clocks.mid_exposure(called_utc_ns, self._latency, settings.exposure_s)
-        told = clocks.camera_time(settings.taken)
-        by_camera = told and clocks.exposure_from_camera(self._camera_clock, *told, settings.exposure_s)
+        shown = clocks.camera_time(settings.taken)
+        by_camera = shown and clocks.exposure_from_camera(self._camera_clock, *shown, settings.exposure_s)
         if by_camera:
-            self._shots.note("untimed", "the driver never said when it fired: the camera's clock is used", shot.index)
+            self._ends.note("untimed", "the driver never said when it fired: the camera's clock is used", shot.index)
             return by_camera
-        self._shots.note("untimed", "the driver never said when it fired: the wish's time is used", shot.index)
+        self._ends.note("untimed", "the driver never said when it fired: the request's time is used", shot.index)
         arrived_utc_ns = pending.frame.arrived_utc_ns if pending.frame else None
         return clocks.mid_exposure_by_request(shot.wished_utc_ns, arrived_utc_ns, self._latency, settings.exposure_s)

@@ -1,6 +1,6 @@
-"""Frames that a crash left safe but without a tag get theirs: the flight goes down the street once more, undecoded.
+"""Tag the frames that a crash left safe but without a tag: replay the flight, undecoded.
 
-Trigger calls, telemetry and frames are all in the record, so the tag is what a replay would make of them.
+Trigger calls, telemetry and frames are all in the record, so the tag is the one that a replay makes.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ from pathlib import Path
 
 from dappled.config import settings as configuration
 from dappled.daemon.navigation import BodyLatency
-from dappled.daemon.pipeline.flight_writer import ReplayVerifier
-from dappled.daemon.pipeline.pending_shot import Names, Observer
+from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import RecordedFlight, RecordedTelemetry, ReplayProgress
+from dappled.daemon.replay.verifier import ReplayVerifier
 from dappled.drivers.camera import Blob, Identity
 from dappled.drivers.replay import ReplayCamera
 from dappled.errors import DappledError
@@ -24,7 +25,7 @@ from dappled.flight import FlightsLock, Frame, Ledger, LedgerReader, Tag, layout
 
 
 class MissingTagWriter(ReplayVerifier):
-    """Enters the tags that the ledger lacks, and what is told of their frames; all others stay as they are."""
+    """Writes the tags that the ledger lacks and the events of their frames; all others stay as they are."""
 
     def __init__(self, recording: RecordedFlight, ledger: Ledger) -> None:
         super().__init__(recording.root, recording.expected)
@@ -32,7 +33,7 @@ class MissingTagWriter(ReplayVerifier):
         self.added: list[int] = []
 
     def record(self, index: int | None, name: str, blob: Blob) -> Frame:
-        """See FlightWriter: bytes are the business of `flight check`."""
+        """See FlightWriter: `flight check` verifies the bytes."""
         frame = None if index is None else self.frame(index)
         if frame is None:
             raise DappledError(f"{name} belongs to no recorded frame")
@@ -47,7 +48,7 @@ class MissingTagWriter(ReplayVerifier):
 
     def event(self, kind: str, text: str, index: int | None = None) -> None:
         """See FlightWriter."""
-        if index is not None and self._lacks(index) and kind not in self._expected[index].told:
+        if index is not None and self._lacks(index) and kind not in self._expected[index].events:
             self._ledger.add_event(kind, text, index)
 
     def _lacks(self, index: int) -> bool:
@@ -74,25 +75,28 @@ def add_missing(flight: Path, utc_ns: Callable[[], int]) -> list[int]:
     settings = configuration.of_tables(facts["settings"], str(folder.settings))
     recording = replay.of_flight(flight)
     recording = replace(recording, shots=[shot for shot in recording.shots if shot.index <= max(missing)])
-    progress, time = ReplayProgress.begin(), replay.clock(recording)
+    progress, time = ReplayProgress(), replay.clock(recording)
     with ExitStack() as stack:
         stack.enter_context(FlightsLock(flight.absolute().parent))
         ledger = stack.enter_context(Ledger(folder.ledger, utc_ns))
         writer = MissingTagWriter(recording, ledger)
+        camera = ReplayCamera(recording.files, Identity("dappled", "recording", "", str(flight)), time)
+        shots = PendingShots(camera)
         pipeline = Pipeline(
-            camera=ReplayCamera(recording.files, Identity("dappled", "recording", "", str(flight)), time),
-            writer=writer,
-            poses=RecordedTelemetry.flown(settings, recording.telemetry, recording.horizons, recording.vehicles).pose,
+            camera,
+            shots,
+            writer,
+            RecordedTelemetry.flown(settings, recording.telemetry, recording.horizons, recording.vehicles),
             decoder=None,
             publisher=None,
             latency=BodyLatency.of(settings.camera),
             names=Names(**facts["names"]),
-            observer=Observer(finished=progress.note),
+            observer=progress,
             decode_queue=1,
         )
         pipeline.start()
         stack.callback(pipeline.stop, 5.0)
-        replay.play(recording, pipeline, progress, time=time, pace=None)
+        replay.play(recording, shots, progress, time=time, pace=None)
         for index in writer.added:
             ledger.add_event("tagged late", "the recording ended before its tag was made; it is made now", index)
     return writer.added

@@ -1,4 +1,4 @@
-"""A recorded flight, or a folder of frames, down the same street: what was, again."""
+"""Replay a recorded flight, or a folder of frames, through the pipeline of a live flight."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from typing import Self
 from dappled.clock import RecordedClock
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_vehicles
-from dappled.daemon.pipeline.flight_writer import Expected, ReplayVerifier
-from dappled.daemon.pipeline.pending_shot import PendingShot
-from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
+from dappled.daemon.replay.verifier import Expected, ReplayVerifier
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import Message, PacketParser
 from dappled.drivers.replay import RecordedShot
@@ -167,23 +166,18 @@ class RecordedTelemetry:
         return self._telemetry.locate(exposure, upto_packet=horizon)
 
 
-@dataclass(slots=True)
-class ReplayProgress:
-    """Hands the shots to the street one by one, and knows when each has come to its end."""
+class ReplayProgress(Observer):
+    """Counts the shots of a replay that have come to their end: frames, and frames with a problem."""
 
-    finished: threading.Semaphore
-    frames: int = 0
-    bad: int = 0
+    def __init__(self) -> None:
+        self.ended = threading.Semaphore(0)
+        self.frames = self.bad = 0
 
-    @classmethod
-    def begin(cls) -> ReplayProgress:
-        return cls(threading.Semaphore(0))
-
-    def note(self, pending: PendingShot) -> None:
-        """For `Observer.finished`: counts, and keeps nothing of the story."""
+    def finished(self, pending: PendingShot) -> None:
+        """See Observer."""
         self.frames += pending.frame is not None
         self.bad += bool(pending.problem) and pending.frame is not None
-        self.finished.release()
+        self.ended.release()
 
 
 Pace = Callable[[Shot, Shot | None], None]  # waits between the shot before (None for the first) and this one
@@ -200,40 +194,38 @@ def as_recorded(rate: float, sleep: Callable[[float], None] = sleep) -> Pace:
 
 
 def clock(recording: RecordedFlight) -> RecordedClock:
-    """The recording's clock, at its first wish."""
+    """The recording's clock, at its first capture request."""
     first = recording.shots[0]
     return RecordedClock(first.wished_utc_ns, first.wished_utc_ns - first.wished_monotonic_ns)
 
 
 def play(
     recording: RecordedFlight,
-    pipeline: Pipeline,
+    shots: PendingShots,
     progress: ReplayProgress,
     *,
     time: RecordedClock,
     pace: Pace | None,
     timeout_s: float = 120.0,
 ) -> None:
-    """Play every shot, at its recorded time. Without a pace each waits for the one before, so that nothing is ever
-    dropped."""
+    """Play every shot at its recorded time. Without a pace each waits for the one before, so that none is dropped."""
     before: Shot | None = None
     for shot in recording.shots:
         if pace:
             pace(shot, before)
         time.advance_to(shot.wished_utc_ns)
-        pipeline.expect(shot)
-        pipeline.fire(shot.index)
-        if pace is None and not progress.finished.acquire(timeout=timeout_s):
+        shots.fire(shot)
+        if pace is None and not progress.ended.acquire(timeout=timeout_s):
             raise ReplayError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
         before = shot
     if pace:
         for shot in recording.shots:
-            if not progress.finished.acquire(timeout=timeout_s):
+            if not progress.ended.acquire(timeout=timeout_s):
                 raise ReplayError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
 
 
-def writer(recording: RecordedFlight, keep: Callable[[Result], object] | None = None) -> ReplayVerifier:
-    """The book that compares this recording with what comes down the street, but for results that `keep` takes."""
+def verifier(recording: RecordedFlight, keep: Callable[[Result], object] | None = None) -> ReplayVerifier:
+    """A writer that compares a replay with this recording; `keep` takes results that are not to be compared."""
     return ReplayVerifier(recording.root, recording.expected, keep)
 
 

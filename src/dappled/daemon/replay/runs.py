@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from dappled.daemon.pipeline import recipes
-from dappled.daemon.pipeline.pending_shot import Names
+from dappled.daemon.pipeline.recipes import Names
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import LIVE, Ledger, LedgerReader, Result, layout, provenance

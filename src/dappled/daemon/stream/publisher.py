@@ -26,6 +26,7 @@ from dappled.daemon.stream.curve import ServerKeys
 from dappled.daemon.stream.sockets import Sockets
 from dappled.daemon.stream.wire import Message, WireError
 from dappled.errors import report
+from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
 
@@ -72,7 +73,7 @@ class InFlightLimit:
 
 
 class Publisher:
-    """Publishes messages and passes questions to `answer(request, reply)`, which replies once, from any thread.
+    """Publishes messages, and passes on questions to what answers them.
 
     `slices` and `ask` are the endpoints; with `ask` "" no question is answered. `keys` turn CURVE on for tcp, `mode`
     is the file mode of ipc sockets. `private` is a further ipc endpoint for processes of the daemon itself; its
@@ -84,16 +85,14 @@ class Publisher:
         slices: str,
         ask: str,
         *,
-        answer: Answer,
-        flight: str = "",
         high_water_mark: int = 12,
         capacity: int = 8,
         keys: ServerKeys | None = None,
         mode: int = 0o660,
         private: str = "",
     ) -> None:
-        self._flight = flight
-        self._answer = answer
+        self._flight = ""
+        self._answer: Answer | None = None
         self._capacity = capacity
         self._lock = threading.Lock()
         self._waiting: deque[tuple[bytes, Message]] = deque()  # (peer of a reply, or b"" for the stream; message)
@@ -105,7 +104,6 @@ class Publisher:
         self._start: Message | None = None
         self._unread_stacks, self._unread_answers = InFlightLimit(UNREAD_STACKS), InFlightLimit(UNREAD_ANSWERS)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._stopping = threading.Event()
         self._way_is_free = threading.Event()
         self._way_is_free.set()
         self._closed = False
@@ -117,12 +115,16 @@ class Publisher:
         except WireError:
             os.close(self._wake)
             raise
-        self._thread = threading.Thread(target=self._run, name="publisher", daemon=True)
+        self._loop = Loop("publisher", self._run)
+        self.dead_threads = self._loop.dead_threads
 
-    def start(self, flight: str = "") -> None:
-        """Start to send and to listen. `flight` is the name in the headers."""
-        self._flight = flight or self._flight
-        self._thread.start()
+    def start(self, flight: str, answer: Answer) -> None:
+        """Start to send and to listen. `flight` is the name in the headers.
+
+        Questions are passed to `answer(request, reply)`, which replies once, from any thread.
+        """
+        self._flight, self._answer = flight, answer
+        self._loop.start()
 
     def publish(self, topic: str, facts: Mapping[str, Any], body: Any = None) -> None:
         """Queue a message; `seq`, `dropped` and the rest of the envelope are added when it is sent. Never waits.
@@ -156,20 +158,14 @@ class Publisher:
                 self._sockets.wrong_keys,
             )
 
-    def dead_threads(self) -> list[str]:
-        """The thread's name if it has ended without a call of `stop`."""
-        begun = self._thread.ident is not None
-        return [self._thread.name] if begun and not self._thread.is_alive() and not self._stopping.is_set() else []
-
     def stop(self, grace_s: float = 2.0) -> None:
         """Send what waits, answer questions until none has come for half a second (at most `grace_s`), then close."""
-        if self._stopping.is_set():
+        if self._loop.stopping.is_set():
             return
         self._grace_s = grace_s
-        self._stopping.set()
+        self._loop.stopping.set()
         self._ring()
-        if self._thread.is_alive():
-            self._thread.join(grace_s + 3)
+        self._loop.stop(grace_s + 3)
         self._sockets.close(grace_s)
         with self._lock:
             self._closed = True  # a late answer must not write to a descriptor that is reused by then
@@ -200,7 +196,7 @@ class Publisher:
             self._sockets.let_in()
             self._send_waiting()
             self._read_questions()
-            if self._stopping.is_set():
+            if self._loop.stopping.is_set():
                 quiet_rounds = 0 if self._open_questions or self._waiting else quiet_rounds + 1
                 if quiet_rounds > 5 or self._grace_s <= 0:
                     return
@@ -318,6 +314,7 @@ class Publisher:
                 self._reply_to(peer, None)(Message("error", {"error": str(error)}))
                 continue
             reply = self._reply_to(peer, request)
+            assert self._answer is not None  # `start` came with it
             try:
                 if request["get"] == "start" and self._start is not None:
                     reply(self._start)

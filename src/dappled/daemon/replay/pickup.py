@@ -17,8 +17,8 @@ from typing import Any
 
 from dappled.config import settings as configuration
 from dappled.daemon.navigation import BodyLatency, clocks, recorded_vehicles
-from dappled.daemon.pipeline import tagger
-from dappled.daemon.pipeline.tagger import Zoom
+from dappled.daemon.pipeline import tagging
+from dappled.daemon.pipeline.tagging import Zoom
 from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
@@ -149,7 +149,7 @@ def bring(
             exposure = clocks.mid_exposure(_called_utc_ns(row), latency, facts_of.exposure_s)
             exposure, pose = telemetry.pose(number, exposure)
             camera = camera_name(names.get("camera", "auto"), facts_of.model)
-            ledger.add_tag(tagger.tag(frame, exposure, facts_of, camera=camera, mask=names.get("mask", ""), pose=pose))
+            ledger.add_tag(tagging.tag(frame, exposure, facts_of, camera=camera, mask=names.get("mask", ""), pose=pose))
             index.put(IndexEntry(number, folder.name, frame.name, "safe"))
             if zoomed := zoom.look(number, facts_of.focal_length_mm):
                 zooms.append(f"frame {number}: {zoomed}")
@@ -227,8 +227,8 @@ def _accompany(recorder: Recorder, source: FileSource, index: int, found: FoundF
         blob.close()
 
 
-def _settings(path: Path) -> tagger.FrameSettings:
+def _settings(path: Path) -> tagging.FrameSettings:
     try:
-        return tagger.FrameSettings.of(reading.read_metadata(path))
+        return tagging.FrameSettings.of(reading.read_metadata(path))
     except DappledError:
-        return tagger.FrameSettings()  # a frame that nobody can read is a frame all the same
+        return tagging.FrameSettings()  # a frame that nobody can read is a frame all the same

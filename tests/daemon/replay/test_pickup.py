@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from dappled.daemon.pipeline import pickup
-from dappled.daemon.pipeline.pickup import Choice, PickupError
+from dappled.daemon.replay import pickup
+from dappled.daemon.replay.pickup import Choice, PickupError
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
 from dappled.flight import recording

@@ -1,0 +1,127 @@
+"""Answer what the shutter and the ground station ask of a running flight: may a shot be taken, which camera is it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dappled.clock import Clock
+from dappled.daemon.camera_protocol import camera_status
+from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, Storage
+from dappled.daemon.flight_handover import FlightHandover, LiveSettings
+from dappled.daemon.health.status_text import Alarms
+from dappled.daemon.navigation import Navigation
+from dappled.daemon.pipeline.capture import PendingShots
+from dappled.daemon.pipeline.flight_writer import LedgerWriter
+from dappled.daemon.pipeline.shutter import CaptureRequest
+from dappled.decode.geometry import Pose
+from dappled.drivers.camera import Identity
+from dappled.drivers.mavlink import MavlinkLinks
+from dappled.flight import Recording, Shot
+
+
+class FlightControl:
+    """The ShotSink and the CameraModel of one live flight.
+
+    `handover` takes what the next flight is flown with; None: there is none. `well` is whether everything works that
+    photographs are taken and kept with, as the working loop saw it last. `identity`, `focal_length_mm` and `chip` are
+    what the camera reported last; ShotEvents sets them.
+    """
+
+    def __init__(
+        self,
+        settings: LiveSettings,
+        clock: Clock,
+        recording: Recording,
+        *,
+        shots: PendingShots,
+        writer: LedgerWriter,
+        navigation: Navigation,
+        links: MavlinkLinks,
+        alarms: Alarms,
+        handover: FlightHandover | None,
+    ) -> None:
+        self._settings, self._clock, self._recording, self._shots = settings, clock, recording, shots
+        self._writer, self._navigation, self._links, self._alarms = writer, navigation, links, alarms
+        self._handover = handover
+        self.well = True
+        self.identity: Identity | None = None
+        self.focal_length_mm: float | None = None
+        self.chip: dict[str, Any] = camera_status.sensor_facts(settings.now, "")
+
+    # ShotSink
+
+    def obstacle(self) -> str | None:
+        """See ShotSink."""
+        if self._handover is not None and self._handover.next is not None:
+            return "the next flight begins in a moment, with what the ground station has set"
+        if self._shots.state not in ("ready", "busy"):
+            return self._shots.camera_sentence()
+        disk = camera_status.disk_storage(self._recording.folder.path)
+        if disk is None:
+            return f"the disk of {self._recording.folder.path} can't be read: is it still mounted?"
+        if disk.available < self._settings.now.record.min_free_mb * 1_000_000:
+            return f"the disk is nearly full: {disk.available // 1_000_000} MB left, record.min_free_mb is more"
+        return None
+
+    def note(self, shot: Shot) -> None:
+        """See ShotSink."""
+        self._recording.journal.note(shot)
+
+    def fire(self, shot: Shot) -> None:
+        """See ShotSink."""
+        self._shots.fire(shot)
+
+    def refused(self, request: CaptureRequest, reason: str) -> None:
+        """See ShotSink."""
+        self._writer.later("refused", f"{request.kind} from {request.source}: {reason}")
+
+    # CameraModel
+
+    @property
+    def mount(self) -> tuple[float, ...]:
+        """See CameraModel."""
+        return self._settings.now.pose.mount
+
+    def facts(self) -> CameraFacts:
+        """See CameraModel."""
+        return camera_status.camera_facts(self.identity, self.focal_length_mm, self.chip)
+
+    def storage(self) -> Storage | None:
+        """See CameraModel."""
+        return camera_status.disk_storage(self._recording.folder.path)
+
+    def lookup(self, index: int) -> Captured | None:
+        """See CameraModel."""
+        if self._shots.untagged(index):
+            return None  # its own message will come
+        return camera_status.captured_image(index, self._recording.index)
+
+    def pose(self) -> Pose | None:
+        """See CameraModel."""
+        return self._navigation.pose_now()
+
+    def healthy(self) -> bool:
+        """See CameraModel."""
+        return self.well
+
+    def troubled(self) -> bool:
+        """See CameraModel."""
+        return self._alarms.troubled
+
+    # what parameters and depth lead to
+
+    def decoding(self) -> str:
+        """The value of LF_DECODE."""
+        return "on" if self._shots.decoding else "off"
+
+    def set_decoding(self, value: str) -> None:
+        """Decode in flight, or leave it to the ground."""
+        self._shots.decoding = value == "on"
+        self._writer.later("decoding", f"{value} from now on, by the ground station")
+
+    def send_distance(self, nearest_m: tuple[float, float]) -> None:
+        """Send the nearest distance and its standard error to the autopilot."""
+        boot_ms = (self._clock.monotonic_ns() // 10**6) % 2**32
+        message = camera_status.distance_message(nearest_m, boot_ms, self.mount)
+        if message is not None:
+            self._links.send(message)

@@ -1,0 +1,100 @@
+"""Report what becomes of shots and camera: to shutter, ground station, logbook, live depth and outside observers."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+from dappled.config.settings import Settings
+from dappled.daemon.camera_protocol import camera_status
+from dappled.daemon.camera_protocol.component import Component
+from dappled.daemon.flight_control import FlightControl
+from dappled.daemon.health.logbook import Logbook, battery_doubt, of_shot
+from dappled.daemon.pipeline.capture import Observer, PendingShot
+from dappled.daemon.pipeline.live_depth import LiveDepth
+from dappled.daemon.pipeline.shutter import Shutter
+from dappled.drivers.camera import Identity, SettingsChanged, StateChanged
+from dappled.drivers.mavlink import mavlink
+from dappled.errors import DappledError, report
+from dappled.flight import Recording
+
+log = logging.getLogger(__name__)
+
+
+class ShotEvents(Observer):
+    """Observes a live pipeline. `utc_ns` corrects a stamp of this flight, None while that can't be done.
+
+    `outside` is called last. `doubt` is a sentence where the camera will soon stop working.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        recording: Recording,
+        control: FlightControl,
+        *,
+        shutter: Shutter,
+        component: Component,
+        logbook: Logbook,
+        depth: LiveDepth | None,
+        outside: Observer,
+        utc_ns: Callable[[int], int | None],
+    ) -> None:
+        self._settings, self._recording, self._control = settings, recording, control
+        self._shutter, self._component, self._logbook = shutter, component, logbook
+        self._depth, self._outside, self._utc_ns = depth, outside, utc_ns
+        self.doubt: str | None = None
+
+    def settled(self, index: int, ok: bool) -> None:
+        """See Observer."""
+        self._shutter.settled(index, ok)
+        self._outside.settled(index, ok)
+
+    def tagged(self, pending: PendingShot) -> None:
+        """See Observer."""
+        captured = camera_status.captured_shot(pending, self._utc_ns)
+        self._component.announce(captured)
+        if not captured.ok:
+            self._component.say(f"image {pending.shot.index} failed: {pending.problem}", mavlink.MAV_SEVERITY_ERROR)
+        if pending.tag is not None:
+            before_mm, now_mm = self._control.focal_length_mm, pending.tag.focal_length_mm
+            if before_mm and now_mm and before_mm != now_mm:
+                text = f"image {pending.shot.index} was zoomed from {before_mm:g} to {now_mm:g} mm: is it calibrated?"
+                self._component.say(text)
+            self._control.focal_length_mm = now_mm or before_mm
+        self._outside.tagged(pending)
+
+    def finished(self, pending: PendingShot) -> None:
+        """See Observer."""
+        self._logbook.add(*of_shot(pending))
+        if self._depth is not None:
+            self._depth.offer(pending)
+        self._outside.finished(pending)
+
+    def camera_changed(self, change: StateChanged) -> None:
+        """See Observer."""
+        log.debug("camera %s %s", change.state, change.reason)
+        if change.state != "busy" and not (change.state == "ready" and self._control.identity):
+            reason = f": {change.reason}" if change.reason else ""
+            calm = change.state in ("ready", "starting")
+            self._logbook.add(f"camera {change.state}{reason}", "info" if calm else "warning")
+        self._component.state_changed()
+        if change.identity is not None and change.identity != self._control.identity:
+            self._meet(change.identity)
+        self._outside.camera_changed(change)
+
+    def settings_changed(self, change: SettingsChanged) -> None:
+        """See Observer."""
+        self.doubt = battery_doubt(change.settings)
+        self._component.settings_changed(change.refused)
+        self._outside.settings_changed(change)
+
+    def _meet(self, camera: Identity) -> None:
+        """Take note of the first camera, or of another one."""
+        self._control.identity = camera
+        self._control.chip = camera_status.sensor_facts(self._settings, camera.model)
+        facts = {"make": camera.make, "model": camera.model, "serial": camera.serial, "port": camera.port}
+        try:
+            self._recording.add_facts({"camera": facts})
+        except DappledError as error:
+            report(log, "camera", error)

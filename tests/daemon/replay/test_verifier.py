@@ -1,0 +1,91 @@
+"""What a replay compares with the record."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dappled.daemon.replay.verifier import Expected, ReplayVerifier
+from dappled.drivers.camera import Blob
+from dappled.errors import DappledError
+from dappled.flight import Cause, Frame, Result, Shot, ShotRow, Tag, digest
+from tests.daemon.fakes import no_pose
+
+SHOT = Shot(0, Cause("test", "console", 1), 10, 20)
+DATA = b"raw bytes"
+
+
+def tag(frame: Frame) -> Tag:
+    return Tag(frame.index, 1, 2, "test", 50.0, 8.0, 0.001, 100.0, "camera", "mask", frame.sha256, no_pose())
+
+
+def replay(tmp_path: Path, **digests: Any) -> tuple[ReplayVerifier, Frame]:
+    """The verifier of a replay of one frame, which stands on disk."""
+    blob = Blob.of(DATA)
+    from dappled.flight import durable  # noqa: PLC0415  # used here only
+
+    frame = Frame(0, "000000.dng", "IMG.DNG", len(DATA), durable.hash_descriptor(blob.fd, blob.size), 5)
+    blob.close()
+    row = ShotRow(SHOT, "safe", None, 30, 40)
+    given: dict[str, Any] = {
+        "pose_sha256": digest(no_pose()),
+        "tag_sha256": digest(tag(frame)),
+        "slices_sha256": "5" * 64,
+        **digests,
+    }
+    return ReplayVerifier(tmp_path, [Expected(row, frame, **given)]), frame
+
+
+def play(verifier: ReplayVerifier, frame: Frame, data: bytes = DATA, slices: str = "5" * 64) -> list[str]:
+    blob = Blob.of(data) if data else Blob(Blob.of(b"x").fd, 0)
+    verifier.record(0, "IMG.DNG", blob)
+    blob.close()
+    verifier.tagged(tag(frame))
+    verifier.decoded(Result(0, slices, 1, 1, "geometric", "predicted", 1.0, "replay"))
+    return verifier.verdict()
+
+
+def test_the_same_again_has_no_differences(tmp_path: Path) -> None:
+    verifier, frame = replay(tmp_path)
+    assert play(verifier, frame) == []
+    assert verifier.tag(0) == tag(frame)
+
+
+@pytest.mark.parametrize("data", [b"raw bytez", b"raw", b""])
+def test_other_bytes_are_a_difference(tmp_path: Path, data: bytes) -> None:
+    verifier, frame = replay(tmp_path)
+    assert any("is not the file that was recorded" in text for text in play(verifier, frame, data))
+
+
+@pytest.mark.parametrize("what", ["pose", "tag", "slices"])
+def test_another_or_a_missing_hash_is_a_difference(tmp_path: Path, what: str) -> None:
+    verifier, frame = replay(tmp_path, **{f"{what}_sha256": "0" * 64})
+    assert play(verifier, frame) == [f"frame 0: its {what} came out different"]
+    verifier, frame = replay(tmp_path, **{f"{what}_sha256": None})
+    assert play(verifier, frame) == [f"frame 0: the record holds no hash of its {what}"]
+
+
+def test_a_frame_that_the_flight_left_undecoded_has_no_slices_to_differ(tmp_path: Path) -> None:
+    left = {"slices_sha256": None, "events": frozenset({"not decoded"})}
+    verifier, frame = replay(tmp_path, **left)
+    assert play(verifier, frame) == []  # the replay could decode it
+    verifier, frame = replay(tmp_path, **left)
+    recorded_again = Blob.of(DATA)
+    verifier.record(0, "IMG_0001.DNG", recorded_again)
+    verifier.tagged(tag(frame))
+    assert verifier.verdict() == []  # nor can the replay
+    verifier, frame = replay(tmp_path, events=frozenset({"not decoded"}))
+    verifier.tagged(tag(frame))
+    assert verifier.verdict() == ["frame 0: its slices did not come out of the replay"]  # somebody decoded it after all
+
+
+def test_what_did_not_come_is_a_difference(tmp_path: Path) -> None:
+    verifier, _ = replay(tmp_path)
+    verifier.failed(0, "can't be read")
+    text = "\n".join(verifier.verdict())
+    for word in ("frame 0: can't be read", "its pose did not", "its tag did not", "its slices did not"):
+        assert word in text
+    with pytest.raises(DappledError, match="no recorded frame"):
+        verifier.record(None, "x", Blob.of(b"x"))
