@@ -1,5 +1,5 @@
 """What the MAVLink side answers in: acknowledgements while both cores decode and while the camera hangs, the way from
-a wish to the driver's call, and what 1000 messages a second cost.
+a request to the driver's call, and what 1000 messages a second cost.
 
 python benchmarks/mavlink.py [--json] [--seconds 30] [--nice -5]
 
@@ -90,7 +90,7 @@ def idle_share(folder: Path, seconds: float) -> dict[str, float]:
 
 def under_load(folder: Path, seconds: float, nice: int) -> dict[str, float]:
     """Acknowledgements (ms) at 200 messages a second: while frames are decoded on both cores, then with a camera that
-    answers nothing; and how long wishes took to the driver's trigger call."""
+    answers nothing; and how long requests took to the driver's trigger call."""
     folder.mkdir()
     port = free_port()
     base = _settings(folder)
