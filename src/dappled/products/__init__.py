@@ -1,1 +1,1 @@
-"""What is made from frames and flights on the ground: light-field files, pictures."""
+"""Products of frames and flights: geotags, maps, exports and batches. Everything here runs on the ground."""

@@ -1,4 +1,4 @@
-"""The lens from pictures of a chessboard: distance, principal point and distortion, and how well they are known."""
+"""Calibrate a lens from pictures of a chessboard: distance, principal point, distortion, and their uncertainty."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ Floats = NDArray[np.float64]
 LEAST_BOARDS = 5
 _WORST_V = 0.02  # relative σ of v that is still a calibration
 _LEAST_SPREAD = math.radians(20)  # between the boards' directions
-_UNITS = 1000.0  # OpenCV likes numbers of the size of pixels: micrometres
+_UNITS = 1000.0  # micrometres: OpenCV expects numbers of the size of pixels
 
 
 class ChessboardError(DappledError):
-    """Pictures that don't calibrate a lens; one sentence."""
+    """The pictures don't calibrate a lens."""
 
 
 @dataclass(frozen=True, slots=True)
 class LensFit:
-    """`residual_um` rms on the chip, `v_sigma_mm` one standard deviation, from so many boards."""
+    """A fitted lens: `residual_um` is rms on the chip, `v_sigma_mm` one standard deviation."""
 
     lens: Lens
     residual_um: float
@@ -37,14 +37,14 @@ class LensFit:
 
 
 def corners(image: NDArray[np.floating], board: tuple[int, int]) -> Floats | None:
-    """(columns · rows, 2) pixels (x, y) of a board's inner corners, row by row; None where it isn't seen whole.
+    """(columns · rows, 2) pixels (x, y) of a board's inner corners, row by row; None where it isn't seen completely.
 
     `board` counts inner corners: (columns, rows).
     """
     cv2 = need("cv2")
     low, high = np.percentile(image, (1, 99))
     eight = np.round(255 * np.clip((image - low) / max(high - low, 1e-12), 0, 1)).astype(np.uint8)
-    for find in (cv2.findChessboardCorners, cv2.findChessboardCornersSB):  # each sees boards that the other doesn't
+    for find in (cv2.findChessboardCorners, cv2.findChessboardCornersSB):  # each finds boards that the other misses
         seen, found = find(eight, board)
         if seen:
             break
@@ -60,9 +60,9 @@ def corners(image: NDArray[np.floating], board: tuple[int, int]) -> Floats | Non
 def fit(
     seen: Sequence[Floats], grids: Sequence[Floats], *, board: tuple[int, int], sensor: Sensor, focal_length_mm: float
 ) -> LensFit:
-    """The lens from corners (n, 2) in pixels of views, each with its `grid` to the sensor, as in `LightField`.
+    """Fit the lens to corners (n, 2) in pixels of views, each with its `grid` to the sensor, as in `LightField`.
 
-    Raises ChessboardError where there are too few boards, or they don't tell the lens' distance.
+    Raises ChessboardError where there are too few boards, or they leave the lens' distance uncertain.
     """
     if len(seen) < LEAST_BOARDS:
         raise ChessboardError(

@@ -313,7 +313,7 @@ def test_the_command_makes_copies_and_says_what_it_could_not(
     said = capsys.readouterr()
     assert json.loads(said.out)["copies"] == []
     assert json.loads(said.out)["geoid"] == "constant 12.5 m"
-    assert "no copy of frames/000000.cr2: it is no TIFF-like raw" in said.err
+    assert "no copy of frames/000000.cr2: it is not a TIFF-like raw" in said.err
     assert main(["geotag", str(flight), "--copies", str(flight / "frames")]) == 1
     assert "into the flight itself" in capsys.readouterr().err
     assert main(["geotag", str(flight), "--geoid", str(tmp_path / "none.gtx")]) == 1

@@ -75,11 +75,11 @@ def test_the_zone_of_a_place() -> None:
 @pytest.mark.parametrize(
     ("crs", "place", "said"),
     [
-        ("EPSG:4326", (41, -91), "no map in metres"),
+        ("EPSG:4326", (41, -91), "not a map projection in metres"),
         ("EPSG:2263", (41, -74), "US survey foot"),
-        ("nonsense", (41, -91), "no coordinate system"),
-        ("EPSG:32633", (41, -91), "is no map of"),
-        ("EPSG:32615", (-41, -91), "is no map of"),
+        ("nonsense", (41, -91), "not a coordinate system"),
+        ("EPSG:32633", (41, -91), "does not cover"),
+        ("EPSG:32615", (-41, -91), "does not cover"),
     ],
 )
 def test_a_wrong_system_is_said_in_a_sentence(crs: str, place: tuple[float, float], said: str) -> None:

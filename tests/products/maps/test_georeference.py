@@ -284,8 +284,8 @@ def tagged(sha256: str, index: int) -> Tag:
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (["--crs", "EPSG:4326"], "no map in metres"),
-        (["--crs", "EPSG:32633"], "is no map of"),
+        (["--crs", "EPSG:4326"], "not a map projection in metres"),
+        (["--crs", "EPSG:32633"], "does not cover"),
         (["--terrain", "none.tif"], "none.tif can't be read"),
         (["--frames", "zero"], "write numbers as 0,3-5"),
         (["--frames", "77"], "can be put on a map"),

@@ -199,7 +199,7 @@ def test_bad_control_points_and_base_maps_are_sentences(exact: Case, tmp_path: P
     for text, said in (
         ("name,frame\n", "lacks the column column"),
         ("name,frame,column,row,latitude,longitude,altitude\na,0,1,2,41,x,3\n", "line 2"),
-        ("name,frame,column,row,latitude,longitude,altitude\na,0,1,2,141,9,3\n", "no place on Earth"),
+        ("name,frame,column,row,latitude,longitude,altitude\na,0,1,2,141,9,3\n", "not a place on Earth"),
     ):
         path.write_text(text)
         with pytest.raises(ControlPointError, match=said):

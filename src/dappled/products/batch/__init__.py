@@ -1,1 +1,1 @@
-"""Whole flights, frame by frame, on many processes."""
+"""Process whole flights frame by frame, in many processes."""

@@ -1,7 +1,8 @@
-"""Whole flights frame by frame: what is to be made of each frame, made in any process, with the same bytes everywhere.
+"""Process whole flights frame by frame, in any process, with the same bytes everywhere.
 
-A job is a value that says everything; `make` needs nothing else, writes under temporary names and renames. So a job may
-be done twice, or on another machine that sees the same folders, and the outcome is the same.
+A job is a value that holds everything `make` needs; `make` writes under temporary names and renames. So a job may run
+twice, or on another machine that sees the same folders, with the same outcome. The manifest lists what is done: a line
+of JSON for each job, appended and synced, so that a batch that is started again continues there.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # mallopt(3)
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One frame and all that is to be made of it. `station` is None where its place isn't known, `why` the reason;
-    `level_m` is the flight's flat ground. `key` names the job by everything that its outcome depends on."""
+    """One frame and all that is to be made of it. `station` is None where its position isn't known, for the reason
+    `why`; `level_m` is the height of flat ground. `key` is a hash of everything that the outcome depends on."""
 
     flight: str
     frame: Frame
@@ -55,7 +56,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class BatchOutput:
-    """A file that was made: its name in the batch's folder, size and SHA-256."""
+    """A file or folder that was made: its name in the batch's folder, size and SHA-256."""
 
     name: str
     size: int
@@ -64,7 +65,7 @@ class BatchOutput:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What became of a job. `error` is a sentence, or None; `cpu_seconds` and `peak_mb` (so far) are the process'."""
+    """The result of a job. `error` is a sentence, or None; `cpu_seconds` and `peak_mb` (so far) are the process'."""
 
     key: str
     flight: str
@@ -124,7 +125,7 @@ def plan(flight: Path, recipe: Recipe, options: Options, kinds: Sequence[str], o
 
 
 def make(job: Job) -> Done:
-    """Do a job. What is wrong with this frame is an error in the answer: it never stops the others."""
+    """Run a job. A failure of this frame is an error in the result and never stops the others."""
     _settle_memory()
     began, cpu = time.monotonic(), time.process_time()
     outputs: tuple[BatchOutput, ...] = ()
@@ -178,7 +179,7 @@ def _made(job: Job) -> list[BatchOutput]:
 
 
 def _output(path: Path, job: Job) -> BatchOutput:
-    """A finished file or folder, with one hash over all that is in it."""
+    """A finished file or folder, with one hash over its content."""
     name = str(path.relative_to(job.output))
     if path.is_file():
         return BatchOutput(name, path.stat().st_size, durable.hash_file(path))
@@ -192,7 +193,7 @@ def _output(path: Path, job: Job) -> BatchOutput:
 
 
 def _digests(recipe: Recipe) -> dict[str, str]:
-    """What the recipe's files hold: another calibration under the same name is another job."""
+    """Hashes of the recipe's files: another calibration under the same name makes another job."""
     named = {"calibration": recipe.calibration, "white": recipe.white, "dark": recipe.dark}
     named |= {
         name: value for name, value in (("camera", recipe.camera), ("mask", recipe.mask)) if value.endswith(".toml")
@@ -201,7 +202,7 @@ def _digests(recipe: Recipe) -> dict[str, str]:
 
 
 def _anywhere(recipe: Recipe) -> Recipe:
-    """The recipe for a worker in whatever folder: full paths; frames are the unit of parallel work."""
+    """The recipe for a worker in any folder: absolute paths, and one thread, as frames run in parallel."""
 
     def full(path: str, is_file: bool) -> str:
         return str(Path(path).absolute()) if is_file else path
@@ -218,12 +219,12 @@ def _anywhere(recipe: Recipe) -> Recipe:
 
 
 def _plain(options: Options) -> dict[str, object]:
-    """The options as JSON can hold them; which frames were chosen is no part of a job."""
+    """The options as JSON values, without the choice of frames, which is not part of a job."""
     values = asdict(replace(options, frames=None, terrain=None))
     return {name: value if isinstance(value, str | None) else repr(value) for name, value in values.items()}
 
 
-_here = threading.local()  # a decoder keeps buffers: one for each thread that works
+_here = threading.local()  # a decoder keeps buffers: one for each working thread
 
 
 def _darkroom(recipe: Recipe) -> Darkroom:
@@ -243,7 +244,7 @@ def _projection(name: str) -> Projection:
 
 
 def _peak_mb() -> float:
-    """The most memory that this process ever held. (getrusage counts its parent's, from before it began.)"""
+    """The most memory that this process held so far. (getrusage would include its parent's, from before the fork.)"""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmHWM:"):
             return round(int(line.split()[1]) / 1024, 1)
@@ -254,8 +255,8 @@ def _peak_mb() -> float:
 def _settle_memory() -> None:
     """Keep freed memory in this process for the next frame.
 
-    glibc gives it back and fetches it anew, page by page, for every array; a Dask worker is told to do so even from
-    64 KiB on (MALLOC_TRIM_THRESHOLD_), which doubles a frame's time. Elsewhere than on glibc nothing happens.
+    glibc returns it to the system and fetches it again, page by page, for every array; in a Dask worker
+    (MALLOC_TRIM_THRESHOLD_) even from 64 KiB on, which doubles a frame's time. Without glibc nothing happens.
     """
     try:
         mallopt = ctypes.CDLL("libc.so.6").mallopt
@@ -266,11 +267,11 @@ def _settle_memory() -> None:
 
 
 class ManifestError(DappledError):
-    """A manifest that can't be used; one sentence."""
+    """A manifest can't be used."""
 
 
 class Manifest:
-    """The manifest of an output folder, held by one batch at a time. Use as a context manager."""
+    """The manifest of an output folder, locked by one batch at a time. Use as a context manager."""
 
     def __init__(self, output: Path) -> None:
         """Raises ManifestError where another batch works in this folder, or the disk refuses."""
@@ -294,13 +295,13 @@ class Manifest:
         os.close(self._fd)
 
     def add(self, done: Done) -> None:
-        """Note an answer, durably."""
+        """Append a result, durably."""
         os.write(self._fd, json.dumps(asdict(done), sort_keys=True).encode() + b"\n")
         os.fsync(self._fd)
         self.done[done.key] = done
 
     def holds(self, key: str) -> bool:
-        """Whether a job was done before and all that it made is still there."""
+        """Whether a job is done and its files are still there."""
         done = self.done.get(key)
         if done is None or done.error is not None:
             return False
@@ -311,7 +312,7 @@ class Manifest:
         while block := os.read(self._fd, 1 << 20):
             text += block
         whole = text.rfind(b"\n") + 1
-        if whole < len(text):  # torn by a power cut: that job is done again
+        if whole < len(text):  # torn by a power cut: that job runs again
             os.ftruncate(self._fd, whole)
             os.lseek(self._fd, 0, os.SEEK_END)
         known: dict[str, Done] = {}
@@ -320,7 +321,7 @@ class Manifest:
                 done = _done(json.loads(line))
             except (ValueError, TypeError, KeyError):
                 raise ManifestError(
-                    f"{self.path}, line {number} is no line of a manifest: move it away, and everything is made anew"
+                    f"{self.path}, line {number} is not a line of a manifest: move it away, and everything is made anew"
                 ) from None
             known[done.key] = done
         return known

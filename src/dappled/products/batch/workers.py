@@ -1,6 +1,6 @@
-"""Jobs done by processes of this machine, or by a Dask cluster. A worker that dies takes no job with it.
+"""Run jobs in processes of this machine or on a Dask cluster. A job survives the death of its worker.
 
-Answers come in the order in which they are ready.
+Results come in the order in which they are ready.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from dappled.errors import DappledError
 from dappled.products.batch.batch import Done, Job
 from dappled.products.extras import need
 
-ATTEMPTS = 3  # a frame that kills so many workers is given up
+ATTEMPTS = 3  # a frame that kills this many workers is given up
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "GDAL_NUM_THREADS"), "1")
 _PATIENCE_S = 10.0  # for the scheduler to answer
 _WORKERS_S = 60.0  # for its first worker to be there
-JOB_S = 900.0  # a frame takes seconds: a worker that is silent so long hangs
+JOB_S = 900.0  # a frame takes seconds: a worker that has not answered for so long hangs
 
 Make = Callable[[Job], Done]
 
 
 class ClusterError(DappledError):
-    """A Dask cluster that can't be used; one sentence."""
+    """A Dask cluster can't be used."""
 
 
 @dataclass(slots=True)
@@ -46,9 +46,9 @@ class _Worker:
 def in_processes(
     jobs: Sequence[Job], make: Make, workers: int, *, job_s: float = JOB_S, now_s: Callable[[], float] = time.monotonic
 ) -> Iterator[Done]:
-    """Answers of jobs done by so many processes, each with one thread.
+    """Run jobs in a number of processes with one thread each, and yield their results.
 
-    A process that dies, or is silent for `job_s`, is replaced, and its job done again, three times in all.
+    A process that dies, or does not answer for `job_s`, is replaced, and its job run again, three times in all.
     """
     waiting = deque(jobs)
     deaths: dict[str, int] = {}
@@ -86,9 +86,9 @@ def in_processes(
 
 
 def on_cluster(jobs: Sequence[Job], make: Make, scheduler: str) -> Iterator[Done]:
-    """Answers of jobs done by the workers of a Dask scheduler, which must see the same folders under the same names.
+    """Run jobs on the workers of a Dask scheduler, which must see the same folders under the same names.
 
-    Raises ClusterError where nobody answers, or where no worker is there within a minute.
+    Raises ClusterError where the scheduler does not answer, or has no worker within a minute.
     """
     distributed = need("distributed")
     try:
@@ -116,7 +116,7 @@ def on_cluster(jobs: Sequence[Job], make: Make, scheduler: str) -> Iterator[Done
 
 
 def given_up(job: Job, why: str) -> Done:
-    """The answer for a job that no worker could end."""
+    """The result of a job that no worker could finish."""
     return Done(job.key, Path(job.flight).name, job.frame.name, (), why, 0.0, 0.0, 0.0)
 
 
@@ -134,11 +134,11 @@ def _hand(worker: _Worker, job: Job) -> None:
     try:
         worker.door.send(job)
     except OSError:
-        return  # it died at once: reading from it will say so
+        return  # it died at once: reading from it will raise
 
 
 def _answer(worker: _Worker) -> Done:
-    """What a worker has to say. Raises EOFError or OSError where it never will."""
+    """Read a worker's answer. Raises EOFError or OSError where it will never answer."""
     if not worker.door.poll():
         raise TimeoutError("overdue")
     answer: Done = worker.door.recv()
@@ -155,8 +155,8 @@ def _dismiss(worker: _Worker) -> None:
 
 
 def _work(door: Connection, make: Make) -> None:
-    """A worker's life: a job in, an answer out, until nobody is there any more."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a person's Ctrl-C is for the one who hands out the jobs
+    """Run in a worker: read a job, send its result, until the pipe is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that hands out the jobs
     single_threaded()
     while True:
         try:
@@ -167,7 +167,7 @@ def _work(door: Connection, make: Make) -> None:
 
 
 def single_threaded() -> None:
-    """OpenCV's own threads off: the frames are what runs side by side."""
+    """Switch off OpenCV's own threads: frames run in parallel instead."""
     try:
         import cv2  # noqa: PLC0415  an extra; light fields are made without it
     except ImportError:
@@ -177,7 +177,7 @@ def single_threaded() -> None:
 
 @contextmanager
 def _environment(values: dict[str, str]) -> Iterator[None]:
-    """These variables for the processes that are started meanwhile."""
+    """Set environment variables for the processes that are started in the meantime."""
     before: dict[str, Any] = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:

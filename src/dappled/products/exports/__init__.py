@@ -1,1 +1,1 @@
-"""Light fields, pictures and point clouds as files."""
+"""Read and write files of light fields, pictures, masks and point clouds."""

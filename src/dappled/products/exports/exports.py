@@ -1,7 +1,8 @@
-"""Light fields in the forms that other tools read: HCI's folder, ESLF, LFToolbox' .mat, quilts.
+"""Export light fields in other tools' formats: HCI's folder, ESLF, LFToolbox' .mat, quilts, Rerun recordings.
 
-Views are turned so that a camera further right sees near things further left, and one further down further up, as those
-tools expect. Values become 8 or 16 bits with `white` (of the sensor's, 1.0) as the brightest; it is told beside them.
+Views are ordered so that a camera further right sees near things further left, and one further down sees them further
+up, as those tools expect. Values become 8 or 16 bits with `white` (a share of the sensor's, 1.0) as the brightest; it
+is written beside them.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ from dappled.decode.lightfield.refocus import shift_and_add
 from dappled.errors import DappledError
 from dappled.products.exports import point_cloud, prints
 
-ESLF_LENSLET_PX = 14  # what LFToolbox' and LiFF's readers take for granted
+ESLF_LENSLET_PX = 14  # LFToolbox' and LiFF's readers assume this size
 _LARGEST_MAT = 2**31 - 1  # bytes of one variable in a version 5 file
 
 
 class ExportError(DappledError):
-    """A light field can't be written in a form; one sentence."""
+    """A light field can't be exported."""
 
 
 def as_cameras(stack: ViewStack) -> NDArray[np.float32]:
@@ -47,7 +48,7 @@ def as_cameras(stack: ViewStack) -> NDArray[np.float32]:
 
 
 def hci(path: Path, field: LightField, depth: DepthMap | None = None) -> None:
-    """HCI's 4D light field benchmark: a folder of input_Cam000.png …, parameters.cfg and, with a depth map,
+    """Write a folder of HCI's 4D light field benchmark: input_Cam000.png …, parameters.cfg and, with a depth map,
     disp_estimate.pfm (NaN where unknown). Raises ExportError."""
     stack = ViewStack.of(field)
     views = as_cameras(stack)
@@ -68,10 +69,10 @@ def hci(path: Path, field: LightField, depth: DepthMap | None = None) -> None:
 
 
 def eslf(path: Path, field: LightField, lenslet_px: int = 0) -> None:
-    """An ESLF image: 16-bit PNG in which each pixel of the views is a lenslet of `lenslet_px`² pixels, one a view.
+    """Write an ESLF image: a 16-bit PNG in which each pixel of the views is a lenslet of `lenslet_px`² pixels.
 
-    0 takes the number of views an axis; more leave black pixels around them. The size and the white are written beside
-    it, in a .txt of the same name. Raises ExportError, also where either of them stands already.
+    0 takes the number of views per axis; more leave black pixels around them. Size and white are written to a .txt of
+    the same name. Raises ExportError, also where either file exists.
     """
     views = as_cameras(ViewStack.of(field))
     side = lenslet_px or max(views.shape[:2])
@@ -98,7 +99,7 @@ def eslf(path: Path, field: LightField, lenslet_px: int = 0) -> None:
 
 
 def mat(path: Path, field: LightField) -> None:
-    """A MATLAB version 5 file as LFToolbox' LFUtilDecodeLytroFolder leaves it: `LF` uint16 [t, s, v, u, c], c red,
+    """Write a MATLAB version 5 file as LFToolbox' LFUtilDecodeLytroFolder does: `LF` uint16 [t, s, v, u, c], c red,
     green, blue and weight. Raises ExportError."""
     values, white = _sixteen_bits(as_cameras(ViewStack.of(field)))
     rgb = values if values.ndim == 5 else np.repeat(values[..., None], 3, axis=4)
@@ -108,7 +109,7 @@ def mat(path: Path, field: LightField) -> None:
         raise ExportError(
             f"{path}: {lf.nbytes / 1e9:.1f} GB don't fit into a version 5 .mat file; export as h5 instead"
         )
-    told = {
+    content = {
         "LF": lf,
         "DecodeOptions": {"NColChans": 3, "NWeightChans": 1, "Precision": "single", "White": white},
         "GeneratedByInfo": {"mfilename": "dappled"},
@@ -117,14 +118,14 @@ def mat(path: Path, field: LightField) -> None:
 
     def write(part: Path) -> None:
         with part.open("wb") as file:
-            io.savemat(file, told, format="5", do_compression=True)
+            io.savemat(file, content, format="5", do_compression=True)
 
     _whole(path, write)
 
 
 def quilt(path: Path, field: LightField, *, disparity: float = 0.0) -> Path:
-    """A quilt for a light-field display: the views of the middle row from the left one (bottom left) to the right one,
-    converging on a disparity. Returns the path, whose name tells `_qs<columns>x<rows>a<aspect>`. Raises ExportError."""
+    """Write a quilt for a light-field display: the middle row's views from left (bottom left) to right, converging on a
+    disparity. Returns the path, whose name ends in `_qs<columns>x<rows>a<aspect>`. Raises ExportError."""
     stack = ViewStack.of(field)
     middle = int(np.argmin(np.abs(stack.row_steps)))
     order = np.argsort(-stack.column_steps)  # the left camera has the largest step
@@ -151,7 +152,7 @@ def quilt(path: Path, field: LightField, *, disparity: float = 0.0) -> Path:
 
 
 def write_pfm(path: Path, values: NDArray[np.float32]) -> None:
-    """A PFM of one channel, little endian, rows from the bottom, as HCI's tools have it."""
+    """Write a PFM of one channel, little endian, rows from the bottom, as HCI's tools do."""
     height, width = values.shape
     with path.open("wb") as file:
         file.write(f"Pf\n{width} {height}\n-1.0\n".encode())
@@ -215,7 +216,7 @@ def _png16(path: Path, values: NDArray[np.uint16]) -> None:
 
 
 def _whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """`write` under another name, then rename. Raises ExportError where something stands there, or the disk refuses."""
+    """`write` under another name, then rename. Raises ExportError where `path` exists, or the disk refuses."""
     if path.exists():
         raise ExportError(f"{path} exists already; choose another name")
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
@@ -238,9 +239,8 @@ def rerun(
     depth: DepthMap | None = None,
     distances: DistanceMap | None = None,
 ) -> None:
-    """Write an .rrd file: `view/v/u`, `picture`, `disparity`, `sigma`, and `points` where distances are known.
-
-    Raises ExportError without the extra.
+    """Write a recording (.rrd) for the Rerun viewer: `view/v/u`, `picture`, `disparity`, `sigma`, and `points` where
+    distances are known. Nothing is sent anywhere. Raises ExportError without the extra `rerun`.
     """
     rr = _rerun()
     if path.suffix != ".rrd":

@@ -1,8 +1,7 @@
-"""Light fields as files: a Zarr v3 group, .npz or .h5, all laid out in the words of `LightField`.
+"""Save and load light fields: a Zarr v3 group, .npz or .h5, with the arrays of `LightField` under their names.
 
-`slices`, `carriers`, `views`, `view_offsets` and `grid` are arrays of these names. The attributes are the group's own
-in Zarr; in .npz they are the JSON text of the array `attributes`; in HDF5 the file's attributes of their own names
-(what HDF5 has no type for as JSON text), and all of them as JSON text in `attributes`.
+The attributes are the group's attributes in Zarr, and the JSON text of the array `attributes` in .npz. In HDF5 they are
+the file's attributes (those without an HDF5 type as JSON text), and all of them as JSON text in `attributes`.
 """
 
 from __future__ import annotations
@@ -35,13 +34,13 @@ _ATTRIBUTES = "attributes"
 
 
 class LightFileError(DappledError):
-    """A light field can't be written or read; one sentence with the file's name."""
+    """A light field can't be written or read."""
 
 
 def save(path: Path, field: LightField, *, overwrite: bool = False) -> None:
-    """Write a light field; the extension says how: .zarr, .npz or .h5. Whole and durable under its name, or not at all.
+    """Write a light field as .zarr, .npz or .h5, by the extension; whole and durable under its name, or not at all.
 
-    Raises LightFileError, also when something stands there already and `overwrite` is false.
+    Raises LightFileError, also when the file exists and `overwrite` is false.
     """
     write = _of(path, {".zarr": _save_zarr, ".npz": _save_npz, ".h5": _save_h5})
     arrays: _Arrays = {name: np.asarray(getattr(field, name), dtype=kind) for name, (kind, _) in _ARRAYS.items()}
@@ -92,7 +91,7 @@ def _of(path: Path, kinds: Mapping[str, Callable[..., Any]]) -> Callable[..., An
 
 
 def _fits(path: Path, arrays: _Arrays) -> None:
-    """Shapes that agree with each other, as `LightField` says them."""
+    """Check that the arrays' shapes agree with each other, as `LightField` has them. Raises LightFileError."""
     for name, (_, dimensions) in _ARRAYS.items():
         if arrays[name].ndim != dimensions and not (name == "views" and arrays[name].ndim == 5):
             raise LightFileError(f"{path}: {name} has {arrays[name].ndim} dimensions, a light field has {dimensions}")
@@ -126,7 +125,7 @@ def _json(path: Path, attributes: Mapping[str, Any]) -> dict[str, Any]:
 def _save_zarr(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
     group = _zarr(part).open_group(store=part, mode="w-", zarr_format=3, attributes=attributes)
     for name, values in arrays.items():
-        # One chunk a slice, or a view: what is looked at one at a time.
+        # One chunk for each slice or view: they are read one at a time.
         lead = {"slices": 1, "views": 2}.get(name, 0)
         chunks = tuple(max(1, side) for side in ((1,) * lead + values.shape[lead:]))
         group.create_array(name, shape=values.shape, dtype=values.dtype, chunks=chunks)[...] = values
@@ -139,7 +138,7 @@ def _load_zarr(path: Path) -> tuple[_Arrays, dict[str, Any]]:
     for name in _ARRAYS:
         array = group[name]
         if not isinstance(array, zarr.Array):
-            raise LightFileError(f"{path} is not a light field: {name} is no array")
+            raise LightFileError(f"{path} is not a light field: {name} is not an array")
         arrays[name] = np.asarray(array[...])
     return arrays, dict(group.attrs)
 
@@ -177,7 +176,7 @@ def _h5py(path: Path) -> Any:
 
 
 def _ground(name: str, path: Path, what: str, instead: str) -> Any:
-    """A library that the onboard install leaves out."""
+    """Import a library that the onboard install leaves out. Raises LightFileError."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -187,7 +186,7 @@ def _ground(name: str, path: Path, what: str, instead: str) -> Any:
 
 
 def _sync(path: Path) -> None:
-    """fsync a file, or a folder with all that is in it."""
+    """fsync a file, or a folder with its content."""
     files = [Path(base, name) for base, _, names in os.walk(path) for name in names] if path.is_dir() else [path]
     for name in files:
         fd = os.open(name, os.O_RDONLY)
@@ -201,7 +200,7 @@ def _sync(path: Path) -> None:
 
 
 def _put_in_place(part: Path, path: Path) -> None:
-    """Rename; a folder can't replace one that isn't empty, so an old one steps aside first."""
+    """Rename. A folder can't replace one that isn't empty, so an old one is moved aside first."""
     old = part.with_name(part.name + ".old.part")
     if path.is_dir():
         os.rename(path, old)

@@ -1,4 +1,4 @@
-"""Files of printed masks: PNG and TIFF with their physical resolution, made in strips; CSV of what was measured."""
+"""Write and read files of printed masks: PNG and TIFF with their physical resolution, and CSV of measurements."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _STRIP = 64  # rows of a PNG at a time
 
 
 class MaskFileError(DappledError):
-    """A mask file can't be written or read; one sentence: what, where, what to do."""
+    """A mask file can't be written or read."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Picture:
-    """What is written: rows and columns, bits, (vertical, horizontal) pixels a mm, and who makes the levels."""
+    """The picture to write: shape, bits, (vertical, horizontal) pixels per mm, and the function of its levels."""
 
     shape: tuple[int, int]
     bits: int
@@ -51,7 +51,7 @@ def write(
 ) -> None:
     """Write a grey image of `shape` to .png or .tif by asking `tile(rows, columns)` for its levels, strip by strip.
 
-    `px_per_mm` (vertical, horizontal) goes into the file (pHYs, or resolution tags). `progress` is told the rows done.
+    `px_per_mm` (vertical, horizontal) goes into the file (pHYs, or resolution tags). `progress` gets the rows done.
     Memory stays at a few strips. The file appears whole or not at all. Raises MaskFileError.
     """
     writers = {".png": _write_png, ".tif": _write_tiff, ".tiff": _write_tiff}
@@ -117,9 +117,9 @@ def _write_tiff(path: Path, picture: _Picture) -> None:
 
 
 def read(path: Path) -> tuple[NDArray[np.float32], tuple[float, float]]:
-    """A grey mask image, float32 (H, W) from 0 to 1, and its (vertical, horizontal) pixels a mm.
+    """Read a grey mask image: float32 (H, W) from 0 to 1, and its (vertical, horizontal) pixels per mm.
 
-    Raises MaskFileError for a file that is no grey image, or does not say its resolution.
+    Raises MaskFileError for a file that is not a grey image, or has no resolution.
     """
     try:
         if path.suffix.lower() == ".png":
@@ -143,7 +143,7 @@ def read(path: Path) -> tuple[NDArray[np.float32], tuple[float, float]]:
 
 
 def read_density_curve(path: Path) -> DensityCurve:
-    """A film's curve from CSV: columns `level` (0 to 255) and `density`. Raises MaskFileError."""
+    """Read a film's curve from CSV: columns `level` (0 to 255) and `density`. Raises MaskFileError."""
     rows = _numbers(path, ("level", "density"))
     try:
         return density_curve([r[0] for r in rows], [r[1] for r in rows])
@@ -152,9 +152,9 @@ def read_density_curve(path: Path) -> DensityCurve:
 
 
 def read_spots(path: Path) -> list[tuple[float, float]]:
-    """Measured spots (x, y) in mm from the centre of the pattern, from CSV: columns `x_mm` and `y_mm`.
+    """Read measured spots (x, y), in mm from the centre of the pattern, from CSV: columns `x_mm` and `y_mm`.
 
-    Rows with an empty place or a dash were not seen, and are left out. Raises MaskFileError.
+    Rows with an empty field or a dash are spots that were not seen; they are left out. Raises MaskFileError.
     """
     return [(r[0], r[1]) for r in _numbers(path, ("x_mm", "y_mm"))]
 

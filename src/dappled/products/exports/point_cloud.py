@@ -1,4 +1,7 @@
-"""Point clouds of distance maps, in camera or map coordinates, as PLY or LAS; points above a σ limit are withheld."""
+"""Make point clouds of distance maps, in camera or map coordinates, and write them as PLY or LAS.
+
+Points above a limit of σ are withheld.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +27,13 @@ Floats = NDArray[np.float64]
 
 
 class PointCloudError(DappledError):
-    """A point cloud can't be made or written; one sentence."""
+    """A point cloud can't be made or written."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointCloud:
-    """`points` float64 (n, 3) in m, `colours` uint16 (n, 3), `sigma_m` (n,) along the line of sight; `withheld` is how
-    many were left out for their σ. `crs` names the projection; "" is camera axes: right, down, forward."""
+    """`points` float64 (n, 3) in m, `colours` uint16 (n, 3), `sigma_m` (n,) along the line of sight; `withheld` is the
+    number of points left out for their σ. `crs` names the projection; "" is camera axes: right, down, forward."""
 
     points: Floats
     colours: NDArray[np.uint16]
@@ -50,7 +53,7 @@ def of(
 ) -> PointCloud:
     """The known points of a distance map whose σ is at most `most_sigma` of their distance.
 
-    `picture` (h, w(, 3)) gives the colours. With a `station` points are on the map: UTM unless `crs` says otherwise.
+    `picture` (h, w(, 3)) gives the colours. With a `station` the points are on the map, in UTM unless `crs` is given.
     Raises DappledError where the camera's profile or focal length isn't known.
     """
     known = np.isfinite(distances.distance_m)

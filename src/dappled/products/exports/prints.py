@@ -1,4 +1,4 @@
-"""Pictures for the eye: tone, mosaics with captions, and false colours with a scale."""
+"""Make pictures for people: tone curve, mosaics with captions, and false colours with a scale."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ _UNKNOWN = (150, 150, 150)
 
 
 class PrintError(DappledError):
-    """A picture can't be written; one sentence."""
+    """A picture can't be written."""
 
 
 def white_of(pictures: Sequence[NDArray[np.floating]]) -> float:
-    """The brightness that becomes white in all of them: what all but the brightest 0.5 % are below."""
+    """The brightness that becomes white in all pictures: their 99.5 % quantile."""
     values = np.concatenate([np.ravel(p)[:: max(1, p.size // 200_000)] for p in pictures])
     values = values[np.isfinite(values)]
     return max(float(np.quantile(values, 0.995)), 1e-9) if values.size else 1.0
@@ -57,7 +57,7 @@ def coloured(values: NDArray[np.floating], low: float, high: float) -> Bytes:
 
 
 def with_scale(values: NDArray[np.floating], low: float, high: float, unit: str) -> Bytes:
-    """`coloured` with a scale below it that names both ends and says what grey means."""
+    """`coloured`, with a scale below it that labels both ends and the meaning of grey."""
     picture = coloured(values, low, high)
     width = picture.shape[1]
     size = max(11, min(22, width // 28))

@@ -1,4 +1,4 @@
-"""Views as a folder of pictures, a file each, as HCI's benchmark and others hand light fields out."""
+"""Read a light field from a folder with a picture for each view, as HCI's benchmark and others distribute them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 
 
 class ViewFolderError(DappledError):
-    """A folder that doesn't hold n × n views; one sentence."""
+    """A folder doesn't hold n × n views."""
 
 
 def read(folder: Path) -> LightField:

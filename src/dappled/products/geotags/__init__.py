@@ -1,1 +1,1 @@
-"""Where each frame was taken, in the forms that other programs read."""
+"""Write where each frame was taken, in the formats that other programs read."""

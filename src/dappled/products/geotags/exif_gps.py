@@ -1,8 +1,8 @@
-"""EXIF GPS in copies of frames: TIFF-like raws (CR2, DNG, NEF, ARW), TIFF, JPEG, PNG, and Fujifilm's RAF.
+"""Write EXIF GPS into copies of frames: TIFF-like raws (CR2, DNG, NEF, ARW), TIFF, JPEG, PNG, and Fujifilm's RAF.
 
-A TIFF gets its GPS directory, and a new first directory that points to it, behind its end: nothing else moves, so
-every offset in it, a maker note's too, stays right. A JPEG's EXIF is such a TIFF, and so is a PNG's eXIf chunk; a RAF
-shows EXIF in its JPEG preview.
+The GPS directory, and a new first directory that points to it, are appended to a TIFF. Nothing else moves, so every
+offset in it, also a maker note's, stays right. A JPEG's EXIF and a PNG's eXIf chunk are such TIFFs; a RAF holds EXIF in
+its JPEG preview.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _EMPTY = b"II*\0" + struct.pack("<IHI", 8, 0, 0)
 
 
 class ExifError(DappledError):
-    """A file that EXIF can't be written into; one sentence."""
+    """EXIF can't be written into a file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """What goes into the GPS directory. Altitude is above mean sea level; None is left out."""
+    """The content of the GPS directory. Altitude is above mean sea level; None is left out."""
 
     latitude_deg: float
     longitude_deg: float
@@ -51,7 +51,7 @@ def place(camera: CameraPose, utc_ns: int | None, error_m: float | None = None) 
 
 
 def tagged(data: bytes, where: Place) -> bytes:
-    """A copy of a file with its place. Raises ExifError for a form that isn't known, or is damaged."""
+    """A copy of a file with its position. Raises ExifError for an unknown format or a damaged file."""
     try:
         if data[:4] in (b"II*\0", b"MM\0*"):
             return _tiff(data, where)
@@ -65,8 +65,8 @@ def tagged(data: bytes, where: Place) -> bytes:
             header = data[:_RAF_JPEG] + struct.pack(">II", len(data), len(preview))
             return header + data[_RAF_JPEG + 8 :] + preview
     except (struct.error, IndexError) as error:
-        raise ExifError(f"its EXIF is damaged ({error}): no place can be written into a copy") from None
-    raise ExifError("it is no TIFF-like raw, TIFF, JPEG, PNG or RAF: its place stands in the sidecar only")
+        raise ExifError(f"its EXIF is damaged ({error}): no position can be written into a copy") from None
+    raise ExifError("it is not a TIFF-like raw, TIFF, JPEG, PNG or RAF: only the sidecar has its position")
 
 
 def _tiff(data: bytes, where: Place) -> bytes:
@@ -88,7 +88,7 @@ def _tiff(data: bytes, where: Place) -> bytes:
 
 
 def _jpeg(data: bytes, where: Place) -> bytes:
-    """APP1 stands where it stood, else behind the start and a JFIF header."""
+    """APP1 stays where it was; a new one follows the start and a JFIF header."""
     at, insert = 2, 2
     while data[at] == 0xFF and data[at + 1] not in (_SOS, 0xD9):
         (length,) = struct.unpack_from(">H", data, at + 2)
@@ -101,18 +101,18 @@ def _jpeg(data: bytes, where: Place) -> bytes:
 
 
 def _png(data: bytes, where: Place) -> bytes:
-    """The eXIf chunk (PNG 1.5 extensions) stands where it stood, else before the pixels; no other byte changes."""
+    """The eXIf chunk (PNG 1.5 extensions) stays in its place; a new one precedes the pixels. No other byte changes."""
     at, first = len(_PNG), dict[bytes, tuple[int, int]]()
     while b"IEND" not in first and at + 12 <= len(data):
         end = at + 12 + int(struct.unpack_from(">I", data, at)[0])
         first.setdefault(data[at + 4 : at + 8], (at, end))
         at = end
     if at > len(data) or not {b"IDAT", b"IEND"} <= first.keys():
-        raise ExifError("the PNG is cut short: no place can be written into a copy")
+        raise ExifError("the PNG is cut short: no position can be written into a copy")
     pixels, _ = first[b"IDAT"]
     start, end = first.get(b"eXIf", (pixels, pixels))
-    told = data[start + 8 : end - 4] if start < end else _EMPTY
-    return data[:start] + _chunk(_tiff(told, where)) + data[end:]
+    present = data[start + 8 : end - 4] if start < end else _EMPTY
+    return data[:start] + _chunk(_tiff(present, where)) + data[end:]
 
 
 def _chunk(tiff: bytes) -> bytes:
@@ -121,12 +121,12 @@ def _chunk(tiff: bytes) -> bytes:
 
 def _segment(tiff: bytes) -> bytes:
     if len(tiff) + 8 > _SEGMENT:
-        raise ExifError("its EXIF has no room left for a place: it stands in the sidecar only")
+        raise ExifError("its EXIF has no room left for a position: only the sidecar has it")
     return struct.pack(">BBH", 0xFF, _APP1, len(tiff) + 8) + _EXIF + tiff
 
 
 def _directory(order: str, start: int, entries: list[tuple[int, int, int, bytes]]) -> bytes:
-    """An image file directory that will stand at `start`, its longer values behind it."""
+    """An image file directory for the offset `start`, followed by its longer values."""
     values = b""
     behind = start + 2 + 12 * len(entries) + 4
     rows = b""

@@ -1,4 +1,4 @@
-"""A recorded flight's places in the forms that other programs read. Nothing recorded is touched."""
+"""Write the positions of a recorded flight in the formats that other programs read. Recorded files stay untouched."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from dappled.products.mounting import Mounting
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """One frame with its tag; `camera` is None where its position is not known. `utc_ns` is mid-exposure, put right
-    where UTC was learnt in flight; None where nobody ever knew it."""
+    """One frame with its tag; `camera` is None where its position is not known. `utc_ns` is mid-exposure, corrected
+    where UTC was learnt in flight; None where UTC was never known."""
 
     frame: Frame
     tag: Tag
@@ -38,7 +38,7 @@ class Placed:
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """What was written, and which frames have no place or no tag."""
+    """The files that were written, and the frames that have no position or no tag."""
 
     files: tuple[Path, ...]
     placed: int
@@ -72,8 +72,8 @@ def write(
     replace_extension: bool = False,
     force: bool = False,
 ) -> Written:
-    """Sidecars beside the frames, and geo.txt, pix4d.csv and track.geojson in `<flight>/geotags/`; all of it in
-    `output` instead where that is given. Raises FlightError, SidecarError and EarthError."""
+    """Write sidecars beside the frames, and geo.txt, pix4d.csv and track.geojson into `<flight>/geotags/`; or all of
+    them into `output`. Raises FlightError, SidecarError and EarthError."""
     placed, without_tag = read(flight, mounting, geoid)
     folder = output or flight / "geotags"
     _make(folder)
@@ -99,7 +99,7 @@ def write(
 def copies(
     flight: Path, folder: Path, mounting: Mounting, geoid: Geoid | None = None
 ) -> Iterator[tuple[str, Path | str]]:
-    """Copies of the placed frames in `folder` with their place in EXIF: (frame, the copy or why there is none).
+    """Copy the placed frames to `folder`, with positions in EXIF; yields (frame, its copy or why there is none).
 
     The originals are only read. Raises FlightError, also for a folder within the flight.
     """
@@ -155,7 +155,7 @@ def _write(path: Path, data: bytes) -> None:
 def odm(placed: Sequence[Placed]) -> str:
     """OpenDroneMap's geo.txt: EPSG:4326, then `name x y z [yaw pitch roll [hacc [vacc]]]`.
 
-    Its fields go by position: where one is unknown a line ends before it. z is above mean sea level.
+    Fields are positional: a line ends before the first unknown one. z is above mean sea level.
     """
     lines = ["EPSG:4326"]
     for one in placed:
@@ -190,8 +190,8 @@ def pix4d(placed: Sequence[Placed]) -> str:
 
 
 def geojson(placed: Sequence[Placed]) -> str:
-    """A point a frame and a line through them, in the order of exposure (RFC 7946). The third coordinate is the height
-    above the ellipsoid, where it is known; the altitude above mean sea level is a property."""
+    """GeoJSON (RFC 7946): a point for each frame and a line through them, in the order of exposure. The third
+    coordinate is the height above the ellipsoid, where known; the altitude above mean sea level is a property."""
     known = sorted(((one, one.camera) for one in placed if one.camera), key=lambda pair: pair[0].tag.utc_ns)
     features: list[dict[str, Any]] = []
     if len(known) > 1:

@@ -1,4 +1,4 @@
-"""XMP sidecars: what a frame knows of itself, in the words of Pix4D, drone-dji and EXIF, beside the untouched file."""
+"""Write XMP sidecars: a frame's position, attitude and times in the properties of Pix4D, drone-dji and EXIF."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ _SPACES = {
     "dappled": "urn:dappled:sidecar:1",
 }
 
-_RTK_FLAGS = {3: "16", 4: "16", 5: "34", 6: "50"}  # DJI's words for a single, differential, float and fixed solution
+_RTK_FLAGS = {3: "16", 4: "16", 5: "34", 6: "50"}  # DJI's codes for a single, differential, float and fixed solution
 
 
 class SidecarError(DappledError):
-    """A sidecar can't be written; one sentence."""
+    """A sidecar can't be written."""
 
 
 def path_of(frame: Path, *, replace_extension: bool = False) -> Path:
-    """`name.ext.xmp` (darktable, digiKam), or `name.xmp` (Lightroom)."""
+    """The sidecar of a frame: `name.ext.xmp` (darktable, digiKam), or `name.xmp` (Lightroom)."""
     return frame.with_suffix(".xmp") if replace_extension else frame.with_name(frame.name + ".xmp")
 
 
 def text(tag: Tag, camera: CameraPose | None, utc_ns: int | None) -> str:
-    """The sidecar of a frame, `utc_ns` being its mid-exposure put right. What is unknown is not in it."""
+    """The sidecar's text. `utc_ns` is the corrected mid-exposure. Unknown values are left out."""
     words = {**_of_tag(tag, utc_ns), **(_of_place(tag, camera) if camera else {})}
     spaces = "\n".join(f"    xmlns:{name}={quoteattr(uri)}" for name, uri in _SPACES.items())
     values = "\n".join(f"    {name}={quoteattr(value)}" for name, value in words.items() if value is not None)
@@ -46,8 +46,8 @@ def text(tag: Tag, camera: CameraPose | None, utc_ns: int | None) -> str:
 
 
 def write(path: Path, content: str, *, force: bool = False) -> None:
-    """Whole or not at all. Raises SidecarError for a sidecar that another program wrote (`force` replaces it), and
-    FlightError when the disk refuses."""
+    """Write a sidecar, whole or not at all. Raises SidecarError for one that another program wrote (`force` replaces
+    it), and FlightError when the disk refuses."""
     try:
         if not force and path.exists() and f'xmp:CreatorTool="{_MARK}"' not in path.read_text("utf-8", "replace"):
             raise SidecarError(

@@ -1,1 +1,1 @@
-"""Frames and flights as maps, terrain and footprints."""
+"""Make maps, terrain and footprints from a flight's frames."""

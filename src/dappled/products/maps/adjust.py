@@ -1,9 +1,9 @@
-"""Least squares over a strip: the eyes that agree best with each other, with known places, and with their telemetry.
+"""Bundle adjustment of a strip: least squares over the eyes' poses, known places, and the telemetry's sigmas.
 
-Unknown are each eye's shift and turn (`Eye.moved`), and for each group of sightings how much higher its ground lies
-than the model of it. A sighting's residual is in pixels; its covariance is the pixel's own, plus what the ground's
-unknown height does along the ray's shadow in the picture. So flat ground under houses is trusted across the flight line
-more than along it, and nobody has to solve for heights.
+The unknowns are each eye's shift and turn (`Eye.moved`) and, for each group of observations, how much higher the ground
+is than its model. A residual is in pixels; its covariance is the pixel's own plus the effect of the ground's unknown
+height along the ray's shadow in the picture. So flat ground under houses is trusted more across the flight line than
+along it, and heights need not be solved for.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from dappled.products.maps.eye import Eye
 from dappled.products.maps.ground import Ground
 
 Floats = NDArray[np.float64]
-_ROBUST = 2.0  # sigmas up to which a sighting has its full say (Huber)
+_ROBUST = 2.0  # sigmas up to which an observation has its full weight (Huber)
 _INLIER = 3.0
 _STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])  # metres, radians: for derivatives
-_DENSE = 3000  # unknowns up to which sigmas are worked out
+_DENSE = 3000  # unknowns up to which sigmas are computed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Marks:
     """Known places (n, 3) on the map that frame `frame` shows at `pixels` (n, 2), to `sigma_px`.
 
-    `height_sigma_m` is of each place's height by itself, `level_sigma_m` of what they have in common. `by_hand` means
-    that somebody measured them.
+    `height_sigma_m` is that of each place's own height, `level_sigma_m` that of the height they have in common.
+    `by_hand`: they were measured by hand.
     """
 
     frame: int
@@ -58,9 +58,9 @@ class Ties:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """The adjusted eyes. `changes` (n, 6) as `Eye.moved` takes them, from the given eyes; `sigmas` (n, 6) of what is
-    left to doubt, None for a strip too long to tell. `inliers` and `residuals_px` (rms of the inliers; None without)
-    by group, in the given order."""
+    """The adjusted eyes. `changes` (n, 6) from the given eyes, as `Eye.moved` takes them; `sigmas` (n, 6) of the
+    adjusted poses, None for a strip that is too long. `inliers` and `residuals_px` (rms of the inliers; None without
+    any) by group, in the given order."""
 
     eyes: tuple[Eye, ...]
     changes: Floats
@@ -77,7 +77,7 @@ def adjust(
     sigmas: Floats,
     iterations: int = 20,
 ) -> Solution:
-    """Gauss-Newton from the given eyes, with `sigmas` (n, 6) of their shifts (m) and turns (rad)."""
+    """Adjust by Gauss-Newton from the given eyes, with `sigmas` (n, 6) of their shifts (m) and turns (rad)."""
     given = list(eyes)
     count = len(given)
     changes = np.zeros((count, 6))
@@ -124,7 +124,7 @@ def adjust(
 def _seen(
     group: Marks | Ties, eyes: Sequence[Eye], ground: Ground, level: float
 ) -> tuple[Floats, Floats, Floats, tuple[int, ...]] | None:
-    """(residuals (n, 2), derivatives (n, 2, 6·frames + 1), weights (n, 2, 2), frames) of what can be seen."""
+    """(residuals (n, 2), derivatives (n, 2, 6·frames + 1), weights (n, 2, 2), frames) of the visible observations."""
     residual, slope, heights = _residual(group, eyes, ground, level)
     usable = np.isfinite(residual).all(axis=1) & np.isfinite(slope).all(axis=1)
     if not usable.any():
@@ -171,7 +171,7 @@ def _residual(group: Marks | Ties, eyes: Sequence[Eye], ground: Ground, level: f
 
 
 def _at(group: Marks | Ties, eyes: Sequence[Eye], heights: Floats) -> Floats:
-    """(n, 2): where the frame (of ties the second) shows the group's ground at these heights."""
+    """(n, 2): where the frame (of ties, the second) shows the group's ground at these heights."""
     if isinstance(group, Marks):
         return eyes[group.frame].project(np.concatenate([group.places[:, :2], heights[:, None]], axis=1))
     places = eyes[group.first].on_plane(group.pixels_first, heights)

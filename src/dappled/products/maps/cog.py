@@ -1,4 +1,4 @@
-"""Maps as Cloud-Optimised GeoTIFF, whole or not at all."""
+"""Write maps as Cloud-Optimised GeoTIFF, whole or not at all."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TILE = 512
 def display(image: Image, gain: float) -> NDArray[np.uint8]:
     """(h, w, 2) grey and alpha, or (h, w, 4) red, green, blue and alpha: linear values times `gain` in sRGB's curve.
 
-    NaN is transparent, and black below.
+    NaN becomes transparent black.
     """
     known = np.asarray(np.isfinite(image).all(axis=2))
     linear = np.clip(np.where(known[..., None], image, 0.0) * gain, 0.0, 1.0)
@@ -31,7 +31,7 @@ def display(image: Image, gain: float) -> NDArray[np.uint8]:
 
 
 def gain_of(images: Iterable[Image]) -> float:
-    """What brings the brightest hundredth of these pictures to 0.9 of white."""
+    """The gain that brings the brightest hundredth of these pictures to 0.9 of white."""
     brightest = [float(np.nanpercentile(image, 99)) for image in images]
     level = float(np.median(brightest)) if brightest else 0.0
     return 0.9 / level if level > 0 else 1.0
@@ -47,9 +47,9 @@ def write_pieces(
     tags: Mapping[str, str],
     names: tuple[str, ...] = (),
 ) -> None:
-    """A COG from pieces (rows, columns, values (h, w, bands)) that cover the grid.
+    """Write a COG from pieces (rows, columns, values (h, w, bands)) that cover the grid.
 
-    uint8 with 2 or 4 bands is a picture whose last band is alpha; floats hold NaN where nothing is known.
+    uint8 with 2 or 4 bands is a picture whose last band is alpha; floats are NaN where unknown.
     Raises MapError.
     """
     rasterio, windows, shutil = (need(name) for name in ("rasterio", "rasterio.windows", "rasterio.shutil"))
@@ -67,7 +67,7 @@ def write_pieces(
         "blockysize": TILE,
         "bigtiff": "if_safer",
     }
-    if dtype == "uint8":  # said at its birth: a GeoTIFF keeps what is said of bands later in a file beside it
+    if dtype == "uint8":  # set at creation: GDAL writes what is set later into a file beside the GeoTIFF
         profile |= {"alpha": "yes", "photometric": "rgb" if bands == 4 else "minisblack"}
     else:
         profile["nodata"] = float("nan")
@@ -100,13 +100,13 @@ def write_pieces(
 def write(
     path: Path, grid: MapGrid, values: NDArray[Any], tags: Mapping[str, str], names: tuple[str, ...] = ()
 ) -> None:
-    """A COG of values (rows, columns, bands), as `write_pieces`."""
+    """Write a COG of values (rows, columns, bands); see `write_pieces`."""
     everything = (slice(0, grid.shape[0]), slice(0, grid.shape[1]), values)
     write_pieces(path, grid, [everything], dtype=str(values.dtype), bands=values.shape[2], tags=tags, names=names)
 
 
 def settle(part: Path, path: Path) -> None:
-    """Put a finished file durably under its name."""
+    """Rename a finished file, durably."""
     with part.open("rb") as file:
         os.fsync(file.fileno())
     part.rename(path)

@@ -1,4 +1,4 @@
-"""Two flights over one place: what has changed between them, as a raster."""
+"""Compare two flights over one place: what has changed between them, as a raster."""
 
 from __future__ import annotations
 
@@ -19,14 +19,13 @@ Single = NDArray[np.float32]
 
 
 class DifferenceError(DappledError):
-    """Two flights that can't be compared; one sentence."""
+    """Two flights can't be compared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapDifference:
-    """`values` float32 (rows, columns), second less first, NaN where not both know; `share` of the map that both know.
-
-    For pictures the values are shares of the first one's mean brightness, after the second's was matched to it.
+    """`values` float32 (rows, columns), second minus first, NaN where either is unknown; `share` of the map where both
+    are known. For pictures, values are shares of the first one's mean brightness, to which the second's is matched.
     """
 
     grid: MapGrid
@@ -35,8 +34,8 @@ class MapDifference:
 
 
 def of_pictures(first: Survey, second: Survey) -> MapDifference:
-    """The brightness that has changed. The second's is matched to the first's by gain and offset (median and spread)
-    over the common ground: another hour's light is no change. Raises DifferenceError where there is none."""
+    """The change of brightness. The second's is matched to the first's by gain and offset (median and spread) over the
+    common ground, so that another time of day does not count. Raises DifferenceError where there is no such ground."""
     grid = _common(first, second)
     before, after = (_whole(one, grid) for one in (first, second))
     both = np.isfinite(before) & np.isfinite(after)
@@ -49,7 +48,8 @@ def of_pictures(first: Survey, second: Survey) -> MapDifference:
 
 
 def of_heights(first: TerrainModel, second: TerrainModel) -> MapDifference:
-    """The height that has been gained, m, on the first's grid; both surveys must lie on one projection."""
+    """The gain in height, m, on the first's grid. Raises DifferenceError where the projections differ, or no height is
+    known to both."""
     a, b = first.surface, second.surface
     if a.grid.crs != b.grid.crs:
         raise DifferenceError(f"heights on {a.grid.crs} and {b.grid.crs} can't be compared: give both the same --crs")
@@ -67,7 +67,7 @@ def of_heights(first: TerrainModel, second: TerrainModel) -> MapDifference:
 
 
 def write(first: Survey, second: Survey, made: MapDifference, path: Path, unit: str) -> Path:
-    """A COG of the difference."""
+    """Write the difference as a COG."""
     tags = {**first.tags(), "DAPPLED_AGAINST": second.flight, "DAPPLED_UNIT": unit}
     cog.write(path, made.grid, made.values[..., None], tags, (f"{second.flight} less {first.flight}, {unit}",))
     return path

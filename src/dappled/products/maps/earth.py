@@ -1,7 +1,7 @@
-"""Where on Earth: geodetic, Earth-centred and map coordinates, true against grid north, sea level against ellipsoid.
+"""Convert between geodetic and map coordinates, true and grid north, mean sea level and ellipsoid.
 
 Positions are geodetic on WGS 84. A flight is mapped in one metric projection, by default the UTM zone (UPS near the
-poles) of its first frame. Every transformation is one that PROJ can carry out in full: never a ballpark.
+poles) of its first frame. PROJ must be able to carry out every transformation in full; ballpark ones are refused.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from dappled.errors import DappledError
 
 Floats = NDArray[np.float64]
 GEODETIC = "EPSG:4326"
-_OVERLAP_DEG = 6.0  # a projection is used so far beyond the area that it was made for
+_OVERLAP_DEG = 6.0  # how far a projection may be used beyond the area that it was made for
 _SYSTEM_GRIDS = Path("/usr/share/proj")
 _GEOID_GRIDS = ("egm96_15.gtx", "us_nga_egm96_15.tif", "us_nga_egm08_25.tif", "egm08_25.gtx")
 
 
 class EarthError(DappledError):
-    """A place, a coordinate reference system or a grid that can't be used; one sentence."""
+    """A position, a coordinate reference system or a grid can't be used."""
 
 
 @dataclass(frozen=True, slots=True)
 class Geoid:
-    """How high mean sea level stands above the ellipsoid: a grid file, or one number for the whole flight.
+    """The height of mean sea level above the ellipsoid: a grid file, or one number for the whole flight.
 
-    `name` says in outputs what was used.
+    `name` is written to outputs.
     """
 
     grid: Path | None = None
@@ -70,9 +70,9 @@ class Geoid:
 
 
 def geoid(given: str | None) -> Geoid:
-    """The geoid that a person names: metres, a grid file, or (None) the first one that PROJ's folders hold.
+    """The geoid of the option `given`: metres, a grid file, or (None) the first grid in PROJ's folders.
 
-    Raises EarthError naming the missing grid: PROJ alone would silently leave the geoid out.
+    Raises EarthError that names the missing grid: PROJ alone would leave the geoid out without a word.
     """
     if given is not None:
         try:
@@ -103,8 +103,8 @@ def wrapped(longitude_deg: float) -> float:
 
 
 def touch(a: tuple[float, ...], b: tuple[float, ...], *, degrees: bool) -> bool:
-    """Whether two boxes (west, south, east, north) meet. In degrees also around the antimeridian, where a box's west
-    may lie above its east, and whether a raster counts to 180° or to 360°.
+    """Whether two boxes (west, south, east, north) overlap. Boxes in degrees may cross the antimeridian (west above
+    east), and may count longitudes to 180° or to 360°.
 
     >>> touch((179.9, -17, -179.9, -16), (-180, -90, 180, 90), degrees=True)
     True
@@ -131,10 +131,10 @@ def utm(latitude_deg: float, longitude_deg: float) -> str:
 
 
 class Projection:
-    """A metric map projection: geodetic degrees to (east, north) metres and back, and how its grid lies."""
+    """A metric map projection: geodetic degrees to (east, north) metres and back, and the grid's orientation."""
 
     def __init__(self, name: str) -> None:
-        """Raises EarthError for what is no projected system in metres."""
+        """Raises EarthError where `name` is not a projected system in metres."""
         self.crs = _metric(name)
         epsg = self.crs.to_epsg()
         self.name = f"EPSG:{epsg}" if epsg else name
@@ -158,7 +158,7 @@ class Projection:
         return np.asarray(latitude, float), np.asarray(longitude, float)
 
     def at(self, latitude_deg: float, longitude_deg: float) -> GridAt:
-        """How the grid lies at a place. Raises EarthError where the projection doesn't reach."""
+        """The grid at a place. Raises EarthError outside the projection's area."""
         area = self.crs.area_of_use
         if area is not None:
             beyond = max(area.south - latitude_deg, latitude_deg - area.north, 0.0)
@@ -175,15 +175,15 @@ class Projection:
 
     def _too_far(self, latitude_deg: float, longitude_deg: float) -> str:
         return (
-            f"{self.name} is no map of {latitude_deg:.5f}, {longitude_deg:.5f}: leave --crs out, or name the "
+            f"{self.name} does not cover {latitude_deg:.5f}, {longitude_deg:.5f}: leave --crs out, or name the "
             "projection of that place"
         )
 
 
 @dataclass(frozen=True, slots=True)
 class GridAt:
-    """A place on the map. `convergence_rad` is how far grid north lies clockwise of true north, `scale` map metres
-    for a metre on the ellipsoid."""
+    """A place on the map. `convergence_rad` is the angle from true north clockwise to grid north, `scale` the map
+    metres per metre on the ellipsoid."""
 
     east: float
     north: float
@@ -200,8 +200,10 @@ def _metric(name: str) -> pyproj.CRS:
     try:
         crs = pyproj.CRS.from_user_input(name)
     except CRSError:
-        raise EarthError(f"{name!r} is no coordinate system that PROJ knows: give one as EPSG:32615") from None
+        raise EarthError(f"{name!r} is not a coordinate system that PROJ knows: give one as EPSG:32615") from None
     units = {axis.unit_name for axis in crs.axis_info[:2]}
     if not crs.is_projected or units != {"metre"}:
-        raise EarthError(f"{name} is no map in metres (its unit: {', '.join(sorted(units))}): give one as EPSG:32615")
+        raise EarthError(
+            f"{name} is not a map projection in metres (its unit: {', '.join(sorted(units))}): give one as EPSG:32615"
+        )
     return crs

@@ -1,9 +1,9 @@
-"""One view's geometry on a map: where a ground point appears in it, and where a pixel's ray goes.
+"""The geometry of a view on a map: which pixel shows a ground point, and where a pixel's ray goes.
 
-The world is the map: grid east and north as the projection counts them, height in metres above mean sea level. Within
-a frame's footprint the map is flat and uniform: its grid is turned from true north by the convergence, and a metre on
-the ground is `scale` map metres, both taken at the camera. (A kilometre aside that is good to a few centimetres, at a
-hundred metres to under a millimetre.)
+World coordinates are grid east and north of the projection, and height in metres above mean sea level. Within a frame's
+footprint the map counts as flat and uniform: its grid is turned from true north by the convergence, and a metre on the
+ground is `scale` map metres, both taken at the camera. (The error is a few centimetres at a kilometre, and under a
+millimetre at a hundred metres.)
 
 Camera axes are right, down, forward. A pixel is (x, y) = (column, row) of the view, its centre at whole numbers.
 """
@@ -23,19 +23,19 @@ from dappled.products.maps.earth import GridAt
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
-_LOWEST = math.sin(math.radians(3))  # a ray that dips less is above the horizon for all that a map needs
+_LOWEST = math.sin(math.radians(3))  # a ray that dips less counts as above the horizon
 
 
 class EyeError(DappledError):
-    """A view that can't be put on a map; one sentence."""
+    """A view can't be put on a map."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eye:
-    """A pinhole with distortion above the map.
+    """A pinhole camera with distortion, above the map.
 
-    `matrix` (3, 3) leads from (x, y, 1) on the plane at distance 1 to the pixel (x, y, 1); `rotation` (3, 3) from
-    camera axes to grid east, north, up; `centre` (3,) is the perspective centre on the map; `shape` (rows, columns).
+    `matrix` (3, 3) maps (x, y, 1) on the plane at distance 1 to the pixel (x, y, 1); `rotation` (3, 3) turns camera
+    axes to grid east, north, up; `centre` (3,) is the perspective centre on the map; `shape` is (rows, columns).
     """
 
     matrix: Floats
@@ -65,7 +65,7 @@ class Eye:
     def homography(self, height_m: float) -> Floats:
         """(3, 3) from (east − centre, north − centre, 1) on the plane at a height to the pixel (x, y, 1).
 
-        Exact where the lens does not distort. (East and north count from the centre, for the numbers' sake.)
+        Exact where the lens does not distort. East and north count from the centre, which keeps the numbers small.
         """
         down = self.rotation.T
         columns = [down[:, 0] / self.scale, down[:, 1] / self.scale, down[:, 2] * (height_m - self.centre[2])]
@@ -77,7 +77,7 @@ class Eye:
         return np.array([[0, 0], [columns, 0], [columns, rows], [0, rows]], dtype=np.float64) - 0.5
 
     def border(self, steps: int = 16) -> Floats:
-        """(4·steps, 2): points all around, in the corners' order."""
+        """(4·steps, 2): points along the border, in the corners' order."""
         corners = self.corners()
         share = np.arange(steps)[:, None] / steps
         sides = [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
@@ -101,7 +101,7 @@ class Eye:
         return float(min(np.linalg.norm(place - places[0]) for place in places[1:]) / self.scale)
 
     def on_plane(self, pixels: Floats, height_m: float | Floats) -> Floats:
-        """(n, 2) east and north where rays meet a height; NaN where they never do."""
+        """(n, 2) east and north where rays reach a height; NaN where they never do."""
         rays = self.rays(pixels)
         drop = height_m - self.centre[2]
         depth = drop / np.where(rays[:, 2] < -1e-9, rays[:, 2], np.nan)
@@ -115,7 +115,7 @@ class Eye:
 
 
 def intrinsics(sensor: Sensor, lens: Lens, grid: Floats) -> Floats:
-    """(3, 3) from (x, y, 1) at distance 1 to a view's pixel: lens, chip, and the view's `grid` (2, 3) on the sensor."""
+    """(3, 3) from (x, y, 1) at distance 1 to a view's pixel, by lens, chip, and the view's `grid` (2, 3)."""
     to_mm, offset = _to_chip(sensor, grid)
     back = np.linalg.inv(to_mm)
     principal = np.array([lens.principal_point_mm[1], lens.principal_point_mm[0]])
@@ -156,7 +156,7 @@ def look(
 def through(eye: Eye, aperture_m: tuple[float, float], focus_m: float = math.inf) -> Eye:
     """The eye of one view: light from aperture point θ (y, x, metres) leaves the scene at x·Z/v − θ·(1 − Z/F).
 
-    So the perspective centre stands at −θ, and pixels look aside by θ/F: the principal point moves by −θ·v/F.
+    So the perspective centre is at −θ, and pixels look aside by θ/F: the principal point moves by −θ·v/F.
     """
     theta = np.array([aperture_m[1], aperture_m[0]])
     centre = eye.centre + eye.rotation @ np.array([-theta[0], -theta[1], 0.0]) * (eye.scale, eye.scale, 1.0)
@@ -166,7 +166,7 @@ def through(eye: Eye, aperture_m: tuple[float, float], focus_m: float = math.inf
 
 
 def distorted(plane: Floats, numbers: tuple[float, float, float, float, float]) -> Floats:
-    """OpenCV's model: points (n, 2) on the plane at distance 1 as the lens bends them."""
+    """Distort points (n, 2) on the plane at distance 1 by OpenCV's model."""
     if not any(numbers):
         return plane
     k1, k2, p1, p2, k3 = numbers

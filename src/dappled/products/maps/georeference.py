@@ -1,4 +1,4 @@
-"""From a recorded flight to maps: frames decoded, placed, refined where asked for, and drawn."""
+"""Survey a recorded flight: decode its frames, place them on a map, and refine their poses where asked for."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ Progress = Callable[[str, int, int], None]  # what, done, of
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How a flight is mapped; None leaves a choice to what the flight says.
+    """How a flight is mapped; None takes the flight's own value.
 
-    `ground_m` above sea level is that of home; `terrain` a raster file, whose heights are ellipsoidal where
-    `terrain_geoid` is given. `gsd_m` is the finest of the frames'. `view` is "mean", "ground" (all views, refocused on
-    the ground) or "v,u". `focus_m` is where the lens was focused. `frames` names the frames by number.
+    `ground_m` is the ground's height above sea level (default: home's); `terrain` a raster file, with ellipsoidal
+    heights where `terrain_geoid` is given. `gsd_m` defaults to the finest of the frames'. `view` is "mean", "ground"
+    (all views, refocused on the ground) or "v,u". `focus_m` is the distance at which the lens was focused. `frames`
+    holds the frames' numbers.
     """
 
     mounting: Mounting = field(default_factory=Mounting)
@@ -64,7 +65,7 @@ class Survey:
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def tags(self) -> dict[str, str]:
-        """What map files say of themselves."""
+        """The metadata of map files."""
         return {
             "DAPPLED_FLIGHT": self.flight,
             "DAPPLED_GROUND": self.ground.name,
@@ -74,8 +75,8 @@ class Survey:
 
 
 def survey(flight: Path, recipe: Recipe, options: Options, progress: Progress, stack: ExitStack) -> Survey:
-    """Decode and place a flight's frames. Frames that can't be are left out and named; `stack` keeps the pictures'
-    scratch folder. Raises DappledError where nothing is left, or the call itself is wrong."""
+    """Decode and place a flight's frames. Those that can't be decoded or placed are left out and named; `stack` owns
+    the pictures' scratch folder. Raises DappledError where no frame is left, or the options are wrong."""
     stations, left = photographs.stations(flight, options.mounting)
     if options.frames is not None:
         stations = [one for one in stations if one.frame.index in options.frames]
@@ -112,10 +113,10 @@ def on_ground(
     level_m: float,
     options: Options,
 ) -> Survey:
-    """The survey of placed photographs; those that leave the ground or look above the horizon are left out and named.
+    """The survey of placed photographs; those that miss the ground or look above the horizon are left out and named.
 
-    `level_m` is the flat ground's height, also where one looks for terrain. Raises DappledError where none is left, or
-    the terrain can't be used.
+    `level_m` is the height of flat ground, which also says where terrain is needed. Raises DappledError where none is
+    left, or the terrain can't be used.
     """
     kept, out = [], list(left)
 
@@ -153,8 +154,8 @@ def refined(
     sigmas: tuple[float, float] | None = None,
     progress: Progress = lambda *_: None,
 ) -> Survey:
-    """The survey with poses refined; what became of each frame is in its facts. Raises DappledError where a base map or
-    control points can't be used at all."""
+    """The survey with refined poses; the result for each frame is in its facts. Raises DappledError where the base map
+    or the control points can't be used."""
     raster = None if base is None else BaseMap(base, made.projection, made.gsd_m)
     if raster is not None:
         raster.check(np.concatenate([map_grid.footprint(one.eye, made.ground)[:, :2] for one in made.photographs]))
@@ -179,7 +180,7 @@ def refined(
 
 
 def develop(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, options: Options) -> DecodeResult:
-    """One frame of a flight, decoded. Raises DappledError."""
+    """Decode one frame of a flight. Raises DappledError."""
     return darkroom.decode(
         flight / frame.name,
         focal_length_mm=options.focal_length_mm or (tag.focal_length_mm if tag else None),
@@ -190,7 +191,7 @@ def develop(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, opt
 def place(
     station: Station, made: DecodeResult, darkroom: Darkroom, projection: Projection, options: Options
 ) -> Photograph:
-    """A decoded frame as a photograph on the map. Raises DappledError."""
+    """Place a decoded frame on the map. Raises DappledError."""
     field, gains = made.light_field, photographs.true_colours(made.raw)
     if gains is not None and field.views.ndim == 5:
         field = replace(field, views=field.views * gains.astype(np.float32))
@@ -199,7 +200,7 @@ def place(
 
 
 def _shelved(one: Photograph, scratch: Path) -> Photograph:
-    """The photograph with its pictures in files, mapped and not held: a flight has many."""
+    """The photograph with its pictures in memory-mapped files: a flight's frames need not fit into memory."""
     np.save(scratch / f"{one.name}.npy", one.image)
     kept = replace(one, image=np.load(scratch / f"{one.name}.npy", mmap_mode="r"))
     if one.views is None:
@@ -209,7 +210,7 @@ def _shelved(one: Photograph, scratch: Path) -> Photograph:
 
 
 def level_of(stations: Sequence[Station], options: Options) -> float:
-    """The flat ground's height above sea level."""
+    """The height of flat ground above sea level. Raises DappledError where it isn't known."""
     if options.ground_m is not None:
         return options.ground_m
     homes = [one.ground_m for one in stations if one.ground_m is not None]
@@ -226,7 +227,7 @@ def _terrain(
     met = np.concatenate([map_grid.footprint(one.eye, Flat(level_m))[:, :2] for one in taken])
     centres = np.array([one.eye.centre[:2] for one in taken])
     low, high = np.concatenate([met, centres]).min(axis=0), np.concatenate([met, centres]).max(axis=0)
-    margin = 0.25 * float(np.max(high - low)) + 5.0  # hills lie elsewhere than flat ground
+    margin = 0.25 * float(np.max(high - low)) + 5.0  # rays meet hills elsewhere than flat ground
     bounds = (low[0] - margin, low[1] - margin, high[0] + margin, high[1] + margin)
     return load_ground(path, projection, bounds, geoid=geoid)
 
@@ -237,5 +238,5 @@ def _below(one: Photograph, ground: Ground) -> float:
 
 
 def _two_digits(value: float) -> float:
-    """A length with two digits: a map's step that a person can read."""
+    """A length rounded to two digits, so that the map's step is easy to read."""
     return float(f"{value:.1e}")

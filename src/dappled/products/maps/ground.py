@@ -1,6 +1,6 @@
-"""The ground that rays meet: flat at one height, or a terrain raster (DTED, GeoTIFF …). Heights are above sea level.
+"""Intersect rays with the ground: flat at one height, or a terrain raster (DTED, GeoTIFF …).
 
-`sigma_m` is how far the true ground may lie from this one: refinement trusts points accordingly.
+Heights are above sea level. `sigma_m` is the uncertainty of the ground's height; refinement weights points by it.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from dappled.products.maps.earth import Geoid, Projection, touch
 from dappled.products.maps.eye import Eye
 
 Floats = NDArray[np.float64]
-FLAT_SIGMA_M = 1.5  # grass to roofs, where nobody knows better
-_STEPS = 400  # of a ray through a raster, at most
+FLAT_SIGMA_M = 1.5  # from grass to roofs, where nothing better is known
+_STEPS = 400  # at most, along a ray through a raster
 
 
 class GroundError(DappledError):
-    """A terrain raster that can't be used; one sentence."""
+    """A terrain raster can't be used."""
 
 
 class Ground(Protocol):
-    """What `Eye` rays meet."""
+    """The surface that an `Eye`'s rays meet."""
 
     @property
     def sigma_m(self) -> float: ...
 
     @property
     def name(self) -> str:
-        """What outputs call it."""
+        """Its name in outputs."""
 
     def heights(self, east: Floats, north: Floats) -> Floats:
-        """Height at places, any shape; NaN where it is not known."""
+        """Heights at places of any shape; NaN where unknown."""
 
     def meet(self, eye: Eye, pixels: Floats) -> Floats:
-        """(n, 3) where the rays of pixels (n, 2) meet the ground first; NaN where they don't."""
+        """(n, 3): where the rays of pixels (n, 2) first meet the ground; NaN where they miss it."""
 
     def sees(self, eye: Eye, east: Floats, north: Floats, height: Floats) -> NDArray[np.bool_]:
-        """Whether the ground lets places be seen, any shape."""
+        """Whether places of any shape are visible, not hidden by the ground."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,10 +143,10 @@ def load(
     geoid: Geoid | None = None,
     sigma_m: float | None = None,
 ) -> Raster:
-    """The terrain of a raster file within `bounds` (west, south, east, north on the map), on the map's grid.
+    """Read a terrain raster within `bounds` (west, south, east, north on the map), on the map's grid.
 
-    Heights are taken as above sea level (DTED's are). With a `geoid` they are ellipsoidal, and brought down to it.
-    Raises GroundError where the file can't be read, has no place on Earth, or lies elsewhere.
+    Heights are taken as above sea level (DTED's are); with a `geoid` they are taken as ellipsoidal and converted.
+    Raises GroundError where the file can't be read, is not georeferenced, or does not overlap.
     """
     rasterio, warp = need("rasterio"), need("rasterio.warp")
     try:
@@ -191,7 +191,7 @@ def load(
 
 
 def _step(source: Any, projection: Projection, bounds: tuple[float, float, float, float]) -> float:
-    """A raster's own step in map metres, under the flight."""
+    """The raster's own step under the flight, in map metres."""
     a, e = abs(source.transform.a), abs(source.transform.e)
     if source.crs.is_geographic:
         latitude, _ = projection.to_geodetic((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2)

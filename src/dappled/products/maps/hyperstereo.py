@@ -1,8 +1,8 @@
-"""Heights from frames of one flight that overlap, their poses the baseline: what a single frame's aperture can't tell.
+"""Find heights from overlapping frames of one flight, whose baseline is far longer than a single frame's aperture.
 
-A plane sweep over the map. Each cell is tried at a row of heights; at the right one the frames that see it agree there,
-by normalised correlation over a window of the map. No picture has to be rectified, any number of frames takes part, and
-tilted cameras and lens distortion are in the eyes.
+This is a plane sweep over the map. Each cell is tried at a series of heights; at the right one the frames that see it
+agree, by normalised correlation over a window of the map. Pictures need not be rectified, any number of frames may take
+part, and tilted cameras and lens distortion are handled by the eyes.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ Single = NDArray[np.float32]
 LEAST_OVERLAP = 0.2  # of a frame, for a pair
 _PIXEL_SIGMA = 0.12  # of a match, in pixels
 _STEP_PX = 0.7  # of parallax between heights
-_LEAST_SCORE = 0.88  # below, edges and what only seems to be seen twice: wrong more often than not
+_LEAST_SCORE = 0.88  # lower scores come from edges and false matches: wrong more often than not
 _MOST_PARTNERS = 3
 
 
 class HyperstereoError(DappledError):
-    """A flight that shows no ground twice; one sentence."""
+    """A flight shows no ground twice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Heights float32 (rows, columns) above sea level on a grid, NaN where unknown; `sigma_m` one standard deviation of
-    each by itself, `score` the correlation (−1 to 1) that it was found by. `level_sigma_m` is what doubtful poses do to
-    the heights around a place in common."""
+    """Heights float32 (rows, columns) above sea level on a grid, NaN where unknown; `sigma_m` is one standard deviation
+    of each by itself, `score` its correlation (−1 to 1). `level_sigma_m` is the common error of the heights around a
+    place that comes from uncertain poses."""
 
     grid: MapGrid
     height_m: Single
@@ -60,10 +60,10 @@ def surface(
     window: int = 9,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> Surface:
-    """The ground between two heights, from every frame against those that see the same of it.
+    """Find the ground between two heights, from every frame against those that overlap it.
 
-    Where several frames see a cell as their best partner's, the better score stays. Raises HyperstereoError where no
-    two frames overlap.
+    Where several pairs give a cell a height, the one with the best score is kept. Raises HyperstereoError where no two
+    frames overlap.
     """
     middle = (lowest_m + highest_m) / 2
     height = np.full(grid.shape, np.nan, dtype=np.float32)
@@ -100,7 +100,7 @@ def _level_sigma(one: Photograph, two: Photograph, level_m: float) -> float:
 
 
 def _partners(number: int, photographs: Sequence[Photograph], level_m: float) -> list[Photograph]:
-    """The frames with the widest baselines that still share enough ground with this one."""
+    """The frames with the longest baselines that still share enough ground with this one."""
     one = photographs[number]
     ring = one.eye.on_plane(one.eye.border(4), level_m)
     low, high = ring.min(axis=0), ring.max(axis=0)
@@ -173,12 +173,12 @@ def _sweep(
     known = (score >= _LEAST_SCORE) & (top == inner)
     step = levels[1] - levels[0]
     height = np.where(known, levels[0] + (inner + aside) * step, np.nan)
-    sigma = _PIXEL_SIGMA / slope * np.maximum((1 - score) / 0.02, 1)  # the less alike, the worse
+    sigma = _PIXEL_SIGMA / slope * np.maximum((1 - score) / 0.02, 1)  # larger for a lower score
     return Surface(part, height.astype(np.float32), np.where(known, sigma, np.nan).astype(np.float32), score)
 
 
 def _parallax(one: Photograph, two: Photograph, east: Floats, north: Floats, level: float) -> float:
-    """Pixels that a metre of height moves the second frame's picture against the first's, in the part's middle."""
+    """Parallax in the second frame, in pixels per metre of height, in the middle of the part."""
     place = np.array([[float(east.mean()), float(north.mean()), level]])
     moved = one.eye.on_plane(one.eye.project(place), level + 1.0)
     raised = two.eye.project(np.concatenate([moved, [[level + 1.0]]], axis=1))
@@ -186,7 +186,7 @@ def _parallax(one: Photograph, two: Photograph, east: Floats, north: Floats, lev
 
 
 def _seen(one: Photograph, grey: Single, east: Floats, north: Floats, level: float) -> Single:
-    """The frame laid on a plane at a level; NaN outside of it."""
+    """The frame projected on a plane at a level; NaN outside of it."""
     points = np.stack([east.ravel(), north.ravel(), np.full(east.size, level)], axis=1)
     at = one.eye.project(points)
     rows, columns = one.eye.shape
@@ -195,7 +195,7 @@ def _seen(one: Photograph, grey: Single, east: Floats, north: Floats, level: flo
 
 
 def _correlation(a: Single, b: Single, window: int) -> Single:
-    """Normalised correlation in a window around each cell; NaN where one of the two isn't known all over it."""
+    """Normalised correlation in a window around each cell; NaN where either is unknown in a part of it."""
     known = np.isfinite(a) & np.isfinite(b)
     a, b = np.where(known, a, 0), np.where(known, b, 0)
 

@@ -1,4 +1,4 @@
-"""Pictures on a virtual globe: KMZ with north-up ground overlays, which every viewer draws.
+"""Write pictures for virtual globes: KMZ with north-up ground overlays, which every viewer draws.
 
 A picture across the antimeridian becomes two overlays. A LatLonQuad (Google's extension) keeps a view unrotated; not
 every viewer draws it.
@@ -24,7 +24,7 @@ KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
 TILE = 1024
 Pixels = NDArray[np.uint8]
 _FOLDER = "tiles/"
-_WHEN = (1980, 1, 1, 0, 0, 0)  # zip's zero: the same picture gives the same bytes
+_WHEN = (1980, 1, 1, 0, 0, 0)  # zip's earliest time: the same picture gives the same bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +39,7 @@ class Overlay:
 
 
 def write(path: Path, name: str, overlays: Sequence[Overlay]) -> None:
-    """A KMZ of these overlays. Large ones become trees of tiles that a viewer loads as it comes near.
+    """Write a KMZ of overlays. Large ones become trees of tiles that a viewer loads as it comes near.
 
     Raises OSError.
     """
@@ -83,8 +83,10 @@ def _sides(grid: MapGrid, picture: Pixels) -> list[tuple[MapGrid, Pixels]]:
 
 
 def _tree(files: dict[str, bytes], place: str, overlay: Overlay, folder: str = "") -> ET.Element:
-    """A super-overlay: the link to a page with a coarse picture of the whole and, behind links of its own, the four
-    quarters, and so on. `folder` leads from where the link stands to where all pages and pictures lie."""
+    """A super-overlay: a link to a page with a coarse picture of the whole and links to its four quarters, and so on.
+
+    `folder` is the path from the link's file to the folder of all pages and pictures.
+    """
     grid, picture = overlay.grid, overlay.picture
     assert grid is not None
     link = ET.Element(_k("NetworkLink"))
@@ -136,7 +138,7 @@ def _quad(overlay: Overlay, href: str) -> ET.Element:
 
 
 def _region(grid: MapGrid) -> ET.Element:
-    """Where a viewer must look, and how large on its screen this must be (px), before it loads what lies here."""
+    """The area that must be in view, and its least size on the screen (px), before a viewer loads a tile."""
     region = ET.Element(_k("Region"))
     west, south, east, north = grid.bounds
     box = ET.SubElement(region, _k("LatLonAltBox"))
@@ -149,7 +151,7 @@ def _region(grid: MapGrid) -> ET.Element:
 
 
 def _picture(files: dict[str, bytes], place: str, picture: Pixels) -> str:
-    """The picture as PNG among the archive's files; its name."""
+    """Add the picture as PNG to the archive's files; returns its name."""
     mode = "LA" if picture.shape[2] == 2 else "RGBA"
     memory = io.BytesIO()
     Pictures.fromarray(np.ascontiguousarray(picture), mode).save(memory, "PNG")
@@ -159,7 +161,7 @@ def _picture(files: dict[str, bytes], place: str, picture: Pixels) -> str:
 
 
 def _shrunk(picture: Pixels, step: int) -> Pixels:
-    """Means over step × step cells; what is transparent has no say in the colour."""
+    """Means over step × step cells, weighted by alpha."""
     if step == 1:
         return picture
     rows, columns = (-(-side // step) * step for side in picture.shape[:2])

@@ -22,11 +22,11 @@ from dappled.products.maps.photographs import Photograph
 
 Floats = NDArray[np.float64]
 
-LARGEST_KMZ = 16_384  # cells on a side: a globe overlay is held in memory whole
+LARGEST_KMZ = 16_384  # cells on a side: an overlay is held in memory as a whole
 
 
 def mosaic_cog(made: Survey, path: Path, gain: float | None = None) -> Path:
-    """All frames as one COG on the survey's projection. Raises MapError."""
+    """Write all frames as one COG on the survey's projection. Raises MapError."""
     grid = map_grid.grid_of(made.photographs, made.ground, made.projection, made.gsd_m)
     shown = gain_of(made) if gain is None else gain
     pieces = (
@@ -38,7 +38,7 @@ def mosaic_cog(made: Survey, path: Path, gain: float | None = None) -> Path:
 
 
 def mosaic_kmz(made: Survey, path: Path, gain: float | None = None) -> Path:
-    """All frames as one north-up overlay; as a tree of tiles where it is large. Raises MapError."""
+    """Write all frames as one north-up overlay, a large one as a tree of tiles. Raises MapError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     overlay = _overlay(made, made.photographs, made.flight, gain_of(made) if gain is None else gain)
     kmz.write(path, made.flight, [overlay])
@@ -46,12 +46,12 @@ def mosaic_kmz(made: Survey, path: Path, gain: float | None = None) -> Path:
 
 
 def frame_cog(made: Survey, one: Photograph, path: Path, gain: float) -> Path:
-    """One frame as a COG. Raises MapError."""
+    """Write one frame as a COG. Raises MapError."""
     return mosaic_cog(replace(made, photographs=(one,)), path, gain)
 
 
 def frame_kmz(made: Survey, one: Photograph, path: Path, gain: float, *, quad: bool = False) -> Path:
-    """One frame as a KMZ: north-up, or as a `quad` the view itself between its four corners. Raises MapError."""
+    """Write one frame as a KMZ: north-up, or with `quad` the view itself between its four corners. Raises MapError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     overlay = _quad(made, one, gain) if quad else _overlay(made, [one], one.name, gain)
     kmz.write(path, f"{made.flight} {one.name}", [overlay])
@@ -59,7 +59,7 @@ def frame_kmz(made: Survey, one: Photograph, path: Path, gain: float, *, quad: b
 
 
 def gain_of(made: Survey) -> float:
-    """One gain for the whole survey: frames keep their brightness against each other."""
+    """One gain for the whole survey, so that frames keep their brightness relative to each other."""
     return cog.gain_of([one.image[::4, ::4] for one in made.photographs])
 
 
@@ -90,7 +90,7 @@ def _bands(chosen: Sequence[Photograph]) -> int:
 
 
 def write_footprints(made: Survey, output: Path) -> Path:
-    """footprints.geojson."""
+    """Write footprints.geojson: what each frame covers."""
     features = [feature(one, made.ground, made.projection, made.facts.get(one.name, {})) for one in made.photographs]
     path = output / "footprints.geojson"
     durable.make_folder(output)
@@ -99,7 +99,7 @@ def write_footprints(made: Survey, output: Path) -> Path:
 
 
 def write_report(made: Survey, output: Path, files: Sequence[Path]) -> Path:
-    """report.json: what was mapped onto what, what was left out, and how each frame was refined."""
+    """Write report.json: projection, ground and files of the map, frames left out, and how each frame was refined."""
     facts = {
         "flight": made.flight,
         "crs": made.projection.name,
@@ -130,7 +130,7 @@ def feature(photograph: Photograph, ground: Ground, projection: Projection, fact
 
 
 def _collection(features: Sequence[dict[str, Any]]) -> bytes:
-    """The file of these features."""
+    """The file of some features."""
     return (json.dumps({"type": "FeatureCollection", "features": list(features)}, indent=1) + "\n").encode()
 
 

@@ -1,4 +1,7 @@
-"""From a view to a north-up map: which ground every map cell shows, where the view saw it, and its value there."""
+"""Draw views on a north-up map: the grid, where each view saw each cell, and mosaics of many frames.
+
+A mosaic is made tile by tile: memory is bounded by a tile and the frames' own pictures.
+"""
 
 from __future__ import annotations
 
@@ -19,20 +22,20 @@ from dappled.products.maps.photographs import Photograph
 Floats = NDArray[np.float64]
 LARGEST = 30_000  # cells on a side
 _NODE = 16  # cells between places that are transformed exactly when the map is in degrees
-_SHARPNESS = 8  # a frame's say falls off as its distance from the rim to this power: one frame shows at each place
+_SHARPNESS = 8  # a frame's weight is its distance from the rim to this power: one frame shows at each place
 _TILE = 1024
 _MARGIN = 8  # cells: the rim's points are joined by straight lines
 
 
 class MapError(DappledError):
-    """A map that can't be drawn; one sentence."""
+    """A map can't be drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class MapGrid:
-    """A north-up raster: cell (row, column)'s centre lies at (west + (column + ½)·step_x, north − (row + ½)·step_y).
+    """A north-up raster: the centre of cell (row, column) is (west + (column + ½)·step_x, north − (row + ½)·step_y).
 
-    In `crs` the projection's name, in metres, or EPSG:4326, in degrees of longitude and latitude.
+    `crs` is the projection's name (units: metres), or EPSG:4326 (degrees of longitude and latitude).
     """
 
     crs: str
@@ -70,7 +73,7 @@ class MapGrid:
         if self.crs != GEODETIC:
             east, north = np.meshgrid(x, y)
             return np.asarray(east, np.float64), np.asarray(north, np.float64)
-        # Every _NODE-th cell exactly; between them the two grids differ by far less than a cell's hundredth.
+        # Every _NODE-th cell is exact; between them linear interpolation errs by far less than a hundredth of a cell.
         at_x, at_y = (np.linspace(line[0], line[-1], max(2, math.ceil(len(line) / _NODE) + 1)) for line in (x, y))
         node_x, node_y = np.meshgrid(at_x, at_y)
         nodes = projection.to_map(node_y, node_x)
@@ -80,7 +83,7 @@ class MapGrid:
 
 
 def around(points: Floats, crs: str, step_x: float, step_y: float) -> MapGrid:
-    """The grid that covers points (n, 2) of (x, y), its edges at whole steps. Raises MapError for a vast one."""
+    """The grid that covers points (n, 2) of (x, y), its edges at whole steps. Raises MapError if it is too large."""
     low, high = points.min(axis=0), points.max(axis=0)
     west, east = math.floor(low[0] / step_x), math.ceil(high[0] / step_x)
     south, north = math.floor(low[1] / step_y), math.ceil(high[1] / step_y)
@@ -91,8 +94,8 @@ def around(points: Floats, crs: str, step_x: float, step_y: float) -> MapGrid:
 
 
 def footprint(eye: Eye, ground: Ground, steps: int = 16) -> Floats:
-    """(n, 3) east, north, height all around the view, its corners first of each side. Raises MapError where a ray
-    misses the ground."""
+    """(n, 3) east, north, height along the view's border, each side beginning with its corner. Raises MapError where a
+    ray misses the ground."""
     met = ground.meet(eye, eye.border(steps))
     if np.isnan(met).any():
         raise MapError(f"its view leaves the ground ({ground.name}): give terrain that covers it")
@@ -107,12 +110,12 @@ def degree_steps(projection: Projection, east: float, north: float, gsd_m: float
 
 
 def unwrapped(longitude_deg: Floats, near_deg: float) -> Floats:
-    """Longitudes as numbers within 180° of `near_deg`: a strip across the antimeridian is one strip."""
+    """Longitudes within 180° of `near_deg`, so that a strip across the antimeridian stays in one piece."""
     return np.asarray(near_deg + np.vectorize(wrapped)(longitude_deg - near_deg), dtype=np.float64)
 
 
 def sample(image: Image, at: Floats) -> Image:
-    """float32 (rows, columns, c): an image (h, w, c) at pixels (rows, columns, 2), NaN where those are."""
+    """float32 (rows, columns, c): an image (h, w, c) at pixels (rows, columns, 2); NaN where those are NaN."""
     cv2 = need("cv2")
     inside = np.isfinite(at[..., 0])
     if not inside.any():
@@ -123,7 +126,7 @@ def sample(image: Image, at: Floats) -> Image:
 
 
 def seen_at(eye: Eye, grid: MapGrid, ground: Ground, projection: Projection) -> Floats:
-    """(rows, columns, 2): the view's pixel (x, y) that shows each map cell, NaN where none does."""
+    """(rows, columns, 2): the view's pixel (x, y) that shows each map cell; NaN where none does."""
     east, north = grid.places(projection)
     if isinstance(ground, Flat):  # one homography for the whole frame
         to_view = eye.homography(ground.height_m)
@@ -144,7 +147,7 @@ def seen_at(eye: Eye, grid: MapGrid, ground: Ground, projection: Projection) -> 
 
 
 def smoothed(image: Image, eye: Eye, grid: MapGrid, ground: Ground) -> Image:
-    """The image (h, w, c), smoothed where the map is much coarser than it."""
+    """The image (h, w, c), smoothed where the map is much coarser."""
     if image.ndim == 2:
         image = image[..., None]
     middle = np.array([[(eye.shape[1] - 1) / 2, (eye.shape[0] - 1) / 2]])
@@ -154,7 +157,7 @@ def smoothed(image: Image, eye: Eye, grid: MapGrid, ground: Ground) -> Image:
 
 
 def smoothed_to(image: Image, ratio: float) -> Image:
-    """The image, smoothed to be sampled at every `ratio`-th of its pixels; as it is below 1.5."""
+    """The image, smoothed for sampling at every `ratio`-th pixel; unchanged below 1.5."""
     if ratio < 1.5:
         return image
     cv2 = need("cv2")
@@ -194,9 +197,9 @@ def pieces(
     projection: Projection,
     focus_m: float = math.inf,
 ) -> Iterator[tuple[slice, slice, Image]]:
-    """(rows, columns, float32 (h, w, c)) tiles that cover the grid; NaN where no frame looks.
+    """Yield (rows, columns, float32 (h, w, c)) tiles that cover the grid; NaN where no frame looks.
 
-    Every frame's say at a place grows with the distance from its own rim, so that each place is shown by the frame that
+    A frame's weight at a place grows with the distance from its own rim, so that each place is shown by the frame that
     sees it best, with soft seams.
     """
     colours = max((1 if one.image.ndim == 2 else one.image.shape[2]) for one in photographs)
@@ -235,7 +238,7 @@ def _say(at: NDArray[np.float64], shape: tuple[int, int]) -> Image:
 
 
 def _cells(one: Photograph, grid: MapGrid, ground: Ground, projection: Projection) -> tuple[int, int, int, int]:
-    """First and last row, first and last column that a frame may reach."""
+    """The first and last row, and the first and last column, that a frame may reach."""
     met = footprint(one.eye, ground)
     x, y = met[:, 0], met[:, 1]
     if grid.crs == GEODETIC:

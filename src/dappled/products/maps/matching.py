@@ -1,4 +1,4 @@
-"""The same ground in two pictures: SIFT features, mutual nearest neighbours, and a homography by MAGSAC."""
+"""Find the same ground in two pictures: SIFT features, mutual nearest neighbours, and a homography by MAGSAC."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from dappled.products.extras import need
 
 Floats = NDArray[np.float64]
-_LIMIT = 4000  # features of a picture
-_PATCHES = 600  # of a picture, about
-_RATIO = 0.85  # of the best match's distance to the second best's
+_LIMIT = 4000  # features per picture
+_PATCHES = 600  # per picture, about
+_RATIO = 0.85  # at most, of the best match's distance to the second best's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +25,7 @@ class Features:
 
 
 def features(image: NDArray[np.floating], known: NDArray[np.bool_] | None = None) -> Features:
-    """The features of a picture (h, w) or (h, w, c) in any scale; only where `known`, well inside of it."""
+    """The features of a picture (h, w) or (h, w, c) of any brightness scale, only well inside of `known`."""
     cv2 = need("cv2")
     grey = np.asarray(image, dtype=np.float32)
     grey = grey.mean(axis=2) if grey.ndim == 3 else grey
@@ -43,7 +43,7 @@ def features(image: NDArray[np.floating], known: NDArray[np.bool_] | None = None
 
 
 def matched(a: Features, b: Features) -> NDArray[np.intp]:
-    """(n, 2) indices of features that are each other's nearest, and clearly so."""
+    """(n, 2) indices of features that are each other's nearest by a clear margin."""
     if min(len(a.pixels), len(b.pixels)) < 2:
         return np.zeros((0, 2), dtype=np.intp)
     matcher = need("cv2").BFMatcher()
@@ -56,7 +56,7 @@ def matched(a: Features, b: Features) -> NDArray[np.intp]:
 
 
 def on_one_plane(a: Floats, b: Floats, threshold_px: float) -> NDArray[np.bool_]:
-    """(n,): which of these pairs (n, 2) one homography explains within the threshold; none where there are too few."""
+    """(n,): which pairs (n, 2) fit one homography within the threshold; all False where there are too few."""
     none = np.zeros(len(a), dtype=bool)
     if len(a) < 8:
         return none
@@ -71,7 +71,7 @@ def nudges(
     image: NDArray[np.floating], like: NDArray[np.floating], *, patch: int = 25, reach: int = 4
 ) -> tuple[Floats, Floats]:
     """(places (n, 2), shifts (n, 2)) in px: where patches of `image` are found in `like`, a picture of the same shape
-    that shows nearly the same. Only what is alike (correlation above 0.7, NaN nowhere near), to a fraction of a pixel.
+    that shows nearly the same, to a fraction of a pixel. Patches with a correlation below 0.7 or near NaN are left out.
     """
     cv2 = need("cv2")
     a, b = (np.asarray(one, np.float32).mean(axis=2) if one.ndim == 3 else np.asarray(one, np.float32)
@@ -95,7 +95,7 @@ def nudges(
 
 
 def _top(three: NDArray[np.floating]) -> float:
-    """Where a parabola through three values, the middle one the greatest, has its top."""
+    """The position of the top of a parabola through three values, of which the middle one is the greatest."""
     before, here, after = (float(v) for v in three)
     bend = before - 2 * here + after
     return 0.5 * (before - after) / bend if bend < 0 else 0.0

@@ -1,4 +1,4 @@
-"""A flight's frames as photographs of the ground: the decoded image, and the eye that saw it."""
+"""Turn a flight's frames into photographs: the decoded image, and the eye (camera geometry) that took it."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ DEFAULT_ATTITUDE_SIGMA_RAD = 0.02
 
 
 class PhotographError(DappledError):
-    """A frame that can't be placed; one sentence."""
+    """A frame can't be placed on the map."""
 
 
 @dataclass(frozen=True, slots=True)
 class Station:
-    """A frame with everything that places it: its tag, and where the camera stood and how it looked."""
+    """A frame with its tag and the camera's position and attitude."""
 
     frame: Frame
     tag: Tag
@@ -39,12 +39,12 @@ class Station:
 
     @property
     def name(self) -> str:
-        """The frame's number, as its file has it."""
+        """The frame's number, as in its file name."""
         return Path(self.frame.name).stem
 
     @property
     def ground_m(self) -> float | None:
-        """The height of home above sea level, as the autopilot tells it."""
+        """The height of home above sea level, from the autopilot; None where unknown."""
         height = self.camera.height_above_home_m
         return None if height is None else self.camera.altitude_msl_m - height
 
@@ -53,9 +53,9 @@ class Station:
 class Photograph:
     """One frame's image float32 (h, w) or (h, w, 3), linear, 1.0 = sensor white, and its eye on the map.
 
-    Sigmas are one standard deviation of the eye's centre (m) and attitude (rad) as recorded. `grid` leads to the
-    sensor, as in `LightField`. With `views` (n, h, w[, 3]) and their eyes relative to the frame's, maps are drawn from
-    these: their mean on the ground is the frame refocused there.
+    Sigmas are one standard deviation of the eye's centre (m) and attitude (rad) as recorded. `grid` maps to the
+    sensor, as in `LightField`. With `views` (n, h, w[, 3]) and their aperture points, maps are drawn from the views:
+    their mean on the ground is the frame refocused there.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Photograph:
 
 
 def stations(flight: Path, mounting: Mounting) -> tuple[list[Station], list[tuple[str, str]]]:
-    """A flight's frames that have a full pose, in order, and (name, sentence) of those that have none.
+    """A flight's frames that have a full pose, in order, and (name, sentence) of the others.
 
     Raises FlightError.
     """
@@ -101,9 +101,9 @@ def recorded(flight: Path) -> tuple[list[Frame], dict[int, Tag]]:
 
 
 def station(frame: Frame, tag: Tag | None, mounting: Mounting) -> Station:
-    """Where a frame was taken. Raises PhotographError where that isn't known."""
+    """Where a frame was taken. Raises PhotographError where its pose isn't known."""
     if tag is None:
-        raise PhotographError(f"{frame.name} was never tagged: `dappled geotag` tags what a crash left so")
+        raise PhotographError(f"{frame.name} was never tagged: `dappled geotag` tags frames that a crash left untagged")
     camera = mounting.camera(tag.pose)
     if camera is None:
         raise PhotographError(f"no position is known for {frame.name}: there was no telemetry at its exposure")
@@ -187,10 +187,10 @@ def _aperture_m(station: Station, field: LightField) -> float:
 
 
 def true_colours(raw: RawFile) -> NDArray[np.float64] | None:
-    """(3,) what views in red, green and blue are to be multiplied by; None for a frame without such colours.
+    """(3,) gains for the red, green and blue of the views; None for a frame without these colours.
 
-    The decoder gives all colours of a frame one mean, so that the mosaic has no impulse of its own. Here that is
-    undone, and the camera's white balance put in its place: neighbouring frames of one ground have one colour.
+    The decoder gives all colours of a frame one mean, so that the mosaic has no impulse of its own. The gains undo that
+    and apply the camera's white balance, so that neighbouring frames show the ground in one colour.
     """
     names = raw.colour_names
     if raw.cfa is None or not set("RGB") <= set(names):
@@ -209,7 +209,7 @@ def true_colours(raw: RawFile) -> NDArray[np.float64] | None:
 
 
 def mean_view(field: LightField) -> Image:
-    """The mean of the views, or where there are none the slice of the mean: the same picture, in grey."""
+    """The mean of the views; without views the DC slice, which is the same picture in grey."""
     if field.views.shape[0]:
         return np.asarray(field.views.mean(axis=(0, 1), dtype=np.float32))
     return np.ascontiguousarray(field.slices[0].real)
@@ -222,7 +222,7 @@ def _which(view: str, field: LightField) -> tuple[int, int]:
     try:
         v, u = (int(word) for word in view.split(","))
     except ValueError:
-        raise PhotographError(f"{view!r} names no view: give row,column, as 0,4") from None
+        raise PhotographError(f"{view!r} does not name a view: give row,column, as 0,4") from None
     if not (0 <= v < rows and 0 <= u < columns):
         raise PhotographError(f"there is no view {view}: rows go to {rows - 1}, columns to {columns - 1}")
     return v, u

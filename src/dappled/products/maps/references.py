@@ -1,4 +1,4 @@
-"""What poses are refined against: a base map, and ground control points that were measured."""
+"""Read what poses are refined against: a base map, and measured ground control points."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ Floats = NDArray[np.float64]
 
 
 class BaseMapError(DappledError):
-    """A base map that can't be used; one sentence."""
+    """A base map can't be used."""
 
 
 @dataclass(frozen=True, slots=True)
 class BaseMap:
-    """A raster picture, read where frames are looked for. `gsd_m` is the frames' own: finer is not needed."""
+    """A georeferenced raster picture, read in windows. `gsd_m` is the frames' own; nothing finer is read."""
 
     path: Path
     projection: Projection
     gsd_m: float
 
     def check(self, points: Floats) -> None:
-        """Raises BaseMapError where the map can't be read, doesn't say where it lies, or lies elsewhere than the
-        points (n, 2) of the flight."""
+        """Raises BaseMapError where the map can't be read, is not georeferenced, or does not overlap the points (n, 2)
+        of the flight."""
         rasterio, warp = need("rasterio"), need("rasterio.warp")
         with self._open() as source:
             box = (*points.min(axis=0), *points.max(axis=0))
@@ -50,8 +50,8 @@ class BaseMap:
                 )
 
     def window(self, points: Floats, margin: float) -> tuple[NDArray[np.float32], MapGrid] | None:
-        """The picture float32 (rows, columns) around points (n, 2), NaN where it has nothing, and its grid; None where
-        it has nothing there at all."""
+        """The picture float32 (rows, columns) around points (n, 2), NaN where it is empty, and its grid; None where all
+        of it is empty."""
         rasterio, warp = need("rasterio"), need("rasterio.warp")
         with self._open() as source:
             step = max(self.gsd_m, self._step(source, points))
@@ -90,7 +90,7 @@ class BaseMap:
         return source
 
     def _step(self, source: Any, points: Floats) -> float:
-        """The map's own cell in metres, near the points."""
+        """The size of the map's own cells near the points, in metres."""
         if source.crs.is_geographic:
             latitude, _ = self.projection.to_geodetic(*points.mean(axis=0))
             metres = math.radians(1) * 6378137.0
@@ -101,7 +101,7 @@ class BaseMap:
 
 
 class ControlPointError(DappledError):
-    """Control points that can't be used; one sentence with the file and line."""
+    """Control points can't be used; the sentence names file and line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,10 +131,10 @@ def read_control_points(path: Path, projection: Projection) -> list[ControlPoint
                 try:
                     column, line, latitude, longitude, altitude = (float(row[name]) for name in wanted[2:])
                 except (TypeError, ValueError):
-                    raise ControlPointError(f"{path}, line {rows.line_num}: a number is missing or is none") from None
+                    raise ControlPointError(f"{path}, line {rows.line_num}: a number is missing or invalid") from None
                 if not (abs(latitude) <= 90 and math.isfinite(longitude + altitude + column + line)):
                     raise ControlPointError(
-                        f"{path}, line {rows.line_num}: {latitude}, {longitude} is no place on Earth"
+                        f"{path}, line {rows.line_num}: {latitude}, {longitude} is not a place on Earth"
                     )
                 east, north = projection.to_map(latitude, longitude)
                 place = (float(east), float(north), altitude)
@@ -142,12 +142,12 @@ def read_control_points(path: Path, projection: Projection) -> list[ControlPoint
     except OSError as error:
         raise ControlPointError(f"the control points {path} can't be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise ControlPointError(f"the control points {path} are no text in UTF-8") from None
+        raise ControlPointError(f"the control points {path} are not text in UTF-8") from None
     return found
 
 
 def sighted(points: Sequence[ControlPoint], frames: Collection[str]) -> tuple[list[ControlPoint], list[str]]:
-    """The points that these frames show, and a sentence for each other. Raises ControlPointError where none is left."""
+    """The points on these frames, and a sentence for each other point. Raises ControlPointError where none is left."""
     kept = [point for point in points if point.frame in frames]
     if points and not kept:
         raise ControlPointError(

@@ -1,6 +1,6 @@
-"""Poses better than telemetry: against a base map, neighbouring frames, and points that somebody measured.
+"""Refine poses against a base map, neighbouring frames, and measured control points.
 
-Each frame is judged by itself. Where too little agrees it keeps its recorded pose, and the report says why.
+Each frame is judged by itself. A frame with too little agreement keeps its recorded pose, and the report says why.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from dappled.products.maps.references import BaseMap, ControlPoint, ControlPoint
 Floats = NDArray[np.float64]
 LEAST_INLIERS = 15
 LEAST_SHARE = 0.25  # of the matches
-_PLANE_PX = 6.0  # a homography is only a sieve: houses stand above it
+_PLANE_PX = 6.0  # generous, as houses rise above the plane of the homography
 _SIFT_PX = 0.6
 _PATCH_PX = 0.4
 _NODE = 3  # pixels between rays
-_CLICK_PX = 0.5  # of a view: a control point found by eye in the frame
+_CLICK_PX = 0.5  # of a view: a control point that was marked by eye in the frame
 _REACH = 6  # frames ahead that are tried as neighbours
-_LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1.0, math.radians(0.5)  # a base map may overrule telemetry that is too sure
+_LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1.0, math.radians(0.5)  # a base map may overrule overconfident telemetry
 _FARTHEST = 5.0  # sigmas
 
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
-    """What became of one frame. `why` it kept its recorded pose, or None; sigmas are what is left to doubt."""
+    """The result for one frame: `why` it kept its recorded pose, or None; the sigma is that of the refined position."""
 
     matches: int
     inliers: int
@@ -48,7 +48,7 @@ class Refinement:
     why: str | None
 
     def facts(self) -> dict[str, Any]:
-        """For reports."""
+        """The values for reports."""
         return {"refined": self.why is None, **asdict(self)}
 
 
@@ -63,9 +63,9 @@ def refine(
     sigmas: tuple[float, float] | None = None,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> tuple[list[Photograph], list[Refinement]]:
-    """The photographs with better eyes, and what was done to each.
+    """Refine the photographs' eyes; returns the photographs and the result for each.
 
-    `search_m` is how far off the base map is looked for; `sigmas` (m, rad) take the place of the recorded ones.
+    `search_m` is the distance over which the base map is searched; `sigmas` (m, rad) replace the recorded ones.
     """
     doubts = _doubts(photographs, sigmas, loose=base is not None or bool(control))
     found: list[Features] = []
@@ -141,8 +141,8 @@ def _closer(
     base: BaseMap,
     ground: Ground,
 ) -> list[Marks | Ties]:
-    """The groups with features on the base map replaced, where they held, by many patches of the frame that are found
-    in the base map as the adjusted eye would see it."""
+    """Replace each group of features on the base map that held by many patches of the frame, found in the base map as
+    the adjusted eye would see it."""
     made: list[Marks | Ties] = []
     for group, inside in zip(groups, solution.inliers, strict=True):
         if isinstance(group, Ties) or group.by_hand or int(inside.sum()) < LEAST_INLIERS:
@@ -156,7 +156,7 @@ def _closer(
 
 def _patches(group: Marks, one: Photograph, eye: Eye, base: BaseMap, ground: Ground) -> Marks | None:
     rows, columns = eye.shape
-    # Rays at every few pixels, and straight lines between them: the patches' own hits are exact further down.
+    # Rays at every few pixels, and linear interpolation between them; the patches' own hits below are exact.
     at_x, at_y = (np.linspace(0, side - 1, max(2, side // _NODE)) for side in (columns, rows))
     met = ground.meet(eye, np.stack(np.meshgrid(at_x, at_y), axis=-1).reshape(-1, 2))
     if not np.isfinite(met).all():
@@ -202,8 +202,8 @@ def _to_neighbour(
 
 
 def _roughness_m(ground: Ground, places: Floats, aside_m: float) -> float:
-    """How much the ground model's height changes, rms, when one looks so far aside: what it says of a frame's ground is
-    no better than this while nobody knows where the frame is."""
+    """The rms change of the ground model's height at a distance `aside_m`: the uncertainty of a frame's ground that
+    follows from the frame's uncertain position."""
     axis = np.linspace(0, 1, 12)
     low, high = places.min(axis=0), places.max(axis=0)
     east, north = np.meshgrid(low[0] + axis * (high[0] - low[0]), low[1] + axis * (high[1] - low[1]))

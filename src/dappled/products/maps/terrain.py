@@ -1,7 +1,7 @@
-"""Find a survey's heights and write them: a GeoTIFF of heights and sigmas, LAS points, and ground to lay frames on.
+"""Find a survey's heights and write them: a GeoTIFF of heights and sigmas, LAS points, and ground to map frames onto.
 
-Each holds the difference to the given terrain, where there is one. Frames that are laid on heights of their own show
-houses upright.
+Raster and points include the difference to the given terrain, where there is one. Frames that are mapped onto their own
+heights show houses upright.
 """
 
 from __future__ import annotations
@@ -32,18 +32,21 @@ Floats = NDArray[np.float64]
 
 VERTICAL = "EPSG:5773"  # EGM96 height: what autopilots call mean sea level
 CELL = 2.0  # of a map's cells: heights are coarser than pictures
-_MARGIN, _MARGIN_M = 0.25, 5.0  # around the frames, of their extent and in metres: terrain must cover more than they do
-_REACH = (1, 2, 4, 8, 16)  # cells: holes are filled from the nearest heights first, and not from farther off
-_LEAST_SAY = 0.05  # of a hole's surroundings that must be known
-_FADE = 8.0  # cells over which what was found gives way to the given ground
-_SEARCH_M = (3.0, 12.0)  # below and above flat ground, or the given terrain's lowest and highest
+_MARGIN, _MARGIN_M = (
+    0.25,
+    5.0,
+)  # around the frames, of their extent and in metres: terrain must cover more than the frames
+_REACH = (1, 2, 4, 8, 16)  # cells: holes are filled from the nearest heights first, and from no farther than the last
+_LEAST_KNOWN = 0.05  # share of a hole's surroundings that must be known
+_FADE = 8.0  # cells over which found heights fade into the given ground
+_SEARCH_M = (3.0, 12.0)  # below the lowest and above the highest of the given ground
 
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TerrainModel:
-    """A surface, and how far it lies above the given terrain float32 (rows, columns); None where there is none."""
+    """A surface, and its height above the given terrain, float32 (rows, columns); None without given terrain."""
 
     surface: Surface
     difference_m: NDArray[np.float32] | None
@@ -52,14 +55,14 @@ class TerrainModel:
 def of(
     made: Survey, progress: Progress, *, lowest_m: float | None = None, highest_m: float | None = None
 ) -> TerrainModel:
-    """The terrain of a survey by hyperstereo, searched between two heights above sea level. Raises HyperstereoError."""
+    """Find a survey's terrain by hyperstereo, between two heights above sea level. Raises HyperstereoError."""
     grid = map_grid.grid_of(made.photographs, made.ground, made.projection, CELL * made.gsd_m)
     east, north = grid.places(made.projection)
     given = made.ground.heights(east, north)
     low = float(np.nanmin(given)) - _SEARCH_M[0] if lowest_m is None else lowest_m
     high = float(np.nanmax(given)) + _SEARCH_M[1] if highest_m is None else highest_m
     lowest_eye = min(float(one.eye.centre[2]) for one in made.photographs)
-    high = min(high, low + 0.8 * (lowest_eye - low))  # nothing that is nearer than a fifth of the way
+    high = min(high, low + 0.8 * (lowest_eye - low))  # nothing nearer to the lowest camera than a fifth of its height
     surface = hyperstereo.surface(
         made.photographs, grid, made.projection, lowest_m=low, highest_m=high, progress=progress
     )
@@ -68,7 +71,7 @@ def of(
 
 
 def write_raster(made: Survey, terrain: TerrainModel, path: Path) -> Path:
-    """A COG with the bands height, sigma and, where terrain was given, difference; metres, NaN where unknown."""
+    """Write a COG with the bands height, sigma and, where terrain was given, difference; metres, NaN where unknown."""
     surface = terrain.surface
     bands = [surface.height_m, surface.sigma_m]
     names = ["height above sea level, m", "sigma of a height by itself, m"]
@@ -81,7 +84,7 @@ def write_raster(made: Survey, terrain: TerrainModel, path: Path) -> Path:
 
 
 def write_ground(made: Survey, terrain: TerrainModel, path: Path) -> Path:
-    """The heights as ground to lay frames on: a COG without holes, with the survey's own ground around it."""
+    """Write the heights as ground to map frames onto: a COG without holes, with the survey's own ground around it."""
     grid, heights = _filled_heights(terrain.surface, made.ground)
     names = ("height above sea level, m: found, between found ones, or given",)
     cog.write(path, grid, heights[..., None].astype(np.float32), made.tags(), names)
@@ -89,8 +92,8 @@ def write_ground(made: Survey, terrain: TerrainModel, path: Path) -> Path:
 
 
 def write_points(made: Survey, terrain: TerrainModel, path: Path) -> Path:
-    """LAS 1.4 points, on the map's projection with EGM96 heights; `sigma` and, where terrain was given, `difference` as
-    extra dimensions in metres."""
+    """Write LAS 1.4 points, on the map's projection with EGM96 heights; `sigma` and, where terrain was given,
+    `difference` are extra dimensions in metres."""
     laspy = need("laspy")
     surface = terrain.surface
     known = surface.known
@@ -118,7 +121,7 @@ def write_points(made: Survey, terrain: TerrainModel, path: Path) -> Path:
 
 
 def compound(projection: Projection) -> pyproj.CRS:
-    """The map's system with heights above mean sea level (EGM96)."""
+    """The map's coordinate system with heights above mean sea level (EGM96)."""
     vertical = pyproj.CRS.from_user_input(VERTICAL)
     return pyproj.crs.CompoundCRS(f"{projection.crs.name} + {vertical.name}", [projection.crs, vertical])
 
@@ -126,7 +129,7 @@ def compound(projection: Projection) -> pyproj.CRS:
 def _filled_heights(found: Surface, given: Ground) -> tuple[MapGrid, Floats]:
     """(grid, heights (rows, columns) above sea level) of a surface and, around it, of the given ground.
 
-    Holes between found heights are filled from around them; where the given ground is unknown nothing is known.
+    Holes between found heights are filled from their surroundings. Where the given ground is unknown, so is the result.
     """
     grid = _wider(found.grid)
     inner = _inside(found.grid, grid)
@@ -158,15 +161,15 @@ def _inside(inner: MapGrid, outer: MapGrid) -> tuple[slice, slice]:
 
 
 def _filled(above: Floats, known: NDArray[np.bool_]) -> Floats:
-    """Heights above the given ground (rows, columns) where they are known, and what follows from them elsewhere."""
+    """Heights above the given ground (rows, columns): as they are where `known`, filled or faded elsewhere."""
     made, settled = above.copy(), known.copy()
     for reach in _REACH:
         weight = ndimage.gaussian_filter(known.astype(np.float64), reach, mode="constant", truncate=3.0)
         total = ndimage.gaussian_filter(above, reach, mode="constant", truncate=3.0)
-        fresh = ~settled & (weight > _LEAST_SAY)
+        fresh = ~settled & (weight > _LEAST_KNOWN)
         made[fresh] = total[fresh] / weight[fresh]
         settled |= fresh
-    # Beyond the last heights: those at the rim, ever less of them.
+    # Beyond the last heights: those at the rim, fading out.
     if settled.any() and not settled.all():
         away, nearest = ndimage.distance_transform_edt(~settled, return_indices=True)
         made = np.where(settled, made, made[tuple(nearest)] * np.exp(-away / _FADE))
