@@ -101,7 +101,6 @@ class Console:
         self._process: subprocess.Popen[bytes] | None = None
         self._begun: deque[float] = deque(maxlen=RESTARTS)
         self._thread = threading.Thread(target=self._run, name="console", daemon=True)
-        self.problem = ""
 
     def start(self) -> None:
         """Start the process."""
@@ -117,12 +116,10 @@ class Console:
     def _run(self) -> None:
         while not self._stopping.is_set():
             if len(self._begun) == RESTARTS and time.monotonic() - self._begun[0] < RESTART_WINDOW_S:
-                self.problem = "the console's process ended five times in a minute: it starts again in a minute"
-                log.warning("%s", self.problem)
+                log.warning("the console's process ended five times in a minute: it starts again in a minute")
                 self._stopping.wait(RESTART_WINDOW_S)
                 self._begun.clear()
                 continue
-            self.problem = ""
             self._begun.append(time.monotonic())
             try:
                 self._serve()
