@@ -125,11 +125,11 @@ def test_beside_a_running_daemon_it_asks_that_one(
     config = str(running(WELL))
     assert main(["doctor", "--config", config]) == 0
     out = capfd.readouterr().out.splitlines()
-    assert out[0] == "a daemon runs here, flight 20261121T101503Z-1a2b3c4d; it says"
+    assert out[0] == "a daemon runs here, flight 20261121T101503Z-1a2b3c4d; it reports"
     assert out[1] == "go       Camera      ready"
     assert out[-1] == "GO"
     assert main(["doctor", "--config", config, "--test-shot"]) == 1
-    assert "holds the camera: end it first" in capfd.readouterr().err
+    assert "holds the camera: stop it first" in capfd.readouterr().err
 
 
 def test_a_running_daemon_without_a_camera_is_no_go(

@@ -1,4 +1,4 @@
-"""`dappled batch`: whole flights, frame by frame, on all cores or a cluster."""
+"""`dappled batch`: process whole flights, frame by frame, on all cores or a cluster."""
 
 from __future__ import annotations
 
@@ -24,17 +24,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "examples:\n"
         "  dappled batch ~/flights/20261121T* -o products\n"
         "  dappled batch FLIGHT --as npz cog -o products --scheduler tcp://10.0.0.5:8786\n"
-        "Goes on where it was stopped. A bad frame is noted and does not stop the others."
+        "Continues where it was stopped. A bad frame is reported and does not stop the others."
     )
     parser.add_argument("flights", nargs="+", type=Path, metavar="FLIGHT", help="flight folders")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for what is made")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the results")
     parser.add_argument("--as", dest="kinds", nargs="+", choices=tuple(KINDS), default=["npz"],
                         help="of each frame: light field (npz, zarr, h5) or map (cog, kmz); default: npz")  # fmt: skip
     parser.add_argument("--workers", type=whole, default=os.cpu_count() or 1, metavar="N",
-                        help="processes (default: one a core)")  # fmt: skip
-    parser.add_argument("--scheduler", metavar="URL", help="a Dask scheduler, as tcp://10.0.0.5:8786, instead")
+                        help="number of processes (default: one for each core)")  # fmt: skip
+    parser.add_argument(
+        "--scheduler", metavar="URL", help="use this Dask scheduler instead, such as tcp://10.0.0.5:8786"
+    )
     georeference.add_placing(parser)
-    parser.add_argument("--json", action="store_true", help="a line of JSON for each frame")
+    parser.add_argument("--json", action="store_true", help="print a line of JSON for each frame")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -43,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     for flight in _different(arguments.flights):
         try:
             jobs += _planned(flight, arguments)
-        except DappledError as error:  # the other flights are made all the same
+        except DappledError as error:  # go on with the other flights
             refused += 1
             named = str(error) if str(flight) in str(error) else f"{flight}: {error}"
             print(f"dappled batch: {named}", file=sys.stderr)

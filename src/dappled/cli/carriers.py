@@ -268,10 +268,10 @@ def _summary(table: Table) -> str:
     there = sum(c.on_sensor for c, _ in table.rows) - 1
     if table.carriers_from == "measured" and table.rotation_rad is not None:
         turned = math.degrees(table.rotation_rad)
-        told = f"{start}; {table.seen} of {there} carriers seen, on a lattice turned by {turned:.3f}°"
+        sentence = f"{start}; {table.seen} of {there} carriers seen, on a lattice turned by {turned:.3f}°"
         orders = [(c.ky, c.kx) for c, _ in table.rows]
         strange = doubt(table.used.carriers(orders), [c for c, _ in table.rows])
-        return f"{told}; {strange}" if strange else told
+        return f"{sentence}; {strange}" if strange else sentence
     whose = "calibration's" if table.carriers_from == "calibrated" else "law's"
     if table.seen == 0:
         return (

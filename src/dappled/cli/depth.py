@@ -54,17 +54,17 @@ def run(arguments: argparse.Namespace) -> int:
     between = None if arguments.between is None else (arguments.between[0], arguments.between[1])
     made = found.depth(arguments.method, between=between, window=arguments.window)
     distances = found.distances(made) if found.ranging is not None else None
-    told: dict[str, Any] = summary(found, made, distances)
+    report: dict[str, Any] = summary(found, made, distances)
     for path in arguments.output:
-        told.setdefault("written", []).append(str(path))
-        told |= _write(path, found, made, distances, arguments)
-    print(json.dumps(told) if arguments.json else words(told))
+        report.setdefault("written", []).append(str(path))
+        report |= _write(path, found, made, distances, arguments)
+    print(json.dumps(report) if arguments.json else words(report))
     return 0
 
 
 def summary(found: OpenedLightField, made: DepthMap, distances: DistanceMap | None) -> dict[str, Any]:
     """A depth map in a few numbers; None where nothing is known."""
-    told: dict[str, Any] = {
+    report: dict[str, Any] = {
         "method": made.method,
         "known": made.known_share(),
         "disparity_px": _quartiles(made.disparity),
@@ -72,14 +72,14 @@ def summary(found: OpenedLightField, made: DepthMap, distances: DistanceMap | No
         "distances_from": None if found.ranging is None else found.ranging.source,
     }
     if distances is not None:
-        told["distance_known"] = float(np.isfinite(distances.distance_m).mean())
-        told["distance_m"] = _quartiles(distances.distance_m)
-        told["distance_sigma_m"] = _quartiles(distances.sigma_m)
+        report["distance_known"] = float(np.isfinite(distances.distance_m).mean())
+        report["distance_m"] = _quartiles(distances.distance_m)
+        report["distance_sigma_m"] = _quartiles(distances.sigma_m)
         nearest = distances.nearest()
-        told["nearest_m"] = None if nearest is None else nearest[0]
+        report["nearest_m"] = None if nearest is None else nearest[0]
     else:
-        told["no_distances"] = _why_not(found)
-    return told
+        report["no_distances"] = _why_not(found)
+    return report
 
 
 def _why_not(found: OpenedLightField) -> str:
@@ -92,28 +92,28 @@ def _why_not(found: OpenedLightField) -> str:
     return "distances need --focus, or a calibration with targets (--calibration)"
 
 
-def words(told: dict[str, Any]) -> str:
+def words(report: dict[str, Any]) -> str:
     """The summary as lines."""
 
     def three(values: list[float] | None, unit: str) -> str:
         return "unknown" if values is None else " / ".join(f"{v:.3g}" for v in values) + f" {unit}"
 
     lines = [
-        f"{told['method']}: {told['known']:.0%} of the pixels known",
-        f"disparity (quartiles): {three(told['disparity_px'], 'px/view')}, σ {three(told['sigma_px'], 'px/view')}",
+        f"{report['method']}: {report['known']:.0%} of the pixels known",
+        f"disparity (quartiles): {three(report['disparity_px'], 'px/view')}, σ {three(report['sigma_px'], 'px/view')}",
     ]
-    if "distance_m" in told:
+    if "distance_m" in report:
         lines.append(
-            f"distance (quartiles): {three(told['distance_m'], 'm')}, σ {three(told['distance_sigma_m'], 'm')}, "
-            f"{told['distance_known']:.0%} known; by {told['distances_from']}"
+            f"distance (quartiles): {three(report['distance_m'], 'm')}, σ {three(report['distance_sigma_m'], 'm')}, "
+            f"{report['distance_known']:.0%} known; by {report['distances_from']}"
         )
     else:
-        lines.append(f"relative depth only: {told['no_distances']}")
-    if "withheld" in told:
+        lines.append(f"relative depth only: {report['no_distances']}")
+    if "withheld" in report:
         lines.append(
-            f"{counted(told['points'], 'point')}, {told['withheld']} omitted for their σ ({told['coordinates']})"
+            f"{counted(report['points'], 'point')}, {report['withheld']} omitted for their σ ({report['coordinates']})"
         )
-    lines += [f"written: {path}" for path in told.get("written", [])]
+    lines += [f"written: {path}" for path in report.get("written", [])]
     return "\n".join(lines)
 
 

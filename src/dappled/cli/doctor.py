@@ -1,4 +1,4 @@
-"""`dappled doctor`: what is missing on this machine, and whether the next flight will bring good frames."""
+"""`dappled doctor`: say what is missing on this machine, fire a test shot, measure latency, judge go or no-go."""
 
 from __future__ import annotations
 
@@ -32,25 +32,29 @@ from dappled.errors import DappledError
 _WORDS = {"go": "go", "caution": "caution", "no-go": "NO GO"}
 _HOST_WORDS = {"go": "ok", "caution": "note", "no-go": "WRONG"}
 _VERDICTS = {"go": "GO", "caution": "GO, with the cautions above", "no-go": "NO GO"}
-HEAR_S = 5.0  # a daemon says how it is every second
+HEAR_S = 5.0  # a daemon publishes its health every second
 
 
 class DaemonRunsError(DappledError):
-    """What was asked needs the camera, and a daemon has it."""
+    """The call needs the camera, but a running daemon holds it."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n  dappled doctor\n  dappled doctor --config dappled.toml --test-shot\n"
-        "  dappled doctor --simulate --latency 10\n\nexits 1 while something stands in the way"
+        "  dappled doctor --simulate --latency 10\n\nexits 1 while something prevents a flight"
     )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings (default: every default)")
-    parser.add_argument("--simulate", action="store_true", help="look at a simulated camera and autopilot")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulation (default: 1)")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings file (default: the default settings)")
+    parser.add_argument("--simulate", action="store_true", help="use a simulated camera and autopilot")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the simulation (default: 1)")
     parser.add_argument("--test-shot", action="store_true", help="fire one frame and say go or no-go")
-    parser.add_argument("--latency", type=whole, nargs="?", const=10, metavar="N", help="time N shots (default: 10)")
+    parser.add_argument(
+        "--latency", type=whole, nargs="?", const=10, metavar="N", help="measure the latency of N shots (default: 10)"
+    )
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the test flight here")
-    parser.add_argument("--watch", action="store_true", help="say which cameras come and go on USB, until ^C")
+    parser.add_argument(
+        "--watch", action="store_true", help="print which cameras appear and disappear on USB, until ^C"
+    )
     parser.add_argument("--json", action="store_true", help="as JSON")
 
 
@@ -66,32 +70,32 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.simulate:
             settings, truth = stack.enter_context(_simulated(settings, arguments.seed, folder))
         checked = host_checks.run(settings)
-        told: dict[str, Any] = {"checks": _host_facts(checked)}
+        report: dict[str, Any] = {"checks": _host_facts(checked)}
         ready = all(one.state != "no-go" for one in checked if one.name in ("camera", "disk"))
         good = not go_no_go.next_step(checked)
         lines = _host_lines(checked)
         if (arguments.test_shot or arguments.latency) and ready:
             more, shot = _shoot(settings, arguments, folder, truth)
-            lines, told, good = [*lines, *more], {**told, **shot}, good and shot["verdict"] != "no-go"
+            lines, report, good = [*lines, *more], {**report, **shot}, good and shot["verdict"] != "no-go"
         elif arguments.test_shot or arguments.latency:
             lines.append("no shot was fired: the camera or the disk is not ready")
-    lines.append(_last(checked, told.get("verdict")))
-    told["next"] = go_no_go.next_step(checked)
-    print(json.dumps(told, indent=2) if arguments.json else "\n".join(lines))
+    lines.append(_last(checked, report.get("verdict")))
+    report["next"] = go_no_go.next_step(checked)
+    print(json.dumps(report, indent=2) if arguments.json else "\n".join(lines))
     return 0 if good else 1
 
 
 def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) -> int:
-    """A daemon runs here and holds the camera: go or no-go by what it says of itself, as on the console."""
+    """Judge go or no-go by the health record of the daemon that runs here, as the console does."""
     if arguments.test_shot or arguments.latency:
         raise DaemonRunsError(
-            f"a daemon runs at {endpoint} and holds the camera: end it first (sudo systemctl stop dappled), or ask it "
+            f"a daemon runs at {endpoint} and holds the camera: stop it first (sudo systemctl stop dappled), or ask it "
             "for a photograph (dappled trigger, the ground station, the console)"
         )
-    told = status.health(endpoint, HEAR_S)
-    checks = go_no_go.checks(told)
+    report = status.health(endpoint, HEAR_S)
+    checks = go_no_go.checks(report)
     looked: list[Check] = []
-    if told["camera"]["state"] not in ("ready", "busy", "starting"):  # then another program may hold it
+    if report["camera"]["state"] not in ("ready", "busy", "starting"):  # then another program may hold it
         looked = [
             one
             for check in (host_checks.bodies, host_checks.grabbers)
@@ -101,9 +105,9 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
     todo = go_no_go.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
     if arguments.json:
         facts = [*({"name": one.name, "state": one.state, "text": one.text} for one in checks), *_host_facts(looked)]
-        print(json.dumps({"flight": told["flight"], "checks": facts, "verdict": verdict, "next": todo}, indent=2))
+        print(json.dumps({"flight": report["flight"], "checks": facts, "verdict": verdict, "next": todo}, indent=2))
     else:
-        print(f"a daemon runs here, flight {told['flight']}; it says")
+        print(f"a daemon runs here, flight {report['flight']}; it reports")
         print("\n".join([*_lines(checks), *_host_lines(looked)]))
         print(f"{_VERDICTS[verdict]}{f'; next: {todo}' if todo else ''}")
     return 1 if verdict == "no-go" else 0
@@ -130,13 +134,13 @@ def _last(checks: Sequence[Check], verdict: str | None) -> str:
         return f"next: {todo}"
     if verdict is not None:
         return _VERDICTS[verdict]
-    return "nothing stands in the way; next: dappled doctor --test-shot"
+    return "nothing is missing; next: dappled doctor --test-shot"
 
 
 def _shoot(
     settings: Settings, arguments: argparse.Namespace, folder: Path, truth: Path | None
 ) -> tuple[list[str], dict[str, Any]]:
-    """The lines and the facts of the test shots."""
+    """Fire the test shots; the lines and the values of the report."""
     place = folder if arguments.keep is None else arguments.keep
     place.mkdir(parents=True, exist_ok=True)
     count = arguments.latency or 1
@@ -191,7 +195,7 @@ _SPANS = {
 
 
 def _timed(latencies: Sequence[Latency], truth_ms: list[float] | None) -> dict[str, Any]:
-    """Statistics in milliseconds, and the lines that say them."""
+    """Statistics in milliseconds, and lines that print them."""
     facts: dict[str, Any] = {}
     lines = []
     for name, title in _SPANS.items():
@@ -222,14 +226,16 @@ def _timed(latencies: Sequence[Latency], truth_ms: list[float] | None) -> dict[s
         errors = [a - b for a, b in zip(measured, truth_ms, strict=True) if a is not None]
         facts["truth_ms"], facts["worst_error_ms"] = truth_ms, max((abs(e) for e in errors), default=None)
         if errors:
-            lines.append(f"         the simulation's own times differ by at most {facts['worst_error_ms']:.1f} ms")
+            lines.append(
+                f"         the times of the simulation itself differ by at most {facts['worst_error_ms']:.1f} ms"
+            )
     return {**facts, "lines": lines}
 
 
 def _watch() -> int:
-    """Cameras on USB as they come and go."""
+    """Print cameras on USB as they appear and disappear."""
     before: list[usb_bus.UsbBody] = []
-    print("watching USB for cameras; ^C ends", file=sys.stderr)
+    print("watching USB for cameras; press ^C to end", file=sys.stderr)
     while True:
         now = usb_bus.bodies()
         came, went = usb_bus.changes(before, now)
@@ -246,7 +252,7 @@ def _watch() -> int:
 
 @contextmanager
 def _simulated(settings: Settings, seed: int, folder: Path) -> Iterator[tuple[Settings, Path]]:
-    """Settings for a simulated camera and autopilot, and the folder where the simulation writes its truth."""
+    """Settings for a simulated camera and autopilot, and the folder where the simulation writes the truth."""
     from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # a real flight doesn't load the mocks
 
     truth = folder / "truth"
@@ -257,7 +263,7 @@ def _simulated(settings: Settings, seed: int, folder: Path) -> Iterator[tuple[Se
 
 @contextmanager
 def _hot_shoe(settings: Settings, truth: Path | None) -> Iterator[None]:
-    """The simulated body's contact, wired to the simulated autopilot."""
+    """Wire the simulated body's hot shoe to the simulated autopilot."""
     if truth is None:
         yield
         return
@@ -271,5 +277,5 @@ def _hot_shoe(settings: Settings, truth: Path | None) -> Iterator[None]:
 
 
 def _true_latencies(truth: Path, count: int) -> list[float]:
-    """From trigger to exposure in milliseconds, as the simulation knows it."""
+    """The simulation's own times from trigger to exposure, in milliseconds."""
     return [json.loads(path.read_text())["latency_s"] * 1e3 for path in sorted(truth.glob("*.json"))[:count]]

@@ -1,4 +1,4 @@
-"""`dappled georeference`: a recorded flight as maps."""
+"""`dappled georeference`: make maps of a recorded flight."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from dappled.cli import counted
 from dappled.cli.arguments import metres, positive
 from dappled.daemon.pipeline import recipes
 from dappled.drivers.raw.darkroom import Recipe
@@ -39,7 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for the maps (default: FLIGHT/maps)")
     parser.add_argument("--as", dest="kinds", nargs="+", choices=KINDS, default=["kmz", "cog", "footprints"],
                         help="what to make (default: kmz cog footprints)")  # fmt: skip
-    parser.add_argument("--each", action="store_true", help="a kmz or cog of each frame too, in frames/")
+    parser.add_argument("--each", action="store_true", help="also a kmz or cog of each frame, in frames/")
     parser.add_argument("--quad", action="store_true", help="each frame's kmz as a LatLonQuad: the view itself")
     parser.add_argument(
         "--against", type=Path, metavar="FLIGHT", help="for difference: the other, later flight, all its frames"
@@ -54,40 +55,42 @@ def configure(parser: argparse.ArgumentParser) -> None:
     better.add_argument("--gcp", type=Path, metavar="CSV",
                         help="control points: name, frame, column, row, latitude, longitude, altitude")  # fmt: skip
     better.add_argument("--search", type=positive, default=5.0, metavar="M",
-                        help="how far off frames are looked for on the base map (default: 5 m)")  # fmt: skip
+                        help="search radius on the base map (default: 5 m)")  # fmt: skip
     better.add_argument("--pose-sigma", nargs=2, type=positive, metavar=("M", "DEG"),
-                        help="how well poses are known, 1 σ (default: as recorded)")  # fmt: skip
+                        help="σ of the poses (default: as recorded)")  # fmt: skip
     parser.add_argument("--json", action="store_true", help="the report as JSON")
 
 
 def add_placing(parser: argparse.ArgumentParser) -> None:
-    """Arguments that say how frames are decoded and placed."""
+    """Add the arguments that say how frames are decoded and placed."""
     ground = parser.add_argument_group("ground")
     ground.add_argument("--ground", type=float, metavar="M",
                         help="flat ground, metres above sea level (default: home's)")  # fmt: skip
     ground.add_argument("--terrain", type=Path, metavar="FILE", help="terrain raster: DTED, GeoTIFF …")
     ground.add_argument("--terrain-heights", choices=("sea-level", "ellipsoid"), default="sea-level",
-                        help="what the raster's heights count from (default: sea-level)")  # fmt: skip
+                        help="what the raster's heights are measured from (default: sea-level)")  # fmt: skip
     ground.add_argument("--geoid", metavar="FILE|M",
                         help="geoid grid (.gtx, .tif), or metres of sea level above the ellipsoid")  # fmt: skip
     camera = parser.add_argument_group("camera")
     camera.add_argument("--camera", metavar="P", help="camera profile (default: the flight's)")
     camera.add_argument("--mask", metavar="P", help="mask profile (default: the flight's)")
     camera.add_argument("--calibration", metavar="FILE", help="mask calibration (default: the flight's)")
-    camera.add_argument("--focal-length", type=positive, metavar="MM", help="where frames don't say")
-    camera.add_argument("--f-number", type=positive, metavar="N", help="where frames don't say")
+    camera.add_argument("--focal-length", type=positive, metavar="MM", help="if the frames don't say")
+    camera.add_argument("--f-number", type=positive, metavar="N", help="if the frames don't say")
     camera.add_argument("--view", default="mean", metavar="VIEW",
                         help="mean, ground (all views, refocused there), or row,column of one")  # fmt: skip
-    camera.add_argument("--grey", action="store_true", help="in grey (default: in colour where the frames have it)")
+    camera.add_argument("--grey", action="store_true", help="make grey maps (default: in colour if the frames have it)")
     camera.add_argument("--lever-arm", nargs=3, type=float, metavar=("F", "R", "D"),
                         help="antenna to camera, metres forward, right, down (default: the flight's)")  # fmt: skip
     camera.add_argument("--mount", nargs=9, type=float, metavar="R",
                         help="camera axes to body, row by row (default: the flight's)")  # fmt: skip
     camera.add_argument("--focus", type=metres, default=math.inf, metavar="M",
-                        help="distance that the lens was focused at (default: infinity)")  # fmt: skip
+                        help="distance at which the lens was focused (default: infinity)")  # fmt: skip
     maps = parser.add_argument_group("map")
     maps.add_argument("--crs", metavar="EPSG:N", help="projection in metres (default: the UTM zone)")
-    maps.add_argument("--gsd", type=positive, metavar="M", help="metres a map cell (default: the frames' own)")
+    maps.add_argument(
+        "--gsd", type=positive, metavar="M", help="side of a map cell (default: the ground sample of the frames)"
+    )
     maps.add_argument("--frames", metavar="N,A-B", help="only these frames")
 
 
@@ -102,7 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
         layout.open_folder(arguments.against)
     with ExitStack() as stack:
         progress = stack.enter_context(Bar())
-        missing: list[str] = []  # sentences: what could be made is there all the same
+        missing: list[str] = []  # a sentence for each product that could not be made
         made = _survey(folder.path, arguments, progress, stack, missing)
         files = _draw(made, output, arguments)
         terrain_of = None
@@ -126,7 +129,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(report.read_text(), end="")
     else:
-        print(f"{len(made.photographs)} frames on {made.projection.name}, {made.gsd_m:g} m a cell, {made.ground.name}")
+        frames = counted(len(made.photographs), "frame")
+        print(f"{frames} on {made.projection.name}, {made.gsd_m:g} m a cell, {made.ground.name}")
         for path in (*files, report):
             print(path)
     for why in (*(why for _, why in made.left), *made.notes):
@@ -148,7 +152,7 @@ def _compare(
     arguments: argparse.Namespace,
     progress: Progress,
 ) -> Iterator[Path]:
-    """The rasters of what has changed until the flight of --against, one by one as they are made."""
+    """Write the rasters of the change up to the flight of --against; yields each path."""
     changed = difference.of_pictures(made, other)
     yield difference.write(made, other, changed, output / "difference.tif", "share of brightness")
     if heights is not None:
@@ -157,14 +161,14 @@ def _compare(
 
 
 def _for_the_other(arguments: argparse.Namespace, made: Survey) -> argparse.Namespace:
-    """The arguments for the flight of --against: what names frames is about the first flight alone."""
+    """The arguments for the flight of --against, without those that name frames of the first flight."""
     return argparse.Namespace(**{**vars(arguments), "crs": made.projection.name, "frames": None, "gcp": None})
 
 
 def _survey(
     flight: Path, arguments: argparse.Namespace, progress: Progress, stack: ExitStack, missing: list[str]
 ) -> Survey:
-    """A flight decoded, placed, and refined as the arguments say; what could not be done is added to `missing`."""
+    """Decode, place and refine a flight as the arguments say. Adds what could not be done to `missing`."""
     facts = layout.read_facts(layout.open_folder(flight))
     made = georeference.survey(flight, recipe(flight, facts, arguments), options(facts, arguments), progress, stack)
     rasters = [Path(word) for word in arguments.refine if word != "neighbours"]
@@ -213,7 +217,7 @@ def _draw(made: Survey, output: Path, arguments: argparse.Namespace) -> list[Pat
 
 
 def recipe(flight: Path, facts: Mapping[str, Any], arguments: argparse.Namespace) -> Recipe:
-    """How the flight was decoded, with what the arguments say instead."""
+    """The recipe of the flight, changed as the arguments say."""
     given = {name: getattr(arguments, name) for name in ("camera", "mask", "calibration")}
     made = recipes.of_flight(flight, facts, given)
     if made is None:

@@ -1,4 +1,4 @@
-"""`dappled geotag`: where each frame was taken, for other programs."""
+"""`dappled geotag`: write where each frame was taken, for other programs."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from dappled.cli import counted
 from dappled.daemon.replay import late_tags
 from dappled.decode.geometry import camera_pose
 from dappled.errors import DappledError
@@ -31,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "The frames themselves are never touched."
     )
     parser.add_argument("flight", type=Path, metavar="FLIGHT", help="flight folder")
-    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="write everything there instead")
+    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="write everything into this folder instead")
     parser.add_argument("--lightroom", action="store_true", help="name sidecars name.xmp instead of name.ext.xmp")
     parser.add_argument("--force", action="store_true", help="replace sidecars that another program wrote")
     parser.add_argument(
@@ -51,7 +52,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="grid, or metres, of mean sea level above the ellipsoid (default: PROJ's EGM grid, if it is there)",
     )  # fmt: skip
     parser.add_argument(
-        "--copies", type=Path, metavar="DIR", help="also copies of the frames, with their place in EXIF"
+        "--copies", type=Path, metavar="DIR", help="also write copies of the frames with their position in EXIF"
     )
     parser.add_argument("--json", action="store_true", help="as JSON")
 
@@ -88,8 +89,11 @@ def run(arguments: argparse.Namespace) -> int:
             )
         )
     else:
-        words = f"{written.placed} frames placed, {len(written.files)} files written"
-        print(words + (f", {len(copied)} copies with EXIF" if arguments.copies else ""))
+        words = f"{counted(written.placed, 'frame')} placed, {counted(len(written.files), 'file')} written"
+        print(
+            words
+            + (f", {len(copied)} {'copy' if len(copied) == 1 else 'copies'} with EXIF" if arguments.copies else "")
+        )
     for name in written.without_position:
         print(f"no position is known for {name}", file=sys.stderr)
     for name in written.without_tag:
@@ -101,14 +105,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _tag_late(flight: Path) -> list[int]:
-    """What a crash left untagged is tagged first; where that can't be done, the others are placed all the same."""
+    """Tag the frames that a crash left untagged. If that fails, print why, and go on with the others."""
     try:
         added = late_tags.add_missing(flight, time.time_ns)
     except DappledError as error:
-        print(f"frames without a tag stay so: {error}", file=sys.stderr)
+        print(f"frames without a tag stay without one: {error}", file=sys.stderr)
         return []
     if added:
-        print(f"{len(added)} frames that the end of the recording had left untagged are tagged now", file=sys.stderr)
+        print(f"tagged {counted(len(added), 'frame')} that the recording had left without a tag", file=sys.stderr)
     return added
 
 

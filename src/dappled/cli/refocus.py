@@ -29,22 +29,26 @@ def configure(parser: argparse.ArgumentParser) -> None:
     decode_arguments.add_field(parser)
     where = parser.add_argument_group("focus (one of them)").add_mutually_exclusive_group()
     where.add_argument("--alpha", nargs="+", type=float, metavar="A",
-                       help="Eq 29's α: 1 as taken, below 1 nearer, above 1 farther")  # fmt: skip
+                       help="Eq 29's α: 1 as taken, below 1 is nearer, above 1 farther")  # fmt: skip
     where.add_argument("--disparity", nargs="+", type=float, metavar="D", help="px from view to view")
-    where.add_argument("--distance", nargs="+", type=metres, metavar="M", help="metres; needs distances")
+    where.add_argument(
+        "--distance", nargs="+", type=metres, metavar="M", help="metres; needs --focus or a calibration with targets"
+    )
     where.add_argument("--stack", nargs=3, type=float, metavar=("FROM", "TO", "N"), help="N disparities")
     parser.add_argument("--magnify", action="store_true",
-                        help="with --alpha: Eq 29 to the letter, where the picture grows with α")  # fmt: skip
+                        help="with --alpha: exactly Eq 29, where the picture grows with α")  # fmt: skip
     parser.add_argument("--aperture", type=float, metavar="D", help="round synthetic aperture, share of the whole")
     parser.add_argument("--tilt", nargs=2, type=float, default=(0.0, 0.0), metavar=("H", "W"),
                         help="tilted plane: change of disparity over the picture's height and width")  # fmt: skip
     parser.add_argument(
         "--all-in-focus", action="store_true", help="with --stack: each pixel from its sharpest picture"
     )
-    parser.add_argument("--index", type=Path, metavar="FILE", help="with --all-in-focus: which picture, as a picture")
-    parser.add_argument("--eyes", choices=("anaglyph", "side-by-side", "crossed"), help="what two eyes would see")
+    parser.add_argument(
+        "--index", type=Path, metavar="FILE", help="with --all-in-focus: draw which plane each pixel is from"
+    )
+    parser.add_argument("--eyes", choices=("anaglyph", "side-by-side", "crossed"), help="a stereo pair")
     parser.add_argument("--fourier", action="store_true",
-                        help="by a slice of the 4D spectrum (Ng), and how far shift and add is from it")  # fmt: skip
+                        help="by a slice of the 4D spectrum (Ng); prints the difference to shift and add")  # fmt: skip
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=".png, .jpg, .tif or .npy")
 
 

@@ -140,9 +140,9 @@ def _reload(service: Service, arguments: argparse.Namespace, manager: Notifier) 
     """Answer SIGHUP: read the settings again, apply what can change in flight, and say what can't."""
     manager.reloading(time.monotonic_ns())
     try:
-        told = service.reload(configuration.load(arguments.config)) if arguments.config else ["there is no --config"]
+        changes = service.reload(configuration.load(arguments.config)) if arguments.config else ["there is no --config"]
     except DappledError as error:
-        told = [f"the settings stay as they are: {error}"]
-    for text in told or ["nothing has changed"]:
+        changes = [f"the settings stay as they are: {error}"]
+    for text in changes or ["nothing has changed"]:
         remark(f"reload: {text}")
     manager.ready(time.monotonic_ns())

@@ -36,11 +36,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     endpoint = arguments.endpoint or stream_endpoint(arguments.config)
-    told = health(endpoint, arguments.timeout)
+    record = health(endpoint, arguments.timeout)
     if arguments.json:
-        print(json.dumps(told))
+        print(json.dumps(record))
     else:
-        print(screen(told))
+        print(screen(record))
     return 0
 
 
@@ -88,23 +88,23 @@ def health(endpoint: str, timeout_s: float) -> Mapping[str, Any]:
     )
 
 
-def screen(told: Mapping[str, Any]) -> str:
+def screen(record: Mapping[str, Any]) -> str:
     """The record in words."""
-    camera, link, disk, shots = told["camera"], told["link"], told["disk"], told["shots"]
+    camera, link, disk, shots = record["camera"], record["link"], record["disk"], record["shots"]
     free = "unknown" if disk["free_bytes"] is None else f"{disk['free_bytes'] / 1e9:.1f} GB free"
     reason = f": {camera['reason']}" if camera["reason"] else ""
     lines = [
-        f"flight    {told['flight']}",
+        f"flight    {record['flight']}",
         f"camera    {camera['state']}{reason}",
         f"link      {link['urls']} open, {link['packets']} packets, {link['positions']} positions",
         *(f"          {_link(one)}" for one in link["each"]),
         f"disk      {free}, {disk['folder']}",
         f"shots     {shots['wished']} requested, {_counts(shots, 'safe', 'failed', 'pending', 'refused')}",
     ]
-    for stage in told["stages"]:
+    for stage in record["stages"]:
         if "waiting" in stage:
             lines.append(f"{stage['name']:9} {_counts(stage, 'done', 'waiting', 'failed', 'dropped')}")
-    lines += [f"problem   {text}" for text in told["problems"]] or ["all is well"]
+    lines += [f"problem   {text}" for text in record["problems"]] or ["all is well"]
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""One picture of the simulated reference camera as a file, to try the commands on.
+"""Write one picture of the simulated reference camera as a file, to try the commands with.
 
 python -m dappled.mocks.shoot frame.dng
 python -m dappled.mocks.shoot white.dng --scene white --f-number 59.2
@@ -18,15 +18,17 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("output", type=Path, metavar="FILE.dng")
     parser.add_argument("--scene", default="bench", choices=("bench", "white", "terrain"), help="default: bench")
     parser.add_argument("--f-number", type=float, metavar="N", help="default: open, f/7.4")
-    parser.add_argument("--seed", type=int, default=3, help="draws the scene and how the mask sits (default: 3)")
-    parser.add_argument("--scale", type=float, default=0.5, help="side of the sensor over the full one (default: 0.5)")
-    parser.add_argument("--truth", type=Path, metavar="FILE.npz", help="what the camera really saw")
-    told = parser.parse_args(words)
-    camera = reference_camera(told.seed, scale=told.scale, scene=told.scene)
-    shot = camera.expose(0.0, 0, f_number=told.f_number)
-    told.output.write_bytes(shot.file)
-    if told.truth is not None:
-        shot.truth.save(told.truth)
+    parser.add_argument(
+        "--seed", type=int, default=3, help="seed of the scene and of how the mask is installed (default: 3)"
+    )
+    parser.add_argument("--scale", type=float, default=0.5, help="share of the full sensor's side (default: 0.5)")
+    parser.add_argument("--truth", type=Path, metavar="FILE.npz", help="also write what the camera really saw")
+    arguments = parser.parse_args(words)
+    camera = reference_camera(arguments.seed, scale=arguments.scale, scene=arguments.scene)
+    shot = camera.expose(0.0, 0, f_number=arguments.f_number)
+    arguments.output.write_bytes(shot.file)
+    if arguments.truth is not None:
+        shot.truth.save(arguments.truth)
     return 0
 
 

@@ -1,8 +1,9 @@
-"""`camera.driver = "simulated"`: the simulated masked camera as an ordinary driver, with nothing between it and the
-daemon. (`dappled run --simulate` puts the same camera behind libgphoto2 and PTP/IP.)
+"""The driver `camera.driver = "simulated"`: the simulated masked camera in the daemon's own process.
 
-`[camera.options]`: seed, scale, scene and law as `reference_camera` has them, f_number, and folder, for what the
-simulation knows of each shot.
+`dappled run --simulate` puts the same camera behind libgphoto2 and PTP/IP.
+
+`[camera.options]`: seed, scale, scene and law as in `reference_camera`; f_number; and folder, for what the simulation
+knows of each shot.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ _HOLD_S = 0.02
 class _Options:
     """`[camera.options]`, as `BodyOptions` has them; `folder` is its `truth`."""
 
-    seed: int = setting(1, "what is drawn", low=0, high=2**32)
+    seed: int = setting(1, "seed of everything drawn at random", low=0, high=2**32)
     scale: float = setting(1.0, "share of the sensor's side", low=0.01, high=4)
     scene: str = setting("terrain", "terrain, bench, white, or a folder of views")
-    law: str = setting("geometric", "where the carriers stand", choices=("geometric", "fd"))
+    law: str = setting("geometric", "law of the carriers", choices=("geometric", "fd"))
     f_number: float | None = setting(None, "the lens' aperture", low=0.1, high=1000)
-    folder: str | None = setting(None, "for what the simulation knows of each shot")
+    folder: str | None = setting(None, "folder for what the simulation knows of each shot")
     picture: str = setting("simulated", "simulated, pattern:SIZE:EXTENSION, or a file")
 
 
@@ -59,9 +60,9 @@ def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
 
 
 class Exposing:
-    """A shutter line whose press takes a picture: the file appears on the card, whole, some time later.
+    """A shutter line that takes a picture when it is pressed. The complete file appears on the card some time later.
 
-    Pictures are taken one by one, in the order in which they were asked for.
+    Pictures are taken one by one, in the order of the presses.
     """
 
     def __init__(self, options: BodyOptions, card: Path) -> None:
@@ -76,7 +77,7 @@ class Exposing:
             self._expose = self._expose or exposer(self._options)
             self._card.mkdir(mode=0o700, exist_ok=True)
         except (ValueError, OSError) as error:
-            raise CameraError(f"the simulated camera can't be: {error}") from None
+            raise CameraError(f"the simulated camera can't start: {error}") from None
 
     def press(self) -> None:
         """See ShutterLine."""
@@ -96,7 +97,7 @@ class Exposing:
             part.write_bytes(data)
             part.rename(target)
         except OSError:
-            return  # the camera was closed meanwhile, its card with it
+            return  # the camera was closed meanwhile, and its card deleted
 
     def let_go(self) -> None:
         """See ShutterLine."""

@@ -1,7 +1,7 @@
-"""Everything around the daemon, simulated: a masked camera in a PTP/IP body, an autopilot, a ground station.
+"""Simulate everything around the daemon: a masked camera in a PTP/IP body, an autopilot, a ground station.
 
-The daemon meets them over its real doors: libgphoto2 over TCP, MAVLink over UDP. What the mask's installation looks
-like is drawn from the seed and told to nobody; the calibration comes from a bench frame, as a user would make it.
+The daemon reaches them as it reaches real ones: libgphoto2 over TCP, MAVLink over UDP. The seed draws how the mask is
+installed, and the daemon doesn't know it; the calibration comes from a bench frame, as a user would make it.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Simulation:
         self._settings, self._folder = settings, folder
 
     def __enter__(self) -> Settings:
-        """Start camera body and autopilot; the settings that make a daemon use them."""
+        """Start camera body and autopilot; returns the settings that make a daemon use them."""
         world = self.world
         camera = reference_camera(world.seed, scale=world.scale, scene="white")
         calibration = write_calibration(camera, self._folder)
@@ -100,16 +100,16 @@ class Simulation:
 
     @property
     def autopilot_url(self) -> str:
-        """Where the autopilot sends to."""
+        """The URL that the autopilot sends to."""
         return f"udpout:127.0.0.1:{self._autopilot_port}"
 
     @property
     def ground_url(self) -> str:
-        """Where a ground station finds the daemon."""
+        """The URL at which a ground station finds the daemon."""
         return f"udpout:127.0.0.1:{self._ground_port}"
 
     def reboot_autopilot(self) -> None:
-        """The autopilot loses power and comes back: its time since boot begins anew, the flight goes on."""
+        """Restart the autopilot: its time since boot starts again, and the flight goes on."""
         self._autopilot.stop()
         self._autopilot = Autopilot.start(
             self.autopilot_url,
@@ -122,19 +122,19 @@ class Simulation:
         self._autopilot.stop()
 
     def ground_station(self, frames: int, interval_s: float = 0.0) -> GroundStation:
-        """A ground station that asks for so many frames, each after the last one ended."""
+        """Start a ground station that requests this many frames, each after the last one ended."""
         station = GroundStation.start(self.ground_url, frames, interval_s)
         self._stack.callback(station.stop)
         return station
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    """A port of loopback that nobody uses at the moment, of UDP or as `kind` says.
+    """A free port of loopback, for UDP or as `kind` says.
 
-    It is none of those that the kernel gives to whoever asks for any, so it is still free when it is bound.
+    It lies outside the range from which the kernel assigns ports, so it is still free when it is bound.
     """
     last = _first_given_out() - 1
-    first = max(1024, last - 12_000)  # above those that services like to have
+    first = max(1024, last - 12_000)  # above the ports of common services
     for _ in range(1000):
         port = first + secrets.randbelow(last - first + 1)
         with socket.socket(socket.AF_INET, kind) as one, contextlib.suppress(OSError):
@@ -148,7 +148,7 @@ def _first_given_out() -> int:
 
 
 def _keys(given: Settings) -> tuple[str, ...]:
-    """Signing keys for the links as they are with the simulated ones, which are not signed."""
+    """Signing keys for all links: the simulated ones, which are not signed, and the user's."""
     keys, links = given.mavlink.keys, len(given.mavlink.url)
     if not keys:
         return ()
@@ -160,7 +160,7 @@ CAMERA, MASK = "reference-36mm", "reference-5x5"
 
 
 def write_calibration(camera: MaskedCamera, folder: Path) -> Path:
-    """What `dappled calibrate` makes of the bench frame of a reference camera; the file that it wrote."""
+    """Calibrate with the bench frame of a reference camera, as `dappled calibrate` does; returns the file."""
     raw = reading.read(camera.bench_frame().file, "bench frame")
     profile = profiles.camera(CAMERA)
     plane = to_plane(raw.mosaic, black=raw.black, white=raw.white, cfa=raw.cfa)

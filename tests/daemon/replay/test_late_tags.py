@@ -117,7 +117,7 @@ def test_without_the_ledger_s_times_the_wish_s_time_stands(killed: Path, capsys:
     recovery.recover_flight(layout.open_folder(killed), time.time_ns)
     assert tags(killed) == []
     assert main(["geotag", str(killed)]) == 0
-    assert "2 frames that the end of the recording had left untagged" in capsys.readouterr().err
+    assert "tagged 2 frames that the recording had left without a tag" in capsys.readouterr().err
     with LedgerReader.open(killed / "flight.sqlite") as ledger:
         assert {tag.time_source for tag in ledger.tags().values()} == {"wish + body latency"}
     assert main(["replay", str(killed), "--verify"]) == 0
@@ -127,5 +127,5 @@ def test_while_a_daemon_records_there_nothing_is_tagged(killed: Path, capsys: py
     recovery.recover_flight(layout.open_folder(killed), time.time_ns)
     with FlightsLock(killed.parent):
         assert main(["geotag", str(killed)]) == 0
-    assert "frames without a tag stay so: another dappled" in capsys.readouterr().err
+    assert "frames without a tag stay without one: another dappled" in capsys.readouterr().err
     assert tags(killed) == [0]

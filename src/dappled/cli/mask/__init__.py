@@ -1,4 +1,4 @@
-"""`dappled mask make|table|diffraction|design|plan`: the printed mask, from altitude to film and back to the bench."""
+"""`dappled mask make|table|diffraction|design|plan`: design a printed mask, draw it, and test it on the bench."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dappled.cli.mask import design, diffraction, make, plan, table
 
 
 class Action(Protocol):
-    """A module of one action."""
+    """The module of one action."""
 
     HELP: str
     EXAMPLE: str

@@ -1,4 +1,4 @@
-"""`dappled mask design`: from an altitude to a mask, its distance and its film."""
+"""`dappled mask design`: design a mask, its distance and its film for an altitude."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dappled.decode.optics.film import FILMS
 from dappled.decode.optics.mask_design import DESIGNS, Design, DesignRequirements
 from dappled.decode.spectrum import pictures
 
-HELP = "mask, distance and film for an altitude"
+HELP = "design mask, distance and film for an altitude"
 EXAMPLE = "dappled mask design --altitude 40 --camera fujifilm-s5200 --focal-length 13 --f-number 3.5 --film 16k"
 
 
@@ -27,12 +27,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--views", type=int, default=5, metavar="N", help="views an axis, odd (default: 5)")
     parser.add_argument("--film", default="4k", choices=tuple(FILMS), help="to print it on (default: 4k)")
     mask_arguments.add_installation(parser, free=True)
-    parser.add_argument("--room", type=float, metavar="MM", help="the most that the mask may stand off (default: 10)")
+    parser.add_argument(
+        "--room", type=float, metavar="MM", help="largest distance of the mask from the sensor (default: 10)"
+    )
     parser.add_argument("--wavelength", type=float, default=550.0, metavar="NM", help="of the light (default: 550)")
     parser.add_argument(
         "--shift-error", type=float, default=0.02, metavar="PX", help="σ of a shift between views (default: 0.02)"
     )
-    parser.add_argument("--mask", metavar="P", help="an installed mask: its best focal length instead")
+    parser.add_argument("--mask", metavar="P", help="print the best focal length of this installed mask instead")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the carriers on the spectrum")
     parser.add_argument("--json", action="store_true", help="as JSON")
 
@@ -94,11 +96,11 @@ def _picture(made: Design) -> Any:
 
 
 def _as_json(made: Design) -> dict[str, Any]:
-    told = asdict(made)
-    wanted = told.pop("wanted")
+    report = asdict(made)
+    wanted = report.pop("wanted")
     return {
         "works": made.works,
-        **told,
+        **report,
         "film": wanted["film"]["name"],
         "views": wanted["views"],
         "altitude_m": wanted["altitude_m"],
@@ -129,5 +131,7 @@ def _as_text(made: Design) -> str:
     if made.problem:
         lines.append(made.problem)
     elif made.depth_sigma_m > wanted.altitude_m / 2:
-        lines.append("this depth is no measurement: fly lower, or take a longer lens with a wider aperture")
+        lines.append(
+            "this depth error is too large to measure depth: fly lower, or use a longer lens with a wider aperture"
+        )
     return "\n".join(lines)

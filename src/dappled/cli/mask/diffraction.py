@@ -1,4 +1,4 @@
-"""`dappled mask diffraction`: where a laser's spots land behind a printed mask, and what they say of it."""
+"""`dappled mask diffraction`: predict a laser's spots behind a printed mask, and judge the measured ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dappled.decode.optics.film import FILMS, MaskImage
 from dappled.decode.optics.lenses import within
 from dappled.products.exports import mask_files
 
-HELP = "where a laser's spots land, and what they say of the print"
+HELP = "predict a laser's spots, and judge a print by the measured ones"
 EXAMPLE = "dappled mask diffraction --mask mask-1 --measured bench.csv"
 
 
@@ -35,7 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="mask to wall (default: %(default)g)",
     )
-    parser.add_argument("--measured", type=Path, metavar="CSV", help="x_mm,y_mm of the spots that were seen")
+    parser.add_argument("--measured", type=Path, metavar="CSV", help="x_mm,y_mm of the measured spots")
     parser.add_argument(
         "--tolerance", type=float, default=0.5, metavar="MM", help="of the measurement (default: %(default)g)"
     )
@@ -64,13 +64,13 @@ def run(arguments: argparse.Namespace) -> int:
         half = screen.intensity.shape[1] / 2 * screen.pitch_mm[1]
         print(f"{arguments.picture}: the wall from {-half:.1f} to {half:.1f} mm", file=sys.stderr)
     if arguments.json:
-        told = {
+        report = {
             "wavelength_nm": wavelength,
             "distance_m": distance,
             "impulses": [{**asdict(i), "x_mm": x, "y_mm": y} for i, (x, y) in found],
             "verdict": asdict(verdict) if verdict else None,
         }
-        print(json.dumps(told, indent=2))
+        print(json.dumps(report, indent=2))
     elif verdict:
         print(verdict.text)
     else:

@@ -1,4 +1,4 @@
-"""`dappled mask make`: the picture that goes on film, or a step wedge."""
+"""`dappled mask make`: write the image that goes on film, or a step wedge."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from dappled.decode.optics.film import FILMS, Film, MaskImage, period_on
 from dappled.decode.optics.lenses import within
 from dappled.products.exports import mask_files
 
-HELP = "write the picture that goes on film, or a step wedge"
+HELP = "write the image that goes on film, or a step wedge"
 EXAMPLE = "dappled mask make mask-2 --negative -o mask-2.png"
 
 
@@ -69,23 +69,23 @@ def run(arguments: argparse.Namespace) -> int:
         def tile(rows: slice, columns: slice) -> mask_files.Levels:
             return np.repeat(levels[:, columns], rows.stop - rows.start, axis=0)
 
-        told: dict[str, Any] = {"wedge_steps": arguments.wedge, "warnings": []}
+        report: dict[str, Any] = {"wedge_steps": arguments.wedge, "warnings": []}
     else:
         image = _image(arguments, chosen)
         tile = image.levels
-        told = {
+        report = {
             "carriers": len(image.orders_drawn()),
             "period_px": list(image.period_px),
             "harmonics": [{**asdict(h), "drawable": h.drawable} for h in image.harmonics()],
             "warnings": image.warnings(),
         }
-    for text in told["warnings"]:
+    for text in report["warnings"]:
         print(f"dappled mask: warning: {text}", file=sys.stderr)
     with tqdm(total=chosen.shape[0], unit="row", disable=not sys.stderr.isatty(), delay=1) as bar:
         mask_files.write(arguments.output, chosen.shape, bits, chosen.px_per_mm, tile, progress=bar.update)
-    told = {"file": str(arguments.output), "shape": list(chosen.shape), "px_per_mm": list(chosen.px_per_mm), **told}
+    report = {"file": str(arguments.output), "shape": list(chosen.shape), "px_per_mm": list(chosen.px_per_mm), **report}
     if arguments.json:
-        print(json.dumps(told, indent=2))
+        print(json.dumps(report, indent=2))
     else:
         high, wide = chosen.vertical.length_mm, chosen.horizontal.length_mm
         print(f"{arguments.output}: {chosen.shape[1]} × {chosen.shape[0]} px, {bits} bits, {wide:.4g} × {high:.4g} mm")
@@ -136,7 +136,7 @@ def _image(arguments: argparse.Namespace, chosen: Film) -> MaskImage:
 
 
 def periods_on(known: MaskProfile, chosen: Film) -> tuple[float, float]:
-    """Whole pixels where the mask was designed in pixels of this very film, else by its frequency."""
+    """The periods (y, x): whole pixels if the mask was designed for this film, else by its frequency."""
     own = known.film_px_per_mm
     if own is not None and known.period_px is not None and np.allclose(chosen.px_per_mm, own, rtol=1e-3):
         return known.period_px, known.period_px

@@ -1,4 +1,4 @@
-"""`dappled mask plan`: what a flight at an altitude asks of camera, pilot and disk."""
+"""`dappled mask plan`: what a flight at an altitude needs of camera, pilot and disk."""
 
 from __future__ import annotations
 
@@ -57,5 +57,5 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"interval   {made.interval_s:.2f} s, {made.spacing_m:.2f} m; lines {made.line_m:.1f} m apart")
     print(f"body       must sustain {made.frames_per_minute:.1f} frames a minute")
     print(f"blur       {made.blur_px:.2f} px; one pixel at {made.longest_exposure_s * 1e3:.2f} ms")
-    print(f"disk       {made.frames} frames, {made.disk_bytes / 1e9:.1f} GB; card and disk alike, without previews")
+    print(f"disk       {made.frames} frames, {made.disk_bytes / 1e9:.1f} GB; on card and disk each, without previews")
     return 0

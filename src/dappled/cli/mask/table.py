@@ -1,4 +1,4 @@
-"""`dappled mask table`: where the carriers land over focal lengths."""
+"""`dappled mask table`: print where the carriers are over focal lengths."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dappled.cli.mask import arguments as mask_arguments
 from dappled.cli.mask.arguments import Installed
 from dappled.decode.optics import carrier_tables
 
-HELP = "where the carriers land over focal lengths (Tables 11 and 14)"
+HELP = "print where the carriers are over focal lengths (Tables 11 and 14)"
 EXAMPLE = "dappled mask table --mask mask-2 --camera fujifilm-s5200"
 THESIS_FOCAL_LENGTHS_MM = (6, 8, 10, 11, 12, 13, 15, 19, 25, 29, 33, 39, 52)  # Table 11
 
@@ -39,13 +39,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.carriers or arguments.rotation:
         return _carriers(one, lengths, math.radians(arguments.rotation), as_json=arguments.json)
     if arguments.json:
-        told = {
+        listed = {
             "shape": list(one.sensor.shape),
             "law": one.law,
             "mask_distance_mm": one.distance_mm,
             "rows": [asdict(r) for r in rows],
         }
-        print(json.dumps(told, indent=2))
+        print(json.dumps(listed, indent=2))
         return 0
     names = "".join(f"  {'×' + str(m):>10} H {'V':>7}" for m in one.mask.multiples)
     high, wide = one.sensor.shape
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _carriers(one: Installed, lengths: Sequence[float], rotation_rad: float, *, as_json: bool) -> int:
-    told = []
+    listed = []
     for length in lengths:
         lattice = carrier_tables.lattice_of(
             one.law, one.mask, one.sensor, one.distance_mm, length, rotation_rad=rotation_rad
@@ -74,12 +74,12 @@ def _carriers(one: Installed, lengths: Sequence[float], rotation_rad: float, *, 
             for carrier in lattice.carriers(orders):
                 row, column = carrier.index(one.sensor.shape)
                 place = {"row": row, "col": column, "main": main, "on_sensor": carrier.on_sensor}
-                told.append({"focal_length_mm": length, "ky": carrier.ky, "kx": carrier.kx, **place})
+                listed.append({"focal_length_mm": length, "ky": carrier.ky, "kx": carrier.kx, **place})
     if as_json:
-        print(json.dumps({"shape": list(one.sensor.shape), "law": one.law, "carriers": told}, indent=2))
+        print(json.dumps({"shape": list(one.sensor.shape), "law": one.law, "carriers": listed}, indent=2))
         return 0
     print(f"{'f/mm':>6} {'ky':>4} {'kx':>4} {'row':>9} {'col':>9}")
-    for c in told:
+    for c in listed:
         words = f"{'' if c['main'] else '  crossed'}{'' if c['on_sensor'] else '  off the sensor'}"
         print(f"{c['focal_length_mm']:6g} {c['ky']:4d} {c['kx']:4d} {c['row']:9.1f} {c['col']:9.1f}{words}")
     return 0

@@ -91,7 +91,7 @@ def flight(path: FlightPath, boot: BootTime, start_s: float, stop_s: float) -> I
 
 @dataclass(slots=True)
 class Flyer:
-    """The running autopilot: what is due, answers to TIMESYNC and to message interval requests, a slow link."""
+    """The running autopilot: sends what is due, answers TIMESYNC and message interval requests, delays telemetry."""
 
     path: FlightPath
     start_monotonic_ns: int
@@ -115,7 +115,7 @@ class Flyer:
         return self.boot.ns((monotonic_ns - self.start_monotonic_ns) / 1e9)
 
     def step(self, now_ns: int) -> float:
-        """Send what is due; seconds until the next."""
+        """Send what is due; returns the seconds until the next message."""
         pose: TruePose | None = None
         with self.lock:
             due = [number for number, at_ns in self.due_ns.items() if now_ns >= at_ns]
@@ -227,7 +227,7 @@ def _euler(pose: TruePose) -> tuple[float, float, float]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The process."""
+    """Run the process."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--url", required=True)
     parser.add_argument("--seed", type=int, default=1)
@@ -280,24 +280,24 @@ class HotShoe:
         self._thread.start()
 
     def close(self) -> None:
-        """Cut the wire."""
+        """Stop reporting."""
         self._stop.set()
         self._thread.join(5)
         self._socket.close()
 
     def _run(self) -> None:
-        told: set[str] = set()
+        reported: set[str] = set()
         while not self._stop.wait(_LOOK_S):
             for path in sorted(self._truth.glob("*.json")):
-                if path.name not in told:
+                if path.name not in reported:
                     try:
                         times = json.loads(path.read_text())
                     except ValueError:
                         continue  # it is still written
-                    told.add(path.name)
-                    self._tell(int(path.stem), times["trigger_t_s"] + times["latency_s"])
+                    reported.add(path.name)
+                    self._report(int(path.stem), times["trigger_t_s"] + times["latency_s"])
 
-    def _tell(self, number: int, opened_t_s: float) -> None:
+    def _report(self, number: int, opened_t_s: float) -> None:
         boot_us = BootTime().ns(opened_t_s) // 1000
         message = mavlink.MAVLink_camera_feedback_message(boot_us, 1, 0, number, 0, 0, 0.0, 0.0, 0, 0, 0, 0, 0, number)
         self._socket.send(message.pack(self._speech))

@@ -1,8 +1,8 @@
-"""A simulated ground station in a process of its own: asks for photographs, prints how each one ended.
+"""A simulated ground station in a process of its own: requests photographs, prints the result of each.
 
     python -m dappled.mocks.autopilot.ground_station --url udpout:127.0.0.1:14550 --count 8
 
-ends with 0 if all were had. It can misbehave: see `MANNERS`; a bad radio is `mocks.autopilot.bad_link`.
+exits 0 if all photographs were taken. It can misbehave: see `MANNERS`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from dappled.daemon.camera_protocol.ground_client import ACK_TRIES, GroundClient
 from dappled.drivers.mavlink import LinkError, Message, mavlink
 
 MANNERS = {
-    "deaf": "hears no answer: each command is repeated four times, and never says so (confirmation 0)",
-    "nan": "what a command doesn't need is NaN",
-    "dies": "is gone as soon as it has asked for a photograph",
+    "deaf": "hears no answer: it sends each command four times, always with confirmation 0",
+    "nan": "sets parameters that a command doesn't need to NaN",
+    "dies": "ends as soon as it has requested a photograph",
 }
 
 
@@ -47,7 +47,7 @@ class RudeClient(GroundClient):
 
 
 class GroundStation:
-    """The ground station as a process; `wait` tells how it went."""
+    """The ground station as a process; `wait` returns the results."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
@@ -63,7 +63,7 @@ class GroundStation:
         return cls(subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True))
 
     def running(self) -> bool:
-        """Whether it is still asking."""
+        """Whether it is still running."""
         return self._process.poll() is None
 
     def wait(self, timeout_s: float) -> tuple[int, list[dict[str, object]]]:

@@ -1,8 +1,8 @@
-"""Where the simulated vehicle truly is: a smooth survey flight as a pure function of time.
+"""The true path of the simulated vehicle: a smooth survey flight as a pure function of time.
 
-Camera and autopilot run in processes of their own; both call this function with the same seed and so agree on the
-truth without a word between them. Local frame: north, east, down in metres from home. The mathematics is SciPy's and
-its own, not the daemon's, which is checked with it.
+Camera and autopilot run in processes of their own. Both call this function with the same seed, and so agree on the
+truth without communication. Local frame: north, east, down in metres from home. The mathematics does not come from the
+daemon, which is checked with it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,11 @@
-"""A simulated camera body, as whoever uses one sees it: what it is to be, its process, what it is told and asked."""
+"""A simulated camera body in a process of its own: its options, its pictures, its client and its process.
+
+    python -m dappled.mocks.body.body --seed 1 --scale 0.25
+
+prints `port N` once it listens, then obeys lines on standard input: a fault of `faults` ("busy 2"), or "releases",
+"contact", "card", "move". It answers every line with one line, `ok …` or `error …`. It ends when its input ends, so it
+never outlives the process that started it.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +37,7 @@ class BodyError(DappledError):
 
 @dataclass(frozen=True, slots=True)
 class BodyOptions:
-    """What a body is and shows.
+    """What a body is, and what its pictures show.
 
     `picture`: "simulated" (the reference camera's raw files), "pattern:SIZE:EXTENSION" (bytes that `pattern` makes),
     or a file's path (its bytes, every time). `start_monotonic_ns`: when the simulation's time began (None: when the
@@ -99,7 +106,7 @@ class SimulatedBody:
         except (BodyError, ValueError) as error:
             _end(process)
             raise BodyError(f"the simulated body did not start: {error}") from error
-        except BaseException:  # interrupted: it must not be left behind
+        except BaseException:  # interrupted: the process must not be left behind
             _end(process)
             raise
         return cls(process, lines, ports)
@@ -128,7 +135,7 @@ class SimulatedBody:
         self.ask(line)
 
     def ask(self, line: str) -> str:
-        """One line to the body, its answer without the "ok". Raises BodyError."""
+        """Send one line to the body; returns its answer without the "ok". Raises BodyError."""
         assert self._process.stdin is not None  # a pipe by construction
         try:
             self._process.stdin.write(line.encode() + b"\n")
@@ -185,7 +192,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def pattern(shot_number: int, size: int) -> bytes:
-    """Bytes that differ from shot to shot and from page to page, so that nothing lost or swapped goes unseen."""
+    """Bytes that differ from shot to shot and from page to page, so that lost or swapped pages are noticed."""
     page = bytes(range(256)) * 16
     stamps = (f"shot {shot_number:06d} page {number:08d} ".encode() for number in range(size // len(page) + 1))
     return b"".join(stamp + page[len(stamp) :] for stamp in stamps)[:size]
@@ -215,7 +222,7 @@ def _delayed(delay_s: float, make: Callable[[int], bytes], extension: str) -> Ex
 
 
 def _simulated(options: BodyOptions) -> Expose:
-    # Imported here: it brings the whole renderer, which a body that shows patterns doesn't need.
+    # Imported here: it loads the whole renderer, which a body that shows patterns doesn't need.
     from dappled.mocks.scene.masked_camera import reference_camera  # noqa: PLC0415  # reason above
 
     start_ns = time.monotonic_ns() if options.start_monotonic_ns is None else options.start_monotonic_ns
@@ -283,7 +290,7 @@ def _say(text: str) -> None:
 
 
 def serve(options: BodyOptions, lines: Iterable[str]) -> None:
-    """Be a body until the lines end."""
+    """Serve a body until the lines end."""
     faults = BodyFaults(time.monotonic_ns)
     for fault in options.faults:
         faults.command(fault)
@@ -310,7 +317,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except ValueError as error:
         sys.exit(f"body: {error}")
     except BrokenPipeError:
-        os._exit(0)  # the starter is gone; nothing is left to be said, not even at the exit
+        os._exit(0)  # the parent is gone: end without a word
 
 
 if __name__ == "__main__":

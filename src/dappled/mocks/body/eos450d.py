@@ -1,9 +1,8 @@
-"""A Canon EOS 450D, transaction by transaction: its identity, its session, its captures.
+"""A simulated Canon EOS 450D, transaction by transaction: identity, session, captures, properties and events.
 
-No sockets here: `mocks.ptpip` carries the transactions. `eos_card` answers for its card, `eos_properties` for its
-properties. Operation and event lists are those of a real body (PTP device info published with libgphoto2); its quirks
-kept here are the ones that drivers meet: RemoteRelease without RemoteReleaseOn, busy while it works on a capture, room
-on the computer to be announced before it shoots to memory.
+`ptpip` has the sockets and `eos_card` the card. Operation and event lists are those of a real body (PTP device info
+published with libgphoto2). Of its quirks, those that drivers meet are simulated: RemoteRelease without RemoteReleaseOn,
+busy during a capture, and no shot to memory before the computer has announced room.
 """
 
 from __future__ import annotations
@@ -91,12 +90,12 @@ class Eos450d:
             return self._card.names
 
     def contact(self) -> bool:
-        """The contact of its remote socket closes: an exposure, whoever is connected. False where it makes none."""
+        """Close the contact of the remote socket: an exposure, with or without a link. False if there is none."""
         with self._lock:
             return self._release(PtpRequest(Op.EOS_REMOTE_RELEASE, 0, ()), b"").code == Code.OK
 
     def disconnected(self) -> None:
-        """The link is gone: the session with it; the card, and what the body works on, stay."""
+        """The link is gone, and the session with it. The card and a running capture stay."""
         with self._lock:
             self._session = False
             self._properties.forget_events()
@@ -174,7 +173,7 @@ class Eos450d:
         return PtpResponse(parameters=(0,))
 
     def _hunt(self, _triggered_ns: int, _number: int, _to_memory: bool) -> None:
-        """The autofocus finds nothing, and no picture is taken."""
+        """Simulate an autofocus that fails: no picture is taken."""
         time.sleep(_HUNT_S)
         self._done()
 
@@ -257,7 +256,7 @@ _FORMATS = (_RAW, _RAW_AND_JPEG)
 
 
 class Properties:
-    """What each property is, and the events that nobody has fetched yet. Whoever calls holds the body's lock."""
+    """The values of the properties, and the events not fetched yet. The caller holds the body's lock."""
 
     def __init__(self, serial: str, *, pairs: bool) -> None:
         self._events: deque[bytes] = deque()
@@ -298,7 +297,7 @@ class Properties:
         self._events.extend(records)
 
     def forget_events(self) -> None:
-        """Nobody will ask for what has been announced so far."""
+        """Drop what has been announced so far."""
         self._events.clear()
 
     @property

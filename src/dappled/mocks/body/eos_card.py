@@ -1,4 +1,4 @@
-"""The card of a Canon EOS 450D, and what waits in its memory: folders and files by handle, asked for over PTP."""
+"""The card and memory of a simulated Canon EOS 450D: folders and files by handle, read over PTP."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dappled.mocks.body.faults import BodyFaults
 from dappled.mocks.body.ptp import Code, Format, Handler, Op, PtpRequest, PtpResponse
 
 CARD_BYTES = 512 << 20
-"""A card for about a hundred small frames: it lies in this process' memory."""
+"""Room for about a hundred small frames: the card is in this process' memory."""
 STORAGE = 0x00020001
 DCIM = 0x20000000
 FOLDER = 0x21900000
@@ -35,7 +35,7 @@ class StoredObject:
 
 
 class Card:
-    """All objects of a body. Whoever calls holds the body's lock. The fault "short" cuts an object's data."""
+    """All objects of a body. The caller holds the body's lock. The fault "short" cuts an object's data."""
 
     def __init__(self, size: int, faults: BodyFaults, unix_s: int) -> None:
         self._size = size
@@ -158,7 +158,7 @@ class Card:
         return PtpResponse(Code.INVALID_OBJECT_HANDLE) if found is None else PtpResponse()
 
     def _transferred(self, request: PtpRequest, _data: bytes) -> PtpResponse:
-        """The file has been fetched from memory, which lets go of it."""
+        """The file has been fetched: free its memory."""
         if request.parameter(0) < DCIM:
             self._objects.pop(request.parameter(0), None)
         return PtpResponse()

@@ -1,4 +1,4 @@
-"""What goes wrong with a simulated body, said in words while it runs.
+"""Faults of a simulated body, put in force by words while it runs.
 
 Lasting faults take seconds ("busy 2.5"; without a number: until "clear"), counted ones a number of times ("error 3";
 without a number: once), "drop" happens at once, and "unplug" is both: it cuts the links and lasts.
@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 LASTING = ("busy", "silence", "refuse", "unplug", "slow", "full")
 """busy: a release is answered DeviceBusy. silence: nothing is answered. refuse: no new connection is accepted, as if
-another program held the body. unplug: the links are cut and nobody is there. slow: an object's data come at 2 MB/s.
-full: the card takes no more."""
+another program held the body. unplug: the links are cut, and no new one is accepted. slow: an object's data come
+at 2 MB/s. full: the card takes no more."""
 
 COUNTED = ("error", "no-event", "short", "drop-transfer", "unplug-transfer", "no-focus")
 """error: a release is answered GeneralError. no-event: a new object isn't announced. short: an object's data end one

@@ -1,4 +1,4 @@
-"""PTP/IP as bytes: its codes, its packets, a request and its answer. Pure; no sockets.
+"""PTP/IP as bytes: codes, packets, requests, responses, and the data sets of a Canon EOS. Pure; no sockets.
 
 Sources: PIMA 15740 (operation and response codes), CIPA DC-005 (packets). The Canon EOS extension is undocumented; its
 codes are those that libgphoto2 reads.

@@ -1,6 +1,6 @@
-"""A PTP/IP responder on a TCP port: carries transactions to a body, and the link's own faults.
+"""A PTP/IP responder on a TCP port: passes transactions to a body, and makes the faults of the link.
 
-One initiator at a time, as with a real body: a second one is turned away while the first is connected.
+As with a real body, one initiator at a time is served: a second one is refused while the first is connected.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Transactions(Protocol):
 
 class Responder:
     """Serves a body on ports of its own choosing; `close` ends all its threads. The body answers at the first of its
-    `addresses`, at the others nobody is there; `move` takes it to the next one."""
+    `addresses`, the others refuse; `move` takes it to the next one."""
 
     def __init__(self, body: Transactions, faults: BodyFaults, host: str = "127.0.0.1", addresses: int = 1) -> None:
         self._body = body
@@ -143,7 +143,7 @@ class Responder:
     def _transact(self, link: socket.socket) -> None:
         kind, payload = _read(link)
         if kind != PtpPacket.REQUEST:
-            return  # a cancel, or data that nobody asked for
+            return  # a cancel, or data without a request
         request = ptp.parse_request(payload)
         data = _read_data(link) if request.code in ptp.WITH_DATA_OUT else b""
         self._wait_out_silence()

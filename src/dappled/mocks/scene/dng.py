@@ -1,6 +1,6 @@
-"""A raw file that LibRaw opens: an uncompressed DNG with one Bayer plane and the EXIF of the shot.
+"""Write a raw file that LibRaw opens: an uncompressed DNG with one Bayer plane and the EXIF of the shot.
 
-Written by hand because the EXIF values belong into a folder of their own, where cameras put them. Adobe DNG 1.4,
+No library is used, because the EXIF values must be in a folder of their own, where cameras put them. Adobe DNG 1.4,
 TIFF 6, EXIF 2.3; little endian.
 """
 
@@ -25,7 +25,7 @@ COLOUR_MATRIX = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2
 
 @dataclass(frozen=True, slots=True)
 class Exif:
-    """What a camera body notes about a shot. `taken_utc_ns` is cut to whole seconds, as bodies do."""
+    """What a camera body records about a shot. `taken_utc_ns` is cut to whole seconds, as bodies do."""
 
     make: str
     model: str

@@ -1,4 +1,4 @@
-"""The landscape as the vehicle's camera sees it: straight down in body axes, the picture's top towards the nose."""
+"""Render the landscape as the vehicle's camera sees it: down in body axes, the picture's top towards the nose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ground of the simulation: one procedural landscape, built from a seed, that repeats every `EXTENT_M` metres.
+"""Build the ground of the simulation: a procedural landscape from a seed, which repeats every `EXTENT_M` metres.
 
 Maps are square, row = −north, column = east, home in the middle (index n/2);
 everything wraps. Heights are metres above home.

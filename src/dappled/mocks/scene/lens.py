@@ -74,7 +74,7 @@ class Optics:
 
 @dataclass(frozen=True, slots=True)
 class Installation:
-    """How the mask really sits in this one camera: the decoder has to find out.
+    """How the mask is installed in this camera, which the decoder has to find out.
 
     `rotation_rad` turns carriers from the row axis towards the column axis (as `Lattice.rotated`), `shift_mm` (y, x)
     is in the mask's own axes, `distance_mm` from mask to sensor.
@@ -103,7 +103,7 @@ class Installation:
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """What a scene is asked for: one ray for every aperture point and every sensor sample.
+    """The rays to render: one for every aperture point and every sensor sample.
 
     `y_mm` (h,) and `x_mm` (w,) are the samples' places on the sensor, `aperture_mm` (J, 2) the aperture points.
     """
@@ -117,8 +117,8 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Rendering:
-    """What a scene answers: `radiance` (J, 3, h, w) red, green, blue in the scene's own scale; `depth_m` (h, w) along
-    the axis as seen from the aperture's centre, None where nobody knows it."""
+    """The result of a scene: `radiance` (J, 3, h, w) red, green, blue in the scene's own scale; `depth_m` (h, w) along
+    the axis as seen from the aperture's centre, None where it is unknown."""
 
     radiance: Floats
     depth_m: Floats | None

@@ -1,7 +1,7 @@
-"""The simulated masked camera: a shot in, a raw file and the truth about it out.
+"""Simulate the masked camera: chip, exposure, the raw file of a shot, and the truth about it.
 
-The file is what a daemon may see. The truth (views, depth, pose, how the mask really sits, when the shutter was open)
-is for tests and pictures only.
+The daemon sees only the file. The truth (views, depth, pose, installation of the mask, time of the exposure) is for
+tests and pictures.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class SimulatedExposure:
 
     @property
     def truth(self) -> Truth:
-        """The truth, worked out anew each time it is asked for (the file is ready long before)."""
+        """The truth, computed at each call (the file is ready long before)."""
         return self._truth()
 
 
@@ -65,12 +65,12 @@ class MaskedCamera:
 
     @property
     def installed(self) -> Installation:
-        """How the mask really sits."""
+        """How the mask is installed."""
         return self.installation or Installation.drawn(self.seed, self.optics)
 
     @property
     def lattice(self) -> Lattice:
-        """Where the carriers really lie, in cycles/pixel."""
+        """Where the carriers really are, in cycles/pixel."""
         return lens.carrier_lattice(self.optics, self.installed, self.sensor.chip)
 
     def latency_s(self, shot_number: int) -> float:
@@ -100,7 +100,7 @@ class MaskedCamera:
         """Take a picture: triggered at `trigger_t_s` (seconds on the path's clock).
 
         Without `f_number` the lens is open, without `exposure_s` the exposure is metered. Raises ValueError for an
-        aperture that the lens has not, an exposure that is not positive, and what the scene can't show.
+        aperture that the lens doesn't have, an exposure that is not positive, and what the scene can't show.
         """
         n_stop = self.optics.f_number if f_number is None else f_number
         points = self.optics.aperture_points_mm(n_stop)
@@ -140,7 +140,7 @@ class MaskedCamera:
         )
 
     def bench_frame(self, *, f_number: float | None = None, shot_number: int = 0) -> SimulatedExposure:
-        """A white card through the stopped-down lens, for calibration: 1/8 of the aperture unless told otherwise."""
+        """Photograph a white card for calibration: 1/8 of the aperture unless `f_number` is given."""
         bench = replace(self, scene=WhiteCard(), path=None)
         return bench.expose(0.0, shot_number, f_number=8 * self.optics.f_number if f_number is None else f_number)
 

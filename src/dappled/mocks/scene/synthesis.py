@@ -1,4 +1,4 @@
-"""From the views of a scene to the masked frame, quickly and without approximation.
+"""Compute the masked frame from the views of a scene, quickly and without approximation.
 
 The frame is the ray sum I(x) = mean over θ of L_θ(x)·M(mask crossing of (x, θ)). M is a sum of cosines, so the sum may
 be taken in another order: first over θ, which gives for each carrier k a smooth image S_k(x) = mean of

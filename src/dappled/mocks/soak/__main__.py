@@ -30,15 +30,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         folder = wanted.keep or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
         began = time.monotonic()
-        account = soak(
+        result = soak(
             SoakPlan(wanted.minutes * 60, wanted.seed),
             folder.absolute(),
             lambda text: print(f"{time.monotonic() - began:7.1f} s  {text}", file=sys.stderr),  # noqa: T201  # a tool that prints
         )
-    told = {name: getattr(account, name) for name in SoakReport.__slots__ if name not in ("before", "after")}
-    told |= {"before": account.before and account.before.told(), "after": account.after and account.after.told()}
-    print(json.dumps(told, indent=1))  # noqa: T201  # as above
-    return 1 if account.problems else 0
+    report = {name: getattr(result, name) for name in SoakReport.__slots__ if name not in ("before", "after")}
+    report |= {"before": result.before and result.before.as_dict(), "after": result.after and result.after.as_dict()}
+    print(json.dumps(report, indent=1))  # noqa: T201  # as above
+    return 1 if result.problems else 0
 
 
 if __name__ == "__main__":

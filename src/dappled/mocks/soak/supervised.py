@@ -21,7 +21,7 @@ class Resources:
     threads: int
     children: int
 
-    def told(self) -> dict[str, float]:
+    def as_dict(self) -> dict[str, float]:
         """The values as a mapping, for JSON."""
         return asdict(self)
 
@@ -81,11 +81,11 @@ class Supervised:
     def resources(self) -> Resources:
         """Its resources now."""
         status = Path(f"/proc/{self.pid}/status").read_text(encoding="ascii", errors="replace")
-        told = dict(line.split(":", 1) for line in status.splitlines() if ":" in line)
+        facts = dict(line.split(":", 1) for line in status.splitlines() if ":" in line)
         return Resources(
-            rss_mb=int(told["VmRSS"].split()[0]) / 1e3,
+            rss_mb=int(facts["VmRSS"].split()[0]) / 1e3,
             files=len(os.listdir(f"/proc/{self.pid}/fd")),
-            threads=int(told["Threads"]),
+            threads=int(facts["Threads"]),
             children=len(self.children()),
         )
 
