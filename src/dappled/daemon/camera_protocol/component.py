@@ -87,12 +87,14 @@ class Component:
         if packet.sent or message.get_srcSystem() == 0:
             return
         if (message.get_srcSystem(), message.get_srcComponent()) == (self._links.system_id, self._links.component_id):
-            return  # our own packet, come back over another link
+            return  # our own packet, received over another link
         handler = _HANDLERS.get(message.get_type())
         if handler is not None and packet.trusted:
             handler(self, packet)
         elif message.get_type() == "HEARTBEAT":
-            if packet.trusted:  # else anybody could say whose camera this is, and where orders to its autopilot go
+            if (
+                packet.trusted
+            ):  # an untrusted one must not decide whose camera this is, or which autopilot gets commands
                 now_ns = self._clock.monotonic_ns()
                 self._identity.heard(message, packet.link, now_ns)
                 self._stations.heard(message, now_ns)
@@ -108,7 +110,7 @@ class Component:
             return
         echo = self._commands.fires(command) and self._autopilot.is_echo(packet, str(command.name))
         answer = CommandAnswer(ACCEPTED) if echo else self._commands.answer(command)
-        if not command.broadcast or answer.result == ACCEPTED:  # a broadcast is for whoever can: never refused
+        if not command.broadcast or answer.result == ACCEPTED:  # a broadcast is never refused
             self._acknowledge(command, answer.result)
             self._results.append((command, answer.result))
         for message in answer.then:
@@ -116,7 +118,7 @@ class Component:
         if answer.words is not None:
             self.say(answer.words)
         if answer.result not in (ACCEPTED, UNSUPPORTED):
-            self.state_changed()  # a ground station's button waits for it
+            self.state_changed()  # a ground station's button waits for the status
 
     def _acknowledge(self, command: Command, result: int) -> None:
         self._links.send(
@@ -125,7 +127,7 @@ class Component:
         )
 
     def _acknowledge_again(self, command: Command) -> None:
-        """A copy of a packet is not obeyed again. On another link its sender may wait for the answer there."""
+        """Answer a duplicate packet without doing its command again: its sender may wait on another link."""
         for known, result in reversed(self._results):
             if (known.source, known.name) == (command.source, command.name):
                 if not command.broadcast:
@@ -133,13 +135,13 @@ class Component:
                 return
 
     def _trigger(self, packet: Packet) -> None:
-        """CAMERA_TRIGGER (112), and CAMERA_FEEDBACK (180) where the autopilot fires: nobody acknowledges these."""
+        """CAMERA_TRIGGER (112), and CAMERA_FEEDBACK (180) where the autopilot fires. Neither is acknowledged."""
         message = packet.message
         name = message.get_type()
         if message.get_srcSystem() != self._identity.system_id or self._is_duplicate(packet):
             return
         if name == "CAMERA_FEEDBACK" and not self._feedback_is_shot:
-            return  # the hot shoe's time of a shot that is known already: telemetry has it
+            return  # the hot shoe's time of a known shot: telemetry uses it
         if self._autopilot.is_echo(packet, name):
             return
         source = f"mavlink:{message.get_srcSystem()}/{message.get_srcComponent()}"
@@ -159,7 +161,7 @@ class Component:
         elif name == "PARAM_EXT_REQUEST_READ":
             reply = self._parameters.read(message)
         else:
-            self._send_changed_parameters()  # what changed before is told apart from what this changes
+            self._send_changed_parameters()  # earlier changes first, so that the reply follows them
             reply = self._parameters.set(message, packet.link, self._clock.monotonic_ns())
         self._send_reply(reply, packet.link)
         self._send_changed_parameters()
@@ -189,32 +191,32 @@ class Component:
         return self._autopilot.command(number, parameters)
 
     def announce(self, captured: Captured) -> None:
-        """A shot ended, its frame safe or lost: tell everybody, once."""
+        """Report a shot that ended, its frame safe or lost, on all links, once."""
         self._links.send(image_captured(captured, self._status.boot_ms()))
         self.state_changed()
 
     def state_changed(self) -> None:
-        """What CAMERA_CAPTURE_STATUS says may have changed: push it with the next tick."""
+        """CAMERA_CAPTURE_STATUS may have changed: send it with the next tick."""
         self._status_wanted.set()
 
     def settings_changed(self, refused: str = "") -> None:
-        """The body told its settings, with its sentence where it would not have a change."""
+        """The body reported its settings, with a sentence where it `refused` a change."""
         for link, reply in self._parameters.settled(self._clock.monotonic_ns(), refused):
             self._send_reply(reply, link)
         self._send_changed_parameters()
         self._links.send(self._status.settings())
 
     def say(self, text: str, severity: int = mavlink.MAV_SEVERITY_WARNING) -> None:
-        """A line for the pilot (STATUSTEXT)."""
+        """Send a line to the pilot (STATUSTEXT)."""
         for message in self._lines.messages(text, severity, self._clock.monotonic_ns()):
             self._links.send(message)
 
     def audience_has_grown(self) -> bool:
-        """Whether a ground station listens that missed what was said before; True once."""
+        """Whether a ground station has connected that missed earlier lines; True once."""
         return self._stations.new_one(self._clock.monotonic_ns())
 
     def tick(self) -> None:
-        """What is due by now: heartbeat, time requests, stream requests, status, periodic messages, old images."""
+        """Send what is due by now: heartbeat, time requests, stream requests, status, periodic messages, old images."""
         now_ns = self._clock.monotonic_ns()
         if not self._identity.decide(now_ns):
             return
