@@ -61,10 +61,6 @@ class FlightFolder:
     def frames(self) -> Path:
         return self.path / "frames"
 
-    @property
-    def lightfields(self) -> Path:
-        return self.path / "lightfields"
-
 
 def extension(camera_name: str) -> str:
     """The extension to store a camera's file with: its own in lower case if it is letters and digits, else "raw".
