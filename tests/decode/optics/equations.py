@@ -103,9 +103,15 @@ def spots(screen: Screen, *, separation_mm: float = 1.0, faintest: float = 1e-4)
         box = smooth[top : min(height, row + reach[0] + 1), left : min(width, column + reach[1] + 1)]
         weight = np.clip(box - 0.5 * smooth[row, column], 0, None)
         y, x = np.mgrid[top : top + box.shape[0], left : left + box.shape[1]]
-        x_mm, y_mm = screen.at_mm(float((weight * y).sum() / weight.sum()), float((weight * x).sum() / weight.sum()))
+        x_mm, y_mm = _at_mm(screen, float((weight * y).sum() / weight.sum()), float((weight * x).sum() / weight.sum()))
         found.append(Spot(x_mm, y_mm, float(smooth[row, column]) / brightest))
     return sorted(found, key=lambda spot: -spot.strength)
 
 
 # --- what a person measured --------------------------------------------------------------------------------------
+
+
+def _at_mm(screen: Screen, row: float, column: float) -> tuple[float, float]:
+    """(x, y) in mm of a fractional index."""
+    height, width = screen.intensity.shape
+    return (column - width // 2) * screen.pitch_mm[1], (row - height // 2) * screen.pitch_mm[0]

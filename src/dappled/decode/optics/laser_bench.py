@@ -73,11 +73,6 @@ class Screen:
     intensity: NDArray[np.float64]
     pitch_mm: tuple[float, float]
 
-    def at_mm(self, row: float, column: float) -> tuple[float, float]:
-        """(x, y) in mm of a fractional index."""
-        height, width = self.intensity.shape
-        return (column - width // 2) * self.pitch_mm[1], (row - height // 2) * self.pitch_mm[0]
-
 
 def far_screen(
     field: NDArray[np.floating],

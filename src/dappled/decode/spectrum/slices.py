@@ -16,7 +16,7 @@ from scipy import fft
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics.carriers import Carrier, Lattice, Window
-from dappled.decode.spectrum.transform import TILE, Complex, Run, Spectrum, column_runs, in_runs, row_runs
+from dappled.decode.spectrum.transform import TILE, BinRun, Complex, Spectrum, column_runs, in_runs, row_runs
 from dappled.decode.threads import share
 
 _LAYOUTS = 4  # kept: focal lengths that a zoom goes back to
@@ -115,9 +115,9 @@ class Band:
     weights: NDArray[np.float32] | None
     noise_share: float
     pieces: tuple[_Piece, ...]
-    across: tuple[Run, ...]
+    across: tuple[BinRun, ...]
     beyond: tuple[slice, ...]
-    rows: tuple[tuple[Run, ...], tuple[Run, ...]]
+    rows: tuple[tuple[BinRun, ...], tuple[BinRun, ...]]
     turn_down: Complex
     turn_across: Complex
     is_mean: bool
@@ -214,7 +214,7 @@ def _bands(
     return tuple(made)
 
 
-def _uncovered(across: Sequence[Run], width: int) -> tuple[slice, ...]:
+def _uncovered(across: Sequence[BinRun], width: int) -> tuple[slice, ...]:
     """The parts of 0…width that no run covers."""
     runs = sorted(across, key=lambda run: run.at)
     edges = [0, *(edge for run in runs for edge in (run.at, run.at + run.count)), width]
@@ -228,7 +228,7 @@ def _turn(place: float, count: int, size: int) -> NDArray[np.complex128]:
     return turned
 
 
-def _pieces(across: Sequence[Run], *, mirrored: bool) -> list[_Piece]:
+def _pieces(across: Sequence[BinRun], *, mirrored: bool) -> list[_Piece]:
     """Runs of columns, tile by tile. The last bin of a mirrored run comes first."""
     found = []
     for run in across:

@@ -35,7 +35,7 @@ def padded_shape(shape: tuple[int, int]) -> tuple[int, int]:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class BinRun:
     """`count` adjacent bins of one axis, from `at` on in a block, from `source` on in the spectrum."""
 
     at: int
@@ -43,7 +43,7 @@ class Run:
     source: int
 
 
-def row_runs(first: int, count: int, side: int, *, wrap: bool = True) -> list[Run]:
+def row_runs(first: int, count: int, side: int, *, wrap: bool = True) -> list[BinRun]:
     """Rows first…first+count−1 (signed) of a spectrum of `side` rows in DFT order.
 
     Cyclic with `wrap`, else only up to the Nyquist frequency.
@@ -55,12 +55,12 @@ def row_runs(first: int, count: int, side: int, *, wrap: bool = True) -> list[Ru
     while at < end:
         source = (first + at) % side
         length = min(end - at, side - source)
-        found.append(Run(at, length, source))
+        found.append(BinRun(at, length, source))
         at += length
     return found
 
 
-def column_runs(first: int, count: int, side: int, *, wrap: bool = True) -> tuple[list[Run], list[Run]]:
+def column_runs(first: int, count: int, side: int, *, wrap: bool = True) -> tuple[list[BinRun], list[BinRun]]:
     """(plain, mirrored) runs of columns first…first+count−1 (signed) in half of a spectrum of `side` columns.
 
     A mirrored run lies left of DC. Its bins are the conjugates of `source`… backwards, at the negative row.
@@ -73,9 +73,9 @@ def column_runs(first: int, count: int, side: int, *, wrap: bool = True) -> tupl
         frequency = (first + at + side // 2) % side - side // 2  # −side/2 … side/2 − 1
         length = min(end - at, (0 if frequency < 0 else side // 2) - frequency)
         if frequency >= 0:
-            plain.append(Run(at, length, frequency))
+            plain.append(BinRun(at, length, frequency))
         else:
-            mirrored.append(Run(at, length, -(frequency + length - 1)))
+            mirrored.append(BinRun(at, length, -(frequency + length - 1)))
         at += length
     return plain, mirrored
 
@@ -130,7 +130,7 @@ class Spectrum:
                 np.conjugate(target, out=target)
         return out
 
-    def require(self, across: Sequence[Run]) -> None:
+    def require(self, across: Sequence[BinRun]) -> None:
         """Raises DecodeError where one of these runs of columns was not computed."""
         last = max((run.source + run.count for run in across), default=0)
         if last > self.columns:
