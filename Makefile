@@ -1,4 +1,4 @@
-# Two commands do it all: `make demo` and `make test`. Each sets itself up, on the first run only.
+# `make demo` and `make test` set up the environment themselves on the first run.
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
@@ -8,7 +8,7 @@ PREFIX ?= /usr/local
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
-setup: ## the environment in .venv (done by the others when needed)
+setup: ## create the environment in .venv (the other targets do it if needed)
 	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
 	@$(PYTHON) tools/bootstrap.py
 
@@ -16,12 +16,12 @@ peers: ## MAVSDK and MAVProxy, which slow tests talk to, in .venv-peers (done by
 	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
 	@$(PYTHON) tools/bootstrap.py peers
 
-demo: setup ## eight simulated frames through the whole daemon, and pictures of the last
+demo: setup ## fly eight simulated frames through the whole daemon, and draw the last one
 	@tools/demo
 
-test: check test-fast ## lint, types, layers, and the default tests
+test: check test-fast ## lint, types, import contracts, and the default tests
 
-check: setup ## lint, format, types, layers
+check: setup ## lint, format, types, import contracts
 	@$(BIN)/ruff check -q .
 	@$(BIN)/ruff format -q --check .
 	@$(BIN)/mypy
@@ -30,7 +30,7 @@ check: setup ## lint, format, types, layers
 test-fast: setup
 	@$(BIN)/pytest -q --no-header -n auto --dist worksteal -m "not slow" --durations=25
 
-coverage: setup ## the default tests again, and which lines they reach (a third slower)
+coverage: setup ## run the default tests and report which lines they reach (a third slower)
 	@$(BIN)/coverage erase
 	@$(BIN)/pytest -q --no-header -n auto --dist worksteal -m "not slow" --cov --cov-report=term
 
@@ -40,14 +40,14 @@ test-slow: setup peers ## the tests that take longer
 clean-room: ## the README's commands in bare Debian roots (SUITES="bookworm trixie", RUN="make demo && make test"); as root
 	@for suite in $(or $(SUITES),bookworm trixie); do tools/clean-room $$suite "$${RUN:-make demo && make test}" || exit 1; done
 
-soak: setup ## half an hour in which something goes wrong every few seconds; MINUTES=n for another time
+soak: setup ## fly half an hour in which something goes wrong every few seconds; MINUTES=n for another time
 	@$(BIN)/python -m dappled.mocks.soak --minutes $(or $(MINUTES),30)
 
-faults: setup ## every camera fault against the daemon, again and again; ROUNDS=n for another number
+faults: setup ## run every camera fault against the daemon in 20 rounds; ROUNDS=n for another number
 	@for round in $$(seq $(or $(ROUNDS),20)); do echo "== round $$round"; \
 	  $(BIN)/pytest -q -p no:cacheprovider -m "" tests/system/test_camera_faults.py || exit 1; done
 
-bench: setup ## what the performance claims are measured with
+bench: setup ## run the benchmarks behind the performance figures
 	@for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
 
 lock: setup ## resolve the locks anew from pyproject.toml: everything, the peers of tests, and what flies
@@ -58,14 +58,14 @@ lock: setup ## resolve the locks anew from pyproject.toml: everything, the peers
 	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header -c requirements.lock \
 	  --no-annotate pyproject.toml -o requirements-onboard.lock
 
-arm64: setup ## whether the onboard set installs on a Raspberry Pi, and its size
+arm64: setup ## check that the onboard part installs on a Raspberry Pi, and print its size
 	@$(BIN)/python tools/arm64.py
 
-install: ## the service under PREFIX (default /usr/local): environment, unit, udev rule, settings
+install: ## install the service under PREFIX (default /usr/local): environment, unit, udev rule, settings
 	@$(PYTHON) tools/install.py install --prefix $(PREFIX) $(if $(DESTDIR),--destdir $(DESTDIR)) $(if $(SYSCONFDIR),--sysconfdir $(SYSCONFDIR))
 
-uninstall: ## take it away again; settings and flights stay
+uninstall: ## remove the service; settings and flights stay
 	@$(PYTHON) tools/install.py uninstall --prefix $(PREFIX) $(if $(DESTDIR),--destdir $(DESTDIR)) $(if $(SYSCONFDIR),--sysconfdir $(SYSCONFDIR))
 
-clean: ## remove what set-up and tests made
+clean: ## remove what setup and tests made
 	rm -rf .venv .venv-peers .tools build .coverage* htmlcov .mypy_cache .ruff_cache .pytest_cache .hypothesis

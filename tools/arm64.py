@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""What flies on a Raspberry Pi: every onboard library as an aarch64 wheel (glibc 2.36), and how much room they take."""
+"""Check that every onboard library has an aarch64 wheel (glibc 2.36) for a Raspberry Pi, and print their size."""
 
 from __future__ import annotations
 

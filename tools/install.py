@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Install dappled as a service under a prefix, or take it away: `make install PREFIX=…`, `make uninstall PREFIX=…`.
+"""Install dappled as a service under a prefix, or remove it: `make install PREFIX=…`, `make uninstall PREFIX=…`.
 
 An environment of its own in PREFIX/lib/dappled, from the onboard lock with its hashes; the command in PREFIX/bin; the
 unit, the udev rule, the service's user and its folders under PREFIX/lib; the configuration in SYSCONFDIR (default: /etc
