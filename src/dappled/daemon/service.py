@@ -338,11 +338,6 @@ class Service:
         return self._recording.folder.path
 
     @property
-    def utc_learnt(self) -> bool:
-        """Whether the autopilot has given UTC to a machine that didn't know it."""
-        return self._navigation.utc.learnt is not None
-
-    @property
     def requested(self) -> int:
         """Shots so far."""
         return self._shutter.statistics().shots

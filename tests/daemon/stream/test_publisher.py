@@ -340,31 +340,6 @@ def test_what_follows_a_large_message_at_once_is_not_lost(endpoint: str, monkeyp
     one.stop(0.0)
 
 
-def test_large_messages_wait_while_a_frame_is_made_safe(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(publisher, "_GIVE_WAY_S", 60.0)  # a machine may be slow
-    one = Publisher(endpoint, "")
-    one.start("f", no_answer)
-    with Subscriber(endpoint) as subscriber:
-        connected(one, subscriber)
-        with one.giving_way():
-            one.publish("frame", {"frame": 0})
-            one.publish("slices", {"frame": 0, "arrays": []}, bytes(1 << 20))
-            assert receive(subscriber, "frame").header["frame"] == 0
-            assert one.statistics().sent["slices"] == 0
-        assert receive(subscriber, "slices").header["frame"] == 0
-    one.stop(0.0)
-
-
-def test_a_disk_that_never_ends_holds_up_no_message_for_long(endpoint: str) -> None:
-    one = Publisher(endpoint, "")
-    one.start("f", no_answer)
-    with Subscriber(endpoint) as subscriber, one.giving_way():
-        connected(one, subscriber)
-        one.publish("slices", {"frame": 0, "arrays": []}, bytes(1 << 20))
-        assert receive(subscriber, "slices").header["frame"] == 0
-    one.stop(0.0)
-
-
 def test_askers_that_never_read_keep_four_answers_of_all_together(endpoint: str) -> None:
     bodies = Bodies()
 

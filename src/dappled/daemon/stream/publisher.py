@@ -15,7 +15,7 @@ import threading
 import time
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,7 +38,6 @@ UNREAD_ANSWERS = 4  # with a body, of all askers together
 UNREAD_STACKS = 8  # of all subscribers together: those that stop at different times hold different ones
 _LARGE_BYTES = 1_000_000
 _PATIENCE_S, _LARGE_PATIENCE_S = 0.02, 0.1  # after a message, while its bytes are on their way to readers
-_GIVE_WAY_S = 0.25  # how long a large message waits while a frame is made safe
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +103,6 @@ class Publisher:
         self._start: Message | None = None
         self._unread_stacks, self._unread_answers = InFlightLimit(UNREAD_STACKS), InFlightLimit(UNREAD_ANSWERS)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._way_is_free = threading.Event()
-        self._way_is_free.set()
         self._closed = False
         self._sockets = Sockets(keys, mode)
         try:
@@ -136,15 +133,6 @@ class Publisher:
             if sum(not peer for peer, _ in self._waiting) > self._capacity:
                 self._drop_one()
         self._ring()
-
-    @contextlib.contextmanager
-    def giving_way(self) -> Iterator[None]:
-        """While a frame is made safe: large messages wait, each at most a quarter of a second. One thread calls it."""
-        self._way_is_free.clear()
-        try:
-            yield
-        finally:
-            self._way_is_free.set()
 
     def statistics(self) -> PublisherStatistics:
         """Counters, taken together."""
@@ -229,7 +217,6 @@ class Publisher:
         patience_s = _PATIENCE_S
         if body is not None and body.nbytes >= _LARGE_BYTES:
             patience_s = _LARGE_PATIENCE_S
-            self._way_is_free.wait(_GIVE_WAY_S)
             if not self._unread_stacks.admit(body):
                 with self._lock:
                     self._dropped[message.topic] += 1
