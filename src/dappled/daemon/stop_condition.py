@@ -42,7 +42,7 @@ class StopCondition:
     """So many shots ended, or so many seconds gone since the first flight began; None: no such end.
 
     `ask` starts who asks for the frames, once the camera is `ready`. When they have nothing more to ask, and all that
-    they wished has ended, there is nothing left to wait for either.
+    they asked for has ended, there is nothing left to wait for either.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class StopCondition:
         return self._frames is not None and self._tally.good < self._frames
 
     def begin(self, requested: Callable[[], int]) -> None:
-        """A flight has begun: what it counts as wished comes on top of the shots of those before, which have ended."""
+        """A flight has begun. Its requested shots are added to those of earlier flights, which have ended."""
         if self._until_s is None and self._seconds is not None:
             self._until_s = self._clock_s() + self._seconds
         earlier = self._tally.count

@@ -86,7 +86,7 @@ class FrameDepth:
 
 
 class FrameDecoder(Protocol):
-    """What the street and the answers need."""
+    """Decodes recorded frames, for the pipeline and for answers to subscribers."""
 
     def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
         """Decode the raw file at `path`. Raises DecodeProcessError."""
