@@ -63,7 +63,7 @@ def test_it_ends_when_it_has_its_frames(
     ground.join(60)
     said = capsys.readouterr()
     assert json.loads(said.out)["index"] == 0
-    assert said.err.splitlines()[-1] == "1 shots: 1 frames safe, 0 decoded, 0 with a problem"
+    assert said.err.splitlines()[-1] == "1 shot: 1 frame safe, 0 decoded, 0 with a problem"
     (flight,) = flight_report.list_flights(tmp_path / "flights")
     assert f"flight {flight.path}" in said.err
     assert flight.balance is not None

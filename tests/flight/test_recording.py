@@ -20,10 +20,10 @@ from dappled.flight import (
     Stray,
     flight_report,
     layout,
+    logs,
     recording,
     recovery,
 )
-from dappled.flight import journal as journals
 from dappled.flight.check import check
 from dappled.flight.index import IndexEntry, in_order
 from tests.flight.conftest import START_UTC_NS
@@ -140,7 +140,7 @@ def test_a_shot_that_only_the_ledger_kept_is_noted_again(flights: Path, flight: 
     crash(flight)
     flight.folder.journal.write_bytes(b'{"torn')  # a power cut took what was not flushed
     begin_later(flights).close()
-    assert journals.read(flight.folder.journal).shots == (shot(0),)
+    assert logs.read_journal(flight.folder.journal).shots == (shot(0),)
     assert check(flight.folder.path).problems == ()
 
 
@@ -225,7 +225,7 @@ def test_the_next_index_is_beyond_all_that_an_unindexed_flight_mentions(flights:
         index.put(IndexEntry(10, "a", None, "failed"))
         assert index.next_index() == 11
         folder = layout.create(flights, START_UTC_NS)
-        journal = journals.ShotJournal(folder.journal)
+        journal = logs.ShotJournal(folder.journal)
         journal.note(shot(20))
         journal.close()
         assert index.next_index() == 21

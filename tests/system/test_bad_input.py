@@ -548,7 +548,7 @@ def test_sigterm_in_the_middle_of_a_shot_finishes_the_frame(here: Path) -> None:
         daemon.process.send_signal(signal.SIGTERM)
         out, err = daemon.process.communicate(timeout=15)
         assert daemon.process.returncode == 0, err
-        assert "1 shots: 1 frames safe" in err
+        assert "1 shot: 1 frame safe" in err
         assert "000000" in out
     (flight,) = flights(here)
     assert_whole(flight)

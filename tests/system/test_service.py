@@ -222,7 +222,7 @@ def test_installed_flown_and_removed(tmp_path: Path) -> None:
         check=False,
     )
     assert flown.returncode == 0, flown.stderr
-    assert "1 shots: 1 frames safe, 1 decoded" in flown.stderr
+    assert "1 shot: 1 frame safe, 1 decoded" in flown.stderr
     settings = prefix / "etc/dappled/dappled.toml"
     settings.write_text("# mine\n", encoding="utf-8")
     subprocess.run([*make, "install"], check=True, capture_output=True)

@@ -13,15 +13,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from dappled.cli.arguments import seconds, whole
-from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, remark
+from dappled.cli.stop_condition import Asker, StopCondition
+from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, RunObserver, Tally, remark
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
 from dappled.daemon.flight_handover import FlightHandover, flights
 from dappled.daemon.health.systemd import Notifier
-from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.service import Service
-from dappled.daemon.stop_condition import Asker, StopCondition, Tally
-from dappled.drivers.camera import StateChanged
 from dappled.errors import DappledError
 
 
@@ -69,22 +67,6 @@ def _run(arguments: argparse.Namespace) -> int:
             return _serve(simulated, arguments, ask)
 
 
-class _Reporting(Observer):
-    """Counts and prints the shots that have ended, and what becomes of the camera."""
-
-    def __init__(self, tally: Tally, frames: FrameLines, camera: CameraRemarks) -> None:
-        self._tally, self._frames, self._camera = tally, frames, camera
-
-    def finished(self, pending: PendingShot) -> None:
-        """See Observer."""
-        self._tally.add(pending)
-        self._frames.finished(pending)
-
-    def camera_changed(self, change: StateChanged) -> None:
-        """See Observer."""
-        self._camera.changed(change)
-
-
 def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], Asker] | None) -> int:
     """Run the daemon, flight after flight, until a signal, --frames or --for ends it."""
     manager, camera, tally = Notifier(), CameraRemarks(), Tally()
@@ -94,7 +76,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
 
     def fly(flown: Settings, after: FlightHandover) -> bool:
         """Run one flight. Returns whether another may follow."""
-        service = Service(flown, observer=_Reporting(tally, frames, camera), after=after)
+        service = Service(flown, observer=RunObserver(tally, frames, camera), after=after)
         problems = ProblemRemarks(service, manager)
 
         def turn() -> bool:

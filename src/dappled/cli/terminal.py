@@ -10,16 +10,18 @@ import json
 import logging
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any, Protocol
 
+from dappled.cli import counted
 from dappled.daemon.health.logbook import NewProblems
 from dappled.daemon.health.record import line as status_line
 from dappled.daemon.health.systemd import JournalHandler
-from dappled.daemon.pipeline.capture import PendingShot
+from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.stream import wire
 from dappled.drivers.camera import StateChanged
 from dappled.workers import Worker
@@ -99,6 +101,44 @@ class CameraRemarks:
         self._say(
             f"camera {change.state}" + (f": {change.reason}" if change.reason else ""), level, camera=change.state
         )
+
+
+class Tally:
+    """Counts the shots that have ended, over all flights of the process. Any thread may `add`."""
+
+    def __init__(self) -> None:
+        self.count = self.safe = self.decoded = self.good = 0
+        self._lock = threading.Lock()
+
+    def add(self, one: PendingShot) -> None:
+        """A shot has come to its end."""
+        with self._lock:
+            self.count += 1
+            self.safe += one.frame is not None
+            self.decoded += one.decoded is not None
+            self.good += not one.problem
+
+    def summary(self) -> str:
+        """The counts as a line."""
+        bad = self.count - self.good
+        shots, frames = counted(self.count, "shot"), counted(self.safe, "frame")
+        return f"{shots}: {frames} safe, {self.decoded} decoded, {bad} with a problem"
+
+
+class RunObserver(Observer):
+    """Counts and prints the shots that have ended, and what becomes of the camera."""
+
+    def __init__(self, tally: Tally, frames: FrameLines, camera: CameraRemarks) -> None:
+        self._tally, self._frames, self._camera = tally, frames, camera
+
+    def finished(self, pending: PendingShot) -> None:
+        """See Observer."""
+        self._tally.add(pending)
+        self._frames.finished(pending)
+
+    def camera_changed(self, change: StateChanged) -> None:
+        """See Observer."""
+        self._camera.changed(change)
 
 
 class HealthSource(Protocol):

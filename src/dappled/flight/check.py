@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.flight import durable, layout, provenance, telemetry_log
-from dappled.flight import journal as journals
+from dappled.flight import durable, layout, logs, provenance
 from dappled.flight.errors import FlightError
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
@@ -103,7 +102,7 @@ def _names(folder: FlightFolder, ledger: LedgerReader, closed: bool) -> Iterator
 
 
 def _shots(folder: FlightFolder, ledger: LedgerReader, notes: list[str]) -> Iterator[str]:
-    journal = journals.read(folder.journal)
+    journal = logs.read_journal(folder.journal)
     notes.extend(journal.problems)  # a torn line; where it hid a shot, that is a problem below
     rows = {row.shot.index: row for row in ledger.shots()}
     noted = {shot.index: shot for shot in journal.shots}
@@ -147,7 +146,7 @@ def _telemetry(folder: FlightFolder, ledger: LedgerReader, problems: list[str], 
             notes.append("the flight has no telemetry")
         return 0
     gaps: list[str] = []
-    found = telemetry_log.summarise(folder.telemetry, gaps.append)
+    found = logs.summarise(folder.telemetry, gaps.append)
     noted = facts.get("telemetry_sha256")
     if noted is not None and noted != found.sha256:
         problems.append("telemetry.tlog was changed: its SHA-256 is not the ledger's")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-from dappled.flight import journal, layout
+from dappled.flight import layout, logs
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Database, LedgerReader
@@ -181,7 +181,7 @@ def in_order(root: Path) -> list[FlightFolder]:
 
 def highest_in(folder: FlightFolder) -> int | None:
     """The highest image index that a flight's journal, ledger or frames mention; a damaged ledger is skipped."""
-    found = [shot.index for shot in journal.read(folder.journal).shots]
+    found = [shot.index for shot in logs.read_journal(folder.journal).shots]
     try:
         with LedgerReader.open(folder.ledger) as ledger:
             found += [row.shot.index for row in ledger.shots()]

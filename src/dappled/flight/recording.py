@@ -17,11 +17,10 @@ from typing import Any, Protocol
 from dappled.flight import durable, layout, provenance, recovery
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.index import ImageIndex, IndexEntry, open_or_rebuild
-from dappled.flight.journal import ShotJournal
 from dappled.flight.layout import FlightFolder, FlightsLock
 from dappled.flight.ledger import Ledger
+from dappled.flight.logs import ShotJournal, TelemetryLog
 from dappled.flight.records import Frame, Stray
-from dappled.flight.telemetry_log import TelemetryLog
 
 
 class FileBytes(Protocol):

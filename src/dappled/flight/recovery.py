@@ -12,13 +12,12 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from dappled.flight import durable, layout, telemetry_log
-from dappled.flight import journal as journals
+from dappled.flight import durable, layout, logs
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.index import ImageIndex
-from dappled.flight.journal import ShotJournal
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, ledger_damage
+from dappled.flight.logs import ShotJournal
 from dappled.flight.records import Frame, Stray
 
 SIDECAR = ".xmp"
@@ -73,12 +72,12 @@ def close_ledger(
     folder: FlightFolder,
     ledger: Ledger,
     utc_ns: int,
-    telemetry: telemetry_log.TelemetrySummary | None,
+    telemetry: logs.TelemetrySummary | None,
     report: list[str],
 ) -> None:
     """Store in the ledger the telemetry's summary (read from the file when not given) and the flight's end."""
     if telemetry is None and folder.telemetry.exists():
-        telemetry = telemetry_log.summarise(folder.telemetry, report.append)
+        telemetry = logs.summarise(folder.telemetry, report.append)
     if telemetry is not None:
         ledger.set_fact("telemetry_packets", telemetry.packets)
         ledger.set_fact("telemetry_bytes", telemetry.size)
@@ -113,7 +112,7 @@ def _remove_parts(folder: FlightFolder) -> list[str]:
 
 
 def _add_noted_shots(folder: FlightFolder, ledger: Ledger) -> list[str]:
-    journal = journals.read(folder.journal)
+    journal = logs.read_journal(folder.journal)
     report = [*journal.problems]
     for shot in journal.shots:
         if ledger.shot(shot.index) is None:

@@ -29,8 +29,7 @@ from dappled.decode.depth.evidence import Evidence
 from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield import refocus as refocusing
 from dappled.decode.lightfield.refocus import FocalPlane, StereoPair, eyes
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
-from dappled.drivers.raw.recipe import of_flight
+from dappled.drivers.raw.darkroom import Darkroom, Recipe, of_flight
 from dappled.errors import DappledError
 from dappled.flight import Tag, flight_report, layout
 from dappled.products.exports import light_files, view_folders

@@ -15,8 +15,8 @@ from dappled.clock import SystemClock
 from dappled.config import settings as configuration
 from dappled.config.settings import MavlinkSettings, PoseSettings, PublishSettings, RecordSettings, Settings
 from dappled.daemon import service as module
-from dappled.daemon.camera_protocol import autopilot
-from dappled.daemon.camera_protocol.autopilot import SystemIdentity
+from dappled.daemon.camera_protocol import component
+from dappled.daemon.camera_protocol.component import SystemIdentity
 from dappled.daemon.navigation.clocks import ExposureTime
 from dappled.daemon.navigation.navigation import Navigation, Telemetry, recorded_vehicles
 from dappled.daemon.pipeline.capture import PendingShot
@@ -121,7 +121,7 @@ def test_whose_telemetry_counts(heard: tuple[int, ...], vehicle: int | None) -> 
 @pytest.fixture
 def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Settings]:
     monkeypatch.setattr(module, "open_camera", lambda _: FakeCamera())
-    monkeypatch.setattr(autopilot, "LISTEN_NS", 5 * 10**8)
+    monkeypatch.setattr(component, "LISTEN_NS", 5 * 10**8)
     with tempfile.TemporaryDirectory(prefix="dpl-") as sockets:
         yield configuration.resolve(
             Settings(

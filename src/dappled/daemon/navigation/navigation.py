@@ -26,7 +26,7 @@ from dappled.daemon.navigation.clocks import (
     refine,
 )
 from dappled.daemon.navigation.samples import HALF_MS_NS, AttitudeSample, GnssSample, PositionSample
-from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, Around, Counts, VehicleHistory
+from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, USED_MESSAGES, Around, Counts, VehicleHistory
 from dappled.decode.geometry import (
     Gnss,
     Pose,
@@ -95,8 +95,10 @@ class Telemetry:
                 if system_id != self._history.system_id:
                     self._history = VehicleHistory(system_id, self._component_id, self._counts)
             self._packets = number + 1
-            used = self._history.feed(number, stamp_us * 1000, message)
-            if used and number >= self._prune_at:  # by packets that a replay decodes as well
+            if message.get_type() not in USED_MESSAGES:
+                return
+            self._history.feed(number, stamp_us * 1000, message)
+            if number >= self._prune_at:  # by packets that a replay decodes as well
                 self._prune_at = number + _PRUNE_EVERY
                 self._history.prune(stamp_us * 1000 - HISTORY_NS)
 

@@ -263,12 +263,9 @@ class VehicleHistory:
         self._receiver: list[GnssSample] = []
         self._feedbacks: list[Feedback] = []
 
-    def feed(self, number: int, stamp_ns: int, message: Message) -> bool:
-        """Take a packet; False for a message type that isn't used. A packet of another vehicle changes nothing."""
-        handler = _HANDLERS.get(message.get_type())
-        if handler is not None:
-            handler(self, number, stamp_ns, message)
-        return handler is not None
+    def feed(self, number: int, stamp_ns: int, message: Message) -> None:
+        """Take a packet whose message is one of `USED_MESSAGES`. A packet of another vehicle changes nothing."""
+        _HANDLERS[message.get_type()](self, number, stamp_ns, message)
 
     def prune(self, before_ns: int) -> None:
         """Forget what came before."""
@@ -387,6 +384,7 @@ _HANDLERS: dict[str, Callable[[VehicleHistory, int, int, Message], None]] = {
     "CAMERA_FEEDBACK": VehicleHistory._feedback,
     "CAMERA_TRIGGER": VehicleHistory._feedback,
 }
+USED_MESSAGES = frozenset(_HANDLERS)
 
 
 def _between(history: Sequence[N], first: int, limit: int) -> Sequence[N]:

@@ -31,7 +31,7 @@ DEPTH_NICENESS = 14
 Reply = tuple[Mapping[str, Any], tuple[int, ...]]
 
 
-class Worker:
+class DecodeWorker:
     """Answers the parent's questions with a darkroom that it sets up once."""
 
     def __init__(self) -> None:
@@ -159,7 +159,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C is the parent's to act on
     os.nice(NICENESS)
     goes_first(DECODER_GOES)
-    serve(socket.socket(fileno=fd), Worker())
+    serve(socket.socket(fileno=fd), DecodeWorker())
 
 
 if __name__ == "__main__":

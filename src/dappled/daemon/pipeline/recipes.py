@@ -14,8 +14,7 @@ from typing import Any
 
 from dappled.config import profiles
 from dappled.config.settings import Settings
-from dappled.drivers.raw.darkroom import Darkroom, Recipe, camera_name
-from dappled.drivers.raw.recipe import FILES, FOLDER, of_flight
+from dappled.drivers.raw.darkroom import FILES, FOLDER, Darkroom, Recipe, camera_name, of_flight
 from dappled.errors import DappledError
 from dappled.flight import durable
 

@@ -15,7 +15,7 @@ from scipy import fft
 from dappled.decode.depth.depth_map import DepthMap, Search, box, confidence, judged, peaked, windowed
 from dappled.decode.depth.evidence import Evidence
 from dappled.decode.lightfield.light_field import centred
-from dappled.decode.threads import each, spans
+from dappled.workers import each, spans
 
 Volume = NDArray[np.float32]
 _COARSEST = 0.04  # cycles/pixel: coarser detail carries no depth, and outweighs the detail that does

@@ -17,7 +17,7 @@ from dappled.decode.depth.depth_map import DepthMap, Search, box, judged, window
 from dappled.decode.depth.evidence import Evidence
 from dappled.decode.lightfield.light_field import Image, ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
-from dappled.decode.threads import each
+from dappled.workers import each
 
 _SMOOTH_PX = 0.8  # sigma: finer detail is not linear over the shifts
 _VALID = 1.0  # px that the outermost view may be from the shear

@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.light_field import Image, ViewStack
-from dappled.decode.threads import each
+from dappled.workers import each
 
 _SHARPNESS_BOX = 5  # px: the side of the box that sharpness is averaged over, twice
 _LEAST_WEIGHT = 1e-6  # of all views: a pixel that less is seen of is unknown

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.threads import each, spans
+from dappled.workers import each, spans
 
 Plane = NDArray[np.float32]
 LARGEST_PIXELS = 120_000_000  # 480 MB of float32; a spectrum of it takes as much again

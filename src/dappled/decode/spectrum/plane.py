@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.spectrum.lineariser import Plane, check_frame, colour_gains, levels_of
-from dappled.decode.threads import spans
+from dappled.workers import spans
 
 Places = tuple[NDArray[np.intp], NDArray[np.intp]]
 Period = tuple[int, int]

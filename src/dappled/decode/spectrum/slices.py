@@ -17,7 +17,7 @@ from scipy import fft
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics.carriers import Carrier, Lattice, Window
 from dappled.decode.spectrum.transform import TILE, BinRun, Complex, Spectrum, column_runs, in_runs, row_runs
-from dappled.decode.threads import share
+from dappled.workers import share
 
 _LAYOUTS = 4  # kept: focal lengths that a zoom goes back to
 

@@ -18,7 +18,7 @@ from scipy import fft
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.spectrum.lineariser import ArraySource, LinearRows, Plane, check_sides, rows_at_once
-from dappled.decode.threads import each, share, spans
+from dappled.workers import each, share, spans
 
 Source: TypeAlias = "Plane | LinearRows"
 Complex = NDArray[np.complex64]

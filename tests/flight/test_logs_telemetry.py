@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.flight import FlightError, telemetry_log
-from dappled.flight.telemetry_log import TelemetryLog, packet_length, split
+from dappled.flight import FlightError, logs
+from dappled.flight.logs import TelemetryLog, packet_length, split
 from tests.flight.makers import logged, mavlink_1, mavlink_2
 
 PACKETS = st.builds(mavlink_1, st.binary(max_size=255), st.integers(0, 255)) | st.builds(
@@ -27,9 +27,9 @@ def test_what_is_logged_is_read(tmp_path_factory: pytest.TempPathFactory, record
     assert [log.append(*record) for record in records] == list(range(len(records)))
     summary = log.close()
     problems: list[str] = []
-    assert list(telemetry_log.read(path, problems.append)) == [(n, *record) for n, record in enumerate(records)]
+    assert list(logs.read_telemetry(path, problems.append)) == [(n, *record) for n, record in enumerate(records)]
     assert problems == []
-    assert summary == telemetry_log.summarise(path)
+    assert summary == logs.summarise(path)
     assert summary.sha256 == hashlib.sha256(b"".join(logged(*record) for record in records)).hexdigest()
 
 
@@ -100,7 +100,7 @@ def test_threads_share_the_log(tmp_path: Path) -> None:
         thread.join()
     assert sorted(numbers) == list(range(600))
     summary = log.close()
-    assert telemetry_log.summarise(log.path) == summary
+    assert logs.summarise(log.path) == summary
 
 
 @pytest.mark.parametrize("fault", ["ENOSPC", "short"])
@@ -121,9 +121,9 @@ def test_a_full_disk_uses_up_no_number(tmp_path: Path, monkeypatch: pytest.Monke
     assert log.append(3, mavlink_1(b"c")) == 1
     summary = log.close()
     problems: list[str] = []
-    assert [stamp for _, stamp, _ in telemetry_log.read(log.path, problems.append)] == [1, 3]
+    assert [stamp for _, stamp, _ in logs.read_telemetry(log.path, problems.append)] == [1, 3]
     assert problems == []
-    assert telemetry_log.summarise(log.path) == summary
+    assert logs.summarise(log.path) == summary
 
 
 def test_a_torn_record_that_can_not_be_cut_at_once_is_cut_before_the_next(
@@ -147,8 +147,8 @@ def test_a_torn_record_that_can_not_be_cut_at_once_is_cut_before_the_next(
     monkeypatch.undo()
     assert log.append(3, mavlink_1(b"c")) == 1
     summary = log.close()
-    assert [stamp for _, stamp, _ in telemetry_log.read(log.path)] == [1, 3]
-    assert telemetry_log.summarise(log.path) == summary
+    assert [stamp for _, stamp, _ in logs.read_telemetry(log.path)] == [1, 3]
+    assert logs.summarise(log.path) == summary
 
 
 def test_what_is_logged_after_the_end_gets_into_no_other_file(tmp_path: Path) -> None:
@@ -159,25 +159,25 @@ def test_what_is_logged_after_the_end_gets_into_no_other_file(tmp_path: Path) ->
     with (tmp_path / "other").open("wb"), pytest.raises(FlightError, match=told):  # it is given the log's descriptor
         log.append(2, mavlink_1(b"b"))
     assert (tmp_path / "other").read_bytes() == b""
-    assert log.close() == telemetry_log.summarise(log.path) == summary
+    assert log.close() == logs.summarise(log.path) == summary
 
 
 def test_faults_of_the_file_are_told(tmp_path: Path) -> None:
     log = TelemetryLog(tmp_path / "telemetry.tlog")
     log.close()
-    assert list(telemetry_log.read(log.path)) == []
+    assert list(logs.read_telemetry(log.path)) == []
     with pytest.raises(FlightError, match="in the way"):
         TelemetryLog(log.path)
     with pytest.raises(FlightError, match="does not exist"):
-        list(telemetry_log.read(tmp_path / "missing"))
+        list(logs.read_telemetry(tmp_path / "missing"))
     with pytest.raises(FlightError, match="is a folder"):
-        list(telemetry_log.read(tmp_path))
+        list(logs.read_telemetry(tmp_path))
 
 
 def test_a_real_flight_reads_but_for_its_torn_end(shared_data: Path) -> None:
     problems: list[str] = []
     path = shared_data / "telemetry" / "dronekit-flight.tlog"
-    stamps = [stamp for _, stamp, _ in telemetry_log.read(path, problems.append)]
+    stamps = [stamp for _, stamp, _ in logs.read_telemetry(path, problems.append)]
     assert problems == [f"{path}: 19 bytes at the end are not telemetry and were skipped"]
     assert len(stamps) > 10_000
     assert round((stamps[-1] - stamps[0]) / 1e6) == 1377

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from dappled.decode.threads import each, share, spans
+from dappled.workers import each, share, spans
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])

@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.flight import Cause, FlightError, Shot
-from dappled.flight import journal as journals
-from dappled.flight.journal import Flusher
+from dappled.flight import Cause, FlightError, Shot, logs
+from dappled.flight.logs import Flusher
 from tests.flight.makers import shot
 
 DEADLINE_S = 20.0
@@ -31,31 +30,31 @@ def test_shots_come_back_and_a_torn_end_is_reported(
     tmp_path_factory: pytest.TempPathFactory, shots: list[Shot], torn: bytes
 ) -> None:
     path = tmp_path_factory.mktemp("journal") / "shots.jsonl"
-    journal = journals.ShotJournal(path)
+    journal = logs.ShotJournal(path)
     for each in shots:
         journal.note(each)
     journal.close()
-    assert journals.read(path) == journals.JournalContents(tuple(shots), ())
+    assert logs.read_journal(path) == logs.JournalContents(tuple(shots), ())
 
     torn = torn.replace(b"\n", b"")
     with path.open("ab") as file:
         file.write(torn)
-    found = journals.read(path)
+    found = logs.read_journal(path)
     assert found.shots == tuple(shots)
     assert len(found.problems) == (1 if torn else 0)
 
-    again = journals.ShotJournal(path)  # closes the torn line off
+    again = logs.ShotJournal(path)  # closes the torn line off
     new = shot(2**31 + 1)
     again.note(new)
     again.close()
-    assert journals.read(path).shots == (*shots, new)
+    assert logs.read_journal(path).shots == (*shots, new)
 
 
 @given(st.binary(max_size=300))
 def test_any_bytes_are_read_without_a_crash(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
     path = tmp_path_factory.mktemp("journal") / "shots.jsonl"
     path.write_bytes(data)
-    found = journals.read(path)
+    found = logs.read_journal(path)
     lines = data.split(b"\n")
     assert len(found.shots) + len(found.problems) == len(lines) - (lines[-1] == b"")
 
@@ -74,22 +73,22 @@ def test_any_bytes_are_read_without_a_crash(tmp_path_factory: pytest.TempPathFac
 def test_a_line_that_is_not_a_shot_is_reported(tmp_path: Path, line: bytes) -> None:
     path = tmp_path / "shots.jsonl"
     path.write_bytes(line + b"\n")
-    assert journals.read(path) == journals.JournalContents((), (f"line 1 of {path} is not a shot",))
+    assert logs.read_journal(path) == logs.JournalContents((), (f"line 1 of {path} is not a shot",))
 
 
 def test_a_shot_noted_twice_is_told(tmp_path: Path) -> None:
     path = tmp_path / "shots.jsonl"
-    journal = journals.ShotJournal(path)
+    journal = logs.ShotJournal(path)
     journal.note(shot(1))
     journal.note(shot(1))
     journal.close()
-    assert journals.read(path) == journals.JournalContents((shot(1),), (f"line 2 of {path} notes shot 1 again",))
+    assert logs.read_journal(path) == logs.JournalContents((shot(1),), (f"line 2 of {path} notes shot 1 again",))
 
 
 def test_no_journal_is_an_empty_one(tmp_path: Path) -> None:
-    assert journals.read(tmp_path / "missing") == journals.JournalContents((), ())
+    assert logs.read_journal(tmp_path / "missing") == logs.JournalContents((), ())
     with pytest.raises(FlightError, match="is a folder"):
-        journals.read(tmp_path)
+        logs.read_journal(tmp_path)
 
 
 def test_a_note_is_one_write_and_reaches_the_disk_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,7 +106,7 @@ def test_a_note_is_one_write_and_reaches_the_disk_soon(tmp_path: Path, monkeypat
 
     monkeypatch.setattr(os, "write", watched_write)
     monkeypatch.setattr(os, "fdatasync", watched_fdatasync)
-    journal = journals.ShotJournal(tmp_path / "shots.jsonl", flush_interval_s=0.01)
+    journal = logs.ShotJournal(tmp_path / "shots.jsonl", flush_interval_s=0.01)
     journal.note(shot(3))
     assert len(writes) == 1
     assert writes[0].endswith(b"\n")
@@ -125,18 +124,18 @@ def test_a_note_that_the_disk_refuses_raises(tmp_path: Path, monkeypatch: pytest
             return write(fd, data[:5])
         raise OSError(errno.ENOSPC, "full")
 
-    journal = journals.ShotJournal(tmp_path / "shots.jsonl")
+    journal = logs.ShotJournal(tmp_path / "shots.jsonl")
     monkeypatch.setattr(os, "write", refuse)
     with pytest.raises(FlightError, match=r"cannot note shot 3 in .*disk"):
         journal.note(shot(3))
     monkeypatch.undo()
     journal.note(shot(4))
     journal.close()
-    assert journals.read(tmp_path / "shots.jsonl").shots == (shot(4),)
+    assert logs.read_journal(tmp_path / "shots.jsonl").shots == (shot(4),)
 
 
 def test_what_is_noted_after_the_end_gets_into_no_other_file(tmp_path: Path) -> None:
-    journal = journals.ShotJournal(tmp_path / "shots.jsonl")
+    journal = logs.ShotJournal(tmp_path / "shots.jsonl")
     journal.close()
     journal.close()
     told = r"cannot note shot 3 in .*shots\.jsonl: the flight is closed"
@@ -149,7 +148,7 @@ def test_a_flush_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     def refuse(_: int) -> None:
         raise OSError(errno.EIO, "io")
 
-    journal = journals.ShotJournal(tmp_path / "shots.jsonl")
+    journal = logs.ShotJournal(tmp_path / "shots.jsonl")
     monkeypatch.setattr(os, "fdatasync", refuse)
     journal.note(shot(3))
     journal.close()
@@ -160,13 +159,13 @@ def test_a_flush_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_a_note_survives_the_process(tmp_path: Path) -> None:
     path = tmp_path / "shots.jsonl"
     code = (
-        "import os, sys; from pathlib import Path; from dappled.flight.journal import ShotJournal;"
+        "import os, sys; from pathlib import Path; from dappled.flight.logs import ShotJournal;"
         "from tests.flight.makers import shot;"
         f"ShotJournal(Path({str(path)!r}), 60.0).note(shot(5)); os.kill(os.getpid(), 9)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=False, timeout=60)
     assert done.returncode == -9
-    assert journals.read(path).shots == (shot(5),)
+    assert logs.read_journal(path).shots == (shot(5),)
 
 
 def test_bytes_written_while_the_disk_was_busy_are_synced_at_the_end(

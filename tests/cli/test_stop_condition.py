@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from dappled.cli.stop_condition import StopCondition
+from dappled.cli.terminal import Tally
 from dappled.daemon.pipeline.capture import PendingShot
-from dappled.daemon.stop_condition import StopCondition, Tally
 from dappled.flight import Frame
 from tests.flight.makers import shot
 

@@ -1,13 +1,12 @@
-"""When a daemon that is to take so many frames, or to run for so long, has had them; and what came of its shots."""
+"""Decide when `dappled run --frames N` or `--for SECONDS` has reached its end."""
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from typing import Protocol
 
-from dappled.daemon.pipeline.capture import PendingShot
+from dappled.cli.terminal import Tally
 
 
 class Asker(Protocol):
@@ -17,32 +16,11 @@ class Asker(Protocol):
         """Whether it still asks, or waits for an answer."""
 
 
-class Tally:
-    """Counts the shots that have ended, over all flights of the process. Any thread may `add`."""
-
-    def __init__(self) -> None:
-        self.count = self.safe = self.decoded = self.good = 0
-        self._lock = threading.Lock()
-
-    def add(self, one: PendingShot) -> None:
-        """A shot has come to its end."""
-        with self._lock:
-            self.count += 1
-            self.safe += one.frame is not None
-            self.decoded += one.decoded is not None
-            self.good += not one.problem
-
-    def summary(self) -> str:
-        """The counts as a line."""
-        bad = self.count - self.good
-        return f"{self.count} shots: {self.safe} frames safe, {self.decoded} decoded, {bad} with a problem"
-
-
 class StopCondition:
-    """So many shots ended, or so many seconds gone since the first flight began; None: no such end.
+    """The end of a run: `frames` shots have ended, or `seconds` have passed since the first flight began.
 
-    `ask` starts who asks for the frames, once the camera is `ready`. When they have nothing more to ask, and all that
-    they asked for has ended, there is nothing left to wait for either.
+    None means no such end. `ask` starts the ground station that asks for the frames, once the camera is `ready`. When
+    it has nothing more to ask and all that it requested has ended, the run ends too.
     """
 
     def __init__(
@@ -67,7 +45,7 @@ class StopCondition:
         return self._frames is not None and self._tally.good < self._frames
 
     def begin(self, requested: Callable[[], int]) -> None:
-        """A flight has begun. Its requested shots are added to those of earlier flights, which have ended."""
+        """A flight has begun: its `requested` comes on top of the shots of earlier flights, which have ended."""
         if self._until_s is None and self._seconds is not None:
             self._until_s = self._clock_s() + self._seconds
         earlier = self._tally.count
