@@ -2,7 +2,7 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup peers clean-room demo test check test-fast coverage test-slow soak faults bench lock arm64 install uninstall clean
+.PHONY: help setup peers walk clean-room demo test check test-fast coverage test-slow soak faults bench lock arm64 install uninstall clean
 PREFIX ?= /usr/local
 
 help: ## show this list
@@ -36,6 +36,9 @@ coverage: setup ## run the default tests and report which lines they reach (a th
 
 test-slow: setup peers ## the tests that take longer
 	@$(BIN)/pytest -q --no-header -m slow --durations=25
+
+walk: setup ## the modules that a command and a frame pass, traced anew and written into ARCHITECTURE.md
+	@$(BIN)/python -m tests.architecture.walk --write
 
 clean-room: ## the README's commands in bare Debian roots (SUITES="bookworm trixie", RUN="make demo && make test"); as root
 	@for suite in $(or $(SUITES),bookworm trixie); do tools/clean-room $$suite "$${RUN:-make demo && make test}" || exit 1; done
