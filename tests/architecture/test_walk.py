@@ -34,6 +34,6 @@ def test_a_detour_is_counted() -> None:
         return [walk.Step(at_ns + place, "mavlink 0", name, "") for place, name in enumerate(names)]
 
     straight = ("drivers.mavlink.links", "daemon.pipeline.shutter", "drivers.gphoto2.client")
-    steps = [step for at_ns in range(3) for step in way(at_ns * 100, *straight)]
+    steps = [step for at_ns in range(walk.FRAMES) for step in way(at_ns * 100, *straight)]
     assert walk.command_of(steps) == straight
     assert walk.command_of([*steps, *way(900, *straight, "errors")]) == (*straight, "errors")

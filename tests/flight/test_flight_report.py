@@ -42,5 +42,5 @@ def test_refused_requests_are_counted_at_their_source(flight: Recording) -> None
 def test_the_report_prints_a_line_for_each_source(recorded: FlightFolder, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["flight", "report", str(recorded.path)]) == 0
     said = capsys.readouterr().out.splitlines()
-    assert said[1].split() == ["source", "wishes", "refused", "shots", "safe", "failed", "open", "tagged", "decoded"]
+    assert said[1].split() == ["source", "requests", "refused", "shots", "safe", "failed", "open", "tagged", "decoded"]
     assert said[2].split() == ["mavlink:255/190", "3", "0", "3", "2", "1", "0", "2", "1"]

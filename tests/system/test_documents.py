@@ -65,7 +65,7 @@ NUMBERS = {
     ],
     "operating.md": [
         f"a millisecond instead of {CameraSettings().latency_sigma_ms:g}",
-        "what can change in flight ("
+        "the settings that can change in flight ("
         + ", ".join(f"`{table}.{key}`" for table, key in sorted(CHANGES_IN_FLIGHT, reverse=True))
         + ")",
     ],

@@ -73,7 +73,7 @@ def test_fired_by_a_wire_and_picked_up_after_landing(
     assert main([*pickup, "--dry-run"]) == 0
     assert (flight_report.balance(flight).frames, flight_report.balance(flight).following) == (0, 4)
     assert main(["flight", "report", str(flight)]) == 0
-    assert "4 of the failed were fired" in capfd.readouterr().out
+    assert "4 of the failed have their files at the camera still" in capfd.readouterr().out
     assert main(pickup) == 0
     told = json.loads(capfd.readouterr().out)
     assert [pair["index"] for pair in told["pairs"]] == [0, 1, 2, 3]

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dappled.decode.optics.film import DensityCurve, density_curve
-from dappled.decode.threads import spans
 from dappled.errors import DappledError
+from dappled.workers import spans
 
 Levels = NDArray[np.unsignedinteger]
 Tile = Callable[[slice, slice], Levels]
