@@ -89,7 +89,7 @@ def test_what_was_set_is_asked_for_and_a_second_setting_comes_on_top_of_the_firs
 
 def test_what_is_refused_is_not_shown() -> None:
     def ask(_: Settings, text: str) -> None:
-        raise CameraError(f"{text}: 1 shots are under way")
+        raise CameraError(f"{text}: 1 shot under way")
 
     found = knobs(CONFIGURED, FlightHandover(CONFIGURED), ask)
     for name, word in (("LF_MASK", "mask-2"), ("LF_LAW", "fd")):

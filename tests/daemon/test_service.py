@@ -14,7 +14,6 @@ import pytest
 from dappled.config import settings as configuration
 from dappled.config.settings import MaskSettings, PoseSettings, PublishSettings, RecordSettings, Settings
 from dappled.daemon import service as module
-from dappled.daemon.camera_protocol import camera_status
 from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.navigation import UtcCorrection
 from dappled.daemon.pipeline.capture import PendingShot
@@ -22,7 +21,7 @@ from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import AGAIN_NS, PeriodicTask, Service
 from dappled.drivers.camera import CameraError, Setting, SettingsChanged
 from dappled.errors import DappledError
-from dappled.flight import LedgerReader, check
+from dappled.flight import FlightError, LedgerReader, Recording, check, layout
 from tests.daemon.fakes import CallingObserver, FakeCamera, eventually, good
 
 S = 10**9
@@ -96,15 +95,38 @@ def test_a_disk_that_can_t_be_asked_refuses_in_words(
 ) -> None:
     service = started(settings, [])
 
+    def refuse(_: Path) -> int:
+        raise FlightError("cannot ask for the free space of the disk")
+
     with monkeypatch.context() as broken:
-        broken.setattr(camera_status, "disk_storage", lambda _: None)
+        broken.setattr(layout, "free_bytes", refuse)
         decision = service.request(CaptureRequest("test", "console", 1))
-    assert (decision.outcome, decision.reason) == (
-        "refused",
-        f"the disk of {service.folder} can't be read: is it still mounted?",
-    )
+    assert (decision.outcome, decision.reason) == ("refused", "cannot ask for the free space of the disk")
     service.stop()
     assert not camera.fired
+
+
+def test_a_flight_that_closes_badly_is_kept(
+    camera: FakeCamera, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a shot in the journal there is telemetry still, and perhaps a photograph that somebody took by hand."""
+    service = started(settings, [])
+
+    def refuse(_: object) -> None:
+        raise FlightError("the disk went away")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Recording, "close", refuse)
+        with pytest.raises(FlightError, match="the disk went away"):
+            service.stop()
+    assert (service.folder / "flight.sqlite").exists()
+    assert (service.folder / "telemetry.tlog").exists()
+
+
+def test_without_a_mask_decoding_is_off(camera: FakeCamera, settings: Settings) -> None:
+    service = started(settings, [])
+    assert service._control.decoding() == "off"
+    service.stop()
 
 
 def test_a_start_that_fails_late_leaves_nothing(
@@ -196,7 +218,7 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
     parameters = service._component._parameters._parameters
     camera.script = lambda _: []
     assert service.request(CaptureRequest("test", "console", 1)).index == 0
-    with pytest.raises(CameraError, match="1 shots are under way"):
+    with pytest.raises(CameraError, match="1 shot under way"):
         parameters.change("LF_MASK", "mask-3")
     for event in good(0):
         assert not isinstance(event, Exception)

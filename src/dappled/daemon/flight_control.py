@@ -1,4 +1,4 @@
-"""Answer what the shutter and the ground station ask of a running flight: may a shot be taken, which camera is it."""
+"""Answer the questions of shutter and ground station about a flight: may a shot be taken, which camera, which disk."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.decode.geometry import Pose
 from dappled.drivers.camera import Identity
 from dappled.drivers.mavlink import MavlinkLinks
-from dappled.flight import Recording, Shot
+from dappled.flight import FlightError, Recording, Shot, layout
 
 
 class FlightControl:
@@ -56,11 +56,13 @@ class FlightControl:
             return "the next flight begins in a moment, with what the ground station has set"
         if self._shots.state not in ("ready", "busy"):
             return self._shots.camera_sentence()
-        disk = camera_status.disk_storage(self._recording.folder.path)
-        if disk is None:
-            return f"the disk of {self._recording.folder.path} can't be read: is it still mounted?"
-        if disk.available < self._settings.now.record.min_free_mb * 1_000_000:
-            return f"the disk is nearly full: {disk.available // 1_000_000} MB left, record.min_free_mb is more"
+        try:
+            free = layout.free_bytes(self._recording.folder.path)
+        except FlightError as error:
+            return str(error)
+        wanted_mb = self._settings.now.record.min_free_mb
+        if free < wanted_mb * 1_000_000:
+            return f"the disk is nearly full: {free // 1_000_000} MB left, record.min_free_mb asks for {wanted_mb} MB"
         return None
 
     def note(self, shot: Shot) -> None:

@@ -49,7 +49,7 @@ from dappled.drivers.mavlink import MavlinkLinks, Packet, Signing, Unsigned, ope
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot
-from dappled.errors import DappledError, report, sentence
+from dappled.errors import DappledError, counted, report, sentence
 from dappled.flight import Recording
 from dappled.flight import recording as flights
 
@@ -93,6 +93,7 @@ class Service:
         self._alarms = Alarms()
         self._stack = ExitStack()
         self._stopping = threading.Event()
+        self._started = False
 
     # start, and in the reverse order stop
 
@@ -115,6 +116,7 @@ class Service:
                 self.console_url = door.url
                 act = partial(console_process.answer, shutter=self._shutter, logbook=self._logbook)
                 console_process.start(door, settings, stack, recipe=recipe, act=act, logbook=self._logbook)
+            self._started = True
             self._stack = stack.pop_all()
         for text in self._recording.recovered:
             log.warning("earlier flight: %s", text)
@@ -131,7 +133,7 @@ class Service:
         }
         directory = Path(settings.record.directory)
         self._recording = flights.begin(directory, clock.utc_ns, facts, utc_known=self._utc_known)
-        stack.push(lambda kind, *_: _remove_empty(self._recording) if kind else None)
+        stack.callback(self._remove_unused_flight)
         stack.callback(_close, self._recording)
         stack.callback(self._links.stop)  # before the recording closes: packets are logged there
         if recipe is None:
@@ -239,6 +241,11 @@ class Service:
         stack.callback(self._shutter.stop)
         self._shutter.start()
         self._links.start(self)
+
+    def _remove_unused_flight(self) -> None:
+        """Remove the folder of a flight whose start failed. A flight that has begun is kept, however it ends."""
+        if not self._started:
+            _remove_empty(self._recording)
 
     def _publish_end(self) -> None:
         try:
@@ -369,7 +376,7 @@ class Service:
         if now.interval_s is not None:
             raise CameraError(f"{text} would begin another flight: stop the interval first")
         if now.pending:
-            raise CameraError(f"{text} would begin another flight: {now.pending} shots are under way, ask again")
+            raise CameraError(f"{text} would begin another flight: {counted(now.pending, 'shot')} under way, ask again")
         self._after.next = following
         self._writer.later("next flight", f"{text} from there on, by the ground station")
         self.ask_to_stop()

@@ -44,6 +44,7 @@ class Pipeline:
         preview_interval_s: float = 0.0,
     ) -> None:
         self._shots, self._decodes = shots, decoder is not None
+        shots.decoding = self._decodes
         self._ends = ShotEnds(shots, writer, observer)
         tagging = Tagging(self._ends, poses, publisher, latency=latency, names=names, on_done=self._tagged)
         decoding = decoder and Decoding(self._ends, decoder, publisher, preview_interval_s)
