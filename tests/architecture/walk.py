@@ -4,8 +4,9 @@
     python -m tests.architecture.walk --write    render them, and the list of all modules, into ARCHITECTURE.md
 
 The command is an IMAGE_START_CAPTURE: from the packet on a MAVLink link, through shutter and camera driver, to the
-acknowledgement. The frame is the flight's third: from the camera's arrival event to the published slices, in the
-daemon and in its decode process. Every module of dappled whose functions run counts.
+acknowledgement. A frame is followed from the camera's arrival event to the published slices, in the daemon and in its
+decode process; what the third and the fourth pass is taken together, because not every frame has a preview. Every
+module of dappled whose functions run in the threads of a frame counts; the camera's own process is not followed.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ PAGE = ROOT / "ARCHITECTURE.md"
 WALK = ("<!-- walk: begin -->", "<!-- walk: end -->")
 MODULES = ("<!-- modules: begin -->", "<!-- modules: end -->")
 COMMAND_BUDGET, FRAME_BUDGET = 15, 45
-FRAMES = 4  # the third is followed: the decode process has set up by then
+FRAMES = 4  # the third and the fourth are followed: the decode process has set up by then
 _BETWEEN_FRAMES_NS = 300_000_000  # two frames of one camera are further apart
 _FRAME_THREADS = frozenset({"capture", "tag", "decode", "publisher"})
-_SETTINGS = '[record]\ndirectory = "flights"\n'
+_SETTINGS = '[record]\ndirectory = "flights"\n[publish]\nslices = "ipc://{sockets}/slices"\n'
 
 
 class WalkError(Exception):
@@ -58,17 +59,18 @@ def fly(folder: Path) -> Walk:
     """Fly a simulated flight of `FRAMES` frames in `folder` under the tracer, and read the walks from it."""
     trace = folder / "trace"
     trace.mkdir()
-    (folder / "dappled.toml").write_text(_SETTINGS, encoding="utf-8")
     path = os.pathsep.join([str(Path(__file__).parent / "tracing"), str(SOURCE.parent)])
     simulated = ["run", "--simulate", "--seed", "3", "--frames", str(FRAMES), "--config", "dappled.toml"]
-    subprocess.run(
-        [sys.executable, "-m", "dappled", *simulated],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": path, "DAPPLED_TRACE": str(trace)},
-        check=True,
-        timeout=100,
-        stdout=subprocess.DEVNULL,
-    )
+    with tempfile.TemporaryDirectory(prefix="dpl-") as sockets:  # a path of a socket must be short
+        (folder / "dappled.toml").write_text(_SETTINGS.format(sockets=sockets), encoding="utf-8")
+        subprocess.run(
+            [sys.executable, "-m", "dappled", *simulated],
+            cwd=folder,
+            env={**os.environ, "PYTHONPATH": path, "DAPPLED_TRACE": str(trace)},
+            check=True,
+            timeout=100,
+            stdout=subprocess.DEVNULL,
+        )
     return read([list(_steps(file)) for file in sorted(trace.iterdir())])
 
 
@@ -98,19 +100,20 @@ def command_of(daemon: Iterable[Step]) -> tuple[str, ...]:
 
 
 def _frame(daemon: Iterable[Step], worker: Iterable[Step]) -> tuple[str, ...]:
-    """From the wait before the third frame is recorded to just before the fourth one is."""
+    """From the wait before the third frame is recorded to the end of the fourth, which the decode thread finishes."""
     threads = _threads(daemon)
     if missing := _FRAME_THREADS - set(threads):
         raise WalkError(f"the daemon has no thread {', '.join(sorted(missing))}: a frame's way can't be followed")
     recorded = _bursts(step.at_ns for step in threads["capture"] if step.function == "Recorder.record")
     if len(recorded) != FRAMES:
         raise WalkError(f"{len(recorded)} frames in the trace were recorded, and {FRAMES} were taken")
-    began, ended = (_wait_before(threads["capture"], at_ns) for at_ns in recorded[2:4])
-    steps = [step for thread in _FRAME_THREADS for step in threads[thread]] + list(worker)
-    walked = sorted(
-        (step for step in steps if began <= step.at_ns < ended and step.module), key=lambda step: step.at_ns
-    )
-    return tuple(dict.fromkeys(step.module for step in walked))
+    began = _wait_before(threads["capture"], recorded[2])
+    ended = max(step.at_ns for step in threads["decode"] if step.module)
+    captured = _wait_after(threads["capture"], recorded[3])  # later events are the camera's end
+    steps = [step for step in threads["capture"] if step.at_ns <= captured]
+    steps += [step for thread in _FRAME_THREADS - {"capture"} for step in threads[thread]] + list(worker)
+    walked = [(step.at_ns, step.module) for step in steps if began <= step.at_ns <= ended and step.module]
+    return tuple(dict.fromkeys(module for _, module in sorted(walked)))
 
 
 def _steps(file: Path) -> Iterator[Step]:
@@ -150,6 +153,10 @@ def _bursts(times_ns: Iterable[int]) -> list[int]:
 
 def _wait_before(steps: Iterable[Step], at_ns: int) -> int:
     return max(step.at_ns for step in steps if not step.module and step.at_ns <= at_ns)
+
+
+def _wait_after(steps: Iterable[Step], at_ns: int) -> int:
+    return min(step.at_ns for step in steps if not step.module and step.at_ns >= at_ns)
 
 
 def rendered(walk: Walk) -> str:
