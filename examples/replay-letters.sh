@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# A real lenslet photograph with a real flight's poses, through the daemon's own street, published over ZeroMQ.
+# A real lenslet photograph with a real flight's poses, through the daemon's own pipeline, published over ZeroMQ.
 #   examples/replay-letters.sh ../shared/data [subscriber's folder]
 # The frames: plenoptomos' "letters", 1280 × 960, with white and dark frame. The flight: a copter, 1377 s of telemetry.
 set -euo pipefail

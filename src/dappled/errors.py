@@ -1,4 +1,4 @@
-"""The family of errors that a person is told in one sentence: what, where, what to do."""
+"""The errors that are reported to a person in one sentence (what, where, what to do), and words for numbers."""
 
 from __future__ import annotations
 
@@ -16,8 +16,13 @@ class DappledError(Exception):
 
 
 def sentence(error: BaseException) -> str:
-    """What a person is told of an error: its own words, or its kind where it was never meant for a person."""
+    """An error as a sentence: its own, or its kind where it was not meant for a person."""
     return str(error) if isinstance(error, DappledError) else f"unexpected {type(error).__name__}: {error}"
+
+
+def counted(count: int, noun: str, width: int = 0) -> str:
+    """A number with its noun: 1 frame, 2 frames."""
+    return f"{count:{width}d} {noun}" + ("" if count == 1 else "s")
 
 
 def report(log: logging.Logger, what: str, error: BaseException) -> None:

@@ -40,11 +40,6 @@ VERBS: dict[str, tuple[str, str]] = {
 }
 
 
-def counted(count: int, noun: str, width: int = 0) -> str:
-    """A number with its noun: 1 frame, 2 frames."""
-    return f"{count:{width}d} {noun}" + ("" if count == 1 else "s")
-
-
 def parser(wanted: str | None = None) -> argparse.ArgumentParser:
     """The whole command line. Only the module of the wanted verb is loaded."""
     top = argparse.ArgumentParser(

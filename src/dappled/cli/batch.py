@@ -11,9 +11,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dappled.cli import counted, georeference
+from dappled.cli import georeference
 from dappled.cli.arguments import whole
-from dappled.errors import DappledError
+from dappled.errors import DappledError, counted
 from dappled.flight import layout
 from dappled.products.batch import batch, workers
 from dappled.products.batch.batch import KINDS, Job, Manifest

@@ -12,7 +12,7 @@ from typing import Any
 
 from PIL import Image
 
-from dappled.cli import counted, decode_arguments
+from dappled.cli import decode_arguments
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
 from dappled.decode.decoder import CarriersFrom, doubt
@@ -24,6 +24,7 @@ from dappled.decode.spectrum.peaks import Measured, measure
 from dappled.decode.spectrum.pictures import LOOKS, Look, around, spectrum_boxes
 from dappled.decode.spectrum.transform import padded_shape, transform
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, known_to
+from dappled.errors import counted
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

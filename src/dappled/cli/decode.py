@@ -9,9 +9,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dappled.cli import counted, decode_arguments
+from dappled.cli import decode_arguments
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
-from dappled.errors import DappledError
+from dappled.errors import DappledError, counted
 from dappled.products.exports import light_files
 
 

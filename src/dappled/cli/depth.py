@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.cli import counted, decode_arguments
+from dappled.cli import decode_arguments
 from dappled.decode import DecodeError
 from dappled.decode.depth import DepthMap, DistanceMap
 from dappled.decode.depth import estimate as depths
+from dappled.errors import counted
 from dappled.flight import layout
 from dappled.products.exports import exports, point_cloud, prints
 from dappled.products.maps import photographs

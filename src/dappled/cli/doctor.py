@@ -27,7 +27,7 @@ from dappled.daemon.health.go_no_go import Check
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.test_shot import Latency
 from dappled.drivers import usb_bus
-from dappled.errors import DappledError
+from dappled.errors import DappledError, counted
 
 _WORDS = {"go": "go", "caution": "caution", "no-go": "NO GO"}
 _HOST_WORDS = {"go": "ok", "caution": "note", "no-go": "WRONG"}
@@ -214,7 +214,7 @@ def _timed(latencies: Sequence[Latency], truth_ms: list[float] | None) -> dict[s
         one = facts[name]
         lines.append(
             f"         {title:26} {one['median']:8.1f} ms ({one['low']:.1f} to {one['high']:.1f}, "
-            f"σ {one['deviation']:.1f}, {one['shots']} shots)"
+            f"σ {one['deviation']:.1f}, {counted(one['shots'], 'shot')})"
         )
     if facts["to_exposure"]:
         mean = statistics.mean(value for one in latencies if (value := one.to_exposure) is not None)

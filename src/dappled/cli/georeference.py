@@ -13,11 +13,10 @@ from typing import Any
 
 from tqdm import tqdm
 
-from dappled.cli import counted
 from dappled.cli.arguments import metres, positive
 from dappled.daemon.pipeline import recipes
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.errors import DappledError
+from dappled.errors import DappledError, counted
 from dappled.flight import layout
 from dappled.products.maps import difference, earth, georeference, map_files, terrain
 from dappled.products.maps.georeference import Options, Progress, Survey

@@ -13,10 +13,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from dappled.cli import counted
 from dappled.daemon.replay import late_tags
 from dappled.decode.geometry import camera_pose
-from dappled.errors import DappledError
+from dappled.errors import DappledError, counted
 from dappled.flight import layout
 from dappled.products.geotags import geotags
 from dappled.products.maps import earth

@@ -11,7 +11,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from dappled.cli import counted
 from dappled.cli.arguments import positive, seconds
 from dappled.cli.terminal import frame_json, frame_line
 from dappled.config import settings as configuration
@@ -31,6 +30,7 @@ from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import Identity
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.replay import ReplayCamera
+from dappled.errors import counted
 from dappled.flight import LIVE, check, layout
 
 _OF_FOLDERS = ("telemetry", "match", "start", "interval")

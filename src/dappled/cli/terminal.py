@@ -17,13 +17,13 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any, Protocol
 
-from dappled.cli import counted
 from dappled.daemon.health.logbook import NewProblems
 from dappled.daemon.health.record import line as status_line
 from dappled.daemon.health.systemd import JournalHandler
 from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.stream import wire
 from dappled.drivers.camera import StateChanged
+from dappled.errors import counted
 from dappled.workers import Worker
 
 log = logging.getLogger("dappled.run")

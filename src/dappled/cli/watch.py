@@ -6,7 +6,6 @@ import argparse
 import json
 from pathlib import Path
 
-from dappled.cli import counted
 from dappled.cli.arguments import seconds, whole
 from dappled.cli.status import stream_endpoint
 from dappled.daemon.pipeline.memory import reuse_large_blocks
@@ -14,6 +13,7 @@ from dappled.daemon.stream import watch
 from dappled.daemon.stream.curve import ClientKeys, KeyFileError, load_own, load_public
 from dappled.daemon.stream.subscriber import Subscriber
 from dappled.daemon.stream.wire import Message
+from dappled.errors import counted
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

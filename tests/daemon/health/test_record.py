@@ -73,7 +73,7 @@ def test_well(tmp_path: Path) -> None:
         ({"link": replace(LINK, error="link down")}, "link down"),
         (
             {"link": replace(LINK, last_heard_monotonic_ns=None, signing=SigningStatistics(0, 3, 1, 0, 7))},
-            "7 packets were unsigned, 3 forged, 1 too old",
+            "7 packets unsigned, 3 forged, 1 too old",
         ),
         ({"settings": replace(WELL, mavlink=MavlinkSettings())}, "no MAVLink link is configured"),
         ({"settings": replace(WELL, mask=MaskSettings())}, "no mask is configured"),

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dappled.cli import counted, decode_arguments
+from dappled.cli import decode_arguments
 from dappled.cli.calibrate import lens, target
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
@@ -19,7 +19,7 @@ from dappled.decode.calibration.fit import CalibrationFrame, from_lattices, latt
 from dappled.decode.calibration.lattice_fit import FrameLattice
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError
-from dappled.errors import DappledError
+from dappled.errors import DappledError, counted
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

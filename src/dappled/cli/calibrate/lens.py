@@ -11,10 +11,9 @@ import tomli_w
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from dappled.cli import counted
 from dappled.config import profiles
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
-from dappled.errors import DappledError
+from dappled.errors import DappledError, counted
 from dappled.products import chessboard
 
 

@@ -10,12 +10,12 @@ from typing import Any
 import tomli_w
 from tqdm import tqdm
 
-from dappled.cli import counted
 from dappled.config import profiles
 from dappled.decode.depth import RANGING, Ranging
 from dappled.decode.depth.ranging import Target, fit_targets, target_shift
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
+from dappled.errors import counted
 from dappled.products import opened
 from dappled.products.opened import OpenedLightField
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 
-from dappled.cli import counted
+from dappled.errors import counted
 from dappled.flight import LIVE
 from dappled.flight.check import CheckReport
 from dappled.flight.flight_report import Balance, FlightContents, ListedFlight, ShotLine, SourceReport

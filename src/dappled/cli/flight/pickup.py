@@ -9,11 +9,11 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dappled.cli import counted
 from dappled.daemon.replay import pickup
 from dappled.daemon.replay.pickup import Choice, Picked, Proposal
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
+from dappled.errors import counted
 
 HELP = "bring the files that stayed at the camera; exits 1 while shots lack files"
 EXAMPLES = (

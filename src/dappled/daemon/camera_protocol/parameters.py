@@ -1,5 +1,7 @@
-"""The camera's settings as MAVLink parameters: read and set by name (PARAM_EXT, messages 320 to 324), and described
-in the camera definition file, the XML that QGroundControl and MAVSDK read."""
+"""Serve the camera's settings as MAVLink parameters (PARAM_EXT, messages 320 to 324), and describe them in XML.
+
+The XML is the camera definition file, which QGroundControl and MAVSDK read.
+"""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from dappled.drivers import usb_bus
 from dappled.drivers.camera import CameraError, StateChanged
 from dappled.drivers.registry import open_camera
 from dappled.drivers.usb_bus import UsbBody
-from dappled.errors import DappledError
+from dappled.errors import DappledError, counted
 
 OPEN_S = 12.0
 _GRABBERS = ("gvfs-gphoto2-vo", "gvfsd-gphoto2", "gvfs-gphoto2-volume-monitor")  # /proc cuts names to 15 letters
@@ -158,7 +158,7 @@ def disk(settings: Settings, machine: Machine) -> list[Check]:
     if not os.access(place, os.W_OK):
         return [Check("disk", "no-go", f"{place} can't be written to", f"make {folder} yours, or set record.directory")]
     free = shutil.disk_usage(place).free
-    text = f"{free / 1e9:.1f} GB free at {folder}, room for some {int(free / _FRAME_BYTES)} frames"
+    text = f"{free / 1e9:.1f} GB free at {folder}, room for some {counted(int(free / _FRAME_BYTES), 'frame')}"
     if free < settings.record.min_free_mb * 1e6:
         mend = "`dappled flight offload`, then remove frames by hand"
         return [Check("disk", "no-go", f"{text}: below record.min_free_mb", mend)]

@@ -16,7 +16,7 @@ from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import LinkStatistics
-from dappled.errors import DappledError
+from dappled.errors import DappledError, counted
 from dappled.flight import layout
 from dappled.workers import Statistics
 
@@ -118,13 +118,13 @@ def _silence(link: LinkStatistics) -> str:
     if signing is None or signing.refused == 0:
         return "nothing was heard for 5 s"
     return (
-        f"nothing with a valid signature was heard for 5 s ({signing.unsigned_refused} packets were unsigned, "
+        f"nothing with a valid signature was heard for 5 s ({counted(signing.unsigned_refused, 'packet')} unsigned, "
         f"{signing.forged} forged, {signing.replayed} too old); give both ends the same key"
     )
 
 
 def _frames(count: int) -> str:
-    return "1 frame" if count == 1 else f"{count} frames"
+    return counted(count, "frame")
 
 
 def _counters(link: LinkStatistics) -> dict[str, Any]:

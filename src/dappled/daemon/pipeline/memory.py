@@ -1,4 +1,4 @@
-"""Memory: large blocks are used again instead of being given back to the kernel; and who goes when it is short."""
+"""Reuse large blocks of memory instead of returning them to the kernel, and mark processes to be killed first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What decoding was given: the recipe from the settings, copies of its files in the flight, and the recipe of a replay.
+"""Make a decoding recipe from settings or from a recorded flight, and keep copies of its files in the flight.
 
 A flight keeps its own calibration, white and dark frame and profiles, so that it can be decoded the same way when the
 originals have changed.

@@ -10,7 +10,7 @@ from typing import Literal, Protocol
 
 from dappled.clock import Clock
 from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
-from dappled.errors import report
+from dappled.errors import counted, report
 from dappled.flight import Cause, FlightError, Shot
 from dappled.workers import Loop
 
@@ -245,7 +245,7 @@ class Shutter:
         if self._stopped:
             return "the daemon is stopping"
         if len(self._pending) >= self._capacity:
-            return f"{len(self._pending)} shots are waiting for the camera already"
+            return f"{counted(len(self._pending), 'shot')} waiting for the camera already"
         return self._sink.obstacle()
 
     def _run(self) -> None:

@@ -1,4 +1,4 @@
-"""After landing: the files that stayed at the camera become the frames of the shots that made them.
+"""Bring the files that stayed in the camera into a flight after landing, as frames of the shots that made them.
 
 Matching is by order, count and the camera's own time; only what is sure is taken, and what a person says. The frames
 are recorded, tagged from the flight's own telemetry, and entered in the index: the flight is then as if they had come

@@ -1,4 +1,4 @@
-"""Decoding an old flight again, by another recipe: a named run, whose results stand beside those of the flight.
+"""Decode a recorded flight again by another recipe: a named run, with results of its own beside those of the flight.
 
 A run's name, recipe and versions are a fact of the ledger ("run:NAME"); its files are kept in `inputs/NAME/`, so that
 it can be verified and repeated. What was recorded, and what other runs found, is never touched.
