@@ -212,6 +212,10 @@ class QueuedCamera:
     def __init__(self) -> None:
         self._events: queue.SimpleQueue[CameraEvent] = queue.SimpleQueue()
 
+    def report(self, event: CameraEvent) -> None:
+        """Queue an event for the receiver. Any thread may call this; it never waits."""
+        self._events.put(event)
+
     def next_event(self, timeout_s: float) -> CameraEvent | None:
         """See Camera. After `stop` it still returns the events that are left."""
         try:

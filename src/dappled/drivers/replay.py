@@ -41,31 +41,31 @@ class ReplayCamera(PlainCamera):
     def start(self) -> None:
         """See Camera."""
         self._playing = True
-        self._events.put(StateChanged("ready", "", self._clock.monotonic_ns(), self._identity))
+        self.report(StateChanged("ready", "", self._clock.monotonic_ns(), self._identity))
 
     def fire(self, shot: int) -> None:
         """See Camera. The recorded events of this shot follow at once."""
         now_ns = self._clock.monotonic_ns()
         if not self._playing:
-            self._events.put(ShotFailed(shot, "the recording is not playing", now_ns))
+            self.report(ShotFailed(shot, "the recording is not playing", now_ns))
             return
         recorded = self._shots.get(shot)
         if recorded is None:
-            self._events.put(ShotFailed(shot, f"shot {shot} is not in the recording", now_ns))
+            self.report(ShotFailed(shot, f"shot {shot} is not in the recording", now_ns))
             return
         if recorded.fired_monotonic_ns is not None:
-            self._events.put(Fired(shot, *recorded.fired_monotonic_ns))
+            self.report(Fired(shot, *recorded.fired_monotonic_ns))
         if recorded.path is None:
-            self._events.put(ShotFailed(shot, recorded.reason, now_ns))
+            self.report(ShotFailed(shot, recorded.reason, now_ns))
             return
         try:
             fd = os.open(recorded.path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
-            self._events.put(ShotFailed(shot, f"{recorded.path} can't be read: {error.strerror}", now_ns))
+            self.report(ShotFailed(shot, f"{recorded.path} can't be read: {error.strerror}", now_ns))
             return
         arrived_ns = recorded.arrived_monotonic_ns or now_ns
         blob = Blob(fd, os.fstat(fd).st_size)
-        self._events.put(Arrival(shot, recorded.camera_name, blob, arrived_ns, recorded.facts))
+        self.report(Arrival(shot, recorded.camera_name, blob, arrived_ns, recorded.facts))
 
     @property
     def identity(self) -> Identity:

@@ -103,7 +103,7 @@ class GPhoto2Camera(QueuedCamera):
                     return
             else:
                 reason = "the camera's process is not running"
-        self._events.put(ShotFailed(shot, reason, self._clock.monotonic_ns()))
+        self.report(ShotFailed(shot, reason, self._clock.monotonic_ns()))
 
     @property
     def identity(self) -> Identity | None:
@@ -156,7 +156,7 @@ class GPhoto2Camera(QueuedCamera):
                 process, channel = self._spawn(self._settings, self._carryover)
             except OSError as error:  # no memory, no descriptors: may pass
                 reason = f"the camera's process can't be started: {error.strerror}"
-                self._events.put(StateChanged("faulted", reason, self._clock.monotonic_ns()))
+                self.report(StateChanged("faulted", reason, self._clock.monotonic_ns()))
                 self._stopping.wait(_SPAWN_S)
                 continue
             with self._lock:
@@ -171,13 +171,13 @@ class GPhoto2Camera(QueuedCamera):
             end_child(process)
             stopped = self._stopping.is_set()
             for shot in pending:
-                self._events.put(
+                self.report(
                     ShotFailed(shot, "the camera was stopped" if stopped else reason, self._clock.monotonic_ns())
                 )
             if not stopped:
-                self._events.put(StateChanged("faulted", reason, self._clock.monotonic_ns()))
+                self.report(StateChanged("faulted", reason, self._clock.monotonic_ns()))
                 self._await_budget()
-        self._events.put(StateChanged("absent", "the camera was stopped", self._clock.monotonic_ns()))
+        self.report(StateChanged("absent", "the camera was stopped", self._clock.monotonic_ns()))
 
     def _serve(self, process: subprocess.Popen[bytes], channel: ProcessChannel) -> str:
         """Pass events on until the process ends; return why, as a sentence."""
@@ -230,7 +230,7 @@ class GPhoto2Camera(QueuedCamera):
             self._known_settings = event.settings
         if isinstance(event, Arrival | Companion):
             self._learn(event)
-        self._events.put(event)
+        self.report(event)
 
     def _learn(self, event: Arrival | Companion) -> None:
         """Remember what the next process needs, in case this one dies."""
@@ -245,6 +245,6 @@ class GPhoto2Camera(QueuedCamera):
         wait_ns = self._budget.wait_ns(now_ns)
         if wait_ns:
             reason = f"the camera's process ended too often; the next attempt is in {wait_ns / 1e9:.0f} s"
-            self._events.put(StateChanged("faulted", reason, now_ns))
+            self.report(StateChanged("faulted", reason, now_ns))
             self._stopping.wait(wait_ns / 1e9)
         self._budget.spend(self._clock.monotonic_ns())

@@ -92,7 +92,7 @@ class ComposedCamera(PlainCamera):
 
     def start(self) -> None:
         """See Camera."""
-        self._events.put(StateChanged("starting", "", self._clock.monotonic_ns()))
+        self.report(StateChanged("starting", "", self._clock.monotonic_ns()))
         self._fire_thread.start()
         if self._watch is not None:
             self._pick_thread.start()
@@ -112,7 +112,7 @@ class ComposedCamera(PlainCamera):
             reason = "too many shots wait for their files" if self._ready.is_set() else self._line_fault
         if self._stopping.is_set():
             reason = "the camera was stopped"
-        self._events.put(ShotFailed(shot, reason, self._clock.monotonic_ns()))
+        self.report(ShotFailed(shot, reason, self._clock.monotonic_ns()))
 
     @property
     def identity(self) -> Identity | None:
@@ -132,7 +132,7 @@ class ComposedCamera(PlainCamera):
         with self._lock:
             left, self._open = list(self._open), {}
         for shot in left:
-            self._events.put(ShotFailed(shot, "the camera was stopped", self._clock.monotonic_ns()))
+            self.report(ShotFailed(shot, "the camera was stopped", self._clock.monotonic_ns()))
 
     # the shutter
 
@@ -191,7 +191,7 @@ class ComposedCamera(PlainCamera):
         with self._lock:
             self._ready.clear()
             self._line_fault = problem
-            self._events.put(StateChanged("faulted", problem, self._clock.monotonic_ns()))
+            self.report(StateChanged("faulted", problem, self._clock.monotonic_ns()))
         while True:
             try:
                 shot = self._requested.get_nowait()
@@ -201,7 +201,7 @@ class ComposedCamera(PlainCamera):
 
     def _fire_one(self, shot: int) -> bool:
         """Press, hold and release the line for a shot. Returns False when stopping."""
-        self._events.put(StateChanged("busy", "", self._clock.monotonic_ns(), self._identity))
+        self.report(StateChanged("busy", "", self._clock.monotonic_ns(), self._identity))
         called_ns = self._clock.monotonic_ns()
         problem = self._tried(self._line.press)
         returned_ns = self._clock.monotonic_ns()
@@ -209,7 +209,7 @@ class ComposedCamera(PlainCamera):
             self._end(shot, ShotFailed(shot, problem, self._clock.monotonic_ns()))
             self._tried(self._line.close)
             return self._open_line()
-        self._events.put(Fired(shot, called_ns, returned_ns))
+        self.report(Fired(shot, called_ns, returned_ns))
         if self._watch is not None:
             self._watch.expect(Claim(shot, called_ns))
             self._shot_fired.set()
@@ -231,7 +231,7 @@ class ComposedCamera(PlainCamera):
             fault = self._files_fault
             state = StateChanged("faulted" if fault else "ready", fault, self._clock.monotonic_ns(), self._identity)
             if self._ready.is_set():
-                self._events.put(state)
+                self.report(state)
 
     def _end(self, shot: int, event: ShotFailed | Deferred | Arrival) -> bool:
         """Report the end of a shot. Returns False where it had ended before."""
@@ -239,7 +239,7 @@ class ComposedCamera(PlainCamera):
             was = shot in self._open
             self._open.pop(shot, None)
         if was or isinstance(event, Arrival):
-            self._events.put(event)
+            self.report(event)
         return was
 
     # the files
@@ -268,4 +268,4 @@ class ComposedCamera(PlainCamera):
         if isinstance(arrival, Arrival) and arrival.shot is not None:
             self._end(arrival.shot, arrival)
         else:
-            self._events.put(arrival)
+            self.report(arrival)
