@@ -157,7 +157,7 @@ def test_a_refused_press_is_denied_in_words_and_the_button_is_freed_by_a_status(
         for sequence, result in ((1, ACCEPTED), (2, mavlink.MAV_RESULT_TEMPORARILY_REJECTED)):
             qgc.command(2000, 0, 0, 1, sequence)
             assert qgc.ack(2000) == result
-        assert "waiting for the camera" in qgc.one("STATUSTEXT").text + qgc.one("STATUSTEXT").text
+        assert "1 shot waiting for the camera" in qgc.one("STATUSTEXT").text
         qgc.one("CAMERA_CAPTURE_STATUS")
 
 
