@@ -88,14 +88,9 @@ def _cell_means(
     """The mean of each cell for each place (row, column) of the colour pattern; a cell is `steps` patterns."""
     (a, b), (down, across) = period, steps
     rows, columns = plane.shape[0] // (a * down), plane.shape[1] // (b * across)
-    width = columns * across * b
-    sums = np.empty((a, rows, width), dtype=np.float32)
-    for row in range(rows):
-        for place in range(a):
-            first = row * down * a + place
-            plane[first : first + down * a : a, :width].sum(axis=0, out=sums[place, row])
-    cells = sums.reshape(a, rows, columns, across, b).sum(axis=3, dtype=np.float64) / (down * across)
-    return {(row, column): cells[row, :, :, column] for row in range(a) for column in range(b)}
+    cells = plane[: rows * down * a, : columns * across * b].reshape(rows, down, a, columns, across, b)
+    means = cells.mean(axis=(1, 4), dtype=np.float64)
+    return {(row, column): means[:, row, :, column] for row in range(a) for column in range(b)}
 
 
 def _between(places: NDArray[np.floating], blocks: int) -> NDArray[np.float32]:
@@ -103,6 +98,6 @@ def _between(places: NDArray[np.floating], blocks: int) -> NDArray[np.float32]:
 
     Between the blocks' middles; constant beyond the outer ones.
     """
-    at = np.clip(places - 0.5, 0, blocks - 1)
-    weights: NDArray[np.float32] = np.maximum(0, 1 - np.abs(at[:, None] - np.arange(blocks))).astype(np.float32)
-    return weights
+    middles = np.arange(blocks) + 0.5
+    weights = [np.interp(places, middles, block) for block in np.eye(blocks)]
+    return np.stack(weights, axis=1).astype(np.float32)
