@@ -127,14 +127,14 @@ def test_a_slow_one_loses_the_older_frame(bench: Bench) -> None:
     bench.maker.gate.set()
     eventually(lambda: len(bench.published) == 2, "the first and the newest")
     assert [path for path, _ in bench.maker.asked] == ["frames/0.dng", "frames/3.dng"]
-    assert bench.depth.statistics().dropped == 2
+    assert bench.depth._worker.statistics().dropped == 2
 
 
 def test_what_was_not_decoded_has_no_depth_and_a_failure_is_counted(bench: Bench) -> None:
     bench.depth.offer(shot(0, decoded=False))
     bench.maker.problem = "no carriers"
     bench.depth.offer(shot(1))
-    eventually(lambda: bench.depth.statistics().failed == 1, "it failed")
+    eventually(lambda: bench.depth._worker.statistics().failed == 1, "it failed")
     assert [path for path, _ in bench.maker.asked] == ["frames/1.dng"]
     assert bench.published == []
 

@@ -253,7 +253,6 @@ class Capture:
         self._shots, self._writer, self._observer = ends.shots, ends.writer, ends.observer
         self._give_up_at = 0.0
         self._loop = Loop("capture", self._run)
-        self.dead_threads = self._loop.dead_threads
 
     def start(self) -> None:
         """Start the camera, then the thread."""
@@ -267,6 +266,10 @@ class Capture:
         self._ends.tell(self._camera.stop)
         if ended:
             self._last_events()
+
+    def dead_threads(self) -> list[str]:
+        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
+        return self._loop.dead_threads()
 
     def _run(self) -> None:
         while not self._loop.stopping.is_set() or self._worth_waiting():

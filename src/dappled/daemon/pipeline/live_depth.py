@@ -47,16 +47,19 @@ class LiveDepth:
         self._method, self._interval_s, self._on_nearest, self._clock = method, interval_s, on_nearest, clock
         self._last_s = -1e9
         self._worker: Worker[PendingShot] = Worker("depth", self._work, capacity=1, policy="drop oldest")
-        self.start, self.dead_threads, self.statistics = (
-            self._worker.start,
-            self._worker.dead_threads,
-            self._worker.statistics,
-        )
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._worker.start()
 
     def stop(self) -> None:
         """Take no more frames and close the maker. A frame in hand is given up after half a second."""
         self._worker.stop(0.5)
         self._maker.close()
+
+    def dead_threads(self) -> list[str]:
+        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
+        return self._worker.dead_threads()
 
     def offer(self, pending: PendingShot) -> None:
         """Take a finished frame, if one is due and it was decoded."""

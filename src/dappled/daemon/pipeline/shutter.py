@@ -99,7 +99,6 @@ class Shutter:
         self._wake = threading.Event()
         self._stopped = False
         self._loop = Loop("shutter intervals", self._run)
-        self.dead_threads = self._loop.dead_threads
 
     def start(self) -> None:
         """Begin to serve intervals. Single shots need no thread."""
@@ -112,6 +111,10 @@ class Shutter:
             self._interval = None
         self._wake.set()
         self._loop.stop(2.0)
+
+    def dead_threads(self) -> list[str]:
+        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
+        return self._loop.dead_threads()
 
     def request(self, request: CaptureRequest) -> ShotDecision:
         """One message that asks for one shot."""

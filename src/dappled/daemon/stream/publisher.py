@@ -113,7 +113,6 @@ class Publisher:
             os.close(self._wake)
             raise
         self._loop = Loop("publisher", self._run)
-        self.dead_threads = self._loop.dead_threads
 
     def start(self, flight: str, answer: Answer) -> None:
         """Start to send and to listen. `flight` is the name in the headers.
@@ -122,6 +121,10 @@ class Publisher:
         """
         self._flight, self._answer = flight, answer
         self._loop.start()
+
+    def dead_threads(self) -> list[str]:
+        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
+        return self._loop.dead_threads()
 
     def publish(self, topic: str, facts: Mapping[str, Any], body: Any = None) -> None:
         """Queue a message; `seq`, `dropped` and the rest of the envelope are added when it is sent. Never waits.
