@@ -7,7 +7,7 @@ priorities are the service's own (Nice=-5 in its unit, the camera's process befo
 hardware, goes before all; where this user may not have them, it says so.
 File: a 17.6 MB raw file from the body to safe on disk, against a plain copy of it with fsync, taken in turns; and what
 the driver's process holds in memory at most, above what it holds before. Stall: the longest time for which the daemon
-side answers nobody while the body is silent.
+side doesn't answer while the body is silent.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ SPAWN = multiprocessing.get_context("spawn")
 LIMITS = {  # what is wanted of those figures that are a promise
     "ipc_over_memcpy": "at least 0.4",
     "record_crowd_over_alone": "at most 1.05",
-    "wish_note_crowd_over_alone": "at most 1.05",
+    "shot_note_crowd_over_alone": "at most 1.05",
     "most_frames_kept_for_the_hung": "at most 4",
     "safe_to_received_less_decode_median_ms": "at most 15",
     "frames_of_a_subscriber_started_again": "1",
@@ -150,7 +150,7 @@ def _read_bare(there: socket.socket, pipe: Connection) -> None:
 
 
 def hung(root: Path, rounds: int) -> dict[str, float]:
-    """Durable frames of 17 MB recorded while slices go out: to nobody, and to ten subscribers of which three hang.
+    """Durable frames of 17 MB recorded while slices go out: to none, and to ten subscribers of which three hang.
 
     The two take turns, with the niceness that the service's unit gives where this may be had. A frame comes at any
     time after the slices of the one before. Also how many stacks of slices the publisher keeps alive at the most; the
@@ -165,7 +165,7 @@ def hung(root: Path, rounds: int) -> dict[str, float]:
     flight = recording.begin(root / "flights", time.time_ns)
     data = os.urandom(RAW_BYTES)
     times: dict[str, list[float]] = {"alone": [], "crowd": []}
-    wishes: dict[str, list[float]] = {"alone": [], "crowd": []}
+    notes: dict[str, list[float]] = {"alone": [], "crowd": []}
     alive: set[int] = set()
     most = index = 0
     lone = Publisher(f"ipc://{root}/lone", "")
@@ -189,7 +189,7 @@ def hung(root: Path, rounds: int) -> dict[str, float]:
             blob = Blob.of(data)
             began = time.perf_counter()
             flight.journal.note(shot)
-            wishes[name].append(time.perf_counter() - began)
+            notes[name].append(time.perf_counter() - began)
             flight.ledger.add_shot(shot)
             began = time.perf_counter()
             flight.recorder.record(index, "IMG.CR2", blob, arrived_utc_ns=time.time_ns())
@@ -206,7 +206,7 @@ def hung(root: Path, rounds: int) -> dict[str, float]:
         "record_ms_alone": statistics.median(times["alone"]) * 1e3,
         "record_ms_ten_subscribers_three_hung": statistics.median(times["crowd"]) * 1e3,
         "record_crowd_over_alone": statistics.median(times["crowd"]) / statistics.median(times["alone"]),
-        "wish_note_crowd_over_alone": statistics.median(wishes["crowd"]) / statistics.median(wishes["alone"]),
+        "shot_note_crowd_over_alone": statistics.median(notes["crowd"]) / statistics.median(notes["alone"]),
         "most_frames_kept_for_the_hung": float(most),
     }
 
@@ -373,7 +373,7 @@ def _read(endpoint: str, pipe: Connection, topics: list[str], once: bool = False
     said = False
     reuse_large_blocks()
     if os.getpriority(os.PRIO_PROCESS, 0) < 0:
-        os.setpriority(os.PRIO_PROCESS, 0, 0)  # a reader is no part of the service
+        os.setpriority(os.PRIO_PROCESS, 0, 0)  # a reader is not part of the service
     with Subscriber(endpoint, topics=topics) as subscriber:
         while True:
             message = subscriber.receive(60.0)

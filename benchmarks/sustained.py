@@ -2,8 +2,9 @@
 
 python benchmarks/sustained.py [--json] [--directory DIR] [--seconds 300] [--rate 4] [--megabytes 11] [--decode-s 2]
 
-The street of a live flight (shutter, journal, recorder, ledger, tagger, decode queue) in front of a camera that brings
-a new file for every shot. Decoding is too slow on purpose. Afterwards the whole flight is read back and compared.
+The pipeline of a live flight (shutter, journal, recorder, ledger, tagger, decode queue) in front of a camera that
+brings a new file for every shot. Decoding is too slow on purpose. Afterwards the whole flight is read back and
+compared.
 """
 
 from __future__ import annotations
@@ -163,7 +164,7 @@ def main() -> None:
 def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: float) -> dict[str, float]:
     """Counts, milliseconds and megabytes, as the names say. `lost` counts shots without an intact frame, and frames
     neither decoded nor noted as not decoded. Memory: the growth from the second quarter to the last."""
-    clock, wishes_ms = SystemClock(), []
+    clock, notes_ms = SystemClock(), []
     flight = recording.begin(root, clock.utc_ns, {})
     camera = SteadyCamera(size)
     shots = PendingShots(camera)
@@ -190,7 +191,7 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
         time.sleep(max(0.0, start + number / rate - time.monotonic()))
         began = time.perf_counter()
         shutter.request(CaptureRequest("benchmark", "console", number))
-        wishes_ms.append((time.perf_counter() - began) * 1e3)
+        notes_ms.append((time.perf_counter() - began) * 1e3)
         memory.look()
     behind_s = time.monotonic() - start - (count - 1) / rate
     for _ in range(count):
@@ -199,7 +200,7 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
     flight.close()
     return {
         **_account(flight.folder.path, count),
-        **_times(wishes_ms, ends.record_ms),
+        **_times(notes_ms, ends.record_ms),
         "behind_s": behind_s,
         **memory.growth(),
     }
@@ -248,12 +249,12 @@ def _account(flight: Path, count: int) -> dict[str, float]:
     }
 
 
-def _times(wishes_ms: list[float], record_ms: list[float]) -> dict[str, float]:
+def _times(notes_ms: list[float], record_ms: list[float]) -> dict[str, float]:
     def share(values: list[float], part: float) -> float:
         return sorted(values)[min(len(values) - 1, int(part * len(values)))]
 
     rows: dict[str, float] = {}
-    for name, values in (("wish", wishes_ms), ("record", record_ms)):
+    for name, values in (("note", notes_ms), ("record", record_ms)):
         rows |= {f"{name}_median_ms": share(values, 0.5), f"{name}_p99_ms": share(values, 0.99)}
     return rows
 

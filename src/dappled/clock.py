@@ -53,9 +53,10 @@ class TimeOfDayClock(SystemClock):
 
 
 class RecordedClock:
-    """A clock that stands still until it is told the time: for replays, and for tests.
+    """A clock that stands still until it is advanced: for replays, and for tests.
 
-    `advance_to` moves it (never backwards). `close` ends every wait, so that nobody outlives the record.
+    `advance_to` moves it (never backwards). `close` ends every wait, so that no thread
+    waits longer than the record lasts.
     """
 
     def __init__(self, utc_ns: int, utc_minus_monotonic_ns: int = 0) -> None:

@@ -177,7 +177,7 @@ def test_a_rerun_recording_is_written_and_can_be_read(field: str, tmp_path: Path
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["refocus", "{}", "--alpha", "0", "-o", "{out}.png"], "is no image plane"),
+        (["refocus", "{}", "--alpha", "0", "-o", "{out}.png"], "is not an image plane"),
         (["refocus", "{}", "--distance", "5", "-o", "{out}.png"], "has no distances"),
         (["refocus", "{}", "--magnify", "-o", "{out}.png"], "goes with --alpha"),
         (["refocus", "{}", "--eyes", "anaglyph", "--fourier", "-o", "{out}.png"], "--eyes doesn't go with --fourier"),
@@ -188,9 +188,9 @@ def test_a_rerun_recording_is_written_and_can_be_read(field: str, tmp_path: Path
         (["refocus", "{}", "--eyes", "anaglyph", "--tilt", "1", "0", "-o", "{out}.png"], "doesn't go with --tilt"),
         (["refocus", "{}", "--alpha", "1", "--fourier", "--magnify", "-o", "{out}.png"], "doesn't go with --magnify"),
         (["refocus", "{}", "--all-in-focus", "-o", "{out}.png"], "needs --stack"),
-        (["refocus", "{}", "--stack", "0", "1", "0.5", "-o", "{out}.png"], "no number of pictures"),
+        (["refocus", "{}", "--stack", "0", "1", "0.5", "-o", "{out}.png"], "not a number of pictures"),
         (["refocus", "{}", "--stack", "0", "1", "501", "-o", "{out}.png"], "at most 500"),
-        (["refocus", "{}", "--stack", "0", "1", "nan", "-o", "{out}.png"], "no number of pictures"),
+        (["refocus", "{}", "--stack", "0", "1", "nan", "-o", "{out}.png"], "not a number of pictures"),
         (["refocus", "{}", "-o", "{out}.gif"], "name it so"),
         (["depth", "{}", "-o", "{out}.ply"], "has no distances"),
         (["depth", "{}", "--focus", "inf", "--flight", "x", "-o", "{out}.ply"], "--frame N"),

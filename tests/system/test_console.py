@@ -147,13 +147,13 @@ def shoot(page: Page) -> int:
     """Press the button as a keyboard would; the frame's number once its views are drawn."""
     deadline = time.monotonic() + DEADLINE_MS / 1e3
     page.focus("#shoot")
-    while not (told := page.inner_text("#told")).startswith("shot "):
+    while not (told := page.inner_text("#outcome")).startswith("shot "):
         # What others asked for may still be under way: then it is refused in words, and a person presses again.
         assert time.monotonic() < deadline, told
-        page.evaluate("document.querySelector('#told').textContent = ''")
+        page.evaluate("document.querySelector('#outcome').textContent = ''")
         page.keyboard.press("Enter")
-        until(page, "document.querySelector('#told').textContent !== ''")
-    index = int(page.inner_text("#told").split()[1])
+        until(page, "document.querySelector('#outcome').textContent !== ''")
+    index = int(page.inner_text("#outcome").split()[1])
     page.wait_for_selector(f'#strip [data-frame="{index}"][aria-selected="true"] img')
     until(page, f"document.querySelector('#which').textContent === 'frame {index}'")
     until(page, "!document.querySelector('#gl').hidden || !document.querySelector('#picture').hidden")
@@ -286,7 +286,7 @@ def test_an_interval_runs_and_stops(chromium: Browser, daemon: Daemon) -> None:
     until(page, "document.querySelector('#interval-go').textContent === 'Stop'")
     until(page, f"Number(document.querySelector('#counters dd').textContent) >= {before + 2}")
     page.click("#interval-go")
-    until(page, "document.querySelector('#told').textContent === 'the interval is stopped'")
+    until(page, "document.querySelector('#outcome').textContent === 'the interval is stopped'")
     until(page, "document.querySelector('#interval-go').textContent === 'Start'")
     assert watched.wrong == []
 

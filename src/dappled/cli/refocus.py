@@ -103,7 +103,7 @@ def _planes(found: OpenedLightField, arguments: argparse.Namespace) -> list[tupl
     if arguments.stack:
         low, high, count = arguments.stack
         if not count >= 1 or count % 1:
-            raise OpenError(f"--stack: {count:g} is no number of pictures")
+            raise OpenError(f"--stack: {count:g} is not a number of pictures")
         if count > _MOST_PICTURES:
             raise OpenError(f"--stack: {count:g} pictures are too many: at most {_MOST_PICTURES}")
         return [(f"{d:.3g} px/view", float(d)) for d in np.linspace(low, high, round(count))]

@@ -38,7 +38,7 @@ _DEAD_S = 0.5
 
 
 class ChannelError(Exception):
-    """The other process is gone, takes no messages, or sent something that is no message."""
+    """The other process is gone, takes no messages, or sent something that is not a message."""
 
 
 @dataclass(frozen=True, slots=True)

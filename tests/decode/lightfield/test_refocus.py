@@ -74,7 +74,7 @@ def test_alpha_is_equation_29(alpha: float) -> None:
 
 @pytest.mark.parametrize("alpha", [0.0, -1.0, math.nan, math.inf])
 def test_an_alpha_that_is_no_plane_is_told(alpha: float) -> None:
-    with pytest.raises(DecodeError, match="is no image plane"):
+    with pytest.raises(DecodeError, match="is not an image plane"):
         refocus.disparity_of_alpha(alpha)
 
 
@@ -128,7 +128,7 @@ def test_a_smaller_aperture_blurs_less() -> None:
     ("call", "words"),
     [
         (lambda s: refocus.disc(s, 0), "lets no light through"),
-        (lambda s: refocus.shift_and_add(s, math.nan), "is no plane"),
+        (lambda s: refocus.shift_and_add(s, math.nan), "is not a plane"),
         (lambda s: refocus.shift_and_add(s, 0, weights=np.zeros((5, 5))), "not all 0"),
         (lambda s: refocus.shift_and_add(s, 0, weights=np.ones((4, 5))), r"weights of shape \(4, 5\)"),
         (lambda s: refocus.along(s, np.zeros((3, 3))), r"the surface is \(3, 3\)"),

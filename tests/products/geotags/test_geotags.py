@@ -399,7 +399,7 @@ def test_ecef_of_a_known_place() -> None:
 def test_a_mount_is_a_rotation() -> None:
     assert camera_pose.mount(tuple(NADIR.ravel())) == pytest.approx(NADIR)
     for bad in ((1.0,) * 9, (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0), (1.0, 0.0)):
-        with pytest.raises(DappledError, match="no rotation"):
+        with pytest.raises(DappledError, match="not a rotation"):
             camera_pose.mount(bad)
 
 

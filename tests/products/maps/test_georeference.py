@@ -294,7 +294,7 @@ def tagged(sha256: str, index: int) -> Tag:
         (["--terrain", "x.tif", "--terrain-heights", "ellipsoid", "--geoid", "no.gtx"], "no geoid grid no.gtx"),
         (["--refine", "a.tif", "b.tif", "--frames", "0"], "one base map"),
         (["--view", "9,9", "--frames", "0"], "there is no view 9,9"),
-        (["--mount", *"110010001"], "is no rotation"),
+        (["--mount", *"110010001"], "is not a rotation"),
         (["--between", "9", "3"], "the lower height comes first"),
     ],
 )

@@ -45,7 +45,7 @@ class Background:
 def load_background(file: Path) -> Background:
     """Read a map and its world file: six lines, with degrees per pixel and the centre of the first pixel.
 
-    Raises BackgroundError for a file that is no picture, is turned, or is not in degrees.
+    Raises BackgroundError for a file that is not a picture, is turned, or is not in degrees.
     """
     if file.suffix.lower() not in _WORLD:
         raise BackgroundError(f"{file}: a map is a PNG or a JPEG")

@@ -41,7 +41,7 @@ class Logbook(logging.Handler):
         self._count = 0
 
     def add(self, text: str, level: Level = "info") -> None:
-        """Add a line; the oldest is removed when the book is full. The same line twice in a row is kept once."""
+        """Add a line; the oldest is removed when the logbook is full. The same line twice in a row is kept once."""
         with self._guard:
             if self._lines and self._lines[-1].text == text:
                 return

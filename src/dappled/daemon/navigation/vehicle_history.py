@@ -160,7 +160,7 @@ class AutopilotTime:
             return
         if self.now_boot_ns is not None and message.tc1 < self.now_boot_ns - REBOOT_BACK_NS:
             return  # from before or after a reboot that the telemetry has yet to show
-        del self._requests[message.ts1]  # the same answer on a second link is no second observation
+        del self._requests[message.ts1]  # the same answer on a second link is not a second observation
         self.answers_seen += 1
         self._answers.append(answer)
 

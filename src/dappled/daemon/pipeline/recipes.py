@@ -104,7 +104,7 @@ def _copy(source: str, folder: Path, name: str) -> str:
 
 
 def _copy_profile(profile: str, folder: Path, kind: str) -> str:
-    """A copy of the profile under its own name; what is no file ("auto", "lenslet") stays as it is."""
+    """A copy of the profile under its own name; a name that is not a file ("auto", "lenslet") stays as it is."""
     if profile in ("auto", profiles.LENSLET):
         return profile
     target = folder / kind / f"{Path(profile).stem}.toml"

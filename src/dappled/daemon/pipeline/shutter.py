@@ -145,7 +145,7 @@ class Shutter:
         return decision
 
     def stop_interval(self, source: str | None = None) -> bool:
-        """End a running interval, whoever started it; the same command from the same `source` then starts it again.
+        """End a running interval, from any source; the same command from the same `source` then starts it again.
         False where none ran."""
         with self._lock:
             ran = self._interval is not None
@@ -232,7 +232,7 @@ class Shutter:
         try:
             self._sink.fire(shot)
         except Exception:
-            # The shot is noted, so it exists; whoever owns the driver sees the exception and the failed count.
+            # The shot is noted, so it exists; the owner of the driver sees the exception and the failed count.
             self._pending.discard(shot.index)
             self._failed += 1
             raise
@@ -256,7 +256,7 @@ class Shutter:
             self._wake.clear()
             try:
                 wait_s = self.serve()
-            except Exception as error:  # noqa: BLE001  # of whoever notes or fires: the interval goes on
+            except Exception as error:  # noqa: BLE001  # noting or firing failed: the interval goes on
                 report(log, "interval", error)
                 wait_s = _AGAIN_S
             self._clock.wait(self._wake, wait_s)

@@ -231,4 +231,4 @@ def _settings(path: Path) -> tagging.FrameSettings:
     try:
         return tagging.FrameSettings.of(reading.read_metadata(path))
     except DappledError:
-        return tagging.FrameSettings()  # a frame that nobody can read is a frame all the same
+        return tagging.FrameSettings()  # an unreadable frame is still recorded

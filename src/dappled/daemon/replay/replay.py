@@ -45,7 +45,7 @@ class RecordedFlight:
 
 
 def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
-    """A recorded flight, with the slices of one run. Raises FlightError when it is none."""
+    """A recorded flight, with the slices of one run. Raises FlightError when it is not one."""
     flight = layout.open_folder(folder)
     with LedgerReader.open(flight.ledger) as ledger:
         rows = ledger.shots()

@@ -103,7 +103,7 @@ class ReplayVerifier:
             self._compare(result.index, "slices", one.slices_sha256, result.slices_sha256)
 
     def event(self, kind: str, text: str, index: int | None = None) -> None:
-        """See FlightWriter. An event of a kind that the flight has for this shot too is no difference."""
+        """See FlightWriter. An event of a kind that the flight has for this shot too does not count as a difference."""
         if index is not None and kind in self._expected[index].events:
             return
         self.differences.append(f"frame {index}: {kind}: {text}" if index is not None else f"{kind}: {text}")

@@ -114,7 +114,7 @@ class _SubscriberCore:
         """`endpoint` and `ask` are ZeroMQ endpoints; without `ask`, or without `recover`, gaps are only counted.
 
         With `from_start` the slices that a flight sent before count as a gap too. `keys` are for a tcp endpoint with
-        CURVE. Raises WireError for an endpoint that is none.
+        CURVE. Raises WireError for an invalid endpoint.
         """
         self.ended = False
         self._gaps = Gaps(can_ask=bool(ask) and recover, from_start=from_start, answer_timeout_s=answer_timeout_s)
@@ -335,7 +335,7 @@ def subscribe(
     With `from_start` the slices that the flight sent before count as lost too. The loop ends after the flight, or when
     no message came for `idle_s`. A tcp endpoint with CURVE needs both files: `keys`, your own NAME.key_secret, and
     `server_key`, the vehicle's NAME.key. Raises KeyFileError for the files; the loop raises WireError for an endpoint
-    or a message that is none.
+    or an invalid message.
     """
     if (keys is None) != (server_key is None):
         raise KeyFileError("keys and server_key go together: your own secret key, and the vehicle's public one")

@@ -207,7 +207,7 @@ def decode(parts: Sequence[Any]) -> Message:
     except (IndexError, ValueError, RecursionError) as error:  # ValueError: no UTF-8, no JSON, a number without end
         raise WireError(f"not a dappled message: {error}") from None
     if not isinstance(header, dict):
-        raise WireError("not a dappled message: the header is no JSON object")
+        raise WireError("not a dappled message: the header is not a JSON object")
     return Message(topic, header, parts[2] if len(parts) > 2 else None)
 
 

@@ -115,7 +115,7 @@ class Calibration:
     def from_dict(cls, values: Mapping[str, Any]) -> Calibration:
         """The inverse of `to_dict`. Raises DecodeError with the name of what is missing or wrong."""
         if values.get("kind") != "dappled calibration" or values.get("version") != 1:
-            raise DecodeError("this is no calibration of version 1: make one with `dappled calibrate`")
+            raise DecodeError("this is not a calibration of version 1: make one with `dappled calibrate`")
         try:
             shape = _pair(values["shape"])
             mask = Mask(**values["mask"])

@@ -18,7 +18,7 @@ from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Sensor
 
 EXPLAINED_BINS = 2.0  # rms: the residual that a law may leave (the thesis' own readings scatter by 0 to 2)
 PLAUSIBLE = 0.35  # relative: a mask distance further from the stated one is not believed
-_PRINTED = 0.05  # relative: a print is no further off its frequency
+_PRINTED = 0.05  # relative: a print's frequency is not further off
 _FOR_PUPIL = 3  # focal lengths needed to fit a law's second constant, too
 
 

@@ -62,7 +62,9 @@ def mount(values: tuple[float, ...]) -> Matrix:
             left, _, right = np.linalg.svd(square)
             nearest: Matrix = left @ right
             return nearest
-    raise DappledError(f"the mount {list(values)} is no rotation: give nine numbers, row by row, camera axes to body")
+    raise DappledError(
+        f"the mount {list(values)} is not a rotation: give nine numbers, row by row, camera axes to body"
+    )
 
 
 def of(

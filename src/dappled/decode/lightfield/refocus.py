@@ -24,9 +24,9 @@ _LEAST_WEIGHT = 1e-6  # of all views: a pixel that less is seen of is unknown
 
 
 def disparity_of_alpha(alpha: float) -> float:
-    """The disparity 1/α − 1 that Eq 29 brings into focus. Raises DecodeError for an α that is no image plane."""
+    """The disparity 1/α − 1 that Eq 29 brings into focus. Raises DecodeError for an α that is not an image plane."""
     if not (math.isfinite(alpha) and alpha > 0):
-        raise DecodeError(f"α = {alpha:g} is no image plane: it must be above 0 (1 leaves the focus where it was)")
+        raise DecodeError(f"α = {alpha:g} is not an image plane: it must be above 0 (1 leaves the focus where it was)")
     return 1 / alpha - 1
 
 
@@ -39,7 +39,7 @@ def shift_and_add(
     (Keys 1981). A pixel's mean is over the views that have it; pixels that none has are NaN.
     """
     if not math.isfinite(disparity):
-        raise DecodeError(f"a disparity of {disparity} is no plane: give a finite one, in pixels from view to view")
+        raise DecodeError(f"a disparity of {disparity} is not a plane: give a finite one, in pixels from view to view")
     share = _checked(stack, weights)
     if stack.colour:
         made = np.stack(

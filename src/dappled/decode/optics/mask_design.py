@@ -1,4 +1,4 @@
-"""Design a mask and its place for a sensor, a lens and an altitude, or say in a sentence why there is none.
+"""Design a mask and its place for a sensor, a lens and an altitude, or say in a sentence why this is impossible.
 
 Both laws are supported, each by its own rules (`DESIGNS`, by the law's name):
   - `geometric`: N = 2p + 1 views are separated at f_m = v / (d·A), A the aperture's diameter, so the ideal f-number

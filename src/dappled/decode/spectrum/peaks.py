@@ -86,7 +86,7 @@ def _measure_one(spectrum: Spectrum, fy: float, fx: float, radius: float, promin
     floor = float(np.partition(magnitude, magnitude.size // 2, axis=None)[magnitude.size // 2])  # the median
     y, x = np.ogrid[top : top + 2 * around + 1, left : left + 2 * around + 1]
     allowed = (y - row) ** 2 + (x - column) ** 2 <= max(radius, 0.75) ** 2
-    allowed &= y * y + x * x > 9  # the frame's mean is no carrier
+    allowed &= y * y + x * x > 9  # the frame's mean is not a carrier
     allowed[[0, -1], :] = False
     allowed[:, [0, -1]] = False
     i, j = divmod(int(np.argmax(np.where(allowed, magnitude, -1.0))), magnitude.shape[1])

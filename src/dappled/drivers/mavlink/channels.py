@@ -138,9 +138,7 @@ def _sentence(address: Address, error: OSError) -> str:
             f"MAVLink link {url}: port {address.port} is in use; end the program that listens there or change the port"
         )
     if error.errno == errno.EADDRNOTAVAIL:
-        return (
-            f"MAVLink link {url}: {address.host} is no address of this machine; write 0.0.0.0 to listen on all of them"
-        )
+        return f"MAVLink link {url}: {address.host} is not an address of this machine; 0.0.0.0 listens on all of them"
     if error.errno == errno.ENOENT:
         return f"MAVLink link {url}: there is no device {address.host}; plug it in or correct mavlink.url"
     if error.errno == errno.EACCES:

@@ -104,7 +104,7 @@ class RawFile:
 
 
 def read_exif(file: BinaryIO) -> ExposureSettings:
-    """Read the EXIF of an open file, from its start. Damaged or missing EXIF is no error: its values are None."""
+    """Read the EXIF of an open file, from its start. Damaged or missing EXIF is not an error: its values are None."""
     try:
         start = file.read(16)
         file.seek(0)

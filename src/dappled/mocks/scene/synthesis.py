@@ -1,7 +1,7 @@
 """Compute the masked frame from the views of a scene, quickly and without approximation.
 
-The frame is the ray sum I(x) = mean over θ of L_θ(x)·M(mask crossing of (x, θ)). M is a sum of cosines, so the sum may
-be taken in another order: first over θ, which gives for each carrier k a smooth image S_k(x) = mean of
+The frame is the ray sum I(x) = mean over θ of L_θ(x)·M(where (x, θ) meets the mask). M is a sum of cosines, so the sum
+may be taken in another order: first over θ, which gives for each carrier k a smooth image S_k(x) = mean of
 L_θ(x)·exp(2πi·k·f_m·α·R·θ), then over carriers, I(x) = Σ_k c_k·S_k(x)·exp(2πi·carrier_k·x). The S_k are band-limited,
 so they are made on a coarse grid and their spectra laid around the carriers; one inverse FFT for each of the four sites
 of the colour mosaic brings back just the pixels that exist.

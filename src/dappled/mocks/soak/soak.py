@@ -144,7 +144,9 @@ def _settle(
     results = Counter(answers.values())
     accepted = mavlink.MAV_RESULT_ACCEPTED
     problems += [
-        f"request {n} was acknowledged but is no shot" for n, r in answers.items() if r == accepted and not shots[n]
+        f"request {n} was acknowledged but did not become a shot"
+        for n, r in answers.items()
+        if r == accepted and not shots[n]
     ]
     problems += [f"request {n} became {count} shots" for n, count in shots.items() if count > 1]
     problems += [f"a shot of request {n}, which was never sent" for n in shots if n not in answers]

@@ -33,7 +33,7 @@ class Troubles:
         self._stream, self._console = settings.publish.slices, settings.console.bind
         self._chance = chance
         self._settings = config.read_text(encoding="utf-8")
-        self._watchers: list[subprocess.Popen[bytes]] = []
+        self._subscribers: list[subprocess.Popen[bytes]] = []
         self._pages: list[socket.socket] = []
         self._full = False
         self.counts: Counter[str] = Counter()
@@ -75,9 +75,9 @@ class Troubles:
         self._simulation.body.fault("clear")
         if self._full:
             self._disk()
-        for watcher in self._watchers:
+        for watcher in self._subscribers:
             _end(watcher)
-        self._watchers.clear()
+        self._subscribers.clear()
         for page in self._pages:
             page.close()
         self._pages.clear()
@@ -117,11 +117,11 @@ class Troubles:
 
     def _watch(self, then: signal.Signals) -> None:
         """Start a subscriber that connects, receives something, and then hangs or dies."""
-        if len(self._watchers) >= 4:
-            _end(self._watchers.pop(0))
+        if len(self._subscribers) >= 4:
+            _end(self._subscribers.pop(0))
         command = [sys.executable, "-m", "dappled", "watch", self._stream, "--timeout", "600"]
         watcher = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-        self._watchers.append(watcher)
+        self._subscribers.append(watcher)
         assert watcher.stdout is not None
         select.select([watcher.stdout], [], [], HEAR_S)
         watcher.send_signal(then)

@@ -110,7 +110,7 @@ def _json(path: Path, attributes: Mapping[str, Any]) -> dict[str, Any]:
             return value.tolist()
         if isinstance(value, os.PathLike):
             return str(value)
-        raise TypeError(f"{type(value).__name__} is no JSON")
+        raise TypeError(f"{type(value).__name__} is not JSON")
 
     try:
         text = json.dumps(dict(attributes), default=plain, allow_nan=False)

@@ -154,8 +154,8 @@ async function post(path, body) {
 }
 
 function tell(answer) {
-  $("told").textContent = answer.ok ? answer.text : answer.error ?? "refused";
-  $("told").dataset.state = answer.ok ? "" : "bad";
+  $("outcome").textContent = answer.ok ? answer.text : answer.error ?? "refused";
+  $("outcome").dataset.state = answer.ok ? "" : "bad";
 }
 
 const next = () => (sequence = (sequence + 1) % 2 ** 31);

@@ -63,11 +63,11 @@ export class Stage {
       $(`tab-${name}`).tabIndex = chosen ? 0 : -1;
     }
     $("panel").setAttribute("aria-labelledby", `tab-${this.tab}`);
-    this.knob();
+    this.showSlider();
   }
 
   // Show the slider only for a frame with views.
-  knob() {
+  showSlider() {
     $("focus").toggleAttribute("data-off", this.tab !== "refocus" || !this.layout);
   }
 
@@ -90,7 +90,7 @@ export class Stage {
   async fall(base, turn, why) {
     if (this.tab === "refocus") {
       this.layout = this.bitmap = null;
-      this.knob();
+      this.showSlider();
       try {
         await this.loadPicture(`${base}mean.jpg`, "mean", turn);
         if (turn === this.turn) $("caption").textContent = `The mean picture. ${why}`;
@@ -115,7 +115,7 @@ export class Stage {
     if (turn !== this.turn) return;
     this.layout = layout;
     this.bitmap = bitmap;
-    this.knob();
+    this.showSlider();
     this.aspect = layout.tile[1] / layout.tile[0];
     show($("empty"), false);
     show($("overlay"), false);
