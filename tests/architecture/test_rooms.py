@@ -47,6 +47,23 @@ def test_a_class_name_means_one_thing() -> None:
     assert not {title: places for title, places in found.items() if len(places) > 1}
 
 
+def test_other_rooms_import_a_face_where_there_is_one() -> None:
+    """What a room's `__init__` hands out is imported from there; and no private name or module leaves its room."""
+    past, private = [], []
+    for module in MODULES:
+        own = module.relative_to(SOURCE).parent.parts
+        for imported, title in _imports(module):
+            place = f"{name(module)}: {'.'.join(imported)}.{title}"
+            room = _room(imported)
+            inside = own[: len(room)] == room or _room(own) == room[: len(own)]
+            if not inside and (title.startswith("_") or any(part.startswith("_") for part in imported)):
+                private.append(place)
+            if not inside and imported != room and title in FACES.get(room, ()):
+                past.append(place)
+    assert past == []
+    assert private == []
+
+
 def test_nothing_is_there_for_tests_only() -> None:
     finder = vulture.Vulture()
     finder.scavenge([str(SOURCE)], exclude=[str(SOURCE / "testing")])
@@ -68,6 +85,34 @@ def test_a_benchmark_calls_what_ships(benchmark: Path) -> None:
     }
     patched = [ast.unparse(node) for node in ast.walk(tree) if _patches(node, imported)]
     assert not patched
+
+
+def _imports(module: Path) -> list[tuple[tuple[str, ...], str]]:
+    """(module below dappled as a tuple, name) of each `from dappled… import name`."""
+    return [
+        (tuple(node.module.split(".")[1:]), alias.name)
+        for node in ast.walk(ast.parse(module.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "dappled"
+        for alias in node.names
+    ]
+
+
+def _room(parts: tuple[str, ...]) -> tuple[str, ...]:
+    """The innermost folder in which a module of this name lies."""
+    return parts if SOURCE.joinpath(*parts).is_dir() else parts[:-1]
+
+
+def _face(folder: Path) -> tuple[str, ...]:
+    for node in ast.parse((folder / "__init__.py").read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            return tuple(ast.literal_eval(node.value))
+    return ()
+
+
+# The face of `drivers` is for third parties; the project itself imports the contract, `drivers.camera`.
+FACES = {
+    folder.relative_to(SOURCE).parts: _face(folder) for folder in FOLDERS if folder not in (SOURCE, SOURCE / "drivers")
+}
 
 
 def _patches(node: ast.AST, imported: set[str]) -> bool:

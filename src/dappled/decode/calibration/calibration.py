@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Sensor
+from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ from dappled.decode.calibration.lattice_fit import FrameLattice, frame_lattice
 from dappled.decode.calibration.law_choice import PLAUSIBLE, judge, steps_bins
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, at_centre, kappa, origin_of, transfer
+from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
 from dappled.decode.optics.carrier_tables import lattice_rotation
-from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Sensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.aperture import relative_transfer
-from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Order, Sensor
+from dappled.decode.optics import LAWS, Carrier, Lattice, Mask, Order, Sensor
+from dappled.decode.spectrum import Spectrum
 from dappled.decode.spectrum.lattice import candidates, find_lattice
 from dappled.decode.spectrum.peaks import FARTHER, Measured, fit, measure, residual_bins
 from dappled.decode.spectrum.slices import extract
-from dappled.decode.spectrum.transform import Spectrum, transform
+from dappled.decode.spectrum.transform import transform
 
 _ALIKE_BINS = 0.5  # rms from their lattice: peaks farther off belong to the scene
 _ENOUGH = 0.6  # of a mask's carriers: a prediction with so many peaks near it is the right one

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Sensor
+from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
 
 EXPLAINED_BINS = 2.0  # rms: the residual that a law may leave (the thesis' own readings scatter by 0 to 2)
 PLAUSIBLE = 0.35  # relative: a mask distance further from the stated one is not believed

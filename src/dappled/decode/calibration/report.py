@@ -11,7 +11,7 @@ import numpy as np
 
 from dappled.decode.calibration.calibration import Calibration, LatticeFit
 from dappled.decode.calibration.law_choice import LawFit, judge, steps_bins
-from dappled.decode.optics.carriers import LAWS, Carrier, Order
+from dappled.decode.optics import LAWS, Carrier, Order
 
 
 @dataclass(frozen=True, slots=True)

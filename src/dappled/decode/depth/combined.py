@@ -17,7 +17,8 @@ from scipy import ndimage
 from dappled.decode.depth import contrast as depth_contrast
 from dappled.decode.depth.depth_map import DepthMap, Search, Volume, box, confidence, judged, peaked, windowed
 from dappled.decode.depth.evidence import Evidence
-from dappled.decode.lightfield.light_field import Image, ViewStack
+from dappled.decode.lightfield import ViewStack
+from dappled.decode.lightfield.light_field import Image
 from dappled.workers import each
 
 _CLEAN, _NOISY = 2.0, 200.0  # contrast's share beside photo-consistency, by noise over texture and its square

@@ -18,7 +18,7 @@ from dappled.decode.depth import combined, contrast, gradient, stereo
 from dappled.decode.depth.depth_map import DepthMap, Search, peaked, windowed
 from dappled.decode.depth.evidence import Evidence
 from dappled.decode.errors import DecodeError
-from dappled.decode.lightfield.light_field import ViewStack
+from dappled.decode.lightfield import ViewStack
 
 METHODS: Mapping[str, Callable[[Evidence, Search], DepthMap]] = {
     "combined": combined.depth,

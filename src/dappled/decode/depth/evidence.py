@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
+from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield.aperture import Aperture
-from dappled.decode.lightfield.light_field import Image, LightField, ViewStack, needs_parallax
+from dappled.decode.lightfield.light_field import Image, needs_parallax
 from dappled.decode.lightfield.views import finest_detail
 
 _LEAST_NOISE = 1e-9  # variance: float32

@@ -15,7 +15,8 @@ from scipy import ndimage
 
 from dappled.decode.depth.depth_map import DepthMap, Search, box, judged, windowed
 from dappled.decode.depth.evidence import Evidence
-from dappled.decode.lightfield.light_field import Image, ViewStack
+from dappled.decode.lightfield import ViewStack
+from dappled.decode.lightfield.light_field import Image
 from dappled.decode.lightfield.refocus import shift_and_add
 from dappled.workers import each
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dappled.decode.depth.depth_map import DepthMap, Map
 from dappled.decode.depth.estimate import WINDOW
 from dappled.decode.errors import DecodeError
-from dappled.decode.lightfield.light_field import ViewStack
+from dappled.decode.lightfield import ViewStack
 
 RANGING = "ranging"  # the attribute of light fields, and the table of calibrations
 _FARTHEST_SIGMAS = 2.0  # a shift that is not clear of infinity by so many standard errors has no distance

@@ -16,7 +16,8 @@ from scipy import ndimage
 from dappled.decode.depth.depth_map import DepthMap, Search
 from dappled.decode.depth.evidence import Evidence
 from dappled.decode.errors import DecodeError
-from dappled.decode.lightfield.light_field import Image, ViewStack
+from dappled.decode.lightfield import ViewStack
+from dappled.decode.lightfield.light_field import Image
 
 _BASE_PX = 8.0  # views are enlarged until the outermost is so many pixels off for a disparity of 1
 _MOST_ENLARGED = 4

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from dappled.decode.optics.carriers import Lattice, Order
+from dappled.decode.optics import Lattice, Order
 
 Shape = Literal["beams", "filled", "round"]
 _PARTS = 15  # of a cell's side, where a circle cuts through cells

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, transfer
-from dappled.decode.optics.carriers import Carrier, Order
+from dappled.decode.optics import Carrier, Order
 
 Views = NDArray[np.float32]
 _SHARED = 1e3  # variance of what all views share, over that of what one view has alone

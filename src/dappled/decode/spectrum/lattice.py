@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from dappled.decode.errors import NoLattice
-from dappled.decode.optics.carriers import Carrier, Lattice, Order
+from dappled.decode.optics import Carrier, Lattice, Order
 from dappled.decode.spectrum.peaks import Measured, fit, is_suspect, lattice_from, measure, residual_bins
 from dappled.decode.spectrum.transform import Spectrum
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.optics.carriers import Carrier, Lattice
+from dappled.decode.optics import Carrier, Lattice
 from dappled.decode.spectrum.transform import Complex, Spectrum, hann
 
 PROMINENCE_NATS = 2.5  # of log magnitude above the median around; the highest of 400 bins of noise reaches 1.1

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from dappled.decode.optics.carriers import Carrier
+from dappled.decode.optics import Carrier
 from dappled.decode.spectrum.peaks import Measured
 
 Look = Literal["magnitude", "phase", "laplacian"]

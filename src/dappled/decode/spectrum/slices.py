@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.optics.carriers import Carrier, Lattice, Window
+from dappled.decode.optics import Carrier, Lattice
+from dappled.decode.optics.carriers import Window
 from dappled.decode.spectrum.transform import TILE, BinRun, Complex, Spectrum, column_runs, in_runs, row_runs
 from dappled.workers import share
 
