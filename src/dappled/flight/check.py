@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled.confined import OutsideError
 from dappled.flight import durable, layout, logs, provenance
 from dappled.flight.errors import FlightError
 from dappled.flight.layout import FlightFolder
@@ -68,10 +69,10 @@ def check(path: Path) -> CheckReport:
 def _files(folder: FlightFolder, ledger: LedgerReader, *, pruned: bool) -> Iterator[tuple[int, str | None]]:
     """(bytes read, problem) for every file that the ledger acknowledges; in a pruned flight it may be gone."""
     for row in ledger.files():
-        path = folder.path / row.name
-        if pruned and not path.exists():
-            continue
         try:
+            path = folder.file(row.name)
+            if pruned and not path.exists():
+                continue
             size = path.stat().st_size
             if size != row.size:
                 yield size, f"{row.name} has {size} bytes, the ledger says {row.size}"
@@ -79,6 +80,8 @@ def _files(folder: FlightFolder, ledger: LedgerReader, *, pruned: bool) -> Itera
                 yield size, f"{row.name} was changed: its SHA-256 is not the ledger's"
             else:
                 yield size, None
+        except OutsideError as error:
+            yield 0, str(error)
         except FileNotFoundError:
             yield 0, f"{row.name} is in the ledger, but the file is missing"
         except OSError as error:

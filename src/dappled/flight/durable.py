@@ -103,7 +103,7 @@ def hash_descriptor(fd: int, size: int) -> str:
 def _put(path: Path, fill: Callable[[int], None]) -> None:
     part = temporary(path)
     try:
-        fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
         try:
             fill(fd)
             os.fsync(fd)

@@ -23,6 +23,9 @@ _REMEDIES = {
     errno.EIO: "the disk reports an input/output error; check the disk (dmesg) or set record.directory to another one",
     errno.ENOTDIR: "a part of this path is a file, not a folder; set record.directory to a folder",
     errno.EEXIST: "a file of this name is in the way; move it or set record.directory to another folder",
+    errno.ELOOP: "a link stands there, and links are not followed; remove it",
+    errno.EMFILE: "too many files are open; close other programs or raise the limit (ulimit -n)",
+    errno.ENFILE: "too many files are open; close other programs",
     errno.ENOENT: "it does not exist; check the path",
     errno.EISDIR: "it is a folder, not a file; check the path",
 }

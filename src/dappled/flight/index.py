@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
+from dappled import confined
 from dappled.flight import layout, logs
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
@@ -97,6 +98,10 @@ class ImageIndex(Database):
         """The entry of an image index; None when no flight has it."""
         rows = self._rows("SELECT idx, flight, frame, state FROM images WHERE idx = ?", index)
         return None if not rows else IndexEntry(rows[0][0], rows[0][1], rows[0][2], cast(ShotState, rows[0][3]))
+
+    def flight(self, name: str) -> FlightFolder:
+        """The folder of a flight in the index. Raises OutsideError for a name that leads out of the flights folder."""
+        return FlightFolder(confined.path(self.root, name, f"the index {self.path}"))
 
     def highest(self) -> int | None:
         """The highest image index in the index, or mentioned by a sealed flight."""

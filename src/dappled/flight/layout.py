@@ -20,6 +20,7 @@ from typing import Any, Self
 
 import tomli_w
 
+from dappled import confined
 from dappled.flight import durable
 from dappled.flight.errors import FlightError, disk_error
 
@@ -60,6 +61,15 @@ class FlightFolder:
     @property
     def frames(self) -> Path:
         return self.path / "frames"
+
+    def file(self, name: str) -> Path:
+        """The path of a file that the ledger names, inside the flight. Raises OutsideError for a name that isn't."""
+        return confined.path(self.path, name, f"the ledger {self.ledger}")
+
+    def refuse_links(self) -> None:
+        """Raise OutsideError where one of the flight's own files, or the folder of frames, is a link."""
+        for own in (self.settings, self.ledger, self.journal, self.telemetry, self.frames):
+            confined.path(self.path, own.name, f"the flight {self.path}")
 
 
 def extension(camera_name: str) -> str:
@@ -120,7 +130,7 @@ def create(root: Path, utc_ns: int | None, facts: Mapping[str, Any] | None = Non
 
 
 def open_folder(path: Path) -> FlightFolder:
-    """Open a recorded flight. Raises FlightError when `path` is not one."""
+    """Open a recorded flight. Raises FlightError when `path` is not one, OutsideError when a part of it is a link."""
     folder = FlightFolder(path)
     try:
         found = path.is_dir() and (folder.ledger.is_file() or folder.settings.is_file())
@@ -129,6 +139,7 @@ def open_folder(path: Path) -> FlightFolder:
     if not found:
         what = "does not exist" if not path.exists() else "is a file" if path.is_file() else "holds no flight.sqlite"
         raise FlightError(f"{path} is not a flight folder (it {what}); give the folder that holds flight.sqlite")
+    folder.refuse_links()
     return folder
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from dappled.confined import OutsideError
 from dappled.flight import durable, layout
 from dappled.flight.errors import disk_error
 from dappled.flight.layout import FlightFolder
@@ -47,7 +48,11 @@ def problems(folder: FlightFolder, ledger: LedgerReader) -> Iterator[str]:
         if not key.startswith(_FACT):
             continue
         name = key.removeprefix(_FACT)
-        path = folder.path / name
+        try:
+            path = folder.file(name)
+        except OutsideError as error:
+            yield str(error)
+            continue
         if path == folder.settings and not path.exists():
             continue
         yield from _problem(path, name, hashes)

@@ -12,8 +12,9 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+from dappled.errors import DappledError
 from dappled.flight import durable, layout, logs
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import disk_error
 from dappled.flight.index import ImageIndex
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, ledger_damage
@@ -42,7 +43,7 @@ def recover(root: Path, index: ImageIndex, utc_ns: Callable[[], int]) -> list[st
         try:
             report += [f"flight {folder.name}: {text}" for text in recover_flight(folder, utc_ns)]
             report += index.take_in(folder, seal=True)
-        except (FlightError, OSError) as error:
+        except (DappledError, OSError) as error:
             report.append(f"flight {folder.name} could not be put in order: {error}")
     return report
 
@@ -50,8 +51,9 @@ def recover(root: Path, index: ImageIndex, utc_ns: Callable[[], int]) -> list[st
 def recover_flight(folder: FlightFolder, utc_ns: Callable[[], int]) -> list[str]:
     """Repair one flight and close it; a second call finds nothing to do. Returns sentences.
 
-    Raises FlightError or OSError when ledger or disk don't allow it.
+    Raises FlightError or OSError when ledger or disk don't allow it, OutsideError when a part of it is a link.
     """
+    folder.refuse_links()
     report = _remove_parts(folder) + _move_damaged_ledger(folder)
     with Ledger(folder.ledger, utc_ns) as ledger:
         report += _add_noted_shots(folder, ledger)
@@ -143,6 +145,9 @@ def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
         if name in known or file_name.endswith(SIDECAR):
             continue
         path = folder.frames / file_name
+        if path.is_symlink():
+            report.append(f"{name} is a link: it is not followed, and is the frame of no shot")
+            continue
         try:
             stat = path.stat()
             sha256 = durable.hash_file(path)

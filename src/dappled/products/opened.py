@@ -217,7 +217,13 @@ class OpenedFlight:
         if self.darkroom is None:
             raise OpenError(f"{self.path} was recorded without a mask: name one, as in dappled.open(path, mask=…)")
         assert line.frame is not None
-        return OpenedFrame(self.path / line.frame.name, self.darkroom, line.tag, line.frame.index, self.focus_m)
+        return OpenedFrame(
+            layout.FlightFolder(self.path).file(line.frame.name),
+            self.darkroom,
+            line.tag,
+            line.frame.index,
+            self.focus_m,
+        )
 
 
 Opened = OpenedLightField | OpenedFrame | OpenedFlight

@@ -21,7 +21,7 @@ from dappled.decode.geometry import Pose, field_of_view
 from dappled.drivers.camera import Identity
 from dappled.drivers.mavlink import Message, mavlink
 from dappled.errors import DappledError, report
-from dappled.flight import FlightFolder, ImageIndex, LedgerReader
+from dappled.flight import ImageIndex, LedgerReader
 
 log = logging.getLogger(__name__)
 ZOOM = "CAM_FOCALLEN"
@@ -270,7 +270,7 @@ def captured_image(index: int, images: ImageIndex) -> Captured | None:
         entry = images.lookup(index)
         if entry is None or entry.state not in ("safe", "failed"):
             return None
-        with LedgerReader.open(FlightFolder(images.root / entry.flight).ledger) as ledger:
+        with LedgerReader.open(images.flight(entry.flight).ledger) as ledger:
             tag = ledger.tag(index)
             ok = entry.state == "safe" or index in ledger.following()
             correction_ns = ledger.utc_correction_ns()

@@ -145,7 +145,7 @@ def bring(
                 companions += 1
             row = ledger.shot(number)
             assert row is not None
-            facts_of = _settings(folder.path / frame.name)
+            facts_of = _settings(folder.file(frame.name))
             exposure = clocks.mid_exposure(_called_utc_ns(row), latency, facts_of.exposure_s)
             exposure, pose = telemetry.pose(number, exposure)
             camera = camera_name(names.get("camera", "auto"), facts_of.model)

@@ -11,6 +11,7 @@ from pathlib import Path
 from time import sleep
 from typing import Self
 
+from dappled import confined
 from dappled.clock import RecordedClock
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_vehicles
@@ -20,7 +21,7 @@ from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import Message, PacketParser
 from dappled.drivers.replay import RecordedShot
 from dappled.errors import DappledError
-from dappled.flight import LIVE, Cause, Frame, LedgerReader, Result, Shot, ShotRow, durable, layout, logs
+from dappled.flight import LIVE, Cause, FlightFolder, Frame, LedgerReader, Result, Shot, ShotRow, durable, layout, logs
 
 FRAME_SUFFIXES = (".raf", ".cr2", ".dng", ".tif", ".tiff", ".png", ".npy", ".nef", ".arw", ".jpg", ".jpeg")
 
@@ -73,7 +74,7 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
                 frozenset(told[index]),
             )
         )
-        files.append(_file(folder, row, frame, told[index].get("doubt")))
+        files.append(_file(flight, row, frame, told[index].get("doubt")))
     if not frames:
         raise ReplayError(f"{folder} holds no frames: there is nothing to replay")
     telemetry = flight.telemetry if flight.telemetry.is_file() else None
@@ -100,7 +101,9 @@ def of_folder(
         utc_ns = start_utc_ns + round(index * interval_s * 1e9)
         shot = Shot(index, Cause("replay", path.name), utc_ns, utc_ns)
         try:
-            frame = Frame(index, path.name, path.name, path.stat().st_size, durable.hash_file(path), utc_ns)
+            name = path.relative_to(folder).as_posix()
+            confined.parts(name, folder, f"the pattern {match!r}")
+            frame = Frame(index, name, path.name, path.stat().st_size, durable.hash_file(path), utc_ns)
         except OSError as error:
             raise ReplayError(f"{path} can't be read: {error.strerror}") from None
         shots.append(shot)
@@ -229,14 +232,14 @@ def verifier(recording: RecordedFlight, keep: Callable[[Result], object] | None 
     return ReplayVerifier(recording.root, recording.expected, keep)
 
 
-def _file(folder: Path, row: ShotRow, frame: Frame | None, doubt: str | None) -> RecordedShot:
+def _file(folder: FlightFolder, row: ShotRow, frame: Frame | None, doubt: str | None) -> RecordedShot:
     called, returned = row.fired_called_monotonic_ns, row.fired_returned_monotonic_ns
     fired = None if called is None or returned is None else (called, returned)
     if frame is None:
         return RecordedShot(row.shot.index, None, "", fired, reason=row.reason or "no frame was recorded")
     arrived_ns = frame.arrived_utc_ns - row.shot.wished_utc_ns + row.shot.wished_monotonic_ns
     facts = {} if doubt is None else {"doubt": doubt}
-    return RecordedShot(row.shot.index, folder / frame.name, frame.camera_name, fired, arrived_ns, facts=facts)
+    return RecordedShot(row.shot.index, folder.file(frame.name), frame.camera_name, fired, arrived_ns, facts=facts)
 
 
 def _recorded(digests: dict[int, tuple[str, str]], index: int) -> str | None:

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.recipes import Names
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.darkroom import FILES, Recipe
 from dappled.errors import DappledError
 from dappled.flight import LIVE, Ledger, LedgerReader, Result, layout, provenance
 
@@ -88,5 +88,7 @@ def _relative(recipe: Recipe, flight: Path) -> dict[str, Any]:
 
 
 def _absolute(values: Mapping[str, Any], flight: Path) -> dict[str, str]:
-    inside = f"{recipes.FOLDER}/"
-    return {k: str(flight / v) for k, v in values.items() if isinstance(v, str) and v.startswith(inside)}
+    """The files of a recipe, inside the flight. Raises OutsideError for one that leads out of it."""
+    folder = layout.FlightFolder(flight)
+    profiles = {name for name in ("camera", "mask") if str(values.get(name, "")).endswith(".toml")}
+    return {name: str(folder.file(values[name])) for name in {*FILES, *profiles} if values.get(name)}

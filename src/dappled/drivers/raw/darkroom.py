@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import confined
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode import DecodeError
@@ -112,12 +113,17 @@ def of_flight(flight: Path, facts: Mapping[str, Any], overrides: Mapping[str, An
 
 
 def _kept(named: str, folder: Path, name: str) -> str:
-    return str(folder / f"{name}{Path(named).suffix}") if named else ""
+    return str(_inside(folder, f"{name}{Path(named).suffix}")) if named else ""
 
 
 def _kept_profile(profile: str, folder: Path, kind: str) -> str:
-    copy = folder / kind / f"{Path(profile).stem}.toml"
+    copy = _inside(folder, f"{kind}/{Path(profile).stem}.toml")
     return str(copy) if copy.is_file() else profile
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """A file of the flight's own inputs. Raises OutsideError where a link leads out of them."""
+    return confined.path(folder.parent, f"{folder.name}/{name}", f"the flight {folder.parent}")
 
 
 @lru_cache(maxsize=64)  # each frame asks, and finding a model reads every profile

@@ -20,7 +20,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
-from dappled import __version__
+from dappled import __version__, confined
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError, sentence
 from dappled.flight import Frame, Tag, canonical, durable
@@ -305,7 +305,8 @@ class Manifest:
         done = self.done.get(key)
         if done is None or done.error is not None:
             return False
-        return all(_size(self.path.parent / one.name) == one.size for one in done.outputs)
+        folder, where = self.path.parent, f"the manifest {self.path}"
+        return all(_size(confined.path(folder, one.name, where)) == one.size for one in done.outputs)
 
     def _read(self) -> dict[str, Done]:
         text = b""

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import confined
 from dappled.decode.lightfield import LightField
 from dappled.errors import DappledError
 from dappled.flight import durable
@@ -133,6 +134,7 @@ def _save_zarr(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
 
 def _load_zarr(path: Path) -> tuple[_Arrays, dict[str, Any]]:
     zarr = _zarr(path)
+    confined.refuse_links(path, f"the light field {path}")
     group = zarr.open_group(store=path, mode="r")
     arrays: _Arrays = {}
     for name in _ARRAYS:
@@ -163,7 +165,15 @@ def _save_h5(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
 
 
 def _load_h5(path: Path) -> tuple[_Arrays, dict[str, Any]]:
-    with _h5py(path).File(path, "r") as file:
+    h5py = _h5py(path)
+    with h5py.File(path, "r") as file:
+        for name in _ARRAYS:
+            link = file.get(name, getlink=True)
+            elsewhere = link is not None and not isinstance(link, h5py.HardLink)
+            if elsewhere or (link is not None and (file[name].is_virtual or file[name].external)):
+                raise LightFileError(
+                    f"{path}: {name} stands in another file, which is not followed; use a file that holds it itself"
+                )
         return {name: np.asarray(file[name]) for name in _ARRAYS}, json.loads(file.attrs[_ATTRIBUTES])
 
 

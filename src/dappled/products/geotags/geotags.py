@@ -75,21 +75,21 @@ def write(
     """Write sidecars beside the frames, and geo.txt, pix4d.csv and track.geojson into `<flight>/geotags/`; or all of
     them into `output`. Raises FlightError, SidecarError and EarthError."""
     placed, without_tag = read(flight, mounting, geoid)
-    folder = output or flight / "geotags"
-    _make(folder)
-    files = []
-    for one in placed:
-        beside = folder / one.file_name if output else flight / one.frame.name
-        path = sidecars.path_of(beside, replace_extension=replace_extension)
-        sidecars.write(path, sidecars.text(one.tag, one.camera, one.utc_ns), force=force)
-        files.append(path)
+    inside = layout.FlightFolder(flight)
     forms: dict[str, Callable[[Sequence[Placed]], str]] = {
         "geo.txt": odm,
         "pix4d.csv": pix4d,
         "track.geojson": geojson,
     }
-    for name, form in forms.items():
-        path = folder / name
+    frames = [inside.file(one.frame.name) for one in placed]  # every name is looked at before a file is written
+    lists = [output / name if output else inside.file(f"geotags/{name}") for name in forms]
+    _make(lists[0].parent)
+    files = []
+    for one, frame in zip(placed, frames, strict=True):
+        path = sidecars.path_of(output / frame.name if output else frame, replace_extension=replace_extension)
+        sidecars.write(path, sidecars.text(one.tag, one.camera, one.utc_ns), force=force)
+        files.append(path)
+    for path, form in zip(lists, forms.values(), strict=True):
         _write(path, form(placed).encode())
         files.append(path)
     lost = tuple(one.frame.name for one in placed if one.camera is None)
@@ -106,8 +106,9 @@ def copies(
     if folder.resolve().is_relative_to(flight.resolve()):
         raise FlightError(f"cannot write copies into the flight itself ({folder}): give another folder")
     placed, without_tag = read(flight, mounting, geoid)
+    originals = [layout.FlightFolder(flight).file(one.frame.name) for one in placed]
     _make(folder)
-    for one in placed:
+    for one, original in zip(placed, originals, strict=True):
         if one.camera is None:
             yield one.frame.name, "its position is not known"
             continue
@@ -118,9 +119,9 @@ def copies(
             satellites=gnss.satellites if gnss else None,
         )
         try:
-            made = exif_gps.tagged((flight / one.frame.name).read_bytes(), where)
+            made = exif_gps.tagged(original.read_bytes(), where)
         except OSError as error:
-            raise disk_error("read", flight / one.frame.name, error) from error
+            raise disk_error("read", original, error) from error
         except ExifError as error:
             yield one.frame.name, str(error)
             continue

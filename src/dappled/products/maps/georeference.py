@@ -13,7 +13,7 @@ import numpy as np
 
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import DappledError
-from dappled.flight import Frame, Tag
+from dappled.flight import FlightFolder, Frame, Tag
 from dappled.products.maps import map_grid, photographs, references, refine
 from dappled.products.maps.earth import Geoid, Projection, utm
 from dappled.products.maps.eye import EyeError
@@ -182,7 +182,7 @@ def refined(
 def develop(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, options: Options) -> DecodeResult:
     """Decode one frame of a flight. Raises DappledError."""
     return darkroom.decode(
-        flight / frame.name,
+        FlightFolder(flight).file(frame.name),
         focal_length_mm=options.focal_length_mm or (tag.focal_length_mm if tag else None),
         f_number=options.f_number or (tag.f_number if tag else None),
     )
