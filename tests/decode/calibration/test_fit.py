@@ -101,7 +101,7 @@ def test_bad_frames_and_files_are_refused_in_words() -> None:
         attempt(CalibrationFrame(noise[:100], FOCAL_MM, STOPPED_F))
     good = _calibrate(Camera.hidden(1)).to_dict()
     for broken, words in (
-        ({}, "no calibration"),
+        ({}, "not a calibration"),
         ({**good, "law": "none"}, "known are"),
         ({**good, "fits": []}, "transfer"),
         ({k: v for k, v in good.items() if k != "mask"}, "incomplete"),
