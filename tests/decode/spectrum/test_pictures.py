@@ -57,8 +57,8 @@ def test_the_four_bins_around_a_carrier_between_bins_show_the_thesis_s_pattern()
     wave = _wave(shape, *at, centre)
     strength = around(wave, at, bins=8, longest_side=80, look="magnitude")[5::10, 5::10, 0].astype(int)
     rows, columns = np.unravel_index(np.argsort(strength.ravel())[-4:], strength.shape)
-    top, left = rows.min(), columns.min()
-    assert (rows.max() - top, columns.max() - left) == (1, 1)
+    top, left = int(rows.min()), int(columns.min())
+    assert (int(rows.max()) - top, int(columns.max()) - left) == (1, 1)
     green = around(wave, at, bins=8, longest_side=80)[5::10, 5::10, 1].astype(int)[top : top + 2, left : left + 2]
     assert abs(green[0, 0] - green[1, 1]) < 40
     assert abs(green[0, 1] - green[1, 0]) < 40
