@@ -33,12 +33,20 @@ class Statistics:
 
 
 class Loop:
-    """One daemon thread that calls `run` once; `run` returns soon after `stopping` is set."""
+    """One daemon thread that calls `run` once; `run` returns soon after `stopping` is set.
 
-    def __init__(self, name: str, run: Callable[[], None]) -> None:
+    Loops that end together may share `stopping`.
+    """
+
+    def __init__(self, name: str, run: Callable[[], None], stopping: threading.Event | None = None) -> None:
         self.name = name
-        self.stopping = threading.Event()
+        self.stopping = stopping or threading.Event()
         self._thread = threading.Thread(target=run, name=name, daemon=True)
+
+    @property
+    def begun(self) -> bool:
+        """Whether it was started; it may have ended since."""
+        return self._thread.ident is not None
 
     def start(self) -> None:
         """Start the thread."""
@@ -53,8 +61,8 @@ class Loop:
 
     def dead_threads(self) -> list[str]:
         """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
-        begun = self._thread.ident is not None
-        return [self.name] if begun and not self._thread.is_alive() and not self.stopping.is_set() else []
+        ended = self.begun and not self._thread.is_alive()
+        return [self.name] if ended and not self.stopping.is_set() else []
 
 
 class Worker(Loop, Generic[Item]):

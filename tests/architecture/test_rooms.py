@@ -23,6 +23,12 @@ UNUSED = {
     "collect": "prometheus_client calls it",
 }
 
+# What may make a thread besides `workers.Loop`, and why.
+THREADS = {
+    "workers.py": "`Loop` is one, and `share` joins its helpers without a limit of time",
+    "flight/logs.py": "closing a log waits for its last fdatasync without a limit of time, which `Loop.stop` has",
+}
+
 
 def name(path: Path) -> str:
     return str(path.relative_to(SOURCE))
@@ -71,6 +77,21 @@ def test_nothing_is_there_for_tests_only() -> None:
     unused = {item.name for item in finder.get_unused_code() if item.typ in kinds}
     assert unused - set(UNUSED) == set()
     assert set(UNUSED) - unused == set(), "these are used by now: strike them from the list"
+
+
+def test_threads_are_loops() -> None:
+    """So that each has a name, an end, and a place in `dead_threads`."""
+    made = {name(module) for module in MODULES if "Thread(" in _calls(module)}
+    assert made - set(THREADS) == set()
+    assert set(THREADS) - made == set(), "these make none by now: strike them from the list"
+
+
+def _calls(module: Path) -> set[str]:
+    """The last words of what a module calls: {"Thread(", "start(", …}."""
+    called = [
+        node.func for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)
+    ]
+    return {f"{ast.unparse(each).rpartition('.')[2]}(" for each in called}
 
 
 @pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda path: path.stem)

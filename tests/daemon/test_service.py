@@ -256,6 +256,21 @@ def test_a_viewer_s_thread_that_dies_is_told_and_ends_no_flight(
         service.stop()
 
 
+def test_a_camera_driver_s_thread_that_dies_is_reported(
+    settings: Settings, camera: FakeCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dead: list[str] = []
+    monkeypatch.setattr(camera, "dead_threads", lambda: dead, raising=False)
+    service = started(settings, [])
+    try:
+        assert service.healthy()
+        dead.append("gphoto2")
+        assert not service.healthy()
+        assert "the gphoto2 thread has ended: restart dappled" in service.health()["problems"]
+    finally:
+        service.stop()
+
+
 def test_every_turn_or_at_its_own_pace() -> None:
     done: list[str] = []
     tasks = [

@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, cast, runtime_checkable
 
 import dappled
 from dappled.clock import Clock, SystemClock
@@ -25,6 +25,7 @@ from dappled.daemon import flight_handover
 from dappled.daemon.camera_protocol.component import Component
 from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters
 from dappled.daemon.console import process as console_process
+from dappled.daemon.console.process import Console
 from dappled.daemon.flight_control import FlightControl
 from dappled.daemon.flight_handover import FlightHandover, LiveSettings
 from dappled.daemon.health import record as health
@@ -61,8 +62,9 @@ _LOOK_S = 0.02
 _STOP_S = 5.0
 
 
+@runtime_checkable
 class HasThreads(Protocol):
-    """A part with threads."""
+    """A part with threads. A camera driver may be one."""
 
     def dead_threads(self) -> list[str]:
         """The threads that have ended without having been stopped."""
@@ -85,6 +87,7 @@ class Service:
         after: FlightHandover | None = None,
     ) -> None:
         self.console_url = ""
+        self._console: Console | None = None
         self._settings = LiveSettings(settings)
         self._outside, self._after = observer or Observer(), after
         self._clock = clock or SystemClock()
@@ -115,7 +118,9 @@ class Service:
             if door:
                 self.console_url = door.url
                 act = partial(console_process.answer, shutter=self._shutter, logbook=self._logbook)
-                console_process.start(door, settings, stack, recipe=recipe, act=act, logbook=self._logbook)
+                self._console = console_process.start(
+                    door, settings, stack, recipe=recipe, act=act, logbook=self._logbook
+                )
             self._started = True
             self._stack = stack.pop_all()
         for text in self._recording.recovered:
@@ -209,7 +214,8 @@ class Service:
             preview_interval_s=settings.publish.preview_interval_s,
         )
         self._answers = Answers(writer, self._decoder, shots.wait_decoded)
-        self._vital: tuple[HasThreads, ...] = (self._pipeline, self._links, self._shutter)
+        driver = (camera,) if isinstance(camera, HasThreads) else ()
+        self._vital: tuple[HasThreads, ...] = (self._pipeline, self._links, self._shutter, *driver)
         self._tasks = self._periodic_tasks()
 
     def _parameters(self, camera: Camera, names: Names, *, decodes: bool) -> Parameters:
@@ -314,7 +320,7 @@ class Service:
         viewers: list[HasThreads] = [
             self._publisher,
             self._answers,
-            *([self._depth] if self._depth is not None else []),
+            *(part for part in (self._depth, self._console) if part is not None),
         ]
         doubts = (self._component.doubt(), navigation.utc.doubt(), self._events.doubt)
         return health.record(

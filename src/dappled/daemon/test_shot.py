@@ -18,6 +18,7 @@ from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import Service
 from dappled.errors import DappledError
+from dappled.workers import Loop
 
 READY_S = 20.0
 END_S = 60.0
@@ -56,13 +57,13 @@ def daemon(settings: Settings, sockets: Path, record: Path) -> Iterator[TestShot
     ended = EndedShots()
     service = Service(ours, observer=ended)
     service.start()
-    loop = threading.Thread(target=service.run, name="test shot")
+    loop = Loop("test shot", service.run)
     loop.start()
     try:
         yield TestShot(service, ended)
     finally:
         service.ask_to_stop()
-        loop.join(5)
+        loop.stop(5)
         service.stop()
 
 

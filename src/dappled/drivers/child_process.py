@@ -18,11 +18,13 @@ import socket
 import struct
 import subprocess
 import sys
-import threading
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
+
+from dappled.workers import Loop
 
 _MESSAGE_BYTES = 65536
 _FDS = 4
@@ -214,7 +216,7 @@ def end_with_parent(parent: int) -> None:
         watched = os.pidfd_open(parent)
     except OSError:
         sys.exit(0)  # it has already ended
-    threading.Thread(target=_exit_after, args=[watched], name="parent", daemon=True).start()
+    Loop("parent", partial(_exit_after, watched)).start()
 
 
 def _exit_after(pidfd: int) -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import secrets
 import shutil
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -23,8 +22,10 @@ from dappled.drivers.camera import CameraError, Identity, check_options, seconds
 from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.sources import FolderSource
 from dappled.mocks.body.body import BodyOptions, exposer
+from dappled.workers import Worker
 
 _HOLD_S = 0.02
+_WAITING = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +70,7 @@ class Exposing:
         self._options, self._card = options, card
         self._expose: Callable[[int, int], tuple[bytes, str]] | None = None
         self._taken = 0
-        self._at_work: threading.Thread | None = None
+        self._exposures: Worker[tuple[int, int]] | None = None
 
     def open(self) -> None:
         """See ShutterLine."""
@@ -78,17 +79,18 @@ class Exposing:
             self._card.mkdir(mode=0o700, exist_ok=True)
         except (ValueError, OSError) as error:
             raise CameraError(f"the simulated camera can't start: {error}") from None
+        if self._exposures is None:
+            self._exposures = Worker("exposure", self._take, capacity=_WAITING)
+            self._exposures.start()
 
     def press(self) -> None:
         """See ShutterLine."""
+        assert self._exposures is not None
         self._taken += 1
-        work = (time.monotonic_ns(), self._taken, self._at_work)
-        self._at_work = threading.Thread(target=self._take, args=work, name="exposure", daemon=True)
-        self._at_work.start()
+        self._exposures.put((time.monotonic_ns(), self._taken))
 
-    def _take(self, pressed_ns: int, number: int, before: threading.Thread | None) -> None:
-        if before is not None:
-            before.join()
+    def _take(self, exposure: tuple[int, int]) -> None:
+        pressed_ns, number = exposure
         assert self._expose is not None
         data, extension = self._expose(pressed_ns, number)
         target = self._card / f"SIM_{number:04d}.{extension.upper()}"
@@ -104,4 +106,7 @@ class Exposing:
 
     def close(self) -> None:
         """See ShutterLine: files that are open stay readable."""
+        exposures, self._exposures = self._exposures, None
+        if exposures is not None:
+            exposures.stop(0.0)
         shutil.rmtree(self._card, ignore_errors=True)

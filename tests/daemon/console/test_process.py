@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import socket
 import subprocess
@@ -24,7 +25,8 @@ from dappled.daemon.console.process import Console, ConsoleError
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.daemon.stream.curve import KeyFileError
-from tests.daemon.fakes import FakeSink, Rig, rig
+from dappled.drivers.child_process import RestartBudget
+from tests.daemon.fakes import FakeSink, Rig, eventually, rig
 
 TOKEN = "a-token-of-many-letters"  # noqa: S105  # it opens nothing
 
@@ -130,6 +132,27 @@ def test_a_console_that_dies_is_started_again_and_the_socket_stays(tmp_path: Pat
     assert running(console) is None
     with pytest.raises(httpx.ConnectError):
         httpx.get(url, trust_env=False)
+
+
+def test_a_console_that_keeps_dying_is_not_started_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    begun: list[int] = []
+
+    def die(*_arguments: Any, **_options: Any) -> None:
+        begun.append(1)
+        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+
+    monkeypatch.setattr(subprocess, "Popen", die)
+    listener, _ = process.listen(ConsoleSettings(bind="127.0.0.1:0"))
+    console = Console(listener, setup(tmp_path), lambda _: {}, RestartBudget(2, 3600.0))
+    console.start()
+    try:
+        eventually(lambda: "too often; the next attempt is in 3600 s" in caplog.text, "it waits")
+        assert len(begun) == 2
+        assert console.dead_threads() == []
+    finally:
+        console.stop()
 
 
 def test_an_answer_that_fails_ends_one_process_and_not_the_console(tmp_path: Path) -> None:

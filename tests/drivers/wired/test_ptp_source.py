@@ -50,5 +50,5 @@ class TestContractOfAWireAndPtp(CameraContract):
             camera = ComposedCamera(identity, Wire(body), PtpSource(body.port), plan)
             yield Rig(camera, partial(pattern, size=SIZE), loose=True, follows=True)
             camera.stop()
-            if camera._pick_thread.ident is not None:
-                camera._pick_thread.join(_PATIENCE_S)  # it may be at the camera still
+            for loop in camera._loops:
+                loop.stop(_PATIENCE_S)  # it may be at the camera still

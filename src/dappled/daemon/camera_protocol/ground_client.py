@@ -12,6 +12,7 @@ from pathlib import Path
 from dappled.clock import SystemClock
 from dappled.drivers.mavlink import MavlinkLinks, Message, Packet, mavlink, open_signing
 from dappled.errors import DappledError
+from dappled.workers import Loop
 
 ACK_S = 0.5
 ACK_TRIES = 4
@@ -60,8 +61,7 @@ class GroundClient:
         self._changed = threading.Condition()
         self._heard: deque[Message] = deque(maxlen=_KEPT)
         self._camera: tuple[int, int] | None = None
-        self._stop = threading.Event()
-        self._heart = threading.Thread(target=self._beat, name="ground heartbeat", daemon=True)
+        self._heart = Loop("ground heartbeat", self._beat)
         self._sequence = time.time_ns() // 10**8 % 2**23  # differs from a run just before; exact as a float
 
     def __enter__(self) -> GroundClient:
@@ -70,8 +70,7 @@ class GroundClient:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._heart.join(2.0)
+        self._heart.stop(2.0)
         self._links.stop()
 
     @property
@@ -137,7 +136,7 @@ class GroundClient:
             outcomes.append(outcome)
             on_outcome(outcome)
             if len(outcomes) < count:
-                self._stop.wait(max(0.0, began + interval_s - time.monotonic()))
+                self._heart.stopping.wait(max(0.0, began + interval_s - time.monotonic()))
         return outcomes
 
     def _capture_one(self, expected: int, timeout_s: float) -> Outcome:
@@ -192,13 +191,13 @@ class GroundClient:
             self._changed.notify_all()
 
     def _beat(self) -> None:
-        while not self._stop.is_set():
+        while not self._heart.stopping.is_set():
             self._links.send(
                 mavlink.MAVLink_heartbeat_message(
                     mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
                 )
             )
-            self._stop.wait(1.0)
+            self._heart.stopping.wait(1.0)
 
 
 class _Listening:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import socket
@@ -10,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -24,12 +22,13 @@ from dappled.daemon.pipeline.repeats import CaptureRequest
 from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
 from dappled.daemon.stream.curve import read_private
 from dappled.daemon.stream.sockets import is_loopback
-from dappled.drivers.child_process import ChannelError, ProcessChannel
+from dappled.drivers.child_process import ChannelError, ProcessChannel, RestartBudget, end_child
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
+from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
-RESTARTS, RESTART_WINDOW_S = 5, 60.0
+_STOP_S, _END_S = 5.0, 2.0
 _BACKLOG = 32
 _TOKEN_CHARACTERS = 12
 _ANSWER_S = 3.0
@@ -95,32 +94,34 @@ class Console:
     stays open meanwhile, so that browsers wait instead of failing.
     """
 
-    def __init__(self, listener: socket.socket, setup: Mapping[str, Any], act: Act) -> None:
+    def __init__(
+        self, listener: socket.socket, setup: Mapping[str, Any], act: Act, budget: RestartBudget | None = None
+    ) -> None:
         self._listener, self._setup, self._act = listener, setup, act
-        self._stopping = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
-        self._begun: deque[float] = deque(maxlen=RESTARTS)
-        self._thread = threading.Thread(target=self._run, name="console", daemon=True)
+        self._budget = budget or RestartBudget(limit=5, window_s=60.0)
+        self._loop = Loop("console", self._run)
 
     def start(self) -> None:
         """Start the process."""
-        self._thread.start()
+        self._loop.start()
 
     def stop(self) -> None:
         """End the process, and close the listening socket."""
-        self._stopping.set()
-        if self._thread.is_alive():
-            self._thread.join(5)
+        self._loop.stop(_STOP_S)
         self._listener.close()
 
+    def dead_threads(self) -> list[str]:
+        """See `Loop.dead_threads`."""
+        return self._loop.dead_threads()
+
     def _run(self) -> None:
-        while not self._stopping.is_set():
-            if len(self._begun) == RESTARTS and time.monotonic() - self._begun[0] < RESTART_WINDOW_S:
-                log.warning("the console's process ended five times in a minute: it starts again in a minute")
-                self._stopping.wait(RESTART_WINDOW_S)
-                self._begun.clear()
+        while not self._loop.stopping.is_set():
+            if wait_ns := self._budget.wait_ns(time.monotonic_ns()):
+                log.warning("the console's process ended too often; the next attempt is in %.0f s", wait_ns / 1e9)
+                self._loop.stopping.wait(wait_ns / 1e9)
                 continue
-            self._begun.append(time.monotonic())
+            self._budget.spend(time.monotonic_ns())
             try:
                 self._serve()
             except Exception as error:  # noqa: BLE001  # it is started again in any case, at most five times a minute
@@ -128,37 +129,28 @@ class Console:
 
     def _serve(self) -> None:
         channel, there = ProcessChannel.pair()
-        with there:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "dappled.daemon.console", str(there.fileno()), str(self._listener.fileno())],
-                pass_fds=[there.fileno(), self._listener.fileno()],
-                stdin=subprocess.DEVNULL,
-                # One thread for its arithmetic: the other cores are for the flight.
-                env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-            )
         try:
+            with there:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", "dappled.daemon.console", str(there.fileno()), str(self._listener.fileno())],
+                    pass_fds=[there.fileno(), self._listener.fileno()],
+                    stdin=subprocess.DEVNULL,
+                    # One thread for its arithmetic: the other cores are for the flight.
+                    env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+                )
             channel.send(self._setup, timeout_s=5.0)
-            while not self._stopping.is_set():
+            while not self._loop.stopping.is_set():
                 question = channel.receive(0.2)
                 if question is not None:
                     channel.send({**self._act(question.body), "number": question.body.get("number")})
         except ChannelError as error:
-            if not self._stopping.is_set():
+            if not self._loop.stopping.is_set():
                 log.warning("the console ended: %s", error)
         finally:
             channel.close()  # this ends the process
-            self._reap()
-
-    def _reap(self) -> None:
-        process, self._process = self._process, None
-        if process is None:
-            return
-        for end in (None, process.terminate, process.kill):
-            if end is not None:
-                end()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(2.0)
-                return
+            process, self._process = self._process, None
+            if process is not None:
+                end_child(process, _END_S)
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +179,7 @@ def open_listener(settings: Settings, stack: ExitStack) -> ConsoleListener | Non
 
 def start(
     opened: ConsoleListener, settings: Settings, stack: ExitStack, *, recipe: Recipe | None, act: Act, logbook: Logbook
-) -> None:
+) -> Console:
     """Start the console; the stack ends it. `recipe` is how frames are decoded."""
     publish = settings.publish
     setup = {
@@ -205,6 +197,7 @@ def start(
     console = Console(opened.listener, setup, act)
     console.start()
     stack.callback(console.stop)
+    return console
 
 
 class DaemonChannel:

@@ -23,6 +23,7 @@ from dappled.drivers.child_process import ChannelError, ChannelMessage, ProcessC
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import Result
+from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
 NICENESS = 10
@@ -124,7 +125,7 @@ class DecodeProcess:
 
     def begin_warm_up(self) -> None:
         """The same in a thread of its own; what goes wrong is told in the log."""
-        threading.Thread(target=self._warm_up, name="decoder warm-up", daemon=True).start()
+        Loop("decoder warm-up", self._warm_up).start()
 
     def _warm_up(self) -> None:
         try:

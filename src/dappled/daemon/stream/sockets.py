@@ -20,6 +20,7 @@ from zmq.utils.monitor import recv_monitor_message
 from dappled.daemon.stream import curve
 from dappled.daemon.stream.curve import ServerKeys
 from dappled.daemon.stream.wire import WireError
+from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
 NICENESS = 12  # below the decoder's 10
@@ -29,6 +30,7 @@ ROOM_BYTES = (
 )  # of kernel memory for a reader over ipc: the default of 208 kB makes both ends wait for each other
 _HEARTBEAT_MS, _DEAF_MS = 5_000, 30_000  # a peer that reads nothing for so long is disconnected; it may come again
 _PATH_BYTES = 107  # of sockaddr_un
+_BEGIN_S = 10.0
 
 
 class Sockets:
@@ -176,9 +178,9 @@ def niced_context() -> zmq.Context[Any]:
         os.setpriority(os.PRIO_PROCESS, me, os.getpriority(os.PRIO_PROCESS, me) + NICENESS)
         made.socket(zmq.PAIR).close()
 
-    starter = threading.Thread(target=begin, name="publisher context")
+    starter = Loop("publisher context", begin)
     starter.start()
-    starter.join()
+    starter.stop(_BEGIN_S)
     return made
 
 

@@ -35,6 +35,7 @@ from dappled.drivers.camera import (
 from dappled.drivers.child_process import ChannelError, ProcessChannel, RestartBudget, end_child, start_child
 from dappled.drivers.gphoto2.messages import LATE_LIMIT, Carryover, message_event
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
+from dappled.workers import Loop
 
 _PING_S = 1.0
 _STOP_S = 1.2
@@ -72,8 +73,7 @@ class GPhoto2Camera(QueuedCamera):
         self._spawn = spawn
         self._clock = clock or SystemClock()
         self._budget = budget or RestartBudget(limit=5, window_s=60.0)
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._supervise, name="gphoto2", daemon=True)
+        self._loop = Loop("gphoto2", self._supervise)
         self._lock = threading.Lock()  # guards the next three
         self._channel: ProcessChannel | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -84,9 +84,9 @@ class GPhoto2Camera(QueuedCamera):
 
     def start(self) -> None:
         """Start the camera's process. Raises CameraError when called twice."""
-        if self._thread.ident is not None:
+        if self._loop.begun:
             raise CameraError("this camera was started before: open another one")
-        self._thread.start()
+        self._loop.start()
 
     def fire(self, shot: int) -> None:
         """Send the shot to the process: one socket write in the caller's thread."""
@@ -136,28 +136,31 @@ class GPhoto2Camera(QueuedCamera):
 
     def stop(self) -> None:
         """Ask the process to end, and kill it after 1.2 s. Shots that had not ended fail."""
-        self._stopping.set()
+        self._loop.stopping.set()
         with self._lock, contextlib.suppress(ChannelError):  # it is killed below
             if self._channel is not None:
                 self._channel.send({"do": "stop"})
-        if self._thread.ident is None:
+        if self._loop.stop(_STOP_S):
             return
-        self._thread.join(_STOP_S)
         with self._lock:
             if self._process is not None:
                 self._process.kill()
-        self._thread.join(_KILL_S)
+        self._loop.stop(_KILL_S)
+
+    def dead_threads(self) -> list[str]:
+        """See `Loop.dead_threads`."""
+        return self._loop.dead_threads()
 
     # --- the supervising thread
 
     def _supervise(self) -> None:
-        while not self._stopping.is_set():
+        while not self._loop.stopping.is_set():
             try:
                 process, channel = self._spawn(self._settings, self._carryover)
             except OSError as error:  # no memory, no descriptors: may pass
                 reason = f"the camera's process can't be started: {error.strerror}"
                 self.report(StateChanged("faulted", reason, self._clock.monotonic_ns()))
-                self._stopping.wait(_SPAWN_S)
+                self._loop.stopping.wait(_SPAWN_S)
                 continue
             with self._lock:
                 self._process, self._channel = process, channel
@@ -169,7 +172,7 @@ class GPhoto2Camera(QueuedCamera):
             self._carryover = replace(self._carryover, late=(*self._carryover.late, *fired)[-LATE_LIMIT:])
             channel.close()
             end_child(process)
-            stopped = self._stopping.is_set()
+            stopped = self._loop.stopping.is_set()
             for shot in pending:
                 self.report(
                     ShotFailed(shot, "the camera was stopped" if stopped else reason, self._clock.monotonic_ns())
@@ -185,7 +188,7 @@ class GPhoto2Camera(QueuedCamera):
         answer_s = self._settings.timeouts.answer_s
         try:
             while True:
-                if self._stopping.is_set():
+                if self._loop.stopping.is_set():
                     channel.send({"do": "stop"})  # again: the process may have begun after `stop` sent it
                 message = channel.receive(_PING_S)
                 now_ns = self._clock.monotonic_ns()
@@ -246,5 +249,5 @@ class GPhoto2Camera(QueuedCamera):
         if wait_ns:
             reason = f"the camera's process ended too often; the next attempt is in {wait_ns / 1e9:.0f} s"
             self.report(StateChanged("faulted", reason, now_ns))
-            self._stopping.wait(wait_ns / 1e9)
+            self._loop.stopping.wait(wait_ns / 1e9)
         self._budget.spend(self._clock.monotonic_ns())

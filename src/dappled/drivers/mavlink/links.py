@@ -7,7 +7,7 @@ import select
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 from operator import or_
 from typing import Any, Protocol
 
@@ -16,6 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from dappled.clock import Clock
 from dappled.drivers.mavlink.channels import Address, ByteChannel, LinkError, open_channel, parse
 from dappled.drivers.mavlink.signing import SignatureGuard, Signing, SigningError, SigningStatistics
+from dappled.workers import Loop
 
 # `mavlink` holds the message classes, for the whole project: version 2 on the wire, and ArduPilot's dialect, which
 # contains `common`.
@@ -288,7 +289,7 @@ class MavlinkLinks:
         guards = signing.guards if signing else [None] * len(urls)
         pairs = zip(urls, guards, strict=True)
         self._links = [Link(number, parse(url), guard) for number, (url, guard) in enumerate(pairs)]
-        self._threads: list[threading.Thread] = []
+        self._loops: list[Loop] = []
 
     def open(self) -> None:
         """Open all links, without receiving yet.
@@ -316,20 +317,17 @@ class MavlinkLinks:
         self.open()
         self._sink = sink
         for link in self._links:
-            thread = threading.Thread(target=self._receive, args=(link,), name=f"mavlink {link.number}", daemon=True)
-            self._threads.append(thread)
-            thread.start()
+            self._loops.append(Loop(f"mavlink {link.number}", partial(self._receive, link), self._stop))
         if self._signing_time is not None:
-            thread = threading.Thread(target=self._keep_signing_time, name="mavlink signing", daemon=True)
-            self._threads.append(thread)
-            thread.start()
+            self._loops.append(Loop("mavlink signing", self._keep_signing_time, self._stop))
+        for loop in self._loops:
+            loop.start()
 
     def stop(self) -> None:
         """End the threads (within half a second each) and close the links."""
         self._stop.set()
-        for thread in self._threads:
-            if thread is not threading.current_thread():
-                thread.join(2.0)
+        for loop in self._loops:
+            loop.stop(2.0)
         with self._order:
             self._close_channels()
 
@@ -351,10 +349,8 @@ class MavlinkLinks:
         return tuple(link.statistics() for link in self._links)
 
     def dead_threads(self) -> list[str]:
-        """Names of threads that have ended without being asked to: none, unless there is a bug."""
-        if self._stop.is_set():
-            return []
-        return [thread.name for thread in self._threads if not thread.is_alive()]
+        """See `Loop.dead_threads`."""
+        return [name for loop in self._loops for name in loop.dead_threads()]
 
     def _send_on(self, link: Link, message: Message) -> bool:
         channel = link.channel

@@ -26,10 +26,12 @@ from dappled.drivers.camera import (
 from dappled.drivers.wired.file_watch import FileWatch
 from dappled.drivers.wired.shutter_line import CommandSender, ShutterLine, UsesAutopilot
 from dappled.drivers.wired.sources import FileSource
+from dappled.workers import Loop
 
 _WAITING = 64
 _PRESSED = "the shutter stays pressed"
 _FIRST_LOOK_S = 2.0
+_END_S = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +84,9 @@ class ComposedCamera(PlainCamera):
                 pair_s=settings.pair_s,
             )
         self._looked = threading.Event()  # the files from before the first shot are known, or there is no source
-        self._fire_thread = threading.Thread(target=self._fire_all, name="shutter line", daemon=True)
-        self._pick_thread = threading.Thread(target=self._pick_up, name="pickup", daemon=True)
+        self._loops = [Loop("shutter line", self._fire_all, self._stopping)]
+        if self._watch is not None:
+            self._loops.append(Loop("pickup", self._pick_up, self._stopping))
 
     def use_autopilot(self, send: CommandSender) -> None:
         """See UsesAutopilot: hand it on to a line that is fired by the autopilot."""
@@ -93,11 +96,10 @@ class ComposedCamera(PlainCamera):
     def start(self) -> None:
         """See Camera."""
         self.report(StateChanged("starting", "", self._clock.monotonic_ns()))
-        self._fire_thread.start()
-        if self._watch is not None:
-            self._pick_thread.start()
-        else:
+        if self._watch is None:
             self._looked.set()
+        for loop in self._loops:
+            loop.start()
 
     def fire(self, shot: int) -> None:
         """See Camera: a thread of its own presses the line."""
@@ -126,13 +128,16 @@ class ComposedCamera(PlainCamera):
         self._requested.put(-1)
         self._shot_fired.set()
         self._looked.set()
-        for thread in (self._fire_thread, self._pick_thread):
-            if thread.is_alive():
-                thread.join(0.8)
+        for loop in self._loops:
+            loop.stop(_END_S)
         with self._lock:
             left, self._open = list(self._open), {}
         for shot in left:
             self.report(ShotFailed(shot, "the camera was stopped", self._clock.monotonic_ns()))
+
+    def dead_threads(self) -> list[str]:
+        """See `Loop.dead_threads`."""
+        return [name for loop in self._loops for name in loop.dead_threads()]
 
     # the shutter
 

@@ -23,6 +23,7 @@ from pathlib import Path
 from dappled.clock import SystemClock
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, Message, Packet, mavlink
 from dappled.mocks.autopilot.path import FlightPath, TruePose
+from dappled.workers import Loop
 
 RATES_HZ: dict[int, float] = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
@@ -275,19 +276,17 @@ class HotShoe:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect((host, int(port)))
         self._speech = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="hot shoe", daemon=True)
-        self._thread.start()
+        self._loop = Loop("hot shoe", self._run)
+        self._loop.start()
 
     def close(self) -> None:
         """Stop reporting."""
-        self._stop.set()
-        self._thread.join(5)
+        self._loop.stop(5)
         self._socket.close()
 
     def _run(self) -> None:
         reported: set[str] = set()
-        while not self._stop.wait(_LOOK_S):
+        while not self._loop.stopping.wait(_LOOK_S):
             for path in sorted(self._truth.glob("*.json")):
                 if path.name not in reported:
                     try:

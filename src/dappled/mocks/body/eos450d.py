@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from enum import IntEnum
+from functools import partial
 from typing import TypeAlias
 
 from PIL import Image
@@ -22,6 +23,7 @@ from dappled.mocks.body import ptp
 from dappled.mocks.body.eos_card import CARD_BYTES, FOLDER, STORAGE, Card, StoredObject
 from dappled.mocks.body.faults import BodyFaults
 from dappled.mocks.body.ptp import Code, EosEvent, Format, Handler, Op, PtpRequest, PtpResponse
+from dappled.workers import Loop
 
 Expose: TypeAlias = Callable[[int, int], tuple[bytes, str]]
 """(trigger_monotonic_ns, shot_number) -> (the file's bytes, its extension without a dot)."""
@@ -169,7 +171,7 @@ class Eos450d:
         self._properties.announce(ptp.eos_status(1))
         work = (triggered_ns, self._releases, to_memory)
         capture = self._hunt if self._faults.take("no-focus") else self._capture
-        threading.Thread(target=capture, args=work, name="capture", daemon=True).start()
+        Loop("capture", partial(capture, *work)).start()
         return PtpResponse(parameters=(0,))
 
     def _hunt(self, _triggered_ns: int, _number: int, _to_memory: bool) -> None:

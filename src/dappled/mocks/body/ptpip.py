@@ -9,12 +9,14 @@ import contextlib
 import os
 import socket
 import threading
+from functools import partial
 from typing import Protocol
 
 from dappled.mocks.body import ptp
 from dappled.mocks.body.eos450d import MODEL
 from dappled.mocks.body.faults import BodyFaults
 from dappled.mocks.body.ptp import PtpPacket, PtpResponse
+from dappled.workers import Loop
 
 _SILENCE_STEP_S = 0.02
 _SLOW_BYTES = 40_000  # at a time, 50 times a second
@@ -47,12 +49,9 @@ class Responder:
         self._listeners = [socket.create_server((host, 0)) for _ in range(addresses)]
         self.ports: list[int] = [each.getsockname()[1] for each in self._listeners]
         self._at = 0
-        self._threads = [
-            threading.Thread(target=self._accept, args=[number], name="ptpip", daemon=True)
-            for number in range(addresses)
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._loops = [Loop("ptpip", partial(self._accept, number), self._closed) for number in range(addresses)]
+        for loop in self._loops:
+            loop.start()
 
     @property
     def port(self) -> int:
@@ -72,8 +71,8 @@ class Responder:
                 listener.shutdown(socket.SHUT_RDWR)
             listener.close()
         self.drop()
-        for thread in self._threads:
-            thread.join(5)
+        for loop in self._loops:
+            loop.stop(5)
 
     def drop(self) -> None:
         """Cut the links, as a pulled cable does."""
@@ -92,7 +91,7 @@ class Responder:
                 link.close()
                 continue
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            threading.Thread(target=self._greet, args=(link,), name="ptpip-link", daemon=True).start()
+            Loop("ptpip-link", partial(self._greet, link), self._closed).start()
 
     def _greet(self, link: socket.socket) -> None:
         with self._lock:

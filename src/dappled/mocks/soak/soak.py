@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import random
 import socket
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -27,6 +26,7 @@ from dappled.flight import check, flight_report
 from dappled.mocks.simulation import Simulation, World, free_port
 from dappled.mocks.soak.supervised import Resources, Supervised
 from dappled.mocks.soak.troubles import Troubles
+from dappled.workers import Loop
 
 SETTLE_S = 8.0
 START_S = 60.0
@@ -175,21 +175,19 @@ class _Requester:
 
     def __init__(self, ground: GroundClient, interval_s: float, answers: dict[int, int | None]) -> None:
         self._ground, self._interval_s, self._answers = ground, interval_s, answers
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="requests", daemon=True)
+        self._loop = Loop("requests", self._run)
 
     def start(self) -> None:
-        self._thread.start()
+        self._loop.start()
 
     def stop(self) -> None:
         """Stop; the current request is finished first."""
-        self._stop.set()
-        self._thread.join(10.0)
+        self._loop.stop(10.0)
 
     def _run(self) -> None:
         sequence = 0
         due = time.monotonic()
-        while not self._stop.wait(max(0.0, due - time.monotonic())):
+        while not self._loop.stopping.wait(max(0.0, due - time.monotonic())):
             due = max(due + self._interval_s, time.monotonic())
             sequence += 1
             self._answers[sequence] = None
