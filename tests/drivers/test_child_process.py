@@ -16,7 +16,14 @@ from typing import Any
 import pytest
 
 from dappled.drivers.camera import CameraError
-from dappled.drivers.child_process import ChannelError, ProcessChannel, RestartBudget, end_child, start_child
+from dappled.drivers.child_process import (
+    ChannelError,
+    MessageSizeError,
+    ProcessChannel,
+    RestartBudget,
+    end_child,
+    start_child,
+)
 from dappled.drivers.wired.ptp_source import PtpSource
 
 
@@ -146,3 +153,116 @@ def test_a_full_channel_does_not_block(ends: Ends) -> None:
 
     with pytest.raises(ChannelError, match="no more"):
         fill()
+
+
+def test_a_message_that_is_too_long_is_not_sent_and_the_channel_goes_on(ends: Ends) -> None:
+    with pytest.raises(MessageSizeError, match="longer than a message may be"):
+        ends[0].send({"text": "x" * 200_000})
+    ends[0].send({"text": "x" * 130_000})
+    message = ends[1].receive(5.0)
+    assert message is not None
+    assert len(message.body["text"]) == 130_000
+
+
+# --- descriptors run out, for real: in a process of their own, with a limit of their own
+
+STARVED = """
+import contextlib, os, resource, sys
+from dappled.clock import RecordedClock
+from dappled.drivers.camera import Blob
+from dappled.drivers.child_process import ProcessChannel
+
+resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
+clock = RecordedClock(10**12)
+here, there = ProcessChannel.pair()
+there = ProcessChannel(there, clock)
+hogs = []
+
+def exhaust(spare=0):
+    with contextlib.suppress(OSError):
+        while True:
+            hogs.append(os.open(os.devnull, os.O_RDONLY))
+    for _ in range(spare):
+        os.close(hogs.pop())
+
+def free():
+    while hogs:
+        os.close(hogs.pop())
+
+def send(number, files):
+    blobs = [Blob.of(f"frame {number}, file {file}".encode()) for file in range(files)]
+    here.send({"number": number}, tuple(blob.fd for blob in blobs))
+    for blob in blobs:
+        blob.close()
+
+def told(message):
+    if message is None:
+        return None
+    found = [os.pread(fd, 100, 0).decode() for fd in message.fds]
+    for fd in message.fds:
+        os.close(fd)
+    return message.body["number"], found, message.lost
+
+def opened():
+    return len(os.listdir("/proc/self/fd"))
+"""
+
+
+def starved(code: str) -> None:
+    subprocess.run([sys.executable, "-c", STARVED + code], check=True, timeout=60)
+
+
+@pytest.mark.parametrize("spare", [0, 1, 2, 8])
+def test_a_file_stays_in_the_socket_until_there_are_descriptors_again(spare: int) -> None:
+    """Also where there is room for it, and none for writing it to disk."""
+    starved(
+        "before = opened()\n"
+        "send(1, 2)\n"
+        "send(2, 0)\n"
+        f"exhaust({spare})\n"
+        "for _ in range(3):\n"
+        "    assert there.receive(0.0) is None and there.starved\n"
+        "    clock.advance(3.0)\n"
+        "free()\n"
+        "assert told(there.receive(5.0)) == (1, ['frame 1, file 0', 'frame 1, file 1'], '')\n"
+        "assert not there.starved\n"
+        "assert told(there.receive(5.0)) == (2, [], '')\n"
+        "assert opened() == before\n"
+    )
+
+
+def test_a_shortage_that_lasts_costs_the_files_and_not_the_channel() -> None:
+    starved(
+        "send(1, 1)\n"
+        "send(2, 0)\n"
+        "send(3, 1)\n"
+        "exhaust()\n"
+        "assert there.receive(0.0) is None\n"
+        "clock.advance(10.1)\n"
+        "number, files, lost = told(there.receive(0.0))\n"
+        "assert (number, files) == (1, [])\n"
+        "assert 'run out of file descriptors (its limit is 64)' in lost, lost\n"
+        "assert told(there.receive(0.0)) == (2, [], '')\n"
+        "assert told(there.receive(0.0))[1:] == ([], lost)\n"  # the shortage goes on: it was waited for once
+        "free()\n"
+        "send(4, 1)\n"
+        "assert told(there.receive(0.0)) == (4, ['frame 4, file 0'], '')\n"
+        "send(5, 1)\n"
+        "exhaust()\n"
+        "assert there.receive(0.0) is None and there.starved\n"  # another shortage is waited for again
+        "free()\n"
+        "assert told(there.receive(0.0)) == (5, ['frame 5, file 0'], '')\n"
+    )
+
+
+def test_descriptors_that_come_back_while_it_waits_are_used_at_once() -> None:
+    starved(
+        "import threading, time\n"
+        "there = ProcessChannel(there._socket)\n"
+        "send(1, 1)\n"
+        "threading.Thread(target=lambda: (time.sleep(0.3), free())).start()\n"
+        "exhaust()\n"
+        "began = time.monotonic()\n"
+        "assert told(there.receive(60.0)) == (1, ['frame 1, file 0'], '')\n"
+        "assert time.monotonic() - began < 30\n"
+    )

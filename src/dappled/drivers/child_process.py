@@ -3,6 +3,9 @@
 Messages are JSON in packets, with file descriptors beside them. The socket is an AF_UNIX SOCK_SEQPACKET pair: the
 kernel keeps message boundaries and passes descriptors, so a file moves between the processes without a copy. Nothing is
 ever unpickled.
+
+The kernel closes a descriptor that the receiver has no room for. So a message is first looked at (MSG_PEEK, which
+passes copies of its descriptors) and stays in the socket until all of them could be had.
 """
 
 from __future__ import annotations
@@ -18,16 +21,21 @@ import socket
 import struct
 import subprocess
 import sys
+import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from dappled.clock import Clock, SystemClock
 from dappled.workers import Loop
 
-_MESSAGE_BYTES = 65536
+_MESSAGE_BYTES = 131072  # below net.core.wmem_default, 212992, which bounds a packet
 _FDS = 4
+_SPARE = 8  # more than it takes to write a received file to disk, or to map it
+_SHORTAGE_S = 10.0
+_AGAIN_S = 0.05
 _INT = struct.Struct("i")
 _PR_SET_PDEATHSIG = 1
 _REAL_TIME_US = 1_000_000
@@ -43,19 +51,34 @@ class ChannelError(Exception):
     """The other process is gone, takes no messages, or sent something that is not a message."""
 
 
+class MessageSizeError(ChannelError):
+    """A message is longer than a message may be. It was not sent, and the channel goes on."""
+
+
 @dataclass(frozen=True, slots=True)
 class ChannelMessage:
-    """A JSON object and the descriptors that came with it, which the receiver closes."""
+    """A JSON object and the descriptors that came with it, which the receiver closes.
+
+    `lost` is a sentence where it came with descriptors and this process could not receive them; `fds` is empty then.
+    """
 
     body: Mapping[str, Any]
     fds: tuple[int, ...] = ()
+    lost: str = ""
 
 
 class ProcessChannel:
-    """One end of the pair. Messages may be sent from any thread; one thread receives."""
+    """One end of the pair. Messages may be sent from any thread; one thread receives.
 
-    def __init__(self, sock: socket.socket) -> None:
+    A message whose descriptors this process has no room for waits in the socket, and those behind it too: for 10 s from
+    the beginning of the shortage, after which each is received without its descriptors. `starved`: one waits now.
+    """
+
+    def __init__(self, sock: socket.socket, clock: Clock | None = None) -> None:
+        self.starved = False
         self._socket = sock
+        self._clock = clock or SystemClock()
+        self._short_since_ns: int | None = None
         sock.setblocking(False)
 
     @classmethod
@@ -65,8 +88,10 @@ class ProcessChannel:
         return cls(here), there
 
     def send(self, body: Mapping[str, Any], fds: tuple[int, ...] = (), timeout_s: float = 0.0) -> None:
-        """Send one message, waiting at most `timeout_s` for room. Raises ChannelError."""
+        """Send one message, waiting at most `timeout_s` for room. Raises ChannelError, MessageSizeError."""
         raw = json.dumps(body).encode()
+        if len(raw) > _MESSAGE_BYTES:
+            raise MessageSizeError(f"a message of {len(raw)} bytes is longer than a message may be ({_MESSAGE_BYTES})")
         try:
             if timeout_s:
                 _wait(self._socket, select.POLLOUT, timeout_s)
@@ -80,21 +105,42 @@ class ProcessChannel:
             raise ChannelError(f"the other process is gone ({error})") from error
 
     def receive(self, timeout_s: float) -> ChannelMessage | None:
-        """Return the next message, or None when there was none for that long. Raises ChannelError when the other
-        end is closed."""
+        """Return the next message, or None when there was none for that long, or none that could be received whole.
+        Raises ChannelError when the other end is closed."""
+        until_ns = self._clock.monotonic_ns() + round(timeout_s * 1e9)
         try:
-            if not _wait(self._socket, select.POLLIN, timeout_s):
-                return None
-            raw, fds, flags = _received(self._socket)
+            while _wait(self._socket, select.POLLIN, timeout_s):
+                message = self._take()
+                left_s = (until_ns - self._clock.monotonic_ns()) / 1e9
+                if message is not None or left_s <= 0:
+                    return message
+                time.sleep(min(left_s, _AGAIN_S))
         except BlockingIOError:
             return None
         except (OSError, ValueError) as error:
             raise ChannelError(f"the other process is gone ({error})") from error
+        return None
+
+    def _take(self) -> ChannelMessage | None:
+        """Take the first message from the socket; None where it waits for descriptors."""
+        raw, fds, flags = _peeked(self._socket)
+        whole = not flags & socket.MSG_CTRUNC and (not fds or _can_open(_SPARE))
+        if not whole:
+            _close(fds)
+            fds = ()
+            now_ns = self._clock.monotonic_ns()
+            self._short_since_ns = self._short_since_ns or now_ns
+            self.starved = now_ns - self._short_since_ns < _SHORTAGE_S * 1e9
+            if self.starved:
+                return None
+        elif fds:
+            self._short_since_ns = None
+        self.starved = False
+        self._socket.recv(1)  # drops the whole packet; its own descriptors are closed, the copies stay
         try:
-            return ChannelMessage(_parsed(raw, flags), fds)
+            return ChannelMessage(_parsed(raw, flags), fds, "" if whole else _shortage())
         except ChannelError:
-            for fd in fds:
-                os.close(fd)
+            _close(fds)
             raise
 
     def close(self) -> None:
@@ -108,9 +154,11 @@ def _wait(sock: socket.socket, event: int, timeout_s: float) -> bool:
     return bool(poll.poll(timeout_s * 1e3))
 
 
-def _received(sock: socket.socket) -> tuple[bytes, tuple[int, ...], int]:
-    """Receive one packet: bytes, descriptors, flags. `socket.recv_fds` would ignore MSG_CMSG_CLOEXEC."""
-    raw, ancillary, flags, _ = sock.recvmsg(_MESSAGE_BYTES, socket.CMSG_LEN(_FDS * _INT.size), socket.MSG_CMSG_CLOEXEC)
+def _peeked(sock: socket.socket) -> tuple[bytes, tuple[int, ...], int]:
+    """Look at the first packet: bytes, copies of its descriptors, flags."""
+    raw, ancillary, flags, _ = sock.recvmsg(
+        _MESSAGE_BYTES, socket.CMSG_LEN(_FDS * _INT.size), socket.MSG_CMSG_CLOEXEC | socket.MSG_PEEK
+    )
     fds = tuple(
         fd
         for level, kind, data in ancillary
@@ -120,10 +168,33 @@ def _received(sock: socket.socket) -> tuple[bytes, tuple[int, ...], int]:
     return raw, fds, flags
 
 
+def _close(fds: Iterable[int]) -> None:
+    for fd in fds:
+        os.close(fd)
+
+
+def _can_open(count: int) -> bool:
+    """Whether this process may have so many descriptors more."""
+    opened: list[int] = []
+    try:
+        for _ in range(count):
+            opened.append(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
+    except OSError:
+        return False
+    finally:
+        _close(opened)
+    return True
+
+
+def _shortage() -> str:
+    limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return f"dappled has run out of file descriptors (its limit is {limit}): raise LimitNOFILE, or end what holds them"
+
+
 def _parsed(raw: bytes, flags: int) -> dict[str, Any]:
     if not raw:
         raise ChannelError("the other process has ended")
-    if flags & (socket.MSG_TRUNC | socket.MSG_CTRUNC):
+    if flags & socket.MSG_TRUNC:
         raise ChannelError("a message was longer than a message may be")
     try:
         body = json.loads(raw)

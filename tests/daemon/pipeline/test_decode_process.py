@@ -5,16 +5,19 @@ from __future__ import annotations
 import hashlib
 import os
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from dappled.daemon.pipeline.decode_process import DecodeProcess, DecodeProcessError
-from dappled.drivers.child_process import RestartBudget
+from dappled.daemon.pipeline.decode_process import DecodeProcess, DecodeProcessError, serve
+from dappled.drivers.child_process import ProcessChannel, RestartBudget
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.mocks.scene.masked_camera import reference_camera
+from dappled.workers import Loop
 from tests.daemon.fakes import eventually
 
 RECIPE = Recipe("reference-36mm", "reference-5x5")
@@ -120,3 +123,79 @@ def test_close_does_not_wait_for_a_frame_in_hand(frame: str) -> None:
     assert len(problems) == 1
     with pytest.raises(DecodeProcessError, match="stopped"):
         decoder.develop(frame, None, None)
+
+
+STARVED = """
+import contextlib, os, resource, sys, threading, time
+from dappled.daemon.pipeline.decode_process import DecodeProcess, DecodeProcessError, serve
+from dappled.drivers.raw.darkroom import Recipe
+
+hogs = []
+
+def exhaust():
+    with contextlib.suppress(OSError):
+        while True:
+            hogs.append(os.open(os.devnull, os.O_RDONLY))
+
+def free():
+    while hogs:
+        os.close(hogs.pop())
+
+decoder = DecodeProcess(Recipe("reference-36mm", "reference-5x5"))
+decoder.warm_up()
+resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
+exhaust()
+"""
+
+
+def starved(frame: str, code: str) -> None:
+    words = [sys.executable, "-c", f"{STARVED}{code}assert decoder.restarts == 0\ndecoder.close()\n", frame]
+    subprocess.run(words, check=True, timeout=100)
+
+
+def test_without_descriptors_a_decoded_frame_waits_for_some(frame: str) -> None:
+    starved(
+        frame,
+        "def free_when_it_waits():\n"
+        "    deadline = time.monotonic() + 60\n"
+        "    while not decoder._channel.starved and time.monotonic() < deadline:\n"
+        "        time.sleep(0.01)\n"
+        "    free()\n"
+        "threading.Thread(target=free_when_it_waits).start()\n"
+        "assert decoder.develop(sys.argv[1], None, None).carriers\n",
+    )
+
+
+@pytest.mark.slow
+def test_without_descriptors_for_long_one_frame_is_not_decoded_and_says_why(frame: str) -> None:
+    starved(
+        frame,
+        "try:\n"
+        "    decoder.develop(sys.argv[1], None, None)\n"
+        "except DecodeProcessError as error:\n"
+        "    assert sys.argv[1] in str(error) and 'run out of file descriptors' in str(error), error\n"
+        "else:\n"
+        "    raise AssertionError('it was received')\n"
+        "free()\n"
+        "assert decoder.develop(sys.argv[1], None, None).carriers\n",
+    )
+
+
+def test_an_answer_that_is_too_long_is_a_sentence_and_the_next_one_comes() -> None:
+    here, there = ProcessChannel.pair()
+    bodies = iter([{"carriers": "x" * 200_000}, {"carriers": "x"}])
+    worker = Loop("worker", lambda: serve(there, lambda _: (next(bodies), ())))
+    worker.start()
+    try:
+        here.send({"do": "develop", "path": "frame.cr2"})
+        answer = here.receive(20.0)
+        assert answer is not None
+        assert "what frame.cr2 was decoded to can't be reported: a message of" in answer.body["error"]
+        here.send({"do": "develop", "path": "frame.cr2"})
+        answer = here.receive(20.0)
+        assert answer is not None
+        assert answer.body == {"carriers": "x"}
+    finally:
+        here.close()
+        assert worker.stop(20.0)
+        there.close()

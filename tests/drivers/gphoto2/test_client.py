@@ -597,3 +597,83 @@ def test_a_silent_body_on_usb_has_its_port_reset(body: SimulatedBody, monkeypatc
         until_state(camera, "ready")
     finally:
         camera.stop()
+
+
+STARVED = """
+import contextlib, os, resource, sys, time
+from dappled.drivers.camera import Arrival, ShotFailed
+from dappled.drivers.gphoto2.client import GPhoto2Camera, spawn_process
+from dappled.drivers.gphoto2.settings import parse_settings
+from dappled.testing import content, until_shot_ends, until_state
+
+started, hogs = [], []
+
+def spawn(settings, carryover):
+    started.append(spawn_process(settings, carryover))
+    return started[-1]
+
+def exhaust():
+    resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
+    with contextlib.suppress(OSError):
+        while True:
+            hogs.append(os.open(os.devnull, os.O_RDONLY))
+
+def free():
+    while hogs:
+        os.close(hogs.pop())
+
+def waits_for_descriptors():
+    deadline = time.monotonic() + 60
+    while not started[-1][1].starved:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+camera = GPhoto2Camera(parse_settings({"port": sys.argv[1], "capture_target": sys.argv[2]}), spawn=spawn)
+camera.start()
+until_state(camera, "ready")
+exhaust()
+camera.fire(1)
+"""
+
+
+def starved(body: SimulatedBody, target: str, code: str) -> None:
+    words = [sys.executable, "-c", f"{STARVED}{code}camera.stop()\nassert len(started) == 1\n", body.port, target]
+    subprocess.run(words, check=True, timeout=100)
+
+
+@pytest.mark.parametrize("target", ["card", "ram"])
+def test_without_descriptors_a_file_waits_and_comes_when_there_are_some_again(body: SimulatedBody, target: str) -> None:
+    starved(
+        body,
+        target,
+        "waits_for_descriptors()\n"
+        "free()\n"
+        "arrival = until_shot_ends(camera, 1)[-1]\n"
+        "assert isinstance(arrival, Arrival), arrival\n"
+        f"assert len(content(arrival)) == {SIZE}\n",
+    )
+
+
+@pytest.mark.slow
+def test_without_descriptors_for_long_the_shot_fails_alone_and_its_file_stays_on_the_card(body: SimulatedBody) -> None:
+    starved(
+        body,
+        "card",
+        "failed = until_shot_ends(camera, 1)[-1]\n"
+        "assert isinstance(failed, ShotFailed), failed\n"
+        "assert 'run out of file descriptors (its limit is 64)' in failed.reason, failed.reason\n"
+        "assert failed.reason.endswith('IMG_0001.DNG') and 'it stays on the card' in failed.reason, failed.reason\n"
+        "free()\n"
+        "camera.fire(2)\n"
+        "arrival = until_shot_ends(camera, 2)[-1]\n"
+        "assert isinstance(arrival, Arrival), arrival\n"
+        f"assert len(content(arrival)) == {SIZE}\n",
+    )
+    assert body.card == ["IMG_0001.DNG", "IMG_0002.DNG"]
+
+
+def test_a_camera_that_was_started_can_not_be_started_again(ready: Make) -> None:
+    camera = ready()
+    with pytest.raises(CameraError, match="open another one"):
+        camera.start()
+    assert camera.dead_threads() == []

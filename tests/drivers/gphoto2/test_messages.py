@@ -8,9 +8,20 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from dappled.drivers.camera import Arrival, Blob, CameraEvent, Fired, Identity, ShotFailed, StateChanged
+from dappled.drivers.camera import (
+    Arrival,
+    Blob,
+    CameraEvent,
+    Companion,
+    Fired,
+    Identity,
+    Setting,
+    SettingsChanged,
+    ShotFailed,
+    StateChanged,
+)
 from dappled.drivers.child_process import ChannelError, ChannelMessage, ProcessChannel
-from dappled.drivers.gphoto2.messages import event_message, message_event
+from dappled.drivers.gphoto2.messages import EventSender, event_message, lost_file, message_event
 
 Ends = tuple[ProcessChannel, ProcessChannel]
 
@@ -98,3 +109,45 @@ def test_descriptors_of_a_refused_message_are_closed() -> None:
         message_event(ChannelMessage({"is": "party"}, (blob.fd,)))
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(blob.fd)
+
+
+@pytest.mark.parametrize(
+    ("event", "shot", "stays"),
+    [
+        (Arrival(7, "a.cr2", Blob(3, 1), 5, {"folder": "/DCIM", "name": "IMG_7.CR2"}), 7, True),
+        (Arrival(7, "a.cr2", Blob(3, 1), 5, {"folder": "/", "name": "capt0000.cr2"}), 7, False),
+        (Arrival(None, "a.cr2", Blob(3, 1), 5, {}), None, False),
+        (Companion(7, "a.jpg", Blob(3, 1), 5, {"folder": "/DCIM", "name": "IMG_7.CR2"}), None, True),
+    ],
+)
+def test_a_file_that_was_lost_on_the_way_fails_the_shot_that_waited_for_it(
+    event: CameraEvent, shot: int | None, stays: bool
+) -> None:
+    failing, reason = lost_file(ChannelMessage(event_message(event).body, (), "dappled has run out of something"))
+    assert failing == shot
+    assert "could not be received: dappled has run out of something" in reason
+    assert reason.endswith("; it stays on the card as /DCIM/IMG_7.CR2") is stays
+
+
+@pytest.mark.parametrize("body", [{}, {"is": "fired", "shot": 1}, {"is": "arrival", "shot": 1, "facts": 5}])
+def test_a_lost_message_that_is_no_event_is_refused(body: dict[str, object]) -> None:
+    with pytest.raises(ChannelError):
+        lost_file(ChannelMessage(body, (), "gone"))
+
+
+def test_an_event_that_is_too_long_costs_its_shot_alone(ends: Ends) -> None:
+    sender = EventSender(ends[0])
+    blob = Blob.of(b"x")
+    setting = Setting("iso", "100", tuple(str(number) for number in range(50_000)))
+    sender.send(Arrival(1, "a.cr2", blob, 5, {"note": "x" * 200_000}), SettingsChanged((setting,), 6), Fired(2, 7, 8))
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(blob.fd)
+    events = []
+    while (message := ends[1].receive(0.0)) is not None:
+        events.append(message_event(message))
+    failed, settings, fired = events
+    assert isinstance(failed, ShotFailed)
+    assert isinstance(settings, SettingsChanged)
+    assert (failed.shot, settings.settings, fired) == (1, (), Fired(2, 7, 8))
+    assert "longer than a message may be" in failed.reason
+    assert "longer than a message may be" in settings.refused

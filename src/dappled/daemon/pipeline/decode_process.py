@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
-from dappled.drivers.child_process import ChannelError, ChannelMessage, ProcessChannel, RestartBudget
+from dappled.drivers.child_process import ChannelError, ChannelMessage, MessageSizeError, ProcessChannel, RestartBudget
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import Result
@@ -28,6 +28,7 @@ from dappled.workers import Loop
 log = logging.getLogger(__name__)
 NICENESS = 10
 _LOOK_S = 0.1
+_SEND_S = 5.0
 
 
 class DecodeProcessError(DappledError):
@@ -147,7 +148,7 @@ class DecodeProcess:
             answer = self._ask({"do": "depth", **facts})
         (body_fd,) = answer.fds
         try:
-            body = mmap.mmap(body_fd, 0, prot=mmap.PROT_READ)
+            body = _mapped(body_fd)
         finally:
             os.close(body_fd)
         told = answer.body
@@ -173,7 +174,7 @@ class DecodeProcess:
             self.restarts += 1
         try:
             channel = self._channel or self._begin()
-            channel.send(question, timeout_s=5.0)
+            channel.send(question, timeout_s=_SEND_S)
             answer = channel.receive(self._timeout_s)
         except ChannelError:
             code = self._end()
@@ -188,6 +189,8 @@ class DecodeProcess:
             raise DecodeProcessError(f"decoding {question.get('path', '')} took over {self._timeout_s:g} s: given up")
         if "error" in answer.body:
             raise DecodeProcessError(str(answer.body["error"]))
+        if answer.lost:
+            raise DecodeProcessError(f"what {question['path']} was decoded to could not be received: {answer.lost}")
         return answer
 
     def _begin(self) -> ProcessChannel:
@@ -224,11 +227,18 @@ def _manner(code: int | None) -> str:
     return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
 
 
+def _mapped(fd: int) -> mmap.mmap:
+    try:
+        return mmap.mmap(fd, 0, prot=mmap.PROT_READ)
+    except OSError as error:  # no descriptors, no memory
+        raise DecodeProcessError(f"what a frame was decoded to can't be mapped: {error.strerror}") from None
+
+
 def _decoded(answer: ChannelMessage) -> DecodedFrame:
     facts = dict(answer.body)
     body_fd, preview_fd = answer.fds
     try:
-        body = mmap.mmap(body_fd, 0, prot=mmap.PROT_READ)
+        body = _mapped(body_fd)
         preview = os.pread(preview_fd, os.fstat(preview_fd).st_size, 0)
     finally:
         os.close(body_fd)
@@ -250,6 +260,15 @@ def _decoded(answer: ChannelMessage) -> DecodedFrame:
     )
 
 
+def _send(channel: ProcessChannel, question: ChannelMessage, body: Mapping[str, Any], fds: tuple[int, ...]) -> None:
+    """Send an answer, or why it can't be sent. Raises ChannelError."""
+    try:
+        channel.send(body, fds, timeout_s=_SEND_S)
+    except MessageSizeError as error:
+        what = question.body.get("path", "the recipe")
+        channel.send({"error": f"what {what} was decoded to can't be reported: {error}"}, timeout_s=_SEND_S)
+
+
 Serve = Callable[[ChannelMessage], tuple[Mapping[str, Any], tuple[int, ...]]]
 
 
@@ -263,7 +282,7 @@ def serve(end: socket.socket, answer: Serve) -> None:
                 continue
             body, fds = answer(question)
             if body:
-                channel.send(body, fds, timeout_s=5.0)
+                _send(channel, question, body, fds)
         except ChannelError:
             return
         for fd in fds:

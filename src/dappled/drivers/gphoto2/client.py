@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import subprocess
 import threading
 from collections.abc import Callable, Mapping
@@ -32,11 +33,19 @@ from dappled.drivers.camera import (
     StateChanged,
     check_change,
 )
-from dappled.drivers.child_process import ChannelError, ProcessChannel, RestartBudget, end_child, start_child
-from dappled.drivers.gphoto2.messages import LATE_LIMIT, Carryover, message_event
+from dappled.drivers.child_process import (
+    ChannelError,
+    ChannelMessage,
+    ProcessChannel,
+    RestartBudget,
+    end_child,
+    start_child,
+)
+from dappled.drivers.gphoto2.messages import LATE_LIMIT, Carryover, lost_file, message_event
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
 from dappled.workers import Loop
 
+log = logging.getLogger(__name__)
 _PING_S = 1.0
 _STOP_S = 1.2
 _KILL_S = 0.6
@@ -194,8 +203,12 @@ class GPhoto2Camera(QueuedCamera):
                 now_ns = self._clock.monotonic_ns()
                 if message is not None:
                     heard_ns = now_ns
-                    if message.body.get("is") != "pong":
+                    if message.lost:
+                        self._lose_file(message)
+                    elif message.body.get("is") != "pong":
                         self._pass_on(message_event(message))
+                elif channel.starved:
+                    heard_ns = now_ns  # the process has answered; this one can't receive it yet
                 elif now_ns - heard_ns > answer_s * 1e9:
                     end_child(process, 0.0)
                     done = self._reset_port()
@@ -217,6 +230,14 @@ class GPhoto2Camera(QueuedCamera):
         except CameraError as error:
             return f" ({error})"
         return ", the camera's USB port reset"
+
+    def _lose_file(self, message: ChannelMessage) -> None:
+        """Fail the shot whose file could not be received, alone."""
+        shot, reason = lost_file(message)
+        if shot is None:
+            log.warning("%s", reason)
+        else:
+            self._pass_on(ShotFailed(shot, reason, self._clock.monotonic_ns()))
 
     def _pass_on(self, event: CameraEvent) -> None:
         if isinstance(event, Fired):

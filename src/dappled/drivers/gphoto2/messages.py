@@ -25,7 +25,7 @@ from dappled.drivers.camera import (
     ShotFailed,
     StateChanged,
 )
-from dappled.drivers.child_process import ChannelError, ChannelMessage, ProcessChannel
+from dappled.drivers.child_process import ChannelError, ChannelMessage, MessageSizeError, ProcessChannel
 
 LATE_LIMIT = 16
 """How many late shots and files are remembered."""
@@ -63,7 +63,10 @@ class EventSender:
         self.reason = ""
 
     def send(self, *events: CameraEvent) -> None:
-        """Send events in order and close their blobs; skip a state that was sent last."""
+        """Send events in order and close their blobs; skip a state that was sent last.
+
+        A file whose event is too long for a message fails its shot alone.
+        """
         for event in events:
             if isinstance(event, StateChanged):
                 if (event.state, event.reason) == (self.state, self.reason):
@@ -72,6 +75,8 @@ class EventSender:
             message = event_message(event)
             try:
                 self._channel.send(message.body, message.fds, timeout_s=_SEND_S)
+            except MessageSizeError as error:
+                self._channel.send(event_message(_instead(event, error)).body, timeout_s=_SEND_S)
             finally:
                 for fd in message.fds:
                     os.close(fd)
@@ -79,6 +84,17 @@ class EventSender:
     def pong(self) -> None:
         """Answer a ping."""
         self._channel.send({"is": "pong"}, timeout_s=_SEND_S)
+
+
+def _instead(event: CameraEvent, error: MessageSizeError) -> CameraEvent:
+    """What is reported instead of an event that is too long. Raises `error` where there is nothing to report."""
+    match event:
+        case SettingsChanged(_, at_ns):
+            return SettingsChanged((), at_ns, f"the camera's settings can't be reported: {error}")
+        case Arrival(int(shot), _, _, at_ns):
+            return ShotFailed(shot, f"its file can't be reported: {error}", at_ns)
+        case _:
+            raise error
 
 
 def event_message(event: CameraEvent) -> ChannelMessage:
@@ -100,6 +116,21 @@ def event_message(event: CameraEvent) -> ChannelMessage:
             kind = "arrival" if isinstance(event, Arrival) else "companion"
             body = {"is": kind, "shot": shot_or_none, "name": name, "size": blob.size, "ns": at_ns}
             return ChannelMessage({**body, "facts": dict(facts)}, (blob.fd,))
+
+
+def lost_file(message: ChannelMessage) -> tuple[int | None, str]:
+    """For a message whose file could not be received: the shot that fails with it, and a sentence.
+
+    The shot is None where none is known, and for a companion, whose frame is safe. Raises ChannelError.
+    """
+    try:
+        body = message.body
+        folder, name = body["facts"].get("folder"), body["facts"].get("name")
+        stays = "" if folder in (None, "/") else f"; it stays on the card as {folder}/{name}"
+        reason = f"{body['name']} could not be received: {message.lost}{stays}"
+        return body["shot"] if body["is"] == "arrival" else None, reason
+    except (KeyError, AttributeError) as error:
+        raise ChannelError(f"a message could not be understood: {error!r}") from error
 
 
 def message_event(message: ChannelMessage) -> CameraEvent:

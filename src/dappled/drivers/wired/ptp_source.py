@@ -88,6 +88,8 @@ class PtpSource:
             raise CameraError(f"the camera at {self._port} did not answer for {_ANSWER_S:g} s: switch it off and on")
         if "error" in answer.body:
             raise CameraError(str(answer.body["error"]))
+        if answer.lost:
+            raise CameraError(f"a file of the camera at {self._port} could not be received: {answer.lost}")
         return answer
 
 
