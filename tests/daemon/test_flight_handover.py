@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.config import profiles
 from dappled.config.settings import CameraSettings, DecodeSettings, MaskSettings, Settings
 from dappled.daemon import flight_handover
 from dappled.daemon.camera_protocol.parameters import Parameters
-from dappled.daemon.flight_handover import BY_BODY, CHANGES_IN_FLIGHT, NONE, FlightHandover, LiveSettings
+from dappled.daemon.flight_handover import BY_BODY, NONE, FlightHandover, RecipeParameters
+from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.recipes import Names
+from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.drivers.camera import CameraError, Setting, SettingName
 from dappled.errors import DappledError
+from tests.daemon.fakes import FakeSink
 
 CONFIGURED = Settings(
     camera=CameraSettings(profile="reference-36mm"),
@@ -33,10 +36,18 @@ class NoBody:
         raise AssertionError(name)
 
 
-def knobs(settings: Settings, after: FlightHandover | None, ask: Callable[[Settings, str], None]) -> Parameters:
-    return Parameters(
-        NoBody(), flight_handover.parameters(recipes.called(settings), after, LiveSettings(settings), ask)
-    )
+class Flown:
+    """A flight, and what a ground station may set in it. `events` are those that it writes."""
+
+    def __init__(self, settings: Settings, after: FlightHandover | None, names: Names | None = None) -> None:
+        self.events: list[str] = []
+        clock = RecordedClock(10**18)
+        self.shutter = Shutter(FakeSink(), clock, next_index=0)
+        recipe = RecipeParameters(names or recipes.called(settings), after, LiveSettings(settings), self.shutter, self)
+        self.parameters = Parameters(NoBody(), recipe.all())
+
+    def later(self, kind: str, text: str) -> None:
+        self.events.append(f"{kind}: {text}")
 
 
 def test_each_shipped_mask_each_law_and_no_mask_can_be_chosen() -> None:
@@ -52,7 +63,7 @@ def test_lenslets_have_nothing_to_choose() -> None:
     lenslets = replace(CONFIGURED, mask=MaskSettings(profiles.LENSLET))
     after = FlightHandover(lenslets)
     assert (after.masks(), after.laws()) == ((), ())
-    found = knobs(lenslets, after, lambda *_: None)
+    found = Flown(lenslets, after).parameters
     with pytest.raises(CameraError, match="can't be changed"):
         found.change("LF_MASK", "mask-1")
 
@@ -72,36 +83,34 @@ def test_a_calibration_counts_with_its_own_mask_and_law_alone() -> None:
 
 
 def test_what_was_set_is_asked_for_and_a_second_setting_comes_on_top_of_the_first() -> None:
-    after, asked = FlightHandover(CONFIGURED), list[str]()
-
-    def ask(following: Settings, text: str) -> None:
-        asked.append(text)
-        after.next = following
-
-    found = knobs(CONFIGURED, after, ask)
+    after = FlightHandover(CONFIGURED)
+    flown = Flown(CONFIGURED, after)
+    found = flown.parameters
     assert found.change("LF_MASK", "mask-2")
     assert found.change("LF_LAW", "fd")
-    assert asked == ["mask mask-2", "carrier law fd"]
+    assert flown.events == [
+        "next flight: mask mask-2 from there on, by the ground station",
+        "next flight: carrier law fd from there on, by the ground station",
+    ]
     assert after.next is not None
     assert (after.next.mask.profile, after.next.decode.law) == ("mask-2", "fd")
     assert [knob.value for knob in found.all()] == ["mask-2", "fd"]  # what all ground stations are told
 
 
 def test_what_is_refused_is_not_shown() -> None:
-    def ask(_: Settings, text: str) -> None:
-        raise CameraError(f"{text}: 1 shot under way")
-
-    found = knobs(CONFIGURED, FlightHandover(CONFIGURED), ask)
+    after = FlightHandover(CONFIGURED)
+    flown = Flown(CONFIGURED, after)
+    found = flown.parameters
+    assert flown.shutter.request(CaptureRequest("test", "console", 1)).accepted
     for name, word in (("LF_MASK", "mask-2"), ("LF_LAW", "fd")):
         with pytest.raises(CameraError, match="under way"):
             found.change(name, word)
     assert [knob.value for knob in found.all()] == list(flight_handover.words(recipes.called(CONFIGURED)))
+    assert (after.next, flown.events) == (None, [])
 
 
 def test_where_no_flight_can_follow_they_are_to_be_read() -> None:
-    found = Parameters(
-        NoBody(), flight_handover.parameters(Names("auto", "", ""), None, LiveSettings(CONFIGURED), lambda *_: None)
-    )
+    found = Flown(CONFIGURED, None, Names("auto", "", "")).parameters
     assert [(knob.name, knob.value, knob.choices) for knob in found.all()] == [
         ("LF_MASK", NONE, ()),
         ("LF_LAW", BY_BODY, ()),
@@ -164,34 +173,3 @@ def test_what_goes_wrong_in_flight_or_at_the_first_start_is_not_repeated(began: 
     with pytest.raises(DappledError, match="disk is gone"):
         flight_handover.flights(CONFIGURED, fly)
     assert len(flown) == 1
-
-
-def test_what_is_safe_is_taken_and_the_rest_waits() -> None:
-    now = Settings()
-    wanted = replace(
-        now,
-        record=replace(now.record, min_free_mb=900, directory="/elsewhere"),
-        camera=replace(now.camera, driver="other"),
-    )
-    settings = LiveSettings(now)
-    told = settings.reload(wanted)
-    merged = settings.now
-    assert merged.record.min_free_mb == 900
-    assert merged.record.directory == now.record.directory
-    assert merged.camera == now.camera
-    assert told == [
-        "camera.driver stays 'gphoto2': 'other' takes a restart",
-        "record.directory stays '~/flights': '/elsewhere' takes a restart",
-        "record.min_free_mb is 900 now (was 500)",
-    ]
-
-
-def test_the_same_settings_change_nothing() -> None:
-    settings = LiveSettings(Settings())
-    assert (settings.reload(Settings()), settings.now) == ([], Settings())
-
-
-def test_the_safe_keys_exist() -> None:
-    tables = {table.name: {key.name for key in fields(getattr(Settings(), table.name))} for table in fields(Settings)}
-    for table, key in CHANGES_IN_FLIGHT:
-        assert key in tables[table]

@@ -7,6 +7,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -99,7 +100,7 @@ def test_a_disk_that_can_t_be_asked_refuses_in_words(
         raise FlightError("cannot ask for the free space of the disk")
 
     with monkeypatch.context() as broken:
-        broken.setattr(layout, "free_bytes", refuse)
+        broken.setattr(layout, "disk_space", refuse)
         decision = service.request(CaptureRequest("test", "console", 1))
     assert (decision.outcome, decision.reason) == ("refused", "cannot ask for the free space of the disk")
     service.stop()
@@ -273,13 +274,10 @@ def test_a_camera_driver_s_thread_that_dies_is_reported(
 
 def test_every_turn_or_at_its_own_pace() -> None:
     done: list[str] = []
-    tasks = [
-        PeriodicTask("each", lambda: done.append("each")),
-        PeriodicTask("slow", lambda: done.append("slow"), every_ns=S),
-    ]
+    tasks = [PeriodicTask("each"), PeriodicTask("slow", every_ns=S)]
     for now_ns in (5 * S, 5 * S + 1, 6 * S - 1, 6 * S):
         for task in tasks:
-            task.turn(now_ns)
+            task.turn(partial(done.append, task.name), now_ns)
     assert (done.count("each"), done.count("slow")) == (4, 2)
 
 
@@ -293,18 +291,18 @@ def test_one_that_fails_is_tried_again_and_told_once(error: Exception, caplog: p
         if broken:
             raise error
 
-    task = PeriodicTask("events", do)
+    task = PeriodicTask("events")
     with caplog.at_level(logging.WARNING):
         for now_ns in (S, S + 1, S + AGAIN_NS - 1, S + AGAIN_NS, S + 2 * AGAIN_NS):
-            task.turn(now_ns)
+            task.turn(do, now_ns)
     assert len(tries) == 3
     assert len(caplog.records) == 1
     assert str(error) in task.problem
     broken = False
-    task.turn(10 * S)
-    task.turn(10 * S)
+    task.turn(do, 10 * S)
+    task.turn(do, 10 * S)
     assert (len(tries), task.problem) == (5, "")
     broken = True
     with caplog.at_level(logging.WARNING):
-        task.turn(11 * S)
+        task.turn(do, 11 * S)
     assert len(caplog.records) == 2

@@ -101,9 +101,9 @@ def test_a_disk_that_refuses_is_told(flights: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_free_space_is_a_number_or_a_sentence(tmp_path: Path) -> None:
-    assert layout.free_bytes(tmp_path) > 0
+    assert layout.disk_space(tmp_path).available > 0
     with pytest.raises(FlightError, match="does not exist"):
-        layout.free_bytes(tmp_path / "missing")
+        layout.disk_space(tmp_path / "missing")
 
 
 def test_unreadable_facts_are_told(flights: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from dappled.config.settings import CameraSettings, PublishSettings
 from dappled.daemon.console import access, connection, feed
-from dappled.daemon.flight_handover import CHANGES_IN_FLIGHT
+from dappled.daemon.live_settings import CHANGES_IN_FLIGHT
 from dappled.daemon.pipeline import repeats
 from tests.system.documents import ROOT, Stage, commands, stage
 

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from dappled.clock import Clock
 from dappled.daemon.camera_protocol import camera_status
-from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, Storage
-from dappled.daemon.flight_handover import FlightHandover, LiveSettings
+from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, ReportedCamera
+from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.health.status_text import Alarms
+from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import Navigation
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.decode.geometry import Pose
-from dappled.drivers.camera import Identity
-from dappled.drivers.mavlink import MavlinkLinks
+from dappled.drivers.mavlink import PacketSender
 from dappled.flight import FlightError, Recording, Shot, layout
+from dappled.flight.layout import DiskSpace
 
 
 class FlightControl:
     """The ShotSink and the CameraModel of one live flight.
 
-    `handover` takes what the next flight is flown with; None: there is none. `well` is whether everything works that
-    photographs are taken and kept with, as the working loop saw it last. `identity`, `focal_length_mm` and `chip` are
-    what the camera reported last; ShotEvents sets them.
+    `handover` takes what the next flight is flown with; None: there is none.
     """
 
     def __init__(
@@ -36,17 +33,14 @@ class FlightControl:
         shots: PendingShots,
         writer: LedgerWriter,
         navigation: Navigation,
-        links: MavlinkLinks,
+        camera: ReportedCamera,
+        sender: PacketSender,
         alarms: Alarms,
         handover: FlightHandover | None,
     ) -> None:
         self._settings, self._clock, self._recording, self._shots = settings, clock, recording, shots
-        self._writer, self._navigation, self._links, self._alarms = writer, navigation, links, alarms
-        self._handover = handover
-        self.well = True
-        self.identity: Identity | None = None
-        self.focal_length_mm: float | None = None
-        self.chip: dict[str, Any] = camera_status.sensor_facts(settings.now, "")
+        self._writer, self._navigation, self._camera = writer, navigation, camera
+        self._sender, self._alarms, self._handover = sender, alarms, handover
 
     # ShotSink
 
@@ -57,7 +51,7 @@ class FlightControl:
         if self._shots.state not in ("ready", "busy"):
             return self._shots.camera_sentence()
         try:
-            free = layout.free_bytes(self._recording.folder.path)
+            free = layout.disk_space(self._recording.folder.path).available
         except FlightError as error:
             return str(error)
         wanted_mb = self._settings.now.record.min_free_mb
@@ -86,11 +80,14 @@ class FlightControl:
 
     def facts(self) -> CameraFacts:
         """See CameraModel."""
-        return camera_status.camera_facts(self.identity, self.focal_length_mm, self.chip)
+        return self._camera.facts()
 
-    def storage(self) -> Storage | None:
+    def storage(self) -> DiskSpace | None:
         """See CameraModel."""
-        return camera_status.disk_storage(self._recording.folder.path)
+        try:
+            return layout.disk_space(self._recording.folder.path)
+        except FlightError:
+            return None
 
     def lookup(self, index: int) -> Captured | None:
         """See CameraModel."""
@@ -101,10 +98,6 @@ class FlightControl:
     def pose(self) -> Pose | None:
         """See CameraModel."""
         return self._navigation.pose_now()
-
-    def healthy(self) -> bool:
-        """See CameraModel."""
-        return self.well
 
     def troubled(self) -> bool:
         """See CameraModel."""
@@ -126,4 +119,4 @@ class FlightControl:
         boot_ms = (self._clock.monotonic_ns() // 10**6) % 2**32
         message = camera_status.distance_message(nearest_m, boot_ms, self.mount)
         if message is not None:
-            self._links.send(message)
+            self._sender.send(message)

@@ -1,4 +1,4 @@
-"""Change settings while the daemon runs: some at once, after SIGHUP; mask and carrier law with the next flight.
+"""Let a ground station choose another mask or carrier law: with it the flight ends, and the next one begins.
 
 What frames are decoded by belongs to a flight: its record, its replay and every product of it have one recipe. So a
 ground station's choice of another one ends the flight in order, between two frames, and begins the next one with it.
@@ -8,49 +8,23 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
+from typing import Protocol
 
 from dappled.config import profiles
 from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol.parameters import OwnParameter
+from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.recipes import Names
+from dappled.daemon.pipeline.shutter import Shutter
 from dappled.decode.optics import LAWS
-from dappled.errors import DappledError, sentence
+from dappled.drivers.camera import CameraError
+from dappled.errors import DappledError, counted, sentence
 
 log = logging.getLogger(__name__)
 NONE = "none"  # no mask: frames are kept, not decoded
 BY_BODY = "by body"  # no law is named: the first frame shows which body it is, and so which law
-# Settings that are read each time they are used, and that change no record that has begun.
-CHANGES_IN_FLIGHT = frozenset({("pose", "wait_ms"), ("record", "min_free_mb")})
-
-
-class LiveSettings:
-    """The settings in force: `now`."""
-
-    def __init__(self, now: Settings) -> None:
-        self.now = now
-
-    def reload(self, wanted: Settings) -> list[str]:
-        """Take over what may change in flight. Returns a sentence for each difference: taken, or refused."""
-        changes: list[str] = []
-        tables = {}
-        for table in fields(Settings):
-            old, new = getattr(self.now, table.name), getattr(wanted, table.name)
-            taken = {}
-            for key in fields(old):
-                before, after = getattr(old, key.name), getattr(new, key.name)
-                if before == after:
-                    continue
-                name = f"{table.name}.{key.name}"
-                if (table.name, key.name) in CHANGES_IN_FLIGHT:
-                    taken[key.name] = after
-                    changes.append(f"{name} is {after!r} now (was {before!r})")
-                else:
-                    changes.append(f"{name} stays {before!r}: {after!r} takes a restart")
-            tables[table.name] = replace(old, **taken)
-        self.now = Settings(**tables)
-        return changes
 
 
 class FlightHandover:
@@ -101,32 +75,72 @@ def words(names: Names) -> tuple[str, str]:
     return names.mask or NONE, names.law or BY_BODY
 
 
-def parameters(
-    flown: Names, after: FlightHandover | None, settings: LiveSettings, ask: Callable[[Settings, str], None]
-) -> tuple[OwnParameter, OwnParameter]:
-    """LF_MASK and LF_LAW of a flight; read-only where no flight can come `after` it.
+class EventWriter(Protocol):
+    """What takes the events of a flight: `pipeline.flight_writer.LedgerWriter`."""
 
-    `ask` takes the next flight's settings and a sentence; it raises CameraError where that must wait. Once it has
-    taken them, the parameters show those of the next flight: this one takes no more frames.
+    def later(self, kind: str, text: str) -> None:
+        """Take an event from a thread that must not wait for the disk."""
+
+
+class RecipeParameters:
+    """LF_MASK and LF_LAW of a flight with the names `flown`; read-only where no flight can come `after` it.
+
+    Another value ends the flight between two frames, and the next one is flown with it. The parameters show it from
+    then on: this flight takes no more frames.
     """
-    mask, law = words(flown)
-    if after is None:
-        return OwnParameter("LF_MASK", "Mask", lambda: mask), OwnParameter("LF_LAW", "Carrier law", lambda: law)
 
-    def change_mask(word: str) -> None:
-        nonlocal mask
-        ask(after.with_mask(after.next or settings.now, word), f"mask {word}")
-        mask = word
+    def __init__(
+        self,
+        flown: Names,
+        after: FlightHandover | None,
+        settings: LiveSettings,
+        shutter: Shutter,
+        events: EventWriter,
+    ) -> None:
+        self._mask, self._law = words(flown)
+        self._after, self._settings, self._shutter, self._events = after, settings, shutter, events
 
-    def change_law(word: str) -> None:
-        nonlocal law
-        ask(after.with_law(after.next or settings.now, word), f"carrier law {word}")
-        law = word
+    def all(self) -> tuple[OwnParameter, OwnParameter]:
+        """Both, to be read and changed. A change raises CameraError where it would cut something short."""
+        after = self._after
+        if after is None:
+            return OwnParameter("LF_MASK", "Mask", self.mask), OwnParameter("LF_LAW", "Carrier law", self.law)
+        return (
+            OwnParameter("LF_MASK", "Mask", self.mask, after.masks(), self.change_mask),
+            OwnParameter("LF_LAW", "Carrier law", self.law, after.laws(), self.change_law),
+        )
 
-    return (
-        OwnParameter("LF_MASK", "Mask", lambda: mask, after.masks(), change_mask),
-        OwnParameter("LF_LAW", "Carrier law", lambda: law, after.laws(), change_law),
-    )
+    def mask(self) -> str:
+        """The value of LF_MASK."""
+        return self._mask
+
+    def law(self) -> str:
+        """The value of LF_LAW."""
+        return self._law
+
+    def change_mask(self, word: str) -> None:
+        """Fly the next flight with this mask. Raises CameraError."""
+        assert self._after is not None
+        self._begin_next(self._after, self._after.with_mask(self._next(self._after), word), f"mask {word}")
+        self._mask = word
+
+    def change_law(self, word: str) -> None:
+        """Fly the next flight with this carrier law. Raises CameraError."""
+        assert self._after is not None
+        self._begin_next(self._after, self._after.with_law(self._next(self._after), word), f"carrier law {word}")
+        self._law = word
+
+    def _next(self, after: FlightHandover) -> Settings:
+        return after.next or self._settings.now
+
+    def _begin_next(self, after: FlightHandover, following: Settings, text: str) -> None:
+        now = self._shutter.statistics()
+        if now.interval_s is not None:
+            raise CameraError(f"{text} would begin another flight: stop the interval first")
+        if now.pending:
+            raise CameraError(f"{text} would begin another flight: {counted(now.pending, 'shot')} under way, ask again")
+        after.next = following
+        self._events.later("next flight", f"{text} from there on, by the ground station")
 
 
 def flights(settings: Settings, fly: Callable[[Settings, FlightHandover], bool]) -> None:

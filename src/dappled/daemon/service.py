@@ -1,7 +1,8 @@
 """Build a live flight from its parts, start and stop them in order, and run the loop that looks after them.
 
-Parts know only parts that are built before them. Commands go down: component → shutter → FlightControl → PendingShots →
-camera. Events go down too: pipeline → ShotEvents → component, shutter, logbook. `start` reads in that order.
+Parts know only parts that are built before them, so their references form no circle. Packets go from the links to
+Navigation and to the component. Commands go down: component → shutter → FlightControl → PendingShots → camera. Events
+go down too: pipeline → ShotEvents → component, shutter, logbook. `_build` reads in that order.
 """
 
 from __future__ import annotations
@@ -21,16 +22,18 @@ from dappled.clock import Clock, SystemClock
 from dappled.config import settings as configuration
 from dappled.config.schema import ConfigError
 from dappled.config.settings import Settings
-from dappled.daemon import flight_handover
+from dappled.daemon.camera_protocol.camera_status import ReportedCamera
 from dappled.daemon.camera_protocol.component import Component
+from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters
 from dappled.daemon.console import process as console_process
 from dappled.daemon.console.process import Console
 from dappled.daemon.flight_control import FlightControl
-from dappled.daemon.flight_handover import FlightHandover, LiveSettings
+from dappled.daemon.flight_handover import FlightHandover, RecipeParameters
 from dappled.daemon.health import record as health
-from dappled.daemon.health.logbook import Logbook
+from dappled.daemon.health.logbook import Logbook, NewProblems
 from dappled.daemon.health.status_text import Alarms
+from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import BodyLatency, Navigation
 from dappled.daemon.navigation.clocks import utc_known
 from dappled.daemon.pipeline import recipes
@@ -45,12 +48,12 @@ from dappled.daemon.shot_events import ShotEvents
 from dappled.daemon.stream import curve, wire
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher
-from dappled.drivers.camera import Camera, CameraError
-from dappled.drivers.mavlink import MavlinkLinks, Packet, Signing, Unsigned, open_signing
+from dappled.drivers.camera import Camera
+from dappled.drivers.mavlink import MavlinkLinks, Signing, Unsigned, open_signing
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot
-from dappled.errors import DappledError, counted, report, sentence
+from dappled.errors import DappledError, report, sentence
 from dappled.flight import Recording
 from dappled.flight import recording as flights
 
@@ -152,7 +155,8 @@ class Service:
         settings, clock, recording = self._settings.now, self._clock, self._recording
         self._shots = shots = PendingShots(camera)
         self._writer = writer = LedgerWriter(recording, clock)
-        self._navigation = Navigation(lambda: self._settings.now, clock, recording, utc_known=self._utc_known)
+        self._navigation = Navigation(self._settings, clock, recording, utc_known=self._utc_known)
+        reported, sender = ReportedCamera(settings), self._links.sender
         self._control = FlightControl(
             self._settings,
             clock,
@@ -160,23 +164,26 @@ class Service:
             shots=shots,
             writer=writer,
             navigation=self._navigation,
-            links=self._links,
+            camera=reported,
+            sender=sender,
             alarms=self._alarms,
             handover=self._after,
         )
         self._shutter = Shutter(
             self._control, clock, next_index=recording.next_index, capacity=settings.camera.max_pending
         )
+        autopilot = OwnAutopilot(sender, clock)
+        if isinstance(camera, UsesAutopilot):
+            camera.use_autopilot(autopilot.command)
         self._component = Component(
-            self._links,
+            sender,
+            autopilot,
             self._shutter,
             clock,
             self._parameters(camera, names, decodes=recipe is not None),
-            self._control,
+            model=self._control,
             feedback_is_shot=settings.mavlink.feedback_is_shot,
         )
-        if isinstance(camera, UsesAutopilot):
-            camera.use_autopilot(self._component.command_autopilot)
         self._decoder = None if recipe is None else DecodeProcess(recipe)
         self._depth = None
         if recipe is not None and settings.decode.depth:
@@ -190,15 +197,14 @@ class Service:
                 on_nearest=self._control.send_distance if settings.decode.depth_to_autopilot else None,
             )
         self._events = ShotEvents(
-            settings,
             recording,
-            self._control,
+            reported,
+            self._navigation.utc,
             shutter=self._shutter,
             component=self._component,
             logbook=self._logbook,
             depth=self._depth,
             outside=self._outside,
-            utc_ns=self._navigation.utc.utc_ns,
         )
         self._pipeline = Pipeline(
             camera,
@@ -224,8 +230,8 @@ class Service:
         decoding = OwnParameter(
             "LF_DECODE", "Decode in flight", control.decoding, ("on", "off"), control.set_decoding if decodes else None
         )
-        mask_and_law = flight_handover.parameters(names, self._after, self._settings, self._hand_over)
-        return Parameters(camera, (decoding, *mask_and_law))
+        recipe = RecipeParameters(names, self._after, self._settings, self._shutter, self._writer)
+        return Parameters(camera, (decoding, *recipe.all()))
 
     def _start_parts(self, names: Names, stack: ExitStack) -> None:
         """Start the last stage first, so that each item finds its receiver. A part that fails is stopped too."""
@@ -246,7 +252,7 @@ class Service:
         self._pipeline.start()
         stack.callback(self._shutter.stop)
         self._shutter.start()
-        self._links.start(self)
+        self._links.start(self._navigation, self._component)
 
     def _remove_unused_flight(self) -> None:
         """Remove the folder of a flight whose start failed. A flight that has begun is kept, however it ends."""
@@ -274,35 +280,41 @@ class Service:
 
     # the working loop
 
-    def _periodic_tasks(self) -> list[PeriodicTask]:
-        """The tasks of the working loop, in order. Without the loop there is no heartbeat."""
-        tasks = [
-            PeriodicTask("events", self._writer.write_later),
-            PeriodicTask("health", self._publish_health, every_ns=HEALTH_NS),
-        ]
+    def _periodic_tasks(self) -> dict[PeriodicTask, Callable[[], object]]:
+        """The tasks of the working loop, in order, and what each does. Without the loop there is no heartbeat."""
+        tasks: dict[PeriodicTask, Callable[[], object]] = {
+            PeriodicTask("events"): self._writer.write_later,
+            PeriodicTask("health", every_ns=HEALTH_NS): self._publish_health,
+        }
         if not self._settings.now.mavlink.url:
             return tasks
-        return [
-            PeriodicTask("MAVLink", self._tick),
-            PeriodicTask("vehicle", lambda: self._navigation.belongs_to(self._component.vehicle)),
-            *tasks,
-            PeriodicTask("UTC", self._navigation.look_for_utc, every_ns=HEALTH_NS),
-        ]
+        return {
+            PeriodicTask("MAVLink"): self._tick,
+            PeriodicTask("vehicle"): self._follow_vehicle,
+            **tasks,
+            PeriodicTask("UTC", every_ns=HEALTH_NS): self._navigation.look_for_utc,
+        }
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Send heartbeats and health until `ask_to_stop` or `stop` is called, or `until()` is true."""
-        while not self._stopping.is_set() and not until():
+        """Send heartbeats and health until `ask_to_stop` or `stop` is called, the ground station has set what the next
+        flight is flown with, or `until()` is true."""
+        while not (self._stopping.is_set() or self._next_is_set() or until()):
             self.step()
             self._stopping.wait(_LOOK_S)
 
     def step(self) -> None:
         """Do once what is due."""
-        for task in self._tasks:
-            task.turn(self._clock.monotonic_ns())
+        for task, do in self._tasks.items():
+            task.turn(do, self._clock.monotonic_ns())
+
+    def _next_is_set(self) -> bool:
+        return self._after is not None and self._after.next is not None
 
     def _tick(self) -> None:
-        self._control.well = self.healthy()
-        self._component.tick()
+        self._component.tick(healthy=self.healthy())
+
+    def _follow_vehicle(self) -> None:
+        self._navigation.belongs_to(self._component.vehicle)
 
     def _publish_health(self) -> None:
         record = self.health()
@@ -363,58 +375,36 @@ class Service:
         """See LiveSettings.reload."""
         return self._settings.reload(wanted)
 
-    def log_packet(self, stamp_us: int, raw: bytes) -> int | None:
-        """See PacketSink."""
-        return self._recording.telemetry.append(stamp_us, raw)
-
-    def on_packet(self, packet: Packet) -> None:
-        """See PacketSink: first to the poses, so that a command finds the pose of its own packet."""
-        self._navigation.on_packet(packet)
-        self._component.on_packet(packet)
-
-    def _hand_over(self, following: Settings, text: str) -> None:
-        """End this flight between two frames; the next one is flown with `following`.
-
-        Raises CameraError where that would cut something short.
-        """
-        assert self._after is not None
-        now = self._shutter.statistics()
-        if now.interval_s is not None:
-            raise CameraError(f"{text} would begin another flight: stop the interval first")
-        if now.pending:
-            raise CameraError(f"{text} would begin another flight: {counted(now.pending, 'shot')} under way, ask again")
-        self._after.next = following
-        self._writer.later("next flight", f"{text} from there on, by the ground station")
-        self.ask_to_stop()
-
 
 class PeriodicTask:
-    """A task of the working loop: done in every turn, or every `every_ns`.
+    """When a task of the working loop is due: in every turn, or every `every_ns`.
 
-    A task that fails is tried again a second later. The log has the first failure after a success only. Times are
+    A task that fails is tried again a second later. The log has each failure that its last try did not have. Times are
     monotonic.
     """
 
-    def __init__(self, name: str, do: Callable[[], object], *, every_ns: int = 0) -> None:
+    def __init__(self, name: str, *, every_ns: int = 0) -> None:
         self.name = name
         self.problem = ""
-        self._do, self._every_ns = do, every_ns
+        self._every_ns = every_ns
         self._due_ns = 0
+        self._new = NewProblems()
 
-    def turn(self, now_ns: int) -> None:
+    def turn(self, do: Callable[[], object], now_ns: int) -> None:
         """Do it if it is due."""
         if now_ns < self._due_ns:
             return
         try:
-            self._do()
+            do()
         except Exception as error:  # noqa: BLE001  # a disk that refuses, or a bug in one task: the flight goes on
-            if not self.problem:
-                report(log, self.name, error)
             self.problem = f"{self.name}: {sentence(error)}"
             self._due_ns = now_ns + AGAIN_NS
+            if self._new.among([self.problem]):
+                report(log, self.name, error)
         else:
             self.problem = ""
             self._due_ns = now_ns + self._every_ns
+            self._new.among([])
 
 
 def _open_publisher(settings: Settings, private: str) -> Publisher:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 
-from dappled.config.settings import Settings
-from dappled.daemon.camera_protocol import camera_status
+from dappled.daemon.camera_protocol.camera_status import ReportedCamera, captured_shot
 from dappled.daemon.camera_protocol.component import Component
-from dappled.daemon.flight_control import FlightControl
 from dappled.daemon.health.logbook import Logbook, battery_doubt, of_shot
+from dappled.daemon.navigation.clocks import UtcLearner
 from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.shutter import Shutter
@@ -22,27 +20,26 @@ log = logging.getLogger(__name__)
 
 
 class ShotEvents(Observer):
-    """Observes a live pipeline. `utc_ns` corrects a stamp of this flight, None while that can't be done.
+    """Observes a live pipeline. `camera` and `utc` are what is known of the camera and of the time.
 
     `outside` is called last. `doubt` is a sentence where the camera will soon stop working.
     """
 
     def __init__(
         self,
-        settings: Settings,
         recording: Recording,
-        control: FlightControl,
+        camera: ReportedCamera,
+        utc: UtcLearner,
         *,
         shutter: Shutter,
         component: Component,
         logbook: Logbook,
         depth: LiveDepth | None,
         outside: Observer,
-        utc_ns: Callable[[int], int | None],
     ) -> None:
-        self._settings, self._recording, self._control = settings, recording, control
+        self._recording, self._camera, self._utc = recording, camera, utc
         self._shutter, self._component, self._logbook = shutter, component, logbook
-        self._depth, self._outside, self._utc_ns = depth, outside, utc_ns
+        self._depth, self._outside = depth, outside
         self.doubt: str | None = None
 
     def settled(self, index: int, ok: bool) -> None:
@@ -52,16 +49,15 @@ class ShotEvents(Observer):
 
     def tagged(self, pending: PendingShot) -> None:
         """See Observer."""
-        captured = camera_status.captured_shot(pending, self._utc_ns)
+        captured = captured_shot(pending, self._utc.utc_ns)
         self._component.announce(captured)
         if not captured.ok:
             self._component.say(f"image {pending.shot.index} failed: {pending.problem}", mavlink.MAV_SEVERITY_ERROR)
-        if pending.tag is not None:
-            before_mm, now_mm = self._control.focal_length_mm, pending.tag.focal_length_mm
-            if before_mm and now_mm and before_mm != now_mm:
-                text = f"image {pending.shot.index} was zoomed from {before_mm:g} to {now_mm:g} mm: is it calibrated?"
-                self._component.say(text)
-            self._control.focal_length_mm = now_mm or before_mm
+        zoomed = None if pending.tag is None else self._camera.zoomed(pending.tag.focal_length_mm)
+        if zoomed is not None:
+            before_mm, now_mm = zoomed
+            text = f"image {pending.shot.index} was zoomed from {before_mm:g} to {now_mm:g} mm: is it calibrated?"
+            self._component.say(text)
         self._outside.tagged(pending)
 
     def finished(self, pending: PendingShot) -> None:
@@ -74,13 +70,13 @@ class ShotEvents(Observer):
     def camera_changed(self, change: StateChanged) -> None:
         """See Observer."""
         log.debug("camera %s %s", change.state, change.reason)
-        if change.state != "busy" and not (change.state == "ready" and self._control.identity):
+        if change.state != "busy" and not (change.state == "ready" and self._camera.known):
             reason = f": {change.reason}" if change.reason else ""
             calm = change.state in ("ready", "starting")
             self._logbook.add(f"camera {change.state}{reason}", "info" if calm else "warning")
         self._component.state_changed()
-        if change.identity is not None and change.identity != self._control.identity:
-            self._meet(change.identity)
+        if change.identity is not None and self._camera.identify(change.identity):
+            self._record_camera(change.identity)
         self._outside.camera_changed(change)
 
     def settings_changed(self, change: SettingsChanged) -> None:
@@ -89,10 +85,8 @@ class ShotEvents(Observer):
         self._component.settings_changed(change.refused)
         self._outside.settings_changed(change)
 
-    def _meet(self, camera: Identity) -> None:
-        """Take note of the first camera, or of another one."""
-        self._control.identity = camera
-        self._control.chip = camera_status.sensor_facts(self._settings, camera.model)
+    def _record_camera(self, camera: Identity) -> None:
+        """Write down which camera it is: the first one, or another."""
         facts = {"make": camera.make, "model": camera.model, "serial": camera.serial, "port": camera.port}
         try:
             self._recording.add_facts({"camera": facts})

@@ -163,13 +163,22 @@ def _folders(root: Path) -> list[str]:
         raise disk_error("list the flights in", root, error) from error
 
 
-def free_bytes(path: Path) -> int:
-    """Free space for this user on the disk of `path`, in bytes. Raises FlightError."""
+@dataclass(frozen=True, slots=True)
+class DiskSpace:
+    """The space of a disk in bytes: `available` to this user."""
+
+    total: int
+    used: int
+    available: int
+
+
+def disk_space(path: Path) -> DiskSpace:
+    """The space of the disk of `path`. Raises FlightError."""
     try:
-        stat = os.statvfs(path)
+        usage = shutil.disk_usage(path)
     except OSError as error:
         raise disk_error("ask for the free space of", path, error) from error
-    return stat.f_bavail * stat.f_frsize
+    return DiskSpace(usage.total, usage.used, usage.free)
 
 
 def write_facts(folder: FlightFolder, facts: Mapping[str, Any]) -> None:

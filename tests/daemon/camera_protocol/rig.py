@@ -11,14 +11,16 @@ from types import TracebackType
 
 from dappled.clock import Clock, RecordedClock, SystemClock
 from dappled.config.settings import PoseSettings
-from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, Storage
+from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured
 from dappled.daemon.camera_protocol.component import Component
+from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink import MavlinkLinks, Message, Packet, Signing, mavlink, pack
 from dappled.flight import Cause, Shot
+from dappled.flight.layout import DiskSpace
 from tests.daemon.fakes import eventually
 
 
@@ -57,12 +59,13 @@ class Camera:
             signing=signing,
         )
         self.shutter = Shutter(self, self.clock, next_index=first, capacity=capacity)
-        self.component = Component(self.links, self.shutter, self.clock, Parameters(self), self)
-        self.component._identity.settled = settled
+        autopilot = OwnAutopilot(self.links.sender, self.clock)
+        autopilot.identity.settled = settled
+        self.component = Component(self.links.sender, autopilot, self.shutter, self.clock, Parameters(self), model=self)
         self._worker = threading.Thread(target=self._work)
 
     def __enter__(self) -> Camera:
-        self.links.start(self)
+        self.links.start(self, self.component)
         self.shutter.start()
         self._worker.start()
         return self
@@ -114,17 +117,14 @@ class Camera:
     def facts(self) -> CameraFacts:
         return CameraFacts("dappled", "test", (0, 1, 0))
 
-    def storage(self) -> Storage:
-        return Storage(2**34, 2**33, 2**33)
+    def storage(self) -> DiskSpace:
+        return DiskSpace(2**34, 2**33, 2**33)
 
     def lookup(self, index: int) -> Captured | None:
         return self.done.get(index)
 
     def pose(self) -> None:
         """Not known."""
-
-    def healthy(self) -> bool:
-        return True
 
     def troubled(self) -> bool:
         return False
@@ -142,7 +142,6 @@ class Camera:
     def on_packet(self, packet: Packet) -> None:
         assert packet.number is not None
         self.telemetry.feed(packet.number, packet.stamp_us, packet.message)
-        self.component.on_packet(packet)
 
     def _work(self) -> None:
         while True:

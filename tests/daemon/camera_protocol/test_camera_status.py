@@ -9,7 +9,7 @@ import pytest
 
 from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol import camera_status
-from dappled.daemon.camera_protocol.camera_status import distance_message, sensor_orientation
+from dappled.daemon.camera_protocol.camera_status import ReportedCamera, distance_message, sensor_orientation
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.drivers.camera import Identity
 from dappled.drivers.mavlink import mavlink
@@ -18,26 +18,39 @@ from dappled.flight import Cause, ImageIndex, Shot
 SHOT = Shot(7, Cause("test", "console", 1), 1_000, 1_000)
 
 
-def test_the_chip_of_a_profile() -> None:
+WHO = Identity("Canon Inc.", "Canon EOS 450D", "1234", "usb:001,002")
+
+
+def test_the_sensor_of_a_profile_and_of_a_model() -> None:
     settings = Settings()
-    known = camera_status.sensor_facts(replace(settings, camera=replace(settings.camera, profile="canon-eos-450d")), "")
-    assert known["columns"] > known["rows"] > 2000
-    assert 21 < known["sensor_width_mm"] < 23
-    assert camera_status.sensor_facts(settings, "a model that nobody knows") == {}
+    named = ReportedCamera(replace(settings, camera=replace(settings.camera, profile="canon-eos-450d"))).facts()
+    assert named.columns is not None
+    assert named.rows is not None
+    assert named.sensor_width_mm is not None
+    assert named.columns > named.rows > 2000
+    assert 21 < named.sensor_width_mm < 23
+    camera = ReportedCamera(settings)
+    assert camera.facts().columns is None
+    assert camera.identify(WHO)
+    assert camera.facts().columns == named.columns
+    assert camera.identify(replace(WHO, model="a model that nobody knows"))
+    assert camera.facts().columns is None
 
 
 def test_a_camera_that_has_not_said_who_it_is() -> None:
-    unknown = camera_status.camera_facts(None, None, {})
+    camera = ReportedCamera(Settings())
+    unknown = camera.facts()
     assert (unknown.vendor, unknown.model, unknown.focal_length_mm) == ("dappled", "masked camera", None)
-    who = Identity("Canon Inc.", "Canon EOS 450D", "1234", "usb:001,002")
-    assert camera_status.camera_facts(who, 18.0, {}).model == "Canon EOS 450D"
+    assert not camera.known
+    assert [camera.identify(WHO), camera.identify(WHO), camera.known] == [True, False, True]
+    assert camera.facts().model == "Canon EOS 450D"
 
 
-def test_a_disk_that_does_not_say(tmp_path: Path) -> None:
-    told = camera_status.disk_storage(tmp_path)
-    assert told is not None
-    assert told.total >= told.available > 0
-    assert camera_status.disk_storage(tmp_path / "gone") is None
+def test_a_lens_that_was_zoomed_is_seen_and_an_unknown_focal_length_changes_nothing() -> None:
+    camera = ReportedCamera(Settings())
+    seen = [camera.zoomed(length_mm) for length_mm in (None, 35.0, None, 35.0, 55.0)]
+    assert seen == [None, None, None, None, (35.0, 55.0)]
+    assert camera.facts().focal_length_mm == 55.0
 
 
 def test_a_shot_that_failed_was_not_captured() -> None:

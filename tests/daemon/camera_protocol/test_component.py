@@ -11,12 +11,14 @@ from hypothesis import strategies as st
 
 from dappled.clock import RecordedClock
 from dappled.config.settings import PoseSettings
-from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, Storage
+from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured
 from dappled.daemon.camera_protocol.component import Component
+from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters, code
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Setting, SettingName, check_change
 from dappled.drivers.mavlink import Message, Packet, mavlink, pack
+from dappled.flight.layout import DiskSpace
 from tests.daemon.fakes import FakeSink
 
 NAN = math.nan
@@ -59,7 +61,10 @@ class Rig:
         self.sink = FakeSink()
         self.shutter = Shutter(self.sink, self.clock, next_index=5, capacity=capacity)
         knobs = Parameters(self.body, (own,))
-        self.component = Component(self, self.shutter, self.clock, knobs, self, feedback_is_shot=feedback_is_shot)
+        self.autopilot = OwnAutopilot(self, self.clock)
+        self.component = Component(
+            self, self.autopilot, self.shutter, self.clock, knobs, model=self, feedback_is_shot=feedback_is_shot
+        )
 
     @property
     def fired(self) -> list[int]:
@@ -70,17 +75,14 @@ class Rig:
     def facts(self) -> CameraFacts:
         return CameraFacts("Canon", "EOS 450D", (0, 1, 0), 50.0, 22.2, 14.8, 4272, 2848)
 
-    def storage(self) -> Storage:
-        return Storage(2**34, 2**33, 2**33)
+    def storage(self) -> DiskSpace:
+        return DiskSpace(2**34, 2**33, 2**33)
 
     def lookup(self, index: int) -> Captured | None:
         return Captured(index, ok=index != 3) if index < 5 else None
 
     def pose(self) -> None:
         """Not known."""
-
-    def healthy(self) -> bool:
-        return self.well
 
     def troubled(self) -> bool:
         return self.critical
@@ -117,7 +119,7 @@ class Rig:
     def tick(self, seconds: float = 0.0) -> list[str]:
         self.clock.advance(seconds)
         self.sent.clear()
-        self.component.tick()
+        self.component.tick(healthy=self.well)
         return [m.get_type() for m in self.sent]
 
 
@@ -433,7 +435,7 @@ def test_an_unsigned_heartbeat_does_not_decide_whose_camera_this_is(late_s: floa
     autopilot_heartbeat(rig, 66)
     rig.tick(4)
     assert (rig.system_id, rig.component.vehicle) == (7, 7)
-    assert rig.component.command_autopilot(2000, (0,)) is None
+    assert rig.autopilot.command(2000, (0,)) is None
     assert rig.of("COMMAND_LONG")[-1].target_system == 7
 
 
@@ -454,7 +456,7 @@ def test_the_echo_of_an_order_is_no_wish_and_the_next_trigger_is_one() -> None:
     fire = mavlink.MAVLink_command_long_message(0, 0, mavlink.MAV_CMD_DO_DIGICAM_CONTROL, 0, 0, 0, 0, 0, 1, 0, 0)
     feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
     for turn in range(2):
-        assert rig.component.command_autopilot(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1)) is None
+        assert rig.autopilot.command(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1)) is None
         rig.clock.advance(0.05)
         for message in (mavlink.MAVLink_camera_trigger_message(1, turn), fire, feedback):
             rig.hear(message, AUTOPILOT)
@@ -462,7 +464,7 @@ def test_the_echo_of_an_order_is_no_wish_and_the_next_trigger_is_one() -> None:
     assert rig.fired == []
     rig.hear(mavlink.MAVLink_camera_trigger_message(9, 9), AUTOPILOT)
     assert rig.fired == [5]
-    rig.component.command_autopilot(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1))
+    rig.autopilot.command(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1))
     rig.clock.advance(2.1)
     rig.hear(mavlink.MAVLink_camera_trigger_message(10, 10), AUTOPILOT)
     assert rig.fired == [5, 6]
@@ -558,10 +560,10 @@ def test_no_parameters_crash_it(command: int, parameters: list[float], confirmat
 
 def test_the_autopilot_is_given_orders_and_its_refusal_is_told() -> None:
     rig = Rig()
-    assert rig.component.command_autopilot(181, (0, 1)) is not None  # nobody was heard yet
+    assert rig.autopilot.command(181, (0, 1)) is not None  # nobody was heard yet
     rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3), sender=(1, 1))
     rig.tick(4)
-    assert rig.component.command_autopilot(181, (0, 1)) is None
+    assert rig.autopilot.command(181, (0, 1)) is None
     (order,) = rig.of("COMMAND_LONG")[-1:]
     assert (order.target_system, order.target_component, order.command) == (1, 1, 181)
     assert (order.param1, order.param2, order.param7) == (0, 1, 0)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from dappled.config.settings import PoseSettings, Settings
+from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import ExposureTime, Navigation
 from dappled.daemon.navigation.navigation import AHEAD_NS
 from dappled.flight import recording
@@ -39,7 +40,7 @@ def test_without_telemetry_the_wait_is_bounded(tmp_path: Path, ahead_ns: int, wa
     clock, settings = TurningClock(), Settings(pose=PoseSettings(wait_ms=300.0))
     flight = recording.begin(tmp_path, clock.utc_ns, {})
     try:
-        navigation = Navigation(lambda: settings, clock, flight, utc_known=True)
+        navigation = Navigation(LiveSettings(settings), clock, flight, utc_known=True)
         exposure = ExposureTime(NOW_NS + ahead_ns, 10**6, "test")
         found, pose = navigation.pose(0, exposure)
         assert (found, pose.source) == (exposure, "none")

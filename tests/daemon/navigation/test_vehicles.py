@@ -15,8 +15,9 @@ from dappled.clock import SystemClock
 from dappled.config import settings as configuration
 from dappled.config.settings import MavlinkSettings, PoseSettings, PublishSettings, RecordSettings, Settings
 from dappled.daemon import service as module
-from dappled.daemon.camera_protocol import component
-from dappled.daemon.camera_protocol.component import SystemIdentity
+from dappled.daemon.camera_protocol import own_autopilot
+from dappled.daemon.camera_protocol.own_autopilot import SystemIdentity
+from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation.clocks import ExposureTime
 from dappled.daemon.navigation.navigation import Navigation, Telemetry, recorded_vehicles
 from dappled.daemon.pipeline.capture import PendingShot
@@ -85,7 +86,7 @@ def test_a_change_of_vehicle_that_could_not_be_recorded_is_recorded_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flight = recording.begin(tmp_path, SystemClock().utc_ns)
-    navigation = Navigation(Settings, SystemClock(), flight, utc_known=True)
+    navigation = Navigation(LiveSettings(Settings()), SystemClock(), flight, utc_known=True)
 
     def full(key: str, value: object) -> None:
         raise DappledError("the disk is full")
@@ -121,7 +122,7 @@ def test_whose_telemetry_counts(heard: tuple[int, ...], vehicle: int | None) -> 
 @pytest.fixture
 def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Settings]:
     monkeypatch.setattr(module, "open_camera", lambda _: FakeCamera())
-    monkeypatch.setattr(component, "LISTEN_NS", 5 * 10**8)
+    monkeypatch.setattr(own_autopilot, "LISTEN_NS", 5 * 10**8)
     with tempfile.TemporaryDirectory(prefix="dpl-") as sockets:
         yield configuration.resolve(
             Settings(

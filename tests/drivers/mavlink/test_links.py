@@ -68,7 +68,7 @@ def heartbeat() -> object:
 def send_until_received(sender: Side, receiver: Side, count: int = 1) -> list[Packet]:
     deadline = time.monotonic() + 10
     while sum(not p.sent for p in list(receiver.packets)) < count and time.monotonic() < deadline:
-        sender.links.send(heartbeat())
+        sender.links.sender.send(heartbeat())
         with receiver.changed:
             receiver.changed.wait(0.1)
     return receiver.received(count)
@@ -94,9 +94,9 @@ def test_mavlink_1_is_understood_and_answered_in_kind() -> None:
         packer = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
         old.sendto(heartbeat().pack(packer, force_mavlink1=True), ("127.0.0.1", server.links.port(0)))  # type: ignore[attr-defined]  # pymavlink's messages are untyped
         assert server.received(1)[0].raw[0] == 0xFE
-        server.links.send(heartbeat())
+        server.links.sender.send(heartbeat())
         assert old.recv(300)[0] == 0xFE
-        server.links.send(mavlink.MAVLink_camera_settings_message(0, 0, 0, 0))
+        server.links.sender.send(mavlink.MAVLink_camera_settings_message(0, 0, 0, 0))
         assert old.recv(300)[0] == 0xFD
 
 
@@ -119,7 +119,7 @@ def test_a_client_that_fell_silent_does_not_keep_the_next_one_waiting() -> None:
             packer = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
             second.sendall(heartbeat().pack(packer))  # type: ignore[attr-defined]  # as above
             assert server.received(1)[0].message.get_srcSystem() == 9
-            server.links.send(heartbeat())
+            server.links.sender.send(heartbeat())
             second.settimeout(10)
             assert second.recv(300)[0] == 0xFD
             vanished.settimeout(10)
@@ -184,7 +184,7 @@ def test_a_serial_device() -> None:
             packer = mavlink.MAVLink(None, srcSystem=3, srcComponent=1)
             os.write(near, b"noise" + heartbeat().pack(packer))  # type: ignore[attr-defined]  # as above
             assert side.received(1)[0].message.get_srcSystem() == 3
-            side.links.send(heartbeat())
+            side.links.sender.send(heartbeat())
             assert os.read(near, 300)[0] == 0xFD
             assert side.links.statistics()[0].packets_bad >= 1
     finally:

@@ -59,7 +59,7 @@ class Companion:
     def order(self, command: int, parameters: Sequence[float]) -> str | None:
         """See `shutter_line.Order`."""
         seven = (*parameters, *[0.0] * (7 - len(parameters)))
-        sent = self.links.send(mavlink.MAVLink_command_long_message(1, 1, command, 0, *seven))
+        sent = self.links.sender.send(mavlink.MAVLink_command_long_message(1, 1, command, 0, *seven))
         return None if sent else "the link is down"
 
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 import dappled
@@ -22,6 +20,7 @@ from dappled.drivers.camera import Identity
 from dappled.drivers.mavlink import Message, mavlink
 from dappled.errors import DappledError, report
 from dappled.flight import ImageIndex, LedgerReader
+from dappled.flight.layout import DiskSpace
 
 log = logging.getLogger(__name__)
 ZOOM = "CAM_FOCALLEN"
@@ -30,7 +29,6 @@ _NAN = math.nan
 _NEAREST_M, _FARTHEST_M = 0.3, 655.0  # what DISTANCE_SENSOR's centimetres can say
 _UNKNOWN_VARIANCE = 255
 _DOWN, _FORWARD = mavlink.MAV_SENSOR_ROTATION_PITCH_270, mavlink.MAV_SENSOR_ROTATION_NONE
-SensorFacts = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,15 +46,6 @@ class CameraFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class Storage:
-    """The disk that frames are recorded on, in bytes."""
-
-    total: int
-    used: int
-    available: int
-
-
-@dataclass(frozen=True, slots=True)
 class Captured:
     """How a shot ended. `url` names the frame; empty for a failed shot."""
 
@@ -65,6 +54,46 @@ class Captured:
     utc_ns: int | None = None
     pose: Pose | None = None
     url: str = ""
+
+
+class ReportedCamera:
+    """What the camera has reported so far: who it is, and the focal length of its last frame. Any thread may ask."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._identity: Identity | None = None
+        self._focal_length_mm: float | None = None
+        self._sensor = _sensor_facts(settings, "")
+
+    @property
+    def known(self) -> bool:
+        """Whether it has said who it is."""
+        return self._identity is not None
+
+    def identify(self, camera: Identity) -> bool:
+        """Take who it is. Whether that is another camera than before, or the first."""
+        other = camera != self._identity
+        if other:
+            self._identity, self._sensor = camera, _sensor_facts(self._settings, camera.model)
+        return other
+
+    def zoomed(self, focal_length_mm: float | None) -> tuple[float, float] | None:
+        """Take a frame's focal length, None where it is unknown. Returns the last one and this one if they differ."""
+        before_mm = self._focal_length_mm
+        self._focal_length_mm = focal_length_mm or before_mm
+        return (before_mm, focal_length_mm) if before_mm and focal_length_mm and before_mm != focal_length_mm else None
+
+    def facts(self) -> CameraFacts:
+        """CAMERA_INFORMATION's facts."""
+        who = self._identity
+        major, minor, patch = (int(part) for part in dappled.__version__.split(".")[:3])
+        return CameraFacts(
+            vendor=who.make if who else "dappled",
+            model=who.model if who else "masked camera",
+            firmware=(major, minor, patch),
+            focal_length_mm=self._focal_length_mm,
+            **self._sensor,
+        )
 
 
 class CameraModel(Protocol):
@@ -79,7 +108,7 @@ class CameraModel(Protocol):
     def facts(self) -> CameraFacts:
         """Make, model, lens and sensor, as far as they are known."""
 
-    def storage(self) -> Storage | None:
+    def storage(self) -> DiskSpace | None:
         """The disk that frames go to; None while it can't be read."""
 
     def lookup(self, index: int) -> Captured | None:
@@ -87,9 +116,6 @@ class CameraModel(Protocol):
 
     def pose(self) -> Pose | None:
         """The vehicle's pose now; None while it is unknown."""
-
-    def healthy(self) -> bool:
-        """Whether a heartbeat is sent."""
 
     def troubled(self) -> bool:
         """Whether the heartbeat says MAV_STATE_CRITICAL."""
@@ -283,19 +309,7 @@ def captured_image(index: int, images: ImageIndex) -> Captured | None:
     return Captured(index, ok, utc_ns, tag.pose, entry.frame or "")
 
 
-def camera_facts(who: Identity | None, focal_length_mm: float | None, sensor: SensorFacts) -> CameraFacts:
-    """CAMERA_INFORMATION's facts."""
-    major, minor, patch = (int(part) for part in dappled.__version__.split(".")[:3])
-    return CameraFacts(
-        vendor=who.make if who else "dappled",
-        model=who.model if who else "masked camera",
-        firmware=(major, minor, patch),
-        focal_length_mm=focal_length_mm,
-        **sensor,
-    )
-
-
-def sensor_facts(settings: Settings, model: str) -> SensorFacts:
+def _sensor_facts(settings: Settings, model: str) -> dict[str, Any]:
     """Sensor size and pixels of the camera, for CAMERA_INFORMATION; empty where they are unknown."""
     name = settings.camera.profile
     try:
@@ -312,15 +326,6 @@ def sensor_facts(settings: Settings, model: str) -> SensorFacts:
         "columns": chip.shape[1],
         "rows": chip.shape[0],
     }
-
-
-def disk_storage(folder: Path) -> Storage | None:
-    """STORAGE_INFORMATION's facts; None where the disk can't be read."""
-    try:
-        usage = shutil.disk_usage(folder)
-    except OSError:
-        return None
-    return Storage(usage.total, usage.used, usage.free)
 
 
 def _information(
@@ -355,7 +360,7 @@ def _settings(mode: int, zoom_percent: float, boot_ms: int) -> Message:
     return mavlink.MAVLink_camera_settings_message(boot_ms, mode, zoom_percent, _NAN)
 
 
-def _storage(disk: Storage | None, boot_ms: int) -> Message:
+def _storage(disk: DiskSpace | None, boot_ms: int) -> Message:
     """STORAGE_INFORMATION (261) in MiB. READY, else ground stations disable the shutter; NOT_SUPPORTED: unknown."""
     if disk is None:
         return mavlink.MAVLink_storage_information_message(
@@ -379,7 +384,7 @@ def _storage(disk: Storage | None, boot_ms: int) -> Message:
 
 
 def _capture_status(
-    *, busy: bool, interval_s: float | None, image_count: int, disk: Storage | None, boot_ms: int
+    *, busy: bool, interval_s: float | None, image_count: int, disk: DiskSpace | None, boot_ms: int
 ) -> Message:
     """CAMERA_CAPTURE_STATUS (262). image_status: bit 0 capturing now, bit 1 an interval runs."""
     return mavlink.MAVLink_camera_capture_status_message(

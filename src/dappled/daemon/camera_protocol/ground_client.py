@@ -110,7 +110,7 @@ class GroundClient:
 
     def send_command(self, message: Message) -> None:
         """Send one COMMAND_LONG. A simulated ground station with another way of sending overrides this."""
-        self._links.send(message)
+        self._links.sender.send(message)
 
     def capture(
         self,
@@ -166,19 +166,17 @@ class GroundClient:
         return Outcome(sequence, None, False, f"the camera reported nothing about it for {timeout_s:g} s", ack_ms, None)
 
     def _mine(self, message: Message) -> bool:
-        return message.target_system in (0, self._links.system_id) and message.target_component in (
-            0,
-            self._links.component_id,
-        )
+        own = self._links.sender
+        return message.target_system in (0, own.system_id) and message.target_component in (0, own.component_id)
 
     def _listening(self) -> _Listening:
         return _Listening(self._changed, self._heard)
 
     def log_packet(self, _stamp_us: int, _raw: bytes) -> None:
-        """See `PacketSink`: a ground client keeps no log."""
+        """See `PacketLog`: a ground client keeps no log."""
 
     def on_packet(self, packet: Packet) -> None:
-        """See `PacketSink`."""
+        """See `PacketLog`."""
         message = packet.message
         if packet.sent:
             return
@@ -192,7 +190,7 @@ class GroundClient:
 
     def _beat(self) -> None:
         while not self._heart.stopping.is_set():
-            self._links.send(
+            self._links.sender.send(
                 mavlink.MAVLink_heartbeat_message(
                     mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
                 )

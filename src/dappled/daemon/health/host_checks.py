@@ -6,7 +6,6 @@ A check only looks: it never fires the camera, and changes nothing.
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from dappled.drivers.camera import CameraError, StateChanged
 from dappled.drivers.registry import open_camera
 from dappled.drivers.usb_bus import UsbBody
 from dappled.errors import DappledError, counted
+from dappled.flight import layout
 
 OPEN_S = 12.0
 _GRABBERS = ("gvfs-gphoto2-vo", "gvfsd-gphoto2", "gvfs-gphoto2-volume-monitor")  # /proc cuts names to 15 letters
@@ -157,7 +157,7 @@ def disk(settings: Settings, machine: Machine) -> list[Check]:
     place = next(one for one in (folder, *folder.parents) if os.path.exists(one))  # False without permission to look
     if not os.access(place, os.W_OK):
         return [Check("disk", "no-go", f"{place} can't be written to", f"make {folder} yours, or set record.directory")]
-    free = shutil.disk_usage(place).free
+    free = layout.disk_space(place).available
     text = f"{free / 1e9:.1f} GB free at {folder}, room for some {counted(int(free / _FRAME_BYTES), 'frame')}"
     if free < settings.record.min_free_mb * 1e6:
         mend = "`dappled flight offload`, then remove frames by hand"

@@ -175,6 +175,6 @@ def line(health: Mapping[str, Any]) -> str:
 
 def _free(folder: Path) -> int | None:
     try:
-        return layout.free_bytes(folder)
+        return layout.disk_space(folder).available
     except DappledError:
         return None

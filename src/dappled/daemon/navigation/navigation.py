@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 from dappled.clock import Clock
-from dappled.config.settings import Settings
+from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation.clocks import (
     CONTACT_SIGMA_NS,
     BootClock,
@@ -204,15 +204,13 @@ class Telemetry:
 
 
 class Navigation:
-    """Live navigation of one flight: takes packets, gives poses, and records whose telemetry counts and UTC.
+    """Live navigation of one flight: logs packets, gives poses, and records whose telemetry counts and UTC.
 
-    `settings()` returns the current ones: `pose.wait_ms` may change in flight.
+    It is the PacketLog of the flight's links. `pose.wait_ms` of the settings may change in flight.
     """
 
-    def __init__(
-        self, settings: Callable[[], Settings], clock: Clock, recording: Recording, *, utc_known: bool
-    ) -> None:
-        now = settings()
+    def __init__(self, settings: LiveSettings, clock: Clock, recording: Recording, *, utc_known: bool) -> None:
+        now = settings.now
         self._settings, self._clock, self._recording = settings, clock, recording
         self._never = threading.Event()
         self.telemetry = Telemetry(
@@ -221,6 +219,10 @@ class Navigation:
         self.utc = UtcLearner(recording, known=utc_known)
         self._vehicles: list[tuple[int, int]] = []
         self._vehicles_noted = 0
+
+    def log_packet(self, stamp_us: int, raw: bytes) -> int | None:
+        """See PacketLog."""
+        return self._recording.telemetry.append(stamp_us, raw)
 
     def on_packet(self, packet: Packet) -> None:
         """Take a packet, received or sent. One outside the telemetry log is ignored: a replay wouldn't have it."""
@@ -245,7 +247,8 @@ class Navigation:
 
     def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
         """The pose, once telemetry from after the exposure has arrived, or at the latest `pose.wait_ms` after it."""
-        give_up_ns = min(exposure.utc_ns, self._clock.utc_ns() + AHEAD_NS) + round(self._settings().pose.wait_ms * 1e6)
+        wait_ns = round(self._settings.now.pose.wait_ms * 1e6)
+        give_up_ns = min(exposure.utc_ns, self._clock.utc_ns() + AHEAD_NS) + wait_ns
         while not self.telemetry.settled(exposure) and self._clock.utc_ns() < give_up_ns:
             self._clock.wait(self._never, _LOOK_S)
         return self.telemetry.locate(exposure)

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.pipeline.decode_process import DecodedFrame
@@ -219,6 +219,10 @@ class ShotEnds:
             self.shots.add(pending)
         return pending
 
+    def drop(self, pending: PendingShot, what: str) -> None:
+        """A safe frame found a full queue, or was still in it at the flight's end."""
+        self.leave(pending, what, "the queue was full, or the flight ended; the frame is in the record")
+
     def leave(self, pending: PendingShot, what: str, why: str) -> None:
         """A safe frame is not processed further."""
         pending.problem = f"{what}: {why}"
@@ -242,14 +246,21 @@ class ShotEnds:
             report(log, "pipeline", error)
 
 
+class NextStage(Protocol):
+    """The stage of the pipeline that shots go to next."""
+
+    def take(self, pending: PendingShot) -> None:
+        """Queue a shot. Never waits: where the queue is full, the shot ends here."""
+
+
 class Capture:
     """Pull the camera's events in one thread: make each file safe, and give up each shot without one.
 
-    `on_done` takes the shots that are ready to be tagged: their frame is safe, or its file stays at the camera.
+    `following` takes the shots that are ready to be tagged: their frame is safe, or its file stays at the camera.
     """
 
-    def __init__(self, camera: Camera, ends: ShotEnds, on_done: Callable[[PendingShot], object]) -> None:
-        self._camera, self._ends, self._on_done = camera, ends, on_done
+    def __init__(self, camera: Camera, ends: ShotEnds, following: NextStage) -> None:
+        self._camera, self._ends, self._following = camera, ends, following
         self._shots, self._writer, self._observer = ends.shots, ends.writer, ends.observer
         self._give_up_at = 0.0
         self._loop = Loop("capture", self._run)
@@ -374,7 +385,7 @@ class Capture:
             pending.ms["trigger to file"] = (arrival.monotonic_ns - pending.fired.returned_monotonic_ns) / 1e6
         pending.ms["record"] = (time.monotonic_ns() - began) / 1e6
         self._ends.tell(self._observer.settled, frame.index, True)
-        self._on_done(pending)
+        self._following.take(pending)
 
     def _accompanied(self, companion: Companion) -> None:
         try:
@@ -392,4 +403,4 @@ class Capture:
             pending = self._shots.in_hand(event.shot)
             if pending is not None and pending.frame is None:
                 self._ends.follow(pending, event.reason)
-                self._on_done(pending)
+                self._following.take(pending)

@@ -7,7 +7,6 @@ camera, the writer that records or compares, and the source of poses.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import Capture, Observer, PendingShot, PendingShots, ShotEnds
@@ -21,8 +20,6 @@ from dappled.drivers.camera import Camera
 from dappled.errors import sentence
 from dappled.flight import Tag
 from dappled.workers import Statistics, Worker
-
-_TAG_QUEUE = 1000
 
 
 class Pipeline:
@@ -43,31 +40,18 @@ class Pipeline:
         decode_queue: int,
         preview_interval_s: float = 0.0,
     ) -> None:
-        self._shots, self._decodes = shots, decoder is not None
-        shots.decoding = self._decodes
-        self._ends = ShotEnds(shots, writer, observer)
-        tagging = Tagging(self._ends, poses, publisher, latency=latency, names=names, on_done=self._tagged)
-        decoding = decoder and Decoding(self._ends, decoder, publisher, preview_interval_s)
-        self._tag: Worker[PendingShot] = Worker(
-            "tag",
-            tagging.work,
-            capacity=_TAG_QUEUE,
-            on_failure=lambda pending, error: tagging.failed(pending, sentence(error)),
-            on_drop=self._dropped("not tagged"),
+        shots.decoding = decoder is not None
+        ends = ShotEnds(shots, writer, observer)
+        self._decoding = Decoding(
+            ends, decoder, publisher, capacity=decode_queue, preview_interval_s=preview_interval_s
         )
-        self._decode: Worker[PendingShot] = Worker(
-            "decode",
-            decoding.work if decoding else self._ends.finish,
-            capacity=decode_queue,
-            on_failure=lambda pending, error: self._ends.leave(pending, "not decoded", sentence(error)),
-            on_drop=self._dropped("not decoded"),
-        )
-        self._capture = Capture(camera, self._ends, self._tag.put)
+        self._tagging = Tagging(ends, poses, publisher, latency=latency, names=names, following=self._decoding)
+        self._capture = Capture(camera, ends, self._tagging)
 
     def start(self) -> None:
         """Start the last stage first and the camera last, so that each event finds its stage running."""
-        self._tag.start()
-        self._decode.start()
+        self._decoding.worker.start()
+        self._tagging.worker.start()
         self._capture.start()
 
     def stop(self, timeout_s: float) -> None:
@@ -75,47 +59,59 @@ class Pipeline:
         shot without a file has failed."""
         until = time.monotonic() + timeout_s
         self._capture.stop(timeout_s)
-        for stage in (self._tag, self._decode):
-            stage.stop(max(1.0, until - time.monotonic()))
+        for stage in (self._tagging, self._decoding):
+            stage.worker.stop(max(1.0, until - time.monotonic()))
 
     def dead_threads(self) -> list[str]:
         """The threads that have ended without having been stopped: none, unless there is a bug."""
-        return [name for part in (self._capture, self._tag, self._decode) for name in part.dead_threads()]
+        return [
+            name
+            for part in (self._capture, self._tagging.worker, self._decoding.worker)
+            for name in part.dead_threads()
+        ]
 
     def statistics(self) -> tuple[Statistics, ...]:
         """Counters of each stage's queue."""
-        return self._tag.statistics(), self._decode.statistics()
-
-    def _tagged(self, pending: PendingShot) -> None:
-        if self._shots.decoding:
-            self._decode.put(pending)
-        else:
-            if self._decodes:
-                self._ends.note("not decoded", "decoding was switched off", pending.shot.index)
-            self._ends.finish(pending)
-
-    def _dropped(self, what: str) -> Callable[[PendingShot], None]:
-        why = "the queue was full, or the flight ended; the frame is in the record"
-        return lambda pending: self._ends.leave(pending, what, why)
+        return self._tagging.worker.statistics(), self._decoding.worker.statistics()
 
 
 class Decoding:
-    """Decode one shot's frame after the other, in one thread, and publish its slices.
+    """Decode one shot's frame after the other, in one thread, and publish its slices; without a `decoder`, none.
 
     At most one preview is published in `preview_interval_s`.
     """
 
     def __init__(
-        self, ends: ShotEnds, decoder: FrameDecoder, publisher: Publisher | None, preview_interval_s: float
+        self,
+        ends: ShotEnds,
+        decoder: FrameDecoder | None,
+        publisher: Publisher | None,
+        *,
+        capacity: int,
+        preview_interval_s: float,
     ) -> None:
         self._ends, self._decoder, self._publisher = ends, decoder, publisher
         self._preview_interval_s, self._last_preview_s = preview_interval_s, -1e9
+        self.worker: Worker[PendingShot] = Worker(
+            "decode", self._work, capacity=capacity, on_failure=self._failed, on_drop=self._dropped
+        )
 
-    def work(self, pending: PendingShot) -> None:
+    def take(self, pending: PendingShot) -> None:
+        """See NextStage. A frame that is not to be decoded comes to its end here."""
+        if self._decoder is None:
+            self._ends.finish(pending)
+        elif self._ends.shots.decoding:
+            self.worker.put(pending)
+        else:
+            self._ends.note("not decoded", "decoding was switched off", pending.shot.index)
+            self._ends.finish(pending)
+
+    def _work(self, pending: PendingShot) -> None:
         """Decode a tagged frame, record the result, publish it, and end the shot. Raises DecodeProcessError."""
         frame, tag = pending.frame, pending.tag
         assert frame is not None
         assert tag is not None
+        assert self._decoder is not None
         began = time.monotonic_ns()
         writer = self._ends.writer
         decoded = self._decoder.develop(writer.path(frame), tag.focal_length_mm, tag.f_number)
@@ -126,6 +122,12 @@ class Decoding:
         self._publish(tag, decoded)
         pending.ms["publish"] = (time.monotonic_ns() - began) / 1e6
         self._ends.finish(pending)
+
+    def _failed(self, pending: PendingShot, error: Exception) -> None:
+        self._ends.leave(pending, "not decoded", sentence(error))
+
+    def _dropped(self, pending: PendingShot) -> None:
+        self._ends.drop(pending, "not decoded")
 
     def _publish(self, tag: Tag, decoded: DecodedFrame) -> None:
         if self._publisher is None:

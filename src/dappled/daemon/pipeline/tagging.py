@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
 from dappled.daemon.navigation import BodyLatency, CameraClock, ExposureTime, clocks
-from dappled.daemon.pipeline.capture import PendingShot, ShotEnds
+from dappled.daemon.pipeline.capture import NextStage, PendingShot, ShotEnds
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.stream.publisher import Publisher
 from dappled.daemon.stream.wire import frame_header
@@ -17,10 +16,12 @@ from dappled.decode.geometry import Pose
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
 from dappled.drivers.raw.raw_file import ExposureSettings
-from dappled.errors import DappledError
+from dappled.errors import DappledError, sentence
 from dappled.flight import Frame, Tag
+from dappled.workers import Worker
 
 log = logging.getLogger(__name__)
+_QUEUE = 1000
 
 
 class PoseSource(Protocol):
@@ -82,7 +83,7 @@ def tag(frame: Frame, exposure: ExposureTime, settings: FrameSettings, *, camera
 
 
 class Tagging:
-    """Tag one shot after the other, in one thread. `on_done` takes those with a frame, tagged and published."""
+    """Tag one shot after the other, in one thread. `following` takes those with a frame, tagged and published."""
 
     def __init__(
         self,
@@ -92,14 +93,21 @@ class Tagging:
         *,
         latency: BodyLatency,
         names: Names,
-        on_done: Callable[[PendingShot], object],
+        following: NextStage,
     ) -> None:
         self._ends, self._poses, self._publisher = ends, poses, publisher
-        self._latency, self._names, self._on_done = latency, names, on_done
+        self._latency, self._names, self._following = latency, names, following
         self._zoom = Zoom()
         self._camera_clock = CameraClock()
+        self.worker: Worker[PendingShot] = Worker(
+            "tag", self._work, capacity=_QUEUE, on_failure=self._failed, on_drop=self._dropped
+        )
 
-    def work(self, pending: PendingShot) -> None:
+    def take(self, pending: PendingShot) -> None:
+        """See NextStage."""
+        self.worker.put(pending)
+
+    def _work(self, pending: PendingShot) -> None:
         """Tag a shot's frame. Where its file stays at the camera, report where it was exposed, and end it."""
         if pending.frame is None:
             pending.where = self._poses.pose(pending.shot.index, self._expected(pending, FrameSettings()))
@@ -107,12 +115,15 @@ class Tagging:
             self._ends.finish(pending)
             return
         self._tag(pending, pending.frame)
-        self._on_done(pending)
+        self._following.take(pending)
 
-    def failed(self, pending: PendingShot, why: str) -> None:
+    def _failed(self, pending: PendingShot, error: Exception) -> None:
         """A frame that can't be tagged."""
         self._ends.tell(self._ends.observer.tagged, pending)
-        self._ends.leave(pending, "not tagged", why)
+        self._ends.leave(pending, "not tagged", sentence(error))
+
+    def _dropped(self, pending: PendingShot) -> None:
+        self._ends.drop(pending, "not tagged")
 
     def _tag(self, pending: PendingShot, frame: Frame) -> None:
         began = time.monotonic_ns()

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from dappled.clock import Clock
 from dappled.drivers.mavlink.channels import Address, ByteChannel, LinkError, open_channel, parse
-from dappled.drivers.mavlink.signing import SignatureGuard, Signing, SigningError, SigningStatistics
+from dappled.drivers.mavlink.signing import SignatureGuard, Signing, SigningStatistics
 from dappled.workers import Loop
 
 # `mavlink` holds the message classes, for the whole project: version 2 on the wire, and ArduPilot's dialect, which
@@ -28,8 +28,10 @@ __all__ = [
     "MavlinkLinks",
     "Message",
     "Packet",
+    "PacketLog",
     "PacketParser",
-    "PacketSink",
+    "PacketReceiver",
+    "PacketSender",
     "mavlink",
     "pack",
 ]
@@ -42,7 +44,6 @@ _SIGNED = 0x01
 _MAX_ID_1 = 255
 _REOPEN_S = 1.0
 _POLL_S = 0.2
-_KEEP_S = 1.0
 
 
 # --- one packet
@@ -64,14 +65,21 @@ class Packet:
     trusted: bool = True
 
 
-class PacketSink(Protocol):
-    """What takes the packets of `MavlinkLinks`, in the thread that received or sent each. Both calls must be quick."""
+class PacketLog(Protocol):
+    """What takes every packet, in the thread that received or sent it. Both calls must be quick."""
 
     def log_packet(self, stamp_us: int, raw: bytes) -> int | None:
         """Write a packet to the telemetry log. Returns its number there, None where there is no log."""
 
     def on_packet(self, packet: Packet) -> None:
-        """Act on a packet; may call `MavlinkLinks.send`."""
+        """Take a packet that was logged, received or sent."""
+
+
+class PacketReceiver(Protocol):
+    """What acts on the packets that were received."""
+
+    def on_packet(self, packet: Packet) -> None:
+        """Act on a packet, quickly; may call `PacketSender.send`."""
 
 
 class PacketParser:
@@ -266,29 +274,91 @@ class Link:
 # --- all links
 
 
-class MavlinkLinks:
-    """All links of one MAVLink component, with a receiving thread each.
+class PacketSender:
+    """Send messages on the links, and pass each packet, received or sent, to the log, in the order of its number.
 
-    Every packet, received or sent, is logged and then handed to the sink, in the order of its number over all links;
-    one lock sees to that. Stamps are UTC microseconds of `clock`. Between `open` and `start` nothing can be sent.
-
+    One lock over all links sees to that. Stamps are UTC microseconds of `clock`. Before `start` nothing can be sent.
     `system_id` may be set while running: a camera takes its autopilot's.
+    """
+
+    def __init__(self, links: Sequence[Link], clock: Clock, *, system_id: int, component_id: int) -> None:
+        self.order = threading.RLock()
+        self.system_id, self.component_id = system_id, component_id
+        self._links, self._clock = links, clock
+        self._log: PacketLog | None = None
+
+    def start(self, packet_log: PacketLog) -> None:
+        """Send from now on."""
+        self._log = packet_log
+
+    def send(self, message: Message, link: int | None = None) -> bool:
+        """Send on one link, or on all. False where no link took it. Never blocks, never raises for a lost link."""
+        taken = False
+        for each in self._links if link is None else self._links[link : link + 1]:
+            with self.order:
+                taken = self._send_on(each, message) or taken
+        return taken
+
+    def logged(self, link: Link, stamp_us: int, framed: Framed, *, sent: bool = False, trusted: bool = True) -> Packet:
+        """Log a packet, and return it with its number. Under the order lock, after `start`."""
+        packet_log, number = self._log, None
+        assert packet_log is not None, "packets come and go after `start`"
+        try:
+            number = packet_log.log_packet(stamp_us, framed.raw)
+        except Exception:  # a full disk must not stop the commands of a flying machine
+            if link.packets_unlogged == 0:
+                log.exception("A MAVLink packet could not be written to the telemetry log")
+            link.packets_unlogged += 1
+        packet = Packet(number, stamp_us, link.number, framed.message, framed.raw, sent, trusted)
+        self.hand(link, packet, packet_log)
+        return packet
+
+    def hand(self, link: Link, packet: Packet, receiver: PacketReceiver) -> None:
+        """Hand a packet to a receiver. An exception is logged and counted: one packet must not end the link."""
+        try:
+            receiver.on_packet(packet)
+        except Exception:
+            link.failures += 1
+            log.exception("A MAVLink packet (%s) could not be handled", packet.message.get_type())
+
+    def _send_on(self, link: Link, message: Message) -> bool:
+        channel = link.channel
+        if channel is None or self._log is None:
+            link.packets_unsent += 1
+            return False
+        raw = link.packed(message, self.system_id, self.component_id)
+        stamp_us = self._clock.utc_ns() // 1000
+        try:
+            taken = channel.write(raw)
+        except OSError as error:
+            link.fail(error.strerror or error)
+            taken = False
+        if not taken:
+            link.packets_unsent += 1
+            return False
+        link.packets_out += 1
+        self.logged(link, stamp_us, Framed(raw, message), sent=True)
+        return True
+
+
+class MavlinkLinks:
+    """All links of one MAVLink component, with a receiving thread each. `sender` sends on them.
+
+    Every packet is logged before it is acted on. Between `open` and `start` nothing is received or sent.
     """
 
     def __init__(
         self, urls: Sequence[str], *, system_id: int, component_id: int, clock: Clock, signing: Signing | None = None
     ) -> None:
-        self.component_id = component_id
-        self.system_id = system_id
         self._clock = clock
-        self._sink: PacketSink | None = None
-        self._order = threading.RLock()
         self._stop = threading.Event()
         self._opened = False
         self._signing_time = signing.time if signing else None
         guards = signing.guards if signing else [None] * len(urls)
         pairs = zip(urls, guards, strict=True)
         self._links = [Link(number, parse(url), guard) for number, (url, guard) in enumerate(pairs)]
+        self.sender = PacketSender(self._links, clock, system_id=system_id, component_id=component_id)
+        self._order = self.sender.order
         self._loops: list[Loop] = []
 
     def open(self) -> None:
@@ -312,14 +382,17 @@ class MavlinkLinks:
             raise
         self._opened = True
 
-    def start(self, sink: PacketSink) -> None:
-        """Begin to receive; opens the links if `open` did not. Raises LinkError as `open` does."""
+    def start(self, packet_log: PacketLog, receiver: PacketReceiver | None = None) -> None:
+        """Begin to send and to receive; opens the links if `open` did not. Raises LinkError as `open` does.
+
+        `packet_log` takes every packet; `receiver` acts on those that were received.
+        """
         self.open()
-        self._sink = sink
+        self.sender.start(packet_log)
         for link in self._links:
-            self._loops.append(Loop(f"mavlink {link.number}", partial(self._receive, link), self._stop))
+            self._loops.append(Loop(f"mavlink {link.number}", partial(self._receive, link, receiver), self._stop))
         if self._signing_time is not None:
-            self._loops.append(Loop("mavlink signing", self._keep_signing_time, self._stop))
+            self._loops.append(Loop("mavlink signing", partial(self._signing_time.run, self._stop), self._stop))
         for loop in self._loops:
             loop.start()
 
@@ -336,14 +409,6 @@ class MavlinkLinks:
         channel = self._links[link].channel
         return channel.port() if channel else 0
 
-    def send(self, message: Message, link: int | None = None) -> bool:
-        """Send on one link, or on all. False where no link took it. Never blocks, never raises for a lost link."""
-        taken = False
-        for each in self._links if link is None else self._links[link : link + 1]:
-            with self._order:
-                taken = self._send_on(each, message) or taken
-        return taken
-
     def statistics(self) -> tuple[LinkStatistics, ...]:
         """Counters of every link, in the order of the urls."""
         return tuple(link.statistics() for link in self._links)
@@ -352,43 +417,9 @@ class MavlinkLinks:
         """See `Loop.dead_threads`."""
         return [name for loop in self._loops for name in loop.dead_threads()]
 
-    def _send_on(self, link: Link, message: Message) -> bool:
-        channel = link.channel
-        if channel is None or self._sink is None:
-            link.packets_unsent += 1
-            return False
-        raw = link.packed(message, self.system_id, self.component_id)
-        stamp_us = self._clock.utc_ns() // 1000
-        try:
-            taken = channel.write(raw)
-        except OSError as error:
-            link.fail(error.strerror or error)
-            taken = False
-        if not taken:
-            link.packets_unsent += 1
-            return False
-        link.packets_out += 1
-        self._deliver(link, stamp_us, Framed(raw, message), sent=True)
-        return True
-
-    def _deliver(self, link: Link, stamp_us: int, packet: Framed, *, sent: bool, trusted: bool = True) -> None:
-        sink, number = self._sink, None
-        assert sink is not None, "packets come and go after `start`"
-        try:
-            number = sink.log_packet(stamp_us, packet.raw)
-        except Exception:  # a full disk must not stop the commands of a flying machine
-            if link.packets_unlogged == 0:
-                log.exception("A MAVLink packet could not be written to the telemetry log")
-            link.packets_unlogged += 1
-        try:
-            sink.on_packet(Packet(number, stamp_us, link.number, packet.message, packet.raw, sent, trusted))
-        except Exception:  # one unforeseen packet must not end the link
-            link.failures += 1
-            log.exception("A MAVLink packet (%s) could not be handled", packet.message.get_type())
-
     # --- the receiving threads
 
-    def _receive(self, link: Link) -> None:
+    def _receive(self, link: Link, receiver: PacketReceiver | None) -> None:
         framer = Framer()
         while not self._stop.is_set():
             channel = link.channel
@@ -412,7 +443,7 @@ class MavlinkLinks:
             bad = framer.bad
             packets = framer.datagram(data) if channel.datagrams else framer.feed(data)
             for framed in packets:
-                self._received(link, stamp_us, framed)
+                self._received(link, stamp_us, framed, receiver)
             link.packets_bad += framer.bad - bad
 
     def _wait(self, channel: ByteChannel) -> bool:
@@ -427,7 +458,7 @@ class MavlinkLinks:
                 channel.flush()
         return bool(ready & ~select.POLLOUT)
 
-    def _received(self, link: Link, stamp_us: int, framed: Framed) -> None:
+    def _received(self, link: Link, stamp_us: int, framed: Framed, receiver: PacketReceiver | None) -> None:
         with self._order:
             message = framed.message
             trusted = True
@@ -441,7 +472,9 @@ class MavlinkLinks:
             link.last_heard_monotonic_ns = self._clock.monotonic_ns()
             link.heard_1 |= framed.version == 1
             link.heard_2 |= framed.version == 2
-            self._deliver(link, stamp_us, framed, sent=False, trusted=trusted)
+            packet = self.sender.logged(link, stamp_us, framed, trusted=trusted)
+            if receiver is not None:
+                self.sender.hand(link, packet, receiver)
 
     def _reopen(self, link: Link) -> None:
         with self._order:
@@ -457,21 +490,6 @@ class MavlinkLinks:
             link.channel, link.error = channel, None
             if self._stop.is_set():  # it was opened too late for `stop` to close it
                 link.close()
-
-    def _keep_signing_time(self) -> None:
-        assert self._signing_time is not None
-        failed = False
-        while True:
-            ending = self._stop.wait(_KEEP_S)
-            try:
-                self._signing_time.keep(ending=ending)
-                failed = False
-            except SigningError as error:  # the links go on; logged once
-                if not failed:
-                    log.warning("%s", error)
-                failed = True
-            if ending:
-                return
 
     def _close_channels(self) -> None:
         for link in self._links:

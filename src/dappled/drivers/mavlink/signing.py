@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import logging
 import os
 import secrets
 import stat
@@ -24,6 +25,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from dappled.clock import Clock
 from dappled.errors import DappledError
 
+log = logging.getLogger(__name__)
 Unsigned = Literal["refuse", "listen", "allow"]
 Trust = Literal["obey", "hear", "refuse"]
 EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01
@@ -34,6 +36,7 @@ KEY_BYTES = 32
 _BLOCK = 13
 _SIGNED_FLAG = 0x01
 _STREAMS = 256
+_KEEP_S = 1.0
 _LATEST = 2**48 - 1
 
 
@@ -144,6 +147,21 @@ class SigningTime:
                 f"cannot keep the signing times in {self._path}: {error.strerror or error}; check its folder"
             ) from error
         self._kept = (used, accepted)
+
+    def run(self, stop: threading.Event) -> None:
+        """Keep the times until `stop` is set, and then exactly. A file that can't be written is logged once."""
+        failed = False
+        while True:
+            ending = stop.wait(_KEEP_S)
+            try:
+                self.keep(ending=ending)
+                failed = False
+            except SigningError as error:  # the links go on
+                if not failed:
+                    log.warning("%s", error)
+                failed = True
+            if ending:
+                return
 
     def _now(self) -> int:
         return max(0, self._clock.utc_ns() // 10_000 - EPOCH_UNIX_S * UNITS_PER_S)

@@ -136,10 +136,10 @@ class Flyer:
         return max(0.0, (next_ns - time.monotonic_ns()) / 1e9)
 
     def log_packet(self, _stamp_us: int, _raw: bytes) -> None:
-        """See `PacketSink`: the simulated autopilot keeps no log."""
+        """See `PacketLog`: the simulated autopilot keeps no log."""
 
     def on_packet(self, packet: Packet) -> None:
-        """See `PacketSink`: answer what came in."""
+        """See `PacketLog`: answer what came in."""
         message = packet.message
         if packet.sent:
             return
@@ -241,7 +241,7 @@ def main(arguments: list[str] | None = None) -> int:
     start_ns = time.monotonic_ns() if wanted.start_monotonic_ns is None else wanted.start_monotonic_ns
     links = MavlinkLinks([wanted.url], system_id=wanted.system_id, component_id=1, clock=SystemClock())
     boot = BootTime(wanted.booted)
-    flyer = Flyer(FlightPath(wanted.seed), start_ns, boot, links.send, wanted.jitter, wanted.system_id)
+    flyer = Flyer(FlightPath(wanted.seed), start_ns, boot, links.sender.send, wanted.jitter, wanted.system_id)
     try:
         links.start(flyer)
     except LinkError as error:

@@ -1,0 +1,173 @@
+"""The autopilot of the system that the camera belongs to: which one that is, requests and commands to it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Protocol
+
+from dappled.clock import Clock
+from dappled.daemon.pipeline.repeats import AutopilotCommands
+from dappled.drivers.mavlink import Message, Packet, mavlink
+
+TIMESYNC_NS = 200_000_000
+STREAMS_NS = 5 * 10**9
+STREAMS = (  # message, interval in microseconds
+    (mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 20_000),
+    (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, 20_000),
+    (mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, 200_000),
+    (mavlink.MAVLINK_MSG_ID_SYSTEM_TIME, 1_000_000),
+)
+LISTEN_NS = 3 * 10**9
+ALONE_NS = 1_200_000_000  # heartbeats come every second: a second autopilot would have shown by now
+_WANTED = frozenset(message_id for message_id, _ in STREAMS)
+
+
+class Links(Protocol):
+    """What the camera needs of `drivers.mavlink.PacketSender`."""
+
+    system_id: int
+    component_id: int
+
+    def send(self, message: Message, link: int | None = None) -> bool: ...
+
+
+class SystemIdentity:
+    """Which system this camera belongs to.
+
+    Decides three seconds after the start at the latest: the system id of the only autopilot heard, or the configured
+    one where there are several or none. Decides sooner when one autopilot was heard alone for 1.2 s. Where none was
+    heard (it boots more slowly than this machine), the first one heard alone for 1.2 s later is taken, for good.
+    """
+
+    def __init__(self, configured_system_id: int, start_ns: int) -> None:
+        self.system_id = configured_system_id
+        self.settled = False
+        self.autopilots: dict[int, int] = {}  # system id: link it was last heard on
+        self._none_yet = True
+        self._start_ns = start_ns
+        self._first_heard_ns: int | None = None
+
+    def heard(self, message: Message, link: int, now_ns: int) -> None:
+        """Take a HEARTBEAT. Times are monotonic."""
+        if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID or message.type == mavlink.MAV_TYPE_GCS:
+            return
+        if len(self.autopilots) < 32 or message.get_srcSystem() in self.autopilots:
+            self.autopilots[message.get_srcSystem()] = link
+        if self._first_heard_ns is None:
+            self._first_heard_ns = now_ns
+
+    def decide(self, now_ns: int) -> bool:
+        """Decide if possible by now. Whether it is decided."""
+        waited = self._first_heard_ns is not None and now_ns - self._first_heard_ns >= ALONE_NS
+        if not self.settled and now_ns - self._start_ns >= LISTEN_NS:
+            self.settled = waited = True
+        if self._none_yet and self.autopilots and waited:
+            self._none_yet = False
+            heard = tuple(self.autopilots)  # as of now: another may be heard meanwhile
+            if len(heard) == 1:
+                self.settled = True
+                self.system_id = heard[0]
+        return self.settled
+
+    def doubt(self) -> str | None:
+        """A sentence where autopilots are heard, but not the one of the system that the camera belongs to."""
+        heard = sorted(self.autopilots)
+        if not self.settled or self._none_yet or not heard or self.system_id in heard:
+            return None
+        ids = ", ".join(map(str, heard))
+        who = f"autopilot {ids} is" if len(heard) == 1 else f"autopilots {ids} are"
+        return f"{who} heard, the camera belongs to system {self.system_id}: set mavlink.system_id"
+
+    def vehicle(self) -> int | None:
+        """The system whose telemetry counts: our own, once that is decided.
+
+        None while no autopilot was heard, or only one of another system, whose telemetry is better than none.
+        """
+        known = self.settled and (len(self.autopilots) > 1 or self.system_id in self.autopilots)
+        return self.system_id if known else None
+
+    def autopilot(self) -> tuple[int, int] | None:
+        """(system id, link) of our own autopilot; None while it was not heard."""
+        link = self.autopilots.get(self.system_id)
+        return None if link is None else (self.system_id, link)
+
+
+class AutopilotRequests:
+    """Requests for the time at 5 Hz and, every five seconds, for streams that arrived at less than half their rate."""
+
+    def __init__(self) -> None:
+        self._heard: dict[int, int] = {}
+        self._time_due_ns = self._streams_due_ns = 0
+
+    def heard(self, message_id: int) -> None:
+        """Count a message of our autopilot."""
+        if message_id in _WANTED:
+            self._heard[message_id] = self._heard.get(message_id, 0) + 1
+
+    def due(self, system: int, now_ns: int, utc_ns: int) -> Iterator[Message]:
+        """The requests that are due by now."""
+        if now_ns >= self._time_due_ns:
+            self._time_due_ns = now_ns + TIMESYNC_NS
+            yield mavlink.MAVLink_timesync_message(0, utc_ns)
+        if now_ns >= self._streams_due_ns:
+            self._streams_due_ns = now_ns + STREAMS_NS
+            heard, self._heard = self._heard, {}
+            for message_id, interval_us in STREAMS:
+                if heard.get(message_id, 0) < STREAMS_NS / (interval_us * 1e3) / 2:
+                    yield mavlink.MAVLink_command_long_message(
+                        system, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, message_id, interval_us, 0, 0, 0, 0, 0
+                    )
+
+
+class OwnAutopilot:
+    """The autopilot of the system that the camera belongs to, on the link that it was last heard on."""
+
+    def __init__(self, links: Links, clock: Clock) -> None:
+        self._links, self._clock = links, clock
+        self.identity = SystemIdentity(links.system_id, clock.monotonic_ns())
+        self._commands = AutopilotCommands()
+        self._requests = AutopilotRequests()
+
+    def heard(self, message: Message) -> None:
+        """Count a message of its system."""
+        self._requests.heard(message.get_msgId())
+
+    def ask(self) -> None:
+        """Send what is due by now: requests for the time, and for streams that arrive too slowly."""
+        autopilot = self.identity.autopilot()
+        if autopilot is not None:
+            system, link = autopilot
+            for message in self._requests.due(system, self._clock.monotonic_ns(), self._clock.utc_ns()):
+                self._links.send(message, link)
+
+    def command(self, number: int, parameters: Sequence[float]) -> str | None:
+        """Send it a command (MAV_CMD, parameters from the first); a sentence where it can't be sent."""
+        autopilot = self.identity.autopilot()
+        if autopilot is None:
+            return "no autopilot was heard on the MAVLink links"
+        system, link = autopilot
+        self._commands.sent(number, self._clock.monotonic_ns())
+        seven = (*parameters, *(0.0,) * (7 - len(parameters)))
+        sent = self._links.send(mavlink.MAVLink_command_long_message(system, 1, number, 0, *seven), link)
+        return None if sent else "its link takes no more messages"
+
+    def refusal(self, message: Message) -> str | None:
+        """A sentence where a COMMAND_ACK refuses a command of ours."""
+        ours = message.get_srcSystem() == self.identity.system_id and message.target_component in (
+            0,
+            self._links.component_id,
+        )
+        if not ours or message.command not in self._commands.numbers:
+            return None
+        if message.result in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS):
+            return None
+        result = mavlink.enums["MAV_RESULT"].get(message.result)
+        word = result.name.removeprefix("MAV_RESULT_").lower() if result else message.result
+        return f"the autopilot did not fire the camera: command {message.command} {word}"
+
+    def is_echo(self, packet: Packet, kind: str) -> bool:
+        """Whether it only reports that it does what we commanded."""
+        message = packet.message
+        if (message.get_srcSystem(), message.get_srcComponent()) != (self.identity.system_id, 1):
+            return False
+        return self._commands.is_echo(kind, packet.link, self._clock.monotonic_ns())
