@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import ast
 import importlib
+import inspect
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import FunctionType, UnionType
+from typing import Any, Literal, Union, get_origin
 
 import pytest
 
 import dappled
+import dappled.errors
+import dappled.typing
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "api.md"
@@ -70,6 +75,69 @@ def test_every_public_name_is_there_and_in_the_page(module: str) -> None:
     for name in found.__all__:
         assert getattr(found, name) is not None
         assert re.search(rf"`[^`]*\b{name}\b[^`]*`", page), name
+
+
+def public() -> dict[str, object]:
+    """What the public modules hand out, by name."""
+    modules = [importlib.import_module(name) for name in PUBLIC if name != "dappled.errors"]
+    return {name: getattr(module, name) for module in modules for name in module.__all__} | {
+        "DappledError": dappled.errors.DappledError
+    }
+
+
+def promised(name: str, value: object) -> Iterator[tuple[str, Mapping[str, Any], Mapping[str, Any]]]:
+    """(where, annotations, the names that these use) of a public function, or of a public class' promised attributes.
+
+    Of what is opened, the page names the attributes; of all other classes everything public is promised.
+    """
+    if isinstance(value, FunctionType):
+        yield name, inspect.get_annotations(value), value.__globals__
+    if not isinstance(value, type):
+        return
+    spans = re.findall(r"`([^`\n]+)`", PAGE.read_text(encoding="utf-8")) if name in dappled.typing.__all__ else []
+    listed = {word for span in spans for word in re.findall(r"\w+", span)}
+    for kind in value.__mro__:
+        if not kind.__module__.startswith("dappled."):
+            continue
+        space = vars(importlib.import_module(kind.__module__))
+        fields = {f"{name}.{one}": {one: text} for one, text in inspect.get_annotations(kind).items()}
+        calls = {f"{name}.{one}": inspect.get_annotations(call) for one, call in functions(kind)}
+        for where, texts in (fields | calls).items():
+            attribute = where.rpartition(".")[2]
+            special = attribute in ("__iter__", "__aiter__", "__getitem__", *([] if listed else ["__init__"]))
+            on_page = not listed or attribute in listed
+            if special or (on_page and not attribute.startswith("_")):
+                yield where, texts, space
+
+
+def functions(kind: type) -> Iterator[tuple[str, FunctionType]]:
+    for name, value in vars(kind).items():
+        call = getattr(value, "fget", None) or getattr(value, "func", None) or getattr(value, "__func__", value)
+        if isinstance(call, FunctionType):
+            yield name, call
+
+
+def private(annotation: str, space: Mapping[str, Any], known: Mapping[str, object]) -> Iterator[str]:
+    """The classes of dappled in an annotation, and its names for unions, words and signatures, that are not public."""
+    for node in ast.walk(ast.parse(annotation, mode="eval")):
+        if isinstance(node, ast.Name) and node.id in space and node.id not in known:
+            value = space[node.id]
+            ours = isinstance(value, type) and value.__module__.startswith("dappled.")
+            if ours or get_origin(value) in (Literal, Union, UnionType, Callable):
+                yield node.id
+
+
+def test_every_type_that_is_taken_or_returned_is_public() -> None:
+    known = public()
+    missing = {
+        f"{where}: {name}"
+        for one, value in known.items()
+        for where, texts, space in promised(one, value)
+        for text in texts.values()
+        if isinstance(text, str)
+        for name in private(text, space, known)
+    }
+    assert missing == set()
 
 
 @pytest.mark.slow

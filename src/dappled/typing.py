@@ -2,6 +2,23 @@
 
 from dappled.daemon.stream.subscriber import Subscription
 from dappled.daemon.stream.wire import Message
-from dappled.products.opened import OpenedFlight, OpenedFrame, OpenedLightField
+from dappled.decode.depth import DepthMap, DistanceMap
+from dappled.decode.geometry import Gnss, Pose
+from dappled.decode.lightfield.refocus import StereoPair
+from dappled.flight import Tag
+from dappled.products.opened import Opened, OpenedFlight, OpenedFrame, OpenedLightField
 
-__all__ = ["Message", "OpenedFlight", "OpenedFrame", "OpenedLightField", "Subscription"]
+__all__ = [
+    "DepthMap",
+    "DistanceMap",
+    "Gnss",
+    "Message",
+    "Opened",
+    "OpenedFlight",
+    "OpenedFrame",
+    "OpenedLightField",
+    "Pose",
+    "StereoPair",
+    "Subscription",
+    "Tag",
+]

@@ -10,9 +10,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dappled.clock import Clock
     from dappled.drivers.camera import (
         Arrival,
         Blob,
+        BodyState,
         Camera,
         CameraError,
         CameraEvent,
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
         PlainCamera,
         QueuedCamera,
         Setting,
+        SettingName,
         SettingsChanged,
         ShotFailed,
         StateChanged,
@@ -32,15 +35,18 @@ if TYPE_CHECKING:
         text_option,
     )
     from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
-    from dappled.drivers.wired.shutter_line import ShutterLine, UsesAutopilot
+    from dappled.drivers.wired.shutter_line import CommandSender, ShutterLine, UsesAutopilot
     from dappled.drivers.wired.sources import FileSource, FolderSource, FoundFile
 
 __all__ = [
     "Arrival",
     "Blob",
+    "BodyState",
     "Camera",
     "CameraError",
     "CameraEvent",
+    "Clock",
+    "CommandSender",
     "Companion",
     "ComposedCamera",
     "ComposedSettings",
@@ -53,6 +59,7 @@ __all__ = [
     "PlainCamera",
     "QueuedCamera",
     "Setting",
+    "SettingName",
     "SettingsChanged",
     "ShotFailed",
     "ShutterLine",
@@ -65,20 +72,22 @@ __all__ = [
 ]
 
 _ELSEWHERE = {  # all others are in `camera`
-    "ComposedCamera": "wired.composed",
-    "ComposedSettings": "wired.composed",
-    "FileSource": "wired.sources",
-    "FolderSource": "wired.sources",
-    "FoundFile": "wired.sources",
-    "ShutterLine": "wired.shutter_line",
-    "UsesAutopilot": "wired.shutter_line",
+    "Clock": "dappled.clock",
+    "CommandSender": "dappled.drivers.wired.shutter_line",
+    "ComposedCamera": "dappled.drivers.wired.composed",
+    "ComposedSettings": "dappled.drivers.wired.composed",
+    "FileSource": "dappled.drivers.wired.sources",
+    "FolderSource": "dappled.drivers.wired.sources",
+    "FoundFile": "dappled.drivers.wired.sources",
+    "ShutterLine": "dappled.drivers.wired.shutter_line",
+    "UsesAutopilot": "dappled.drivers.wired.shutter_line",
 }
 
 
 def __getattr__(name: str) -> Any:
     """Load a public name from its module."""
     if name in __all__:
-        return getattr(import_module(f"dappled.drivers.{_ELSEWHERE.get(name, 'camera')}"), name)
+        return getattr(import_module(_ELSEWHERE.get(name, "dappled.drivers.camera")), name)
     raise AttributeError(f"module 'dappled.drivers' has no attribute {name!r}")
 
 

@@ -182,13 +182,25 @@ class OpenedFrame:
         """The light field's views."""
         return self.light_field.views
 
-    def refocus(self, **at: Any) -> NDArray[np.float32]:
+    def refocus(
+        self,
+        *,
+        alpha: float | None = None,
+        disparity: float | None = None,
+        distance_m: float | None = None,
+        aperture: float | None = None,
+        tilt: tuple[float, float] = (0.0, 0.0),
+    ) -> NDArray[np.float32]:
         """As `OpenedLightField.refocus`."""
-        return self.light_field.refocus(**at)
+        return self.light_field.refocus(
+            alpha=alpha, disparity=disparity, distance_m=distance_m, aperture=aperture, tilt=tilt
+        )
 
-    def depth(self, method: str = "combined", **options: Any) -> DepthMap:
+    def depth(
+        self, method: str = "combined", *, between: tuple[float, float] | None = None, window: int = depths.WINDOW
+    ) -> DepthMap:
         """As `OpenedLightField.depth`."""
-        return self.light_field.depth(method, **options)
+        return self.light_field.depth(method, between=between, window=window)
 
 
 @dataclass(frozen=True)
