@@ -191,7 +191,7 @@ def test_a_rerun_recording_is_written_and_can_be_read(field: str, tmp_path: Path
         (["refocus", "{}", "--stack", "0", "1", "0.5", "-o", "{out}.png"], "not a number of pictures"),
         (["refocus", "{}", "--stack", "0", "1", "501", "-o", "{out}.png"], "at most 500"),
         (["refocus", "{}", "--stack", "0", "1", "nan", "-o", "{out}.png"], "not a number of pictures"),
-        (["refocus", "{}", "-o", "{out}.gif"], "name it so"),
+        (["refocus", "{}", "-o", "{out}.gif"], "must end in"),
         (["depth", "{}", "-o", "{out}.ply"], "has no distances"),
         (["depth", "{}", "--focus", "inf", "--flight", "x", "-o", "{out}.ply"], "--frame N"),
         (["depth", "{}", "--window", "4"], "a window of 4 px"),

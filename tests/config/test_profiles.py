@@ -38,7 +38,7 @@ def test_a_wrong_name_is_answered_with_the_nearest() -> None:
 
 
 def test_a_frame_of_another_size_is_named() -> None:
-    with pytest.raises(ConfigError, match=r"2776 × 3688.* px, this one has 100 × 200"):
+    with pytest.raises(ConfigError, match=r"2776 × 3688.* px, this one is 100 × 200"):
         profiles.camera("fujifilm-s5200").sensor((100, 200))
 
 

@@ -139,7 +139,7 @@ def test_bad_calls_are_refused_in_words(stopped: tuple[Camera, Plane]) -> None:
     decoder = _decoder()
     with pytest.raises(DecodeError, match="--focal-length"):
         decoder.decode(stopped[1], f_number=8.0)
-    with pytest.raises(DecodeError, match="another profile"):
+    with pytest.raises(DecodeError, match="choose its profile"):
         decoder.decode(stopped[1][:200], focal_length_mm=50.0)
     with pytest.raises(DecodeError, match="above 0"):
         decoder.decode(stopped[1], focal_length_mm=-50.0)

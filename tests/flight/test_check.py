@@ -86,7 +86,7 @@ FAULTS = [
     Fault("a frame's row", lambda f: alter(f, "UPDATE shots SET state = 'safe' WHERE idx = 2"), "has no frame for it"),
     Fault("a pose", lambda f: alter(f, "UPDATE poses SET record = record || ' '"), "the pose of frame 0 was changed"),
     Fault("a tag", lambda f: alter(f, "UPDATE tags SET record = record || ' '"), "the tag of frame 1 was changed"),
-    Fault("a result", lambda f: alter(f, "UPDATE results SET slices_sha256 = 'cd'"), "contradicts itself"),
+    Fault("a result", lambda f: alter(f, "UPDATE results SET slices_sha256 = 'cd'"), "two different hashes"),
     Fault("a tag's text", lambda f: alter(f, "UPDATE tags SET record = '[]'"), "can't be read"),
     Fault("a hash", lambda f: alter(f, "UPDATE frames SET sha256 = 'x' WHERE idx = 0"), "about other bytes"),
     Fault("its end", lambda f: alter(f, "DELETE FROM facts WHERE key = 'closed_utc_ns'"), "never closed"),
@@ -111,7 +111,7 @@ def test_a_flight_that_is_being_recorded_is_no_fault(flight: Recording) -> None:
     request(flight, 0)
     report = check(flight.folder.path)
     assert report.intact
-    assert "still recorded" in report.notes[0]
+    assert "still being recorded" in report.notes[0]
 
 
 def test_a_crash_while_flight_toml_is_written_anew_is_no_fault(

@@ -57,7 +57,7 @@ def test_a_flight_pruned_by_an_earlier_version_is_not_copied_again(closed: Path,
 
 
 def test_a_flight_that_is_recorded_is_refused(flight: Recording, tmp_path: Path) -> None:
-    with pytest.raises(FlightError, match="still recorded"):
+    with pytest.raises(FlightError, match="still being recorded"):
         go(flight.folder.path, tmp_path / "disk")
 
 

@@ -143,7 +143,10 @@ def test_a_disk_that_takes_no_note_either_is_told(flight: Recording, monkeypatch
 
     request(flight, 0)
     monkeypatch.setattr(type(flight.ledger), "failed", refuse)
-    with held(b"abc", size=5) as blob, pytest.raises(FlightError, match=r"ended early .* nor can that be noted"):
+    with (
+        held(b"abc", size=5) as blob,
+        pytest.raises(FlightError, match=r"ended early .* and this could not be noted either"),
+    ):
         flight.recorder.record(0, "A.CR2", blob, arrived_utc_ns=5)
 
 
@@ -161,7 +164,7 @@ def test_a_file_without_its_bytes_fails_the_shot(flight: Recording, data: bytes,
 def test_nothing_is_written_over(flight: Recording) -> None:
     request(flight, 0)
     (flight.folder.frames / "000000.cr2").write_bytes(b"older")
-    with pytest.raises(FlightError, match="stands there already"):
+    with pytest.raises(FlightError, match="already exists without"):
         deliver(flight, 0, DATA)
     assert (flight.folder.frames / "000000.cr2").read_bytes() == b"older"
 

@@ -25,7 +25,7 @@ def test_a_library_that_cannot_be_loaded_is_not_called_missing(monkeypatch: pyte
         raise ImportError("libxcb.so.1: cannot open shared object file", name=name)
 
     monkeypatch.setattr("dappled.products.extras.importlib.import_module", broken)
-    with pytest.raises(MissingExtraError, match=r"opencv-python-headless is installed and can't be loaded: libxcb"):
+    with pytest.raises(MissingExtraError, match=r"opencv-python-headless is installed but can't be loaded: libxcb"):
         need("cv2")
 
 

@@ -73,7 +73,7 @@ def test_fired_by_a_wire_and_picked_up_after_landing(
     assert main([*pickup, "--dry-run"]) == 0
     assert (flight_report.balance(flight).frames, flight_report.balance(flight).following) == (0, 4)
     assert main(["flight", "report", str(flight)]) == 0
-    assert "4 of the failed have their files at the camera still" in capfd.readouterr().out
+    assert "4 of the failed still have their files in the camera" in capfd.readouterr().out
     assert main(pickup) == 0
     told = json.loads(capfd.readouterr().out)
     assert [pair["index"] for pair in told["pairs"]] == [0, 1, 2, 3]
@@ -129,7 +129,7 @@ def test_a_wrong_wish_is_one_sentence(
     with by_wire(here, body, monkeypatch) as (daemon, flight):
         shoot(daemon, body, 1)
         assert main(["flight", "pickup", str(flight), "--from", str(body.card)]) == 1
-        assert "still recorded" in capfd.readouterr().err
+        assert "still being recorded" in capfd.readouterr().err
     assert main(["flight", "pickup", str(flight), "--from", str(body.card), *words]) == 1
     err = capfd.readouterr().err
     assert said in err

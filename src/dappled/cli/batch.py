@@ -29,14 +29,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("flights", nargs="+", type=Path, metavar="FLIGHT", help="flight folders")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the results")
     parser.add_argument("--as", dest="kinds", nargs="+", choices=tuple(KINDS), default=["npz"],
-                        help="of each frame: light field (npz, zarr, h5) or map (cog, kmz); default: npz")  # fmt: skip
+                        help="per frame: a light field (npz, zarr, h5) or a map (cog, kmz); default: npz")  # fmt: skip
     parser.add_argument("--workers", type=whole, default=os.cpu_count() or 1, metavar="N",
-                        help="number of processes (default: one for each core)")  # fmt: skip
+                        help="number of processes (default: one per core)")  # fmt: skip
     parser.add_argument(
         "--scheduler", metavar="URL", help="use this Dask scheduler instead, such as tcp://10.0.0.5:8786"
     )
     georeference.add_placing(parser)
-    parser.add_argument("--json", action="store_true", help="print a line of JSON for each frame")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per frame")
 
 
 def run(arguments: argparse.Namespace) -> int:

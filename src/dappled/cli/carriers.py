@@ -38,15 +38,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--crossed",
         action="store_true",
-        help="also the orders between harmonics that the pattern is not designed to make",
+        help="also list the orders between harmonics, which the pattern is not designed to make",
     )
-    parser.add_argument("--shape", type=int, nargs=2, metavar=("H", "W"), help="predict only, for frames of this size")
+    parser.add_argument("--shape", type=int, nargs=2, metavar=("H", "W"), help="only predict, for frames of this size")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the spectrum with its boxes")
-    parser.add_argument("--look", choices=LOOKS, help="of the picture (default: magnitude; phase with --around)")
     parser.add_argument(
-        "--around", type=int, nargs=2, metavar=("KY", "KX"), help="draw the bins around this carrier, each a square"
+        "--look", choices=LOOKS, help="what the picture shows (default: magnitude; with --around: phase)"
     )
-    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.add_argument(
+        "--around", type=int, nargs=2, metavar=("KY", "KX"), help="draw the bins around this carrier, each as a square"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,7 +278,7 @@ def _summary(table: Table) -> str:
     whose = "calibration's" if table.carriers_from == "calibrated" else "law's"
     if table.seen == 0:
         return (
-            f"{start}; no carriers in this frame: it was not taken through this mask, or near the mask's ideal "
-            f"aperture, where flat parts show none; a decode uses the {whose} prediction"
+            f"{start}; no carriers in this frame: it was taken without this mask, or near the mask's ideal "
+            f"aperture, where flat areas show none; a decode uses the {whose} prediction"
         )
     return f"{start}; {table.seen} of {there} carriers seen, too few or weak: a decode uses the {whose} prediction"

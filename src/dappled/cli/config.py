@@ -14,7 +14,7 @@ from dappled.config import profiles, settings
 
 def configure(parser: argparse.ArgumentParser) -> None:
     if parser.prog.endswith("profiles"):
-        parser.add_argument("--json", action="store_true", help="as JSON")
+        parser.add_argument("--json", action="store_true", help="print JSON")
         parser.epilog = "example: dappled profiles"
         parser.set_defaults(action="profiles")
         return
@@ -26,9 +26,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "show", "show every setting with its value, unit and meaning", "dappled config show > dappled.toml"
     )
     show.add_argument(
-        "file", type=Path, nargs="?", metavar="FILE", help="settings file (default: the default settings)"
+        "file", type=Path, nargs="?", metavar="FILE", help="settings file (default: the built-in settings)"
     )
-    show.add_argument("--json", action="store_true", help="as JSON")
+    show.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -16,7 +16,9 @@ from dappled.products.opened import OpenedLightField
 
 def add_frames(parser: argparse.ArgumentParser, count: str) -> None:
     """Add the frames, as positional arguments."""
-    parser.add_argument("frames", nargs=count, type=Path, metavar="FRAME", help="RAF, CR2, DNG, LFP, TIFF, PNG or NPY")
+    parser.add_argument(
+        "frames", nargs=count, type=Path, metavar="FRAME", help="frame: RAF, CR2, DNG, LFP, TIFF, PNG or NPY"
+    )
 
 
 def add_law(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +29,10 @@ def add_law(parser: argparse.ArgumentParser) -> None:
 def add_recipe(parser: argparse.ArgumentParser, *, mask_needed: bool = True) -> None:
     """Add --camera, --mask, --law, and the files and numbers that go with a frame."""
     parser.add_argument(
-        "--camera", default="auto", metavar="P", help="camera profile or TOML file (default: by the frame)"
+        "--camera",
+        default="auto",
+        metavar="P",
+        help="camera profile or TOML file (default: the one that fits the frame)",
     )
     parser.add_argument("--mask", required=mask_needed, metavar="P", help="mask profile or TOML file, or lenslet")
     add_law(parser)
@@ -87,4 +92,4 @@ def opened_field(arguments: argparse.Namespace) -> OpenedLightField:
 def add_between(parser: argparse.ArgumentParser) -> None:
     """Add --between."""
     parser.add_argument("--between", nargs=2, type=float, metavar=("LOW", "HIGH"),
-                        help="range of disparities to search, px/view (default: that of the scene)")  # fmt: skip
+                        help="range of disparities to search, px/view (default: the scene's)")  # fmt: skip

@@ -31,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "examples:\n  dappled depth frame.zarr -o depth.png\n"
         "  dappled depth frame.zarr --focus inf -o depth.npz points.ply\n"
         "  dappled depth frame.zarr --calibration c.toml --flight FLIGHT --frame 42 -o points.las\n"
-        "OUT: .png (false colours), .npz (all of it), .pfm (disparity), .ply, .las, .laz (points)."
+        "OUT: .png (false colours), .npz (all values), .pfm (disparity), .ply, .las, .laz (points)."
     )
     decode_arguments.add_field(parser)
     parser.add_argument("--method", choices=tuple(depths.METHODS), default="combined",
@@ -42,12 +42,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--most-sigma", type=float, default=0.1, metavar="SHARE",
                         help="omit points with a σ above this share of their distance (default: 0.1)")  # fmt: skip
     parser.add_argument(
-        "--flight", type=Path, metavar="FLIGHT", help="with --frame: place the points on the map, by that frame's pose"
+        "--flight",
+        type=Path,
+        metavar="FLIGHT",
+        help="with --frame: place the points on the map, using the pose of that frame",
     )
     parser.add_argument("--frame", type=int, metavar="N", help="number of this frame in the flight")
     parser.add_argument("--crs", default="", metavar="EPSG:N", help="projection of the points (default: the UTM zone)")
     parser.add_argument("-o", "--output", nargs="+", type=Path, default=[], metavar="OUT", help="files to write")
-    parser.add_argument("--json", action="store_true", help="the summary as JSON")
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:

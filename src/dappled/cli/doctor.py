@@ -42,9 +42,9 @@ class DaemonRunsError(DappledError):
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n  dappled doctor\n  dappled doctor --config dappled.toml --test-shot\n"
-        "  dappled doctor --simulate --latency 10\n\nexits 1 while something prevents a flight"
+        "  dappled doctor --simulate --latency 10\n\nexits 1 if something prevents a flight"
     )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings file (default: the default settings)")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings file (default: the built-in settings)")
     parser.add_argument("--simulate", action="store_true", help="use a simulated camera and autopilot")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the simulation (default: 1)")
     parser.add_argument("--test-shot", action="store_true", help="fire one frame and say go or no-go")
@@ -53,9 +53,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the test flight here")
     parser.add_argument(
-        "--watch", action="store_true", help="print which cameras appear and disappear on USB, until ^C"
+        "--watch", action="store_true", help="print which cameras appear and disappear on USB, until Ctrl-C"
     )
-    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:

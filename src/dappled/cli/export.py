@@ -10,25 +10,29 @@ from dappled.products.exports import exports, light_files
 from dappled.products.opened import OpenedLightField
 
 KINDS = {
-    "hci": "HCI benchmark folder: a PNG a view, parameters.cfg; with --depth also disp_estimate.pfm",
-    "eslf": "ESLF: one 16-bit PNG, a lenslet a pixel; its size in a .txt beside it",
-    "mat": "MATLAB v5 as LFToolbox has it: LF [t, s, v, u, c]",
-    "quilt": "quilt PNG for light-field displays; its name tells columns, rows and aspect",
-    "h5": "HDF5: slices, views and all", "npz": "NumPy", "zarr": "Zarr",
+    "hci": "HCI benchmark folder: one PNG per view, parameters.cfg; with --depth also disp_estimate.pfm",
+    "eslf": "ESLF: one 16-bit PNG with a lenslet for each pixel of a view; the lenslet's size is in a .txt beside it",
+    "mat": "MATLAB v5 in LFToolbox's layout: LF [t, s, v, u, c]",
+    "quilt": "quilt PNG for light-field displays; its name gives columns, rows and aspect",
+    "h5": "HDF5: the whole light field", "npz": "NumPy: the whole light field", "zarr": "Zarr: the whole light field",
     "rerun": "Rerun recording (.rrd): views, picture, depth",
 }  # fmt: skip
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     lines = "\n".join(f"  {name:6} {what}" for name, what in KINDS.items())
-    parser.epilog = f"formats:\n{lines}\nexample: dappled export frame.zarr --as hci -o hci/frame"
+    parser.epilog = f"formats:\n{lines}\n\nexample: dappled export frame.zarr --as hci -o hci/frame"
     decode_arguments.add_field(parser)
     parser.add_argument("--as", dest="kind", choices=tuple(KINDS), required=True, help="the format")
-    parser.add_argument("--depth", action="store_true", help="hci, rerun: with a depth map (combined)")
+    parser.add_argument("--depth", action="store_true", help="hci, rerun: add a depth map (method combined)")
     parser.add_argument("--lenslet", type=int, default=0, metavar="PX",
                         help=f"eslf: side of a lenslet (LFToolbox: {exports.ESLF_LENSLET_PX})")  # fmt: skip
     parser.add_argument(
-        "--disparity", type=float, default=0.0, metavar="D", help="quilt: the disparity that lies in the screen"
+        "--disparity",
+        type=float,
+        default=0.0,
+        metavar="D",
+        help="quilt: the disparity that appears in the plane of the screen",
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="file or folder to write")
 

@@ -33,20 +33,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "examples:\n"
         "  dappled georeference ~/flights/20261121T101503Z-0a1b2c3d --as kmz\n"
         "  dappled georeference FLIGHT --as cog footprints --terrain n41_w092_1arc_v3.dt2 --refine neighbours\n"
-        "Writes into FLIGHT/maps unless -o says otherwise. The recording is never touched."
+        "Writes into FLIGHT/maps unless -o says otherwise. The recording is not changed."
     )
-    parser.add_argument("flight", type=Path, help="flight folder")
+    parser.add_argument("flight", type=Path, metavar="FLIGHT", help="flight folder")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for the maps (default: FLIGHT/maps)")
     parser.add_argument("--as", dest="kinds", nargs="+", choices=KINDS, default=["kmz", "cog", "footprints"],
                         help="what to make (default: kmz cog footprints)")  # fmt: skip
-    parser.add_argument("--each", action="store_true", help="also a kmz or cog of each frame, in frames/")
-    parser.add_argument("--quad", action="store_true", help="each frame's kmz as a LatLonQuad: the view itself")
+    parser.add_argument("--each", action="store_true", help="also make a kmz or cog of each frame, in frames/")
+    parser.add_argument("--quad", action="store_true", help="write each frame's kmz as a LatLonQuad: the view itself")
     parser.add_argument(
-        "--against", type=Path, metavar="FLIGHT", help="for difference: the other, later flight, all its frames"
+        "--against",
+        type=Path,
+        metavar="FLIGHT",
+        help="for difference: the later flight to compare with; all of its frames are used",
     )
     parser.add_argument("--between", nargs=2, type=float, metavar=("LOW", "HIGH"),
                         help="for terrain: heights to search, metres above sea level\n"
-                        "(default: 3 m below to 12 m above the ground that is given)")  # fmt: skip
+                        "(default: from 3 m below to 12 m above the ground given)")  # fmt: skip
     add_placing(parser)
     better = parser.add_argument_group("refinement")
     better.add_argument("--refine", nargs="+", default=[], metavar="WITH",
@@ -57,14 +60,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="search radius on the base map (default: 5 m)")  # fmt: skip
     better.add_argument("--pose-sigma", nargs=2, type=positive, metavar=("M", "DEG"),
                         help="σ of the poses (default: as recorded)")  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="the report as JSON")
+    parser.add_argument("--json", action="store_true", help="print the report as JSON")
 
 
 def add_placing(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that say how frames are decoded and placed."""
     ground = parser.add_argument_group("ground")
     ground.add_argument("--ground", type=float, metavar="M",
-                        help="flat ground, metres above sea level (default: home's)")  # fmt: skip
+                        help="height of flat ground, metres above sea level (default: home's)")  # fmt: skip
     ground.add_argument("--terrain", type=Path, metavar="FILE", help="terrain raster: DTED, GeoTIFF …")
     ground.add_argument("--terrain-heights", choices=("sea-level", "ellipsoid"), default="sea-level",
                         help="what the raster's heights are measured from (default: sea-level)")  # fmt: skip
@@ -74,11 +77,13 @@ def add_placing(parser: argparse.ArgumentParser) -> None:
     camera.add_argument("--camera", metavar="P", help="camera profile (default: the flight's)")
     camera.add_argument("--mask", metavar="P", help="mask profile (default: the flight's)")
     camera.add_argument("--calibration", metavar="FILE", help="mask calibration (default: the flight's)")
-    camera.add_argument("--focal-length", type=positive, metavar="MM", help="if the frames don't say")
-    camera.add_argument("--f-number", type=positive, metavar="N", help="if the frames don't say")
+    camera.add_argument("--focal-length", type=positive, metavar="MM", help="focal length, if the frames don't say")
+    camera.add_argument("--f-number", type=positive, metavar="N", help="f-number, if the frames don't say")
     camera.add_argument("--view", default="mean", metavar="VIEW",
-                        help="mean, ground (all views, refocused there), or row,column of one")  # fmt: skip
-    camera.add_argument("--grey", action="store_true", help="make grey maps (default: in colour if the frames have it)")
+                        help="mean, ground (all views, refocused on it), or the row,column of one view")  # fmt: skip
+    camera.add_argument(
+        "--grey", action="store_true", help="make grey maps (default: in colour if the frames have colour)"
+    )
     camera.add_argument("--lever-arm", nargs=3, type=float, metavar=("F", "R", "D"),
                         help="antenna to camera, metres forward, right, down (default: the flight's)")  # fmt: skip
     camera.add_argument("--mount", nargs=9, type=float, metavar="R",
@@ -88,9 +93,12 @@ def add_placing(parser: argparse.ArgumentParser) -> None:
     maps = parser.add_argument_group("map")
     maps.add_argument("--crs", metavar="EPSG:N", help="projection in metres (default: the UTM zone)")
     maps.add_argument(
-        "--gsd", type=positive, metavar="M", help="side of a map cell (default: the ground sample of the frames)"
+        "--gsd",
+        type=positive,
+        metavar="M",
+        help="side of a map cell (default: the ground sample distance of the frames)",
     )
-    maps.add_argument("--frames", metavar="N,A-B", help="only these frames")
+    maps.add_argument("--frames", metavar="N,A-B", help="use only these frames")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -129,7 +137,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(report.read_text(), end="")
     else:
         frames = counted(len(made.photographs), "frame")
-        print(f"{frames} on {made.projection.name}, {made.gsd_m:g} m a cell, {made.ground.name}")
+        print(f"{frames} on {made.projection.name}, {made.gsd_m:g} m per cell, {made.ground.name}")
         for path in (*files, report):
             print(path)
     for why in (*(why for _, why in made.left), *made.notes):

@@ -26,9 +26,9 @@ from dappled.products.mounting import Mounting
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "example: dappled geotag ~/flights/20261121T101503Z-0a1b2c3d\n"
-        "Writes name.ext.xmp beside each frame, and into geotags/\n"
+        "Writes name.ext.xmp beside each frame, and in geotags/\n"
         "geo.txt (OpenDroneMap), pix4d.csv and track.geojson.\n"
-        "The frames themselves are never touched."
+        "The frames themselves are not changed."
     )
     parser.add_argument("flight", type=Path, metavar="FLIGHT", help="flight folder")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="write everything into this folder instead")
@@ -44,16 +44,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--on-gimbal", action=argparse.BooleanOptionalAction, default=None,
-        help="the camera hangs on the gimbal (default: the flight's pose.on_gimbal)",
+        help="the camera is mounted on the gimbal (default: the flight's pose.on_gimbal)",
     )  # fmt: skip
     parser.add_argument(
         "--geoid", metavar="FILE|M",
-        help="grid, or metres, of mean sea level above the ellipsoid (default: PROJ's EGM grid, if it is there)",
+        help="mean sea level above the ellipsoid: a grid, or metres (default: PROJ's EGM grid, if installed)",
     )  # fmt: skip
     parser.add_argument(
         "--copies", type=Path, metavar="DIR", help="also write copies of the frames with their position in EXIF"
     )
-    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -37,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     token = actions.add("token", "make a token for the console", "dappled keys token /etc/dappled/console.token")
     token.add_argument("file", type=Path, metavar="FILE", help="file to write; must not exist yet")
     for one in actions.all:
-        one.add_argument("--json", action="store_true", help="as JSON")
+        one.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _configure_mavlink(parser: argparse.ArgumentParser) -> None:

@@ -30,25 +30,35 @@ def configure(parser: argparse.ArgumentParser) -> None:
     where = parser.add_argument_group("focus (one of them)").add_mutually_exclusive_group()
     where.add_argument("--alpha", nargs="+", type=float, metavar="A",
                        help="Eq 29's α: 1 as taken, below 1 is nearer, above 1 farther")  # fmt: skip
-    where.add_argument("--disparity", nargs="+", type=float, metavar="D", help="px from view to view")
+    where.add_argument("--disparity", nargs="+", type=float, metavar="D", help="disparities in px from view to view")
     where.add_argument(
-        "--distance", nargs="+", type=metres, metavar="M", help="metres; needs --focus or a calibration with targets"
+        "--distance",
+        nargs="+",
+        type=metres,
+        metavar="M",
+        help="distances in metres; needs --focus or a calibration with targets",
     )
-    where.add_argument("--stack", nargs=3, type=float, metavar=("FROM", "TO", "N"), help="N disparities")
+    where.add_argument(
+        "--stack", nargs=3, type=float, metavar=("FROM", "TO", "N"), help="a focal stack at N disparities"
+    )
     parser.add_argument("--magnify", action="store_true",
-                        help="with --alpha: exactly Eq 29, where the picture grows with α")  # fmt: skip
-    parser.add_argument("--aperture", type=float, metavar="D", help="round synthetic aperture, share of the whole")
+                        help="with --alpha: follow Eq 29 exactly, so that the picture grows with α")  # fmt: skip
+    parser.add_argument(
+        "--aperture", type=float, metavar="D", help="diameter of a round synthetic aperture, as a share of the whole"
+    )
     parser.add_argument("--tilt", nargs=2, type=float, default=(0.0, 0.0), metavar=("H", "W"),
                         help="tilted plane: change of disparity over the picture's height and width")  # fmt: skip
     parser.add_argument(
-        "--all-in-focus", action="store_true", help="with --stack: each pixel from its sharpest picture"
+        "--all-in-focus",
+        action="store_true",
+        help="with --stack: take each pixel from the picture where it is sharpest",
     )
     parser.add_argument(
-        "--index", type=Path, metavar="FILE", help="with --all-in-focus: draw which plane each pixel is from"
+        "--index", type=Path, metavar="FILE", help="with --all-in-focus: draw which plane each pixel came from"
     )
-    parser.add_argument("--eyes", choices=("anaglyph", "side-by-side", "crossed"), help="a stereo pair")
+    parser.add_argument("--eyes", choices=("anaglyph", "side-by-side", "crossed"), help="make a stereo pair")
     parser.add_argument("--fourier", action="store_true",
-                        help="by a slice of the 4D spectrum (Ng); prints the difference to shift and add")  # fmt: skip
+                        help="refocus by a slice of the 4D spectrum (Ng), and compare with shift and add")  # fmt: skip
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=".png, .jpg, .tif or .npy")
 
 

@@ -49,7 +49,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=None,
         type=_rate,
         metavar="RATE",
-        help="1 is as fast as it was recorded, 2 twice as fast, max (default) as fast as possible",
+        help="1: as fast as recorded; 2: twice as fast; max (default): as fast as possible",
     )
     parser.add_argument("--step", action="store_true", help="wait for Enter before each frame")
     parser.add_argument("--publish", action=argparse.BooleanOptionalAction, default=False, help="publish over ZeroMQ")
@@ -58,26 +58,29 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--run",
         dest="run_name",
         metavar="NAME",
-        help="store the results beside those of the flight, under this name (default with another recipe: the time);\n"
+        help="store the results under this name, beside the flight's own (default with another recipe: the time);\n"
         "with --verify: check them",
     )
     parser.add_argument("--camera", metavar="P", help="camera profile or TOML file (default: the flight's)")
     parser.add_argument("--mask", metavar="P", help="mask profile or TOML file, or lenslet (default: the flight's)")
     parser.add_argument(
-        "--telemetry", type=Path, metavar="FILE", help="telemetry of a folder of frames (default: the only .tlog in it)"
+        "--telemetry",
+        type=Path,
+        metavar="FILE",
+        help="telemetry for a folder of frames (default: the only .tlog in it)",
     )
     parser.add_argument("--white", metavar="FILE", help="white frame")
     parser.add_argument("--dark", metavar="FILE", help="dark frame")
     parser.add_argument("--calibration", metavar="FILE", help="file written by dappled calibrate")
-    parser.add_argument("--match", metavar="GLOB", help="which files of a folder are frames (default: all)")
+    parser.add_argument("--match", metavar="GLOB", help="which files in a folder are frames (default: all)")
     parser.add_argument(
         "--start", type=_utc_ns, metavar="UTC", help="time of a folder's first frame, such as 2026-11-21T10:15:03Z"
     )
     parser.add_argument(
         "--interval", type=seconds, metavar="S", help="time between the frames of a folder (default: 1)"
     )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings: endpoints, workers")
-    parser.add_argument("--json", action="store_true", help="one JSON object a frame")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings file, for endpoints and workers")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per frame")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -25,7 +25,7 @@ from dappled.errors import DappledError
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "examples:\n  dappled run --config dappled.toml\n  dappled run --simulate --frames 8"
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings file (default: the default settings)")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings file (default: the built-in settings)")
     parser.add_argument("--simulate", action="store_true", help="use a simulated camera and autopilot, no hardware")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the simulation (default: 1)")
     parser.add_argument("--for", dest="seconds", type=seconds, metavar="SECONDS", help="end after this time")
@@ -33,9 +33,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--frames", type=whole, metavar="N", help="end after N frames; with --simulate, a ground station asks for them"
     )
     parser.add_argument(
-        "--console", metavar="HOST:PORT", help="serve the operator's console here, as console.bind does"
+        "--console", metavar="HOST:PORT", help="serve the operator's console here; overrides console.bind"
     )
-    parser.add_argument("--json", action="store_true", help="one JSON object a frame")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per frame")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -26,12 +26,16 @@ class NotRunningError(DappledError):
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "example: dappled status --config /etc/dappled/dappled.toml"
-    parser.add_argument("endpoint", nargs="?", help="ZeroMQ endpoint of the stream (default: by --config)")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="the daemon's settings (default: every default)")
+    parser.add_argument(
+        "endpoint", nargs="?", metavar="ENDPOINT", help="ZeroMQ endpoint of the stream (default: from --config)"
+    )
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="the daemon's settings file (default: the built-in settings)"
+    )
     parser.add_argument(
         "--timeout", type=seconds, default=3.0, metavar="S", help="how long to wait for a record (default: 3)"
     )
-    parser.add_argument("--json", action="store_true", help="the health record as it is published")
+    parser.add_argument("--json", action="store_true", help="print the health record as it is published")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="how long to wait for the camera, and for each photograph (default: 60)",
     )
     parser.add_argument("--key", type=Path, metavar="FILE", help="the link's signing key (dappled mavlink key)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object a photograph")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per photograph")
 
 
 def run(arguments: argparse.Namespace) -> int:

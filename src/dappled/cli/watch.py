@@ -18,7 +18,7 @@ from dappled.errors import counted
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "example: dappled watch --save slices/ --count 8\n\nexits 1 if slices were lost, or fewer arrived than --count"
+        "example: dappled watch --save slices/ --count 8\n\nexits 1 if slices were lost, or fewer than --count arrived"
     )
     parser.add_argument(
         "endpoint",
@@ -27,15 +27,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="ZeroMQ endpoint of the stream (default: the daemon's on this machine)",
     )
     parser.add_argument(
-        "--ask", metavar="ENDPOINT", help="endpoint that answers requests (default: beside an ipc stream)"
+        "--ask", metavar="ENDPOINT", help="endpoint that answers requests (default: the one beside an ipc stream)"
     )
     parser.add_argument("--save", type=Path, metavar="DIR", help="save each frame's header, slices and mosaic here")
-    parser.add_argument("--from-start", action="store_true", help="also what the flight sent before now")
+    parser.add_argument("--from-start", action="store_true", help="also fetch what the flight has sent already")
     parser.add_argument("--count", type=whole, metavar="N", help="end after the slices of N frames")
     parser.add_argument("--timeout", type=seconds, metavar="S", help="give up after S seconds without a message")
     parser.add_argument("--keys", type=Path, metavar="FILE", help="your NAME.key_secret, for a tcp endpoint")
     parser.add_argument("--server-key", type=Path, metavar="FILE", help="the vehicle's NAME.key")
-    parser.add_argument("--json", action="store_true", help="print one JSON object a line")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per line")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -69,8 +69,8 @@ class CameraProfile:
                 return known.sensor.spread()
         sizes = ", ".join(f"{h} × {w}" for h, w in (known.sensor.shape for known in self.raw))
         raise ConfigError(
-            f"camera profile {self.name} knows frames of {sizes} px, this one has {shape[0]} × {shape[1]}; "
-            "choose another camera.profile, or add the shape to a profile of your own"
+            f"camera profile {self.name} describes frames of {sizes} px, this one is {shape[0]} × {shape[1]}; "
+            "choose another camera.profile, or add the shape to your own profile"
         )
 
     def staggered(self, shape: tuple[int, ...]) -> bool:

@@ -159,7 +159,7 @@ def flights(settings: Settings, fly: Callable[[Settings, FlightHandover], bool])
         except DappledError as error:
             if before is None or after.began:
                 raise
-            log.warning("the next flight can't begin, so all stays as it was: %s", sentence(error))
+            log.warning("the next flight can't begin, so nothing changes: %s", sentence(error))
             now, before = before, None
             continue
         if not goes_on or after.next is None:

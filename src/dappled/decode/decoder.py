@@ -161,7 +161,9 @@ class MaskDecoder:
             raise DecodeError(f"unknown law {self.law!r}; known are {', '.join(LAWS)}")
         known = self.calibration
         if known is not None and (known.mask != self.mask or known.law != self.law):
-            raise DecodeError("the calibration was made with another mask or law: calibrate anew, or name its own")
+            raise DecodeError(
+                "the calibration was made with another mask or law: calibrate again, or choose that mask and law"
+            )
         if known is not None and known.shape != self.sensor.shape:
             raise DecodeError(f"the calibration is for frames of {known.shape}, this camera's are {self.sensor.shape}")
 
@@ -190,11 +192,14 @@ class MaskDecoder:
         if not (focal_length_mm > 0 and (f_number is None or f_number > 0)):
             raise DecodeError(f"focal length {focal_length_mm} mm and f-number {f_number} must be above 0")
         if plane.shape != self.sensor.shape:
-            raise DecodeError(f"the frame is {plane.shape} px, this camera's are {self.sensor.shape}: another profile?")
+            raise DecodeError(
+                f"the frame is {plane.shape} px, this camera's are {self.sensor.shape}: choose its profile"
+            )
         predicted = self.predict(focal_length_mm)
         if len(predicted) < 2:
             raise DecodeError(
-                f"all carriers but the mean fall off the sensor at {focal_length_mm} mm: wrong mask, law or length?"
+                f"all carriers but the mean fall off the sensor at {focal_length_mm} mm: "
+                "check mask, law and focal length"
             )
         with self.buffers.lend(self.sensor.shape) as tiles:
             reach = self.largest_fx(focal_length_mm)

@@ -164,7 +164,9 @@ def lenslet_origin(slices: Slices) -> tuple[float, float]:
 def flattened(views: Views, white: Views) -> Views:
     """The views over the white frame's, which are 1 at their brightest view's mean."""
     if views.shape != white.shape:
-        raise DecodeError(f"the white frame's views are {white.shape}, the frame's {views.shape}: another white frame?")
+        raise DecodeError(
+            f"the white frame's views are {white.shape}, the frame's {views.shape}: use its own white frame"
+        )
     top = float(white.mean(axis=(2, 3)).max())
     divided: Views = views / np.maximum(white / np.float32(top), np.float32(_DARKEST))
     return divided

@@ -48,7 +48,7 @@ def check(path: Path) -> CheckReport:
             closed = "closed_utc_ns" in ledger.facts()
             if not closed:
                 (notes if layout.is_locked(path.parent) else problems).append(
-                    "the flight is still recorded, or was never closed: the next `dappled run` puts it in order"
+                    "the flight is still being recorded, or was never closed: the next `dappled run` repairs it"
                 )
             gone = ledger.facts().get("offloaded")
             if gone is not None:

@@ -71,7 +71,7 @@ def copy_in(source_fd: int, size: int, path: Path) -> str:
         while done < size:
             sent = os.sendfile(fd, source_fd, done, size - done)
             if sent == 0:
-                raise EOFError(f"only {done} of {size} bytes came")
+                raise EOFError(f"only {done} of {size} bytes arrived")
             done += sent
 
     with ThreadPoolExecutor(1, "dappled-hash") as beside:
@@ -94,7 +94,7 @@ def hash_descriptor(fd: int, size: int) -> str:
     while done < size:
         got = os.preadv(fd, [buffer[: size - done]], done)
         if got == 0:
-            raise EOFError(f"only {done} of {size} bytes came")
+            raise EOFError(f"only {done} of {size} bytes arrived")
         sha256.update(buffer[:got])
         done += got
     return sha256.hexdigest()

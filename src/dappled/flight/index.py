@@ -61,7 +61,9 @@ class ImageIndex(Database):
     def _identify(self) -> None:
         empty, application, version = self._identity()
         if not (empty and application == 0) and (application, version) != (_APPLICATION_ID, _VERSION):
-            raise FlightError(f"{self.path} is not an index of this dappled; move it away, it is made anew")
+            raise FlightError(
+                f"{self.path} is not an index that this dappled can read; move it away, and it will be rebuilt"
+            )
         self._db.execute("PRAGMA journal_mode=WAL")
         self._db.execute("PRAGMA synchronous=NORMAL")  # the ledgers are the truth: a lost row is found again there
         if empty:
@@ -89,7 +91,7 @@ class ImageIndex(Database):
         held = self.lookup(entry.index)
         if held is not None and held.flight != entry.flight:
             raise FlightError(
-                f"image {entry.index} is in flight {held.flight} and again in {entry.flight}: the first counts"
+                f"image {entry.index} is in flight {held.flight} and again in {entry.flight}: the first one is used"
             )
         values = (entry.index, entry.flight, entry.frame, entry.state)
         self._rows("INSERT OR REPLACE INTO images VALUES (?, ?, ?, ?)", *values)

@@ -245,7 +245,7 @@ class LedgerReader(Database):
         """A sentence for each result whose record and column hold different hashes."""
         rows = self._rows("SELECT idx, run, slices_sha256, record FROM results ORDER BY idx, run")
         return [
-            f"the result of frame {index} in run {run} contradicts itself"
+            f"the result of frame {index} in run {run} has two different hashes"
             for index, run, sha256, text in rows
             if self._load(_result, text).slices_sha256 != sha256
         ]

@@ -75,7 +75,7 @@ def _offloaded_before(folder: FlightFolder) -> str | None:
         facts = ledger.facts()
     if "closed_utc_ns" not in facts:
         raise FlightError(
-            f"{folder.path} is still recorded, or was never closed: stop the daemon, or start it once to close it"
+            f"{folder.path} is still being recorded, or was never closed: stop the daemon, or start it once to close it"
         )
     return facts[FACT]["destination"] if FACT in facts else None
 

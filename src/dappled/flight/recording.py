@@ -76,7 +76,7 @@ class Recorder:
         """Make a companion safe: a file of the same number beside the frame of a shot. Raises FlightError where the
         shot has no frame, or has such a file already."""
         if self._ledger.frame(index) is None:
-            raise FlightError(f"{camera_name} goes with shot {index}, which has no frame: it was not recorded")
+            raise FlightError(f"{camera_name} belongs to shot {index}, which has no frame: it was not recorded")
         name = layout.frame_name(index, camera_name)
         sha256 = self._write(name, camera_name, blob)
         companion = Frame(index, name, camera_name, blob.size, sha256, arrived_utc_ns)
@@ -106,9 +106,7 @@ class Recorder:
         if blob.size <= 0:
             raise FlightError(f"the camera's file {camera_name} is empty: nothing was recorded")
         if path.exists():
-            raise FlightError(
-                f"{path} stands there already without a ledger row; start a new flight to have it adopted"
-            )
+            raise FlightError(f"{path} already exists without a ledger row; start a new flight to have it adopted")
         try:
             return durable.copy_in(blob.fd, blob.size, path)
         except OSError as error:
@@ -120,7 +118,7 @@ class Recorder:
         try:
             self._ledger.failed(index, str(error))
         except FlightError as second:
-            raise FlightError(f"{error}; nor can that be noted: {second}") from error
+            raise FlightError(f"{error}; and this could not be noted either: {second}") from error
 
 
 @dataclass(frozen=True, slots=True)

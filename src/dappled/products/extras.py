@@ -22,7 +22,7 @@ def need(module: str) -> Any:
     except ImportError as error:
         root = module.partition(".")[0]
         if not (isinstance(error, ModuleNotFoundError) and error.name == root):
-            raise MissingExtraError(f"{_PACKAGES.get(root, root)} is installed and can't be loaded: {error}") from error
+            raise MissingExtraError(f"{_PACKAGES.get(root, root)} is installed but can't be loaded: {error}") from error
         extra = _EXTRAS.get(root, "ground")
         raise MissingExtraError(
             f"this needs {_PACKAGES.get(root, root)}: install it with pip install 'dappled[{extra}]'"

@@ -128,7 +128,7 @@ def test_a_batch_goes_on_past_bad_frames_and_says_so(
     assert "bad.dng" in told[0]
     assert "nameless.npy" in told[1]
     assert "--focal-length" in told[1]
-    assert "knows frames of" in told[2]
+    assert "describes frames of" in told[2]
     assert told[3] == "3 of 5 frames could not be used"
     assert len(calibration_files.load(tmp_path / "c.toml").fits) == 2
 

@@ -65,7 +65,7 @@ def test_frames_of_several_zooms_are_no_targets(folder: Path, tmp_path: Path, mo
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (["--target", "2"], "give --target one distance a frame"),
+        (["--target", "2"], "give --target one distance per frame"),
         (["--target", "6", "2"], "in the order of the frames"),
     ],
 )

@@ -94,7 +94,7 @@ def test_design_from_altitude_to_film(tmp_path: Path, capsys: pytest.CaptureFixt
     best = _json(["mask", "design", *camera, "--mask", "mask-2"], capsys)
     assert best["slices_mm"] == pytest.approx(13.4, abs=0.05)
     assert main(["mask", "plan", *camera, "--focal-length", "13", "--speed", "8", "--mask", "mask-2"]) == 0
-    assert "frames a minute" in capsys.readouterr().out
+    assert "frames per minute" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -105,9 +105,9 @@ def test_design_from_altitude_to_film(tmp_path: Path, capsys: pytest.CaptureFixt
         (["make", "mask-2", "--film", "100x100", "-o", "x.png"], "needs --density"),
         (["make", "mask-2", "--size-mm", "30", "30", "-o", "x.png"], "it has 24 mm"),
         (["make", "--period", "nan", "-o", "x.png"], "period = nan"),
-        (["make", "mask-2", "-o", "x.jpg"], "written as .png or .tif"),
+        (["make", "mask-2", "-o", "x.jpg"], "must end in .png or .tif"),
         (["table", "--mask", "mask-2", "--camera", "fujifilm-s5200", "--focal-length", "0.013"], "millimetres"),
-        (["design", "--altitude", "40", "--camera", "fujifilm-s5200"], "say with --focal-length"),
+        (["design", "--altitude", "40", "--camera", "fujifilm-s5200"], "with --focal-length"),
         (["plan", "--altitude", "40", "--camera", "reference-36mm", "--speed", "-3"], "ground speed = -3"),
         (["diffraction", "--mask", "mask-2", "--measured", "nowhere.csv"], "nowhere.csv can't be read"),
     ],

@@ -95,7 +95,7 @@ def test_a_worker_that_keeps_dying_is_not_started_without_end(frame: str) -> Non
         assert decoder._process is not None
         decoder._process.wait(5)
     now_ns[0] = 20 * 10**9
-    with pytest.raises(DecodeProcessError, match="keeps dying: it starts again in 40 s"):
+    with pytest.raises(DecodeProcessError, match="keeps crashing: it starts again in 40 s"):
         decoder.develop(frame, None, None)
     now_ns[0] = 61 * 10**9
     assert decoder.develop(frame, None, None).sha256

@@ -28,7 +28,7 @@ def test_a_file_is_no_frame_of_a_shot_that_never_fired(tmp_path: Path) -> None:
     card.mkdir()
     (card / "DSCF0001.RAF").write_bytes(b"a frame")
     source = parse_source(str(card), PtpSource)
-    with pytest.raises(PickupError, match=r"shot 1 never fired, as far as the flight knows: the camera was absent$"):
+    with pytest.raises(PickupError, match=r"shot 1 never fired, according to the flight: the camera was absent$"):
         pickup.propose(flight.folder.path, source, Choice(pairs={1: "DSCF0001.RAF"}))
     proposal = pickup.propose(flight.folder.path, source, Choice(pairs={0: "DSCF0001.RAF"}))
     assert [index for index, _ in proposal.pairs] == [0]

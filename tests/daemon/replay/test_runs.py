@@ -79,5 +79,5 @@ def test_a_name_that_is_none(flight: Recording, recipe: Recipe, name: str) -> No
 
 
 def test_a_flight_that_is_still_recorded_gets_no_run(flight: Recording, recipe: Recipe) -> None:
-    with pytest.raises(DappledError, match="still recorded"):
+    with pytest.raises(DappledError, match="still being recorded"):
         RunWriter(flight.folder.path, Run("second", recipe, NAMES), lambda: 5)

@@ -62,7 +62,7 @@ def test_other_bytes_are_a_difference(tmp_path: Path, data: bytes) -> None:
 @pytest.mark.parametrize("what", ["pose", "tag", "slices"])
 def test_another_or_a_missing_hash_is_a_difference(tmp_path: Path, what: str) -> None:
     verifier, frame = replay(tmp_path, **{f"{what}_sha256": "0" * 64})
-    assert play(verifier, frame) == [f"frame 0: its {what} came out different"]
+    assert play(verifier, frame) == [f"frame 0: its {what} differs"]
     verifier, frame = replay(tmp_path, **{f"{what}_sha256": None})
     assert play(verifier, frame) == [f"frame 0: the record holds no hash of its {what}"]
 
@@ -78,14 +78,14 @@ def test_a_frame_that_the_flight_left_undecoded_has_no_slices_to_differ(tmp_path
     assert verifier.verdict() == []  # nor can the replay
     verifier, frame = replay(tmp_path, events=frozenset({"not decoded"}))
     verifier.tagged(tag(frame))
-    assert verifier.verdict() == ["frame 0: its slices did not come out of the replay"]  # somebody decoded it after all
+    assert verifier.verdict() == ["frame 0: the replay made no slices"]  # somebody decoded it after all
 
 
 def test_what_did_not_come_is_a_difference(tmp_path: Path) -> None:
     verifier, _ = replay(tmp_path)
     verifier.failed(0, "can't be read")
     text = "\n".join(verifier.verdict())
-    for word in ("frame 0: can't be read", "its pose did not", "its tag did not", "its slices did not"):
+    for word in ("frame 0: can't be read", "made no pose", "made no tag", "made no slices"):
         assert word in text
     with pytest.raises(DappledError, match="no recorded frame"):
         verifier.record(None, "x", Blob.of(b"x"))

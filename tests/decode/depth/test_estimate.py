@@ -161,8 +161,8 @@ def test_the_picture_of_each_view_has_moved_by_its_step() -> None:
     ("act", "words"),
     [
         (lambda e: estimate.estimate(e, "guess"), "unknown depth method 'guess'"),
-        (lambda e: estimate.estimate(e, between=(1, 1)), "are no range"),
-        (lambda e: estimate.estimate(e, between=(0, float("nan"))), "are no range"),
+        (lambda e: estimate.estimate(e, between=(1, 1)), "are not a range"),
+        (lambda e: estimate.estimate(e, between=(0, float("nan"))), "are not a range"),
         (lambda e: estimate.estimate(e, window=4, between=(0, 1)), "a window of 4 px"),
         (lambda e: Search(0, 1, 1e-4), "too many"),
         (lambda e: estimate.estimate(e, "stereo", between=(-40, 40)), "narrow the range"),
@@ -178,7 +178,7 @@ def test_wrong_calls_are_told(act, words: str) -> None:  # type: ignore[no-untyp
 def test_one_view_and_views_that_are_no_numbers_are_told() -> None:
     with pytest.raises(DecodeError, match="depth needs views from several places"):
         evidence.of_views(ViewStack(np.ones((1, 1, 9, 9), np.float32), np.zeros(1), np.zeros(1)))
-    with pytest.raises(DecodeError, match="no numbers"):
+    with pytest.raises(DecodeError, match="not numbers"):
         evidence.of_views(ViewStack(np.full((3, 3, 9, 9), np.nan, np.float32), centred(3), centred(3)))
 
 

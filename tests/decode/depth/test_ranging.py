@@ -112,7 +112,7 @@ def test_the_target_is_what_fills_the_middle() -> None:
         (lambda: Ranging.of_lens(50, 7.4, 0.01, 0.02), "no camera"),
         (lambda: LENS.disparity(0, STACK), "must be above 0"),
         (lambda: fit_targets([], f_number=None), "no target"),
-        (lambda: fit_targets([Target(5, 1)], f_number=None), "one distance"),
+        (lambda: fit_targets([Target(5, 1)], f_number=None), "single distance"),
         (lambda: fit_targets([Target(5, 1), Target(10, 2)], f_number=None), "smaller shifts"),
         (lambda: fit_targets([Target(-5, 1)], f_number=None), "above 0 m"),
         (lambda: Ranging.from_dict({}), "incomplete"),

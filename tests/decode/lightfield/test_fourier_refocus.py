@@ -53,7 +53,7 @@ def test_a_difference_of_nothing_is_infinite() -> None:
 def test_what_it_cannot_do_is_told() -> None:
     stack, _ = paint([Board(0.2)], (32, 32), 3)
     uneven = ViewStack(stack.views, stack.row_steps, np.array([-1.0, 0.2, 1.0]))
-    with pytest.raises(DecodeError, match="even distances"):
+    with pytest.raises(DecodeError, match="evenly spaced"):
         Spectrum4D.of(uneven, most_disparity=1)
     huge = ViewStack(np.broadcast_to(np.float32(0), (15, 15, 1200, 1200)), centred(15), centred(15))
     with pytest.raises(DecodeError, match=r"would take .* GB"):

@@ -36,12 +36,12 @@ def test_a_curve_is_inverted(gamma: float, top: float, falling: bool, wanted: fl
     ("levels", "densities", "said"),
     [
         ([0, 255], [0, 2], "3 steps or more"),
-        ([0, 100, 255], [0, 1.5, 1.0], "turns back by 0.50 at level 255"),
+        ([0, 100, 255], [0, 1.5, 1.0], "reverses by 0.50 at level 255"),
         ([0, 100, 255], [1, 1, 1.01], "density only changes by 0.01"),
         ([0, 100, 300], [0, 1, 2], "level = 300"),
         ([0, 100, 255], [0, 1, float("nan")], "density = nan"),
         ([90, 100, 255], [0, 1, 2], "measure it from 0 to 255"),
-        ([0, 0, 255], [0, 1, 2], "stands in it twice"),
+        ([0, 0, 255], [0, 1, 2], "is in it twice"),
     ],
 )
 def test_a_bad_curve_is_answered(levels: list[float], densities: list[float], said: str) -> None:

@@ -198,7 +198,7 @@ def test_workers_end_with_the_one_who_asked(tmp_path: Path) -> None:
 
 
 def test_two_batches_cant_share_a_folder(tmp_path: Path) -> None:
-    with Manifest(tmp_path), pytest.raises(ManifestError, match="another batch works in"):
+    with Manifest(tmp_path), pytest.raises(ManifestError, match="another batch is writing to"):
         Manifest(tmp_path)
     with Manifest(tmp_path) as again:
         assert again.done == {}

@@ -57,7 +57,7 @@ def test_a_16k_mask_takes_less_than_200_mb(tmp_path: Path, name: str) -> None:
 
 def test_a_wrong_file_is_answered(tmp_path: Path) -> None:
     tile = MaskImage(Mask(11.38, 2), film_of(50, 50, 113.8), (10, 10)).levels
-    with pytest.raises(mask_files.MaskFileError, match=r"written as .png or .tif"):
+    with pytest.raises(mask_files.MaskFileError, match=r"must end in .png or .tif"):
         mask_files.write(tmp_path / "mask.jpg", (50, 50), 8, (113.8, 113.8), tile)
     with pytest.raises(mask_files.MaskFileError, match="can't be written"):
         mask_files.write(tmp_path / "nowhere" / "mask.png", (50, 50), 8, (113.8, 113.8), tile)
@@ -86,5 +86,5 @@ def test_csv_of_people(tmp_path: Path) -> None:
     (tmp_path / "curve.csv").write_text("level,density\n255,0.1\n0,2.1\n128,0.9\n")
     assert mask_files.read_density_curve(tmp_path / "curve.csv").range == pytest.approx((10**-2.1, 10**-0.1))
     (tmp_path / "bad.csv").write_text("level,density\n255,0.1\n0,2.1\n128,5.9\n")
-    with pytest.raises(mask_files.MaskFileError, match=r"bad.csv: the density turns back"):
+    with pytest.raises(mask_files.MaskFileError, match=r"bad.csv: the density reverses"):
         mask_files.read_density_curve(tmp_path / "bad.csv")

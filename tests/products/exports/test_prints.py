@@ -38,7 +38,7 @@ def test_pictures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
     prints.save(tmp_path / "a.png", np.zeros((4, 5), np.uint8))
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.size == (5, 4)
-    with pytest.raises(PrintError, match="name it so"):
+    with pytest.raises(PrintError, match="must end in"):
         prints.save(tmp_path / "a.gif", np.zeros((4, 5), np.uint8))
     with pytest.raises(PrintError, match="can't be written"):
         prints.save(tmp_path / "gone" / "a.png", np.zeros((4, 5), np.uint8))

@@ -20,9 +20,9 @@ from dappled.products import chessboard
 def add(parser: argparse.ArgumentParser) -> None:
     """Add --lens and --board."""
     group = parser.add_argument_group("lens, for maps")
-    group.add_argument("--lens", action="store_true", help="frames show a chessboard: calibrate the lens instead, and\n"
+    group.add_argument("--lens", action="store_true", help="the frames show a chessboard: calibrate the lens, and\n"
                        "write a copy of the camera's profile with the result (-o FILE.toml)")  # fmt: skip
-    group.add_argument("--board", default="9x6", metavar="CxR", help="its inner corners (default: 9x6)")
+    group.add_argument("--board", default="9x6", metavar="CxR", help="inner corners of the chessboard (default: 9x6)")
 
 
 def run(recipe: Recipe, frames: list[Path], board: str, output: Path, focal_length_mm: float | None) -> int:

@@ -24,8 +24,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     """Add --target."""
     group = parser.add_argument_group("distances")
     group.add_argument("--target", nargs="+", type=float, metavar="M",
-                       help="frames at full aperture show a textured target in the middle, at these distances, one a\n"
-                       "frame: fit disparity to distance (Eq 5), on top of --calibration")  # fmt: skip
+                       help="frames at full aperture show a textured target in the middle, at these distances, one\n"
+                       "per frame: fit disparity to distance (Eq 5), on top of --calibration")  # fmt: skip
 
 
 def run(recipe: Recipe, frames: list[Path], metres: list[float], output: Path, focal_length_mm: float | None) -> int:
@@ -51,7 +51,7 @@ def from_frames(
     """The ranging that frames of targets show, and what each target showed. Raises DappledError."""
     if len(frames) != len(metres):
         both = f"{counted(len(frames), 'frame')} and {counted(len(metres), 'distance')}"
-        raise DarkroomError(f"{both}: give --target one distance a frame")
+        raise DarkroomError(f"{both}: give --target one distance per frame")
     darkroom = Darkroom(recipe)
     targets: list[Target] = []
     stops: set[float | None] = set()
@@ -66,7 +66,7 @@ def from_frames(
         lens = opened.lens_ranging(field.field, float("inf"))
     for several, name in ((stops, "f-numbers"), (lengths, "focal lengths")):
         if len(several) > 1:
-            raise DarkroomError(f"the targets were taken at several {name} ({_listed(several)}): take them at one")
+            raise DarkroomError(f"the targets were taken at several {name} ({_listed(several)}): take them all at one")
     return fit_targets(targets, f_number=stops.pop(), focal_length_mm=lengths.pop(), lens=lens), targets
 
 

@@ -48,8 +48,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     for one in (show, intact, report, away, bring):
         one.add_argument("flight", nargs="?", type=Path, metavar="FLIGHT", help="flight folder (default: the newest)")
     for one in actions.all:
-        one.add_argument("--config", type=Path, metavar="FILE", help="settings that say where flights are")
-        one.add_argument("--json", action="store_true", help="as JSON")
+        one.add_argument("--config", type=Path, metavar="FILE", help="settings file that names the flights folder")
+        one.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:

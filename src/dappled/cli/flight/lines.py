@@ -79,7 +79,7 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
     frames = counted(found.frames, "frame", 6)
     yield f"  {frames}, {found.size / 1e6:.1f} MB: {found.tagged} tagged, {found.decoded} decoded"
     if found.following:
-        yield f"  {found.following:6d} of the failed have their files at the camera still: dappled flight pickup"
+        yield f"  {found.following:6d} of the failed still have their files in the camera: dappled flight pickup"
     if found.companions:
         yield f"  {counted(found.companions, 'file', 6)} beside frames, such as the JPEG of a raw frame"
     if found.strays:

@@ -1,4 +1,4 @@
-"""`dappled flight pickup`: bring the files that stayed at the camera into the flight."""
+"""`dappled flight pickup`: fetch the files that stayed in the camera, and add them to the flight."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
 from dappled.errors import counted
 
-HELP = "bring the files that stayed at the camera; exits 1 while shots lack files"
+HELP = "fetch the files that stayed in the camera; exits 1 if shots still lack files"
 EXAMPLES = (
     "dappled flight pickup --from /media/card/DCIM --dry-run",
     "dappled flight pickup ~/flights/20261121T101503Z-0a1b2c3d --from usb: --pair 17=DSCF0042.RAF",

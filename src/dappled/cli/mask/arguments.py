@@ -41,15 +41,18 @@ def add_installation(parser: argparse.ArgumentParser, *, free: bool = False) -> 
     """--law and --mask-distance; `free` where a design may choose the distance."""
     decode_arguments.add_law(parser)
     default = "default: free; with --mask the camera's" if free else "default: the camera's"
-    parser.add_argument("--mask-distance", type=float, metavar="MM", help=f"mask to sensor ({default})")
+    parser.add_argument("--mask-distance", type=float, metavar="MM", help=f"distance from mask to sensor ({default})")
 
 
 def add_altitude(parser: argparse.ArgumentParser) -> None:
     """--altitude, and the camera that is flown there."""
-    parser.add_argument("--altitude", type=float, required=True, metavar="M", help="above ground")
+    parser.add_argument("--altitude", type=float, required=True, metavar="M", help="height above ground")
     add_sensor(parser)
     parser.add_argument(
-        "--focal-length", type=float, metavar="MM", help="of the lens (default: the camera's, if it has only one)"
+        "--focal-length",
+        type=float,
+        metavar="MM",
+        help="focal length of the lens (default: the camera's, if it has only one)",
     )
 
 
@@ -71,7 +74,7 @@ def camera_set(arguments: argparse.Namespace) -> tuple[CameraProfile, Sensor, fl
     length = only_length(camera) if arguments.focal_length is None else arguments.focal_length
     if length is None:
         raise ConfigError(
-            f"{camera.name} has no focal length of its own: say with --focal-length, in mm, how the lens is set"
+            f"{camera.name} does not fix the focal length: give the lens' setting in mm with --focal-length"
         )
     return camera, sensor(camera, arguments), lenses.focal_length(length)
 

@@ -23,20 +23,26 @@ EXAMPLE = "dappled mask design --altitude 40 --camera fujifilm-s5200 --focal-len
 
 def configure(parser: argparse.ArgumentParser) -> None:
     mask_arguments.add_altitude(parser)
-    parser.add_argument("--f-number", type=float, default=5.6, metavar="N", help="of the lens (default: 5.6)")
-    parser.add_argument("--views", type=int, default=5, metavar="N", help="views an axis, odd (default: 5)")
-    parser.add_argument("--film", default="4k", choices=tuple(FILMS), help="to print it on (default: 4k)")
+    parser.add_argument("--f-number", type=float, default=5.6, metavar="N", help="f-number of the lens (default: 5.6)")
+    parser.add_argument("--views", type=int, default=5, metavar="N", help="views per axis, odd (default: 5)")
+    parser.add_argument("--film", default="4k", choices=tuple(FILMS), help="film to print it on (default: 4k)")
     mask_arguments.add_installation(parser, free=True)
     parser.add_argument(
         "--room", type=float, metavar="MM", help="largest distance of the mask from the sensor (default: 10)"
     )
-    parser.add_argument("--wavelength", type=float, default=550.0, metavar="NM", help="of the light (default: 550)")
     parser.add_argument(
-        "--shift-error", type=float, default=0.02, metavar="PX", help="σ of a shift between views (default: 0.02)"
+        "--wavelength", type=float, default=550.0, metavar="NM", help="wavelength of the light (default: 550)"
+    )
+    parser.add_argument(
+        "--shift-error",
+        type=float,
+        default=0.02,
+        metavar="PX",
+        help="σ of a measured shift between views (default: 0.02)",
     )
     parser.add_argument("--mask", metavar="P", help="print the best focal length of this installed mask instead")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the carriers on the spectrum")
-    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -119,11 +125,11 @@ def _as_text(made: Design) -> str:
         ),
         f"distance   {made.mask_distance_mm:.3f} mm before the sensor",
         f"aperture   {wanted.aperture_mm:.2f} mm (f/{wanted.f_number:g}), {made.baseline_mm:.2f} mm from view to view",
-        f"a view     ±{made.bandwidth_per_mm:.2f} cycles/mm, {made.ground_sample_m * 100:.1f} cm of ground a pixel",
+        f"a view     ±{made.bandwidth_per_mm:.2f} cycles/mm, {made.ground_sample_m * 100:.1f} cm of ground per pixel",
         f"spectrum   {100 * made.spectrum_used:.0f} % used",
         (
             f"depth      ±{made.depth_sigma_m:.2g} m at {wanted.altitude_m:g} m, "
-            f"shifts known to {wanted.shift_sigma_px:g} px a view"
+            f"shifts known to {wanted.shift_sigma_px:g} px per view"
         ),
         *(f"{'ok  ' if c.met else 'FAIL'}       {c.sentence}" for c in made.conditions),
     ]

@@ -27,26 +27,26 @@ EXAMPLE = "dappled mask diffraction --mask mask-1 --measured bench.csv"
 def configure(parser: argparse.ArgumentParser) -> None:
     mask_arguments.add_mask(parser)
     parser.add_argument("--wavelength", type=float, default=laser_bench.THESIS_WAVELENGTH_NM, metavar="NM",
-                        help="of the laser (default: %(default)g)")  # fmt: skip
+                        help="wavelength of the laser (default: %(default)g)")  # fmt: skip
     parser.add_argument(
         "--distance",
         type=float,
         default=laser_bench.THESIS_DISTANCE_M,
         metavar="M",
-        help="mask to wall (default: %(default)g)",
+        help="distance from mask to wall (default: %(default)g)",
     )
     parser.add_argument("--measured", type=Path, metavar="CSV", help="x_mm,y_mm of the measured spots")
     parser.add_argument(
-        "--tolerance", type=float, default=0.5, metavar="MM", help="of the measurement (default: %(default)g)"
+        "--tolerance", type=float, default=0.5, metavar="MM", help="tolerance of the measurement (default: %(default)g)"
     )
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw what the wall should show")
     parser.add_argument(
-        "--image", type=Path, metavar="FILE", help="draw it of this mask image (a positive), not of the design"
+        "--image", type=Path, metavar="FILE", help="draw it for this mask image (a positive) instead of the design"
     )
     parser.add_argument(
         "--beam", type=float, default=2.0, metavar="MM", help="diameter of the laser's beam (default: %(default)g)"
     )
-    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -28,12 +28,18 @@ EXAMPLE = "dappled mask make mask-2 --negative -o mask-2.png"
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("mask", nargs="?", metavar="P", help="mask profile or TOML file (or --period/--frequency)")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=".png or .tif")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="image to write, .png or .tif")
     parser.add_argument("--film", default="4k", metavar="F", help="4k (default), 8k, 16k, or WIDTHxHEIGHT in pixels")
-    parser.add_argument("--density", type=float, metavar="PX/MM", help="of a film given as WIDTHxHEIGHT")
-    parser.add_argument("--size-mm", type=float, nargs=2, metavar=("H", "W"), help="only the middle of the film")
-    parser.add_argument("--period", type=float, metavar="PX", help="longest period in the film's pixels")
-    parser.add_argument("--frequency", type=float, metavar="1/MM", help="fundamental, instead of --period")
+    parser.add_argument("--density", type=float, metavar="PX/MM", help="pixel density of a film given as WIDTHxHEIGHT")
+    parser.add_argument(
+        "--size-mm",
+        type=float,
+        nargs=2,
+        metavar=("H", "W"),
+        help="size of the mask, in the middle of the film (default: the whole film)",
+    )
+    parser.add_argument("--period", type=float, metavar="PX", help="longest period, in pixels of the film")
+    parser.add_argument("--frequency", type=float, metavar="1/MM", help="fundamental frequency, instead of --period")
     parser.add_argument("--p", type=int, metavar="N", help="number of harmonics (default: the profile's, else 2)")
     parser.add_argument(
         "--pattern",
@@ -44,17 +50,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--harmonics", choices=("linear", "octave"), help="1, 2, 3 … or 1, 2, 4 … (default: the profile's, else linear)"
     )
     parser.add_argument(
-        "--negative", action="store_true", help="the negative (Eq 13), for black-and-white negative film"
+        "--negative", action="store_true", help="write the negative (Eq 13), for black-and-white negative film"
     )
-    parser.add_argument("--bits", type=int, default=8, choices=(8, 16), help="of a pixel (default: 8)")
+    parser.add_argument("--bits", type=int, default=8, choices=(8, 16), help="bits per pixel (default: 8)")
     parser.add_argument(
-        "--curve", type=Path, metavar="CSV", help="level,density of this film's wedge: compensate for it"
+        "--curve",
+        type=Path,
+        metavar="CSV",
+        help="level,density measured on this film's wedge; the image compensates for it",
     )
     parser.add_argument("--drawable-only", action="store_true", help="leave out harmonics finer than two pixels")
     parser.add_argument(
         "--wedge", type=int, nargs="?", const=21, metavar="STEPS", help="write a step wedge instead (default: 21 steps)"
     )
-    parser.add_argument("--json", action="store_true", help="what was written, as JSON")
+    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -111,7 +120,7 @@ def _image(arguments: argparse.Namespace, chosen: Film) -> MaskImage:
     if known is None and arguments.period is None and arguments.frequency is None:
         raise ConfigError("name a mask profile, or give --period in px or --frequency in 1/mm")
     if arguments.period is not None and arguments.frequency is not None:
-        raise ConfigError("--period and --frequency say the same: give one of them")
+        raise ConfigError("--period and --frequency set the same thing: give only one of them")
     if arguments.period is not None:
         period = within("period", arguments.period, "px", 1e-2, 1e6)
         mask = Mask(chosen.px_per_mm[1] / period, 2)

@@ -1,4 +1,4 @@
-"""`dappled mask plan`: what a flight at an altitude needs of camera, pilot and disk."""
+"""`dappled mask plan`: the interval, motion blur, frame rate and disk space of a flight at an altitude."""
 
 from __future__ import annotations
 
@@ -10,21 +10,27 @@ from dappled.cli.mask import arguments as mask_arguments
 from dappled.config import profiles
 from dappled.decode.optics import carrier_tables, lenses
 
-HELP = "interval, blur, body and disk of a flight"
+HELP = "plan a flight: interval, motion blur, frame rate and disk space"
 EXAMPLE = "dappled mask plan --altitude 40 --speed 8 --camera fujifilm-s5200 --focal-length 13"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     mask_arguments.add_altitude(parser)
-    parser.add_argument("--speed", type=float, required=True, metavar="M/S", help="over ground")
-    parser.add_argument("--overlap", type=float, default=0.8, metavar="SHARE", help="along the line (default: 0.8)")
-    parser.add_argument("--sidelap", type=float, default=0.6, metavar="SHARE", help="between lines (default: 0.6)")
+    parser.add_argument("--speed", type=float, required=True, metavar="M/S", help="speed over ground")
+    parser.add_argument(
+        "--overlap", type=float, default=0.8, metavar="SHARE", help="overlap along the line (default: 0.8)"
+    )
+    parser.add_argument(
+        "--sidelap", type=float, default=0.6, metavar="SHARE", help="overlap between lines (default: 0.6)"
+    )
     parser.add_argument("--exposure", type=float, default=0.001, metavar="S", help="exposure time (default: 0.001)")
     parser.add_argument("--hours", type=float, default=1.0, metavar="H", help="flight time (default: 1)")
     parser.add_argument("--frame-mb", type=float, default=18.0, metavar="MB", help="size of a raw file (default: 18)")
-    parser.add_argument("--mask", metavar="P", help="mask profile, for the views' own ground sample")
-    parser.add_argument("--sideways", action="store_true", help="the frame's columns lie along the flight")
-    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.add_argument("--mask", metavar="P", help="mask profile, for the ground sample distance of the views")
+    parser.add_argument(
+        "--sideways", action="store_true", help="the width of the frame, not its height, lies along the flight line"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -51,11 +57,11 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(asdict(made), indent=2))
         return 0
-    views = "" if made.view_sample_m is None else f", {made.view_sample_m * 100:.1f} cm a pixel of a view"
+    views = "" if made.view_sample_m is None else f", {made.view_sample_m * 100:.1f} cm per pixel of a view"
     print(f"footprint  {made.footprint_m[1]:.1f} m across, {made.footprint_m[0]:.1f} m along the flight")
-    print(f"ground     {made.ground_sample_m * 100:.2f} cm a pixel{views}")
+    print(f"ground     {made.ground_sample_m * 100:.2f} cm per pixel{views}")
     print(f"interval   {made.interval_s:.2f} s, {made.spacing_m:.2f} m; lines {made.line_m:.1f} m apart")
-    print(f"body       must sustain {made.frames_per_minute:.1f} frames a minute")
+    print(f"body       must sustain {made.frames_per_minute:.1f} frames per minute")
     print(f"blur       {made.blur_px:.2f} px; one pixel at {made.longest_exposure_s * 1e3:.2f} ms")
-    print(f"disk       {made.frames} frames, {made.disk_bytes / 1e9:.1f} GB; on card and disk each, without previews")
+    print(f"disk       {made.frames} frames, {made.disk_bytes / 1e9:.1f} GB, on the card and again on the disk")
     return 0

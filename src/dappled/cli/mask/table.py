@@ -22,13 +22,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     mask_arguments.add_sensor(parser)
     mask_arguments.add_installation(parser)
     parser.add_argument(
-        "--focal-length", type=float, nargs="+", metavar="MM", help="of the lens (default: those of Table 11)"
+        "--focal-length",
+        type=float,
+        nargs="+",
+        metavar="MM",
+        help="focal lengths of the lens (default: those of Table 11)",
     )
     parser.add_argument(
-        "--rotation", type=float, default=0.0, metavar="DEGREES", help="by how much the mask is turned (default: 0)"
+        "--rotation", type=float, default=0.0, metavar="DEGREES", help="rotation of the mask (default: 0)"
     )
-    parser.add_argument("--carriers", action="store_true", help="every carrier with row and column, crossed ones too")
-    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.add_argument(
+        "--carriers", action="store_true", help="list every carrier with its row and column, including crossed ones"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:

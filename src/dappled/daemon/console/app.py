@@ -145,7 +145,7 @@ class ConsoleApp:
         body = await _body(request)
         seconds = body.get("interval_s")
         if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds <= 86400:
-            raise StudioError("interval_s is a number of seconds from 0 to 86400")
+            raise StudioError("interval_s must be a number of seconds from 0 to 86400")
         count, sequence = _whole(body, "count", 0, 10**6), _whole(body, "sequence", 0, 2**31)
         return await self._do({"do": "interval", "sequence": sequence, "interval_s": seconds, "count": count})
 
@@ -174,7 +174,7 @@ class ConsoleApp:
             return _file(await self._rectified_png(frame, _MAP_PX), name)
         if name == "depth.png":
             if known.depth is None:
-                raise FeedError(f"frame {frame} has no depth (any more)")
+                raise FeedError(f"frame {frame} has no depth map, or no longer has one")
             return _file(await self._make(self._studio.depth, known.depth), name)
         message = await self._feed.slices(frame)
         studio = self._studio
@@ -256,7 +256,7 @@ def _file(data: bytes, name: str) -> Response:
 def _whole(body: Mapping[str, Any], name: str, low: int, high: int) -> int:
     value = body.get(name)
     if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-        raise StudioError(f"{name} is a whole number from {low} to {high}")
+        raise StudioError(f"{name} must be a whole number from {low} to {high}")
     return value
 
 
@@ -266,7 +266,7 @@ def _disparity(request: Request) -> float:
     except ValueError:
         disparity = float("nan")
     if not abs(disparity) <= _DISPARITY_PX:  # NaN too
-        raise StudioError(f"disparity is a number of pixels from {-_DISPARITY_PX:g} to {_DISPARITY_PX:g}")
+        raise StudioError(f"disparity must be a number of pixels from {-_DISPARITY_PX:g} to {_DISPARITY_PX:g}")
     return disparity
 
 
@@ -278,7 +278,7 @@ async def _body(request: Request) -> dict[str, Any]:
     except ClientDisconnect:
         raise StudioError("the request ended before its body was complete") from None
     if not isinstance(body, dict):
-        raise StudioError("a request's body is one JSON object")
+        raise StudioError("a request's body must be one JSON object")
     return body
 
 

@@ -163,7 +163,7 @@ class Feed:
             return await asyncio.wait_for(asyncio.shield(waiting), _ASK_S)
         except TimeoutError:
             self._asked.pop(frame, None)
-            raise FeedError(f"the slices of frame {frame} did not come: the decoder is busy") from None
+            raise FeedError(f"the slices of frame {frame} did not arrive: the decoder is busy") from None
 
     def newest(self) -> int | None:
         """The last frame that has slices; without any, the last frame."""

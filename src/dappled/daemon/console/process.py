@@ -52,7 +52,9 @@ def listen(settings: ConsoleSettings) -> tuple[socket.socket, str]:
     host, port = address(settings.bind)
     token = read_private(Path(settings.token), "the console's token").strip() if settings.token else ""
     if settings.token and len(token) < _TOKEN_CHARACTERS:
-        raise ConsoleError(f"{settings.token} holds no token of {_TOKEN_CHARACTERS} characters: dappled keys token")
+        raise ConsoleError(
+            f"{settings.token} holds no token of {_TOKEN_CHARACTERS} characters: make one with `dappled keys token`"
+        )
     if not token and not is_loopback(host):
         raise ConsoleError(
             f"console.bind = {settings.bind!r} would be open to the network without a token: make one with "

@@ -67,7 +67,7 @@ def _disk(health: Mapping[str, Any], frame_bytes: float, *, known: bool) -> Chec
     frames = max(0, int((free - least) / frame_bytes))
     count = f"{frames:,}".replace(",", "\u202f")  # a thin space that doesn't break
     text = (
-        f"{free / 1e9:.1f} GB free, room for {'' if known else 'some '}{count} {'frame' if frames == 1 else 'frames'}"
+        f"{free / 1e9:.1f} GB free, room for {'' if known else 'about '}{count} {'frame' if frames == 1 else 'frames'}"
     )
     if free < least:
         return Check("Disk", "no-go", f"nearly full: {free / 1e6:.0f} MB left, shots are refused")

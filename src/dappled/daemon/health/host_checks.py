@@ -68,7 +68,7 @@ def bodies(settings: Settings, machine: Machine) -> list[Check]:
     if found:
         return [_body(settings, machine, body) for body in found]
     if not _wants_usb(settings):
-        return [Check("USB", "caution", "no camera is on the bus; none is needed there")]
+        return [Check("USB", "caution", "no camera is on the bus; the configured driver needs none there")]
     todo = (
         "connect the camera, switch it on, and set its USB mode to PTP or PC connection; then `dappled doctor` again. "
         "Without a camera: `dappled run --simulate --frames 3`"
@@ -82,7 +82,7 @@ def _body(settings: Settings, machine: Machine, body: UsbBody) -> Check:
     if node.exists() and not os.access(node, os.R_OK | os.W_OK):
         todo = (
             "install the udev rule (systemd/70-dappled-camera.rules to /etc/udev/rules.d/), join the group: "
-            "sudo usermod -aG plugdev $USER; log in anew, and plug the camera in again"
+            "sudo usermod -aG plugdev $USER; log in again, and plug the camera in again"
         )
         return Check("USB", "no-go", f"{name}: you have no permission to open {node}", todo)
     if body.vendor == usb_bus.FUJIFILM:
@@ -158,7 +158,7 @@ def disk(settings: Settings, machine: Machine) -> list[Check]:
     if not os.access(place, os.W_OK):
         return [Check("disk", "no-go", f"{place} can't be written to", f"make {folder} yours, or set record.directory")]
     free = layout.disk_space(place).available
-    text = f"{free / 1e9:.1f} GB free at {folder}, room for some {counted(int(free / _FRAME_BYTES), 'frame')}"
+    text = f"{free / 1e9:.1f} GB free at {folder}, room for about {counted(int(free / _FRAME_BYTES), 'frame')}"
     if free < settings.record.min_free_mb * 1e6:
         mend = "`dappled flight offload`, then remove frames by hand"
         return [Check("disk", "no-go", f"{text}: below record.min_free_mb", mend)]
@@ -182,7 +182,7 @@ def link(settings: Settings, machine: Machine) -> list[Check]:
     for url in urls:
         device = url.split(":")[0].split(",")[0]
         if device.startswith("/dev/") and not os.access(device, os.R_OK | os.W_OK):
-            todo = "connect it, or: sudo usermod -aG dialout $USER and log in anew"
+            todo = "connect it, or: sudo usermod -aG dialout $USER and log in again"
             found.append(Check("MAVLink", "no-go", f"{url}: {device} can't be opened", todo))
         else:
             found.append(Check("MAVLink", "go", f"{url} (`dappled run` says whether the autopilot is heard)"))

@@ -63,14 +63,14 @@ def record(
     problems += doubts
     if not utc_known:
         problems.append(
-            "UTC is not known yet: all time stamps are corrected when the autopilot has it from its satellites"
+            "UTC is not known yet: all time stamps will be corrected when the autopilot gets it from its satellites"
         )
     free = _free(folder)
     if free is not None and free < settings.record.min_free_mb * 1_000_000:
         problems.append(f"disk nearly full: {free // 1_000_000} MB left, new shots are refused")
     elif free is not None and free < settings.record.warn_free_mb * 1_000_000:
         problems.append(
-            f"the disk is filling up: {free // 10**6} MB left, below {settings.record.min_free_mb} MB shots are refused"
+            f"the disk is filling up: {free // 10**6} MB left; shots are refused below {settings.record.min_free_mb} MB"
         )
     if not settings.mask.profile:
         problems.append("no mask is configured: frames are kept, not decoded (set mask.profile)")

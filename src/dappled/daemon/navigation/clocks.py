@@ -416,7 +416,7 @@ class UtcLearner:
         way = "slow" if last.correction_ns > 0 else "fast"
         off_s = abs(last.correction_ns) / 1e9
         return (
-            f"this machine's clock is {off_s:.0f} s {way}, by the autopilot's satellites, and believed all the same: "
+            f"this machine's clock is {off_s:.0f} s {way}, by the autopilot's satellites, but is used all the same: "
             'set it, or set record.utc = "autopilot"'
         )
 

@@ -212,9 +212,9 @@ class ShotEnds:
         pending.frame = frame
         followed, failed = self.shots.file_came(frame.index)
         if followed:
-            self.note("followed", f"its file has come: {name}", frame.index)
+            self.note("followed", f"its file has arrived: {name}", frame.index)
         elif failed:
-            self.note("late", f"its file came after all; it had failed: {pending.problem}", frame.index)
+            self.note("late", f"its file arrived after the shot had failed: {pending.problem}", frame.index)
             pending.problem = ""
             self.shots.add(pending)
         return pending
@@ -352,7 +352,7 @@ class Capture:
     def _shot_failed(self, index: int, reason: str) -> None:
         pending = self._shots.in_hand(index)
         if pending is not None and pending.frame is not None:
-            self._ends.note("contradiction", f"its file is safe, and then the driver says: {reason}", index)
+            self._ends.note("contradiction", f"its file is safe, but then the driver reported: {reason}", index)
             return
         try:
             self._enter(index)

@@ -186,7 +186,9 @@ class DecodeProcess:
         if answer is None:
             self._end()
             self.restarts += 1
-            raise DecodeProcessError(f"decoding {question.get('path', '')} took over {self._timeout_s:g} s: given up")
+            raise DecodeProcessError(
+                f"decoding {question.get('path', '')} took over {self._timeout_s:g} sand was given up"
+            )
         if "error" in answer.body:
             raise DecodeProcessError(str(answer.body["error"]))
         if answer.lost:
@@ -196,7 +198,7 @@ class DecodeProcess:
     def _begin(self) -> ProcessChannel:
         if wait_ns := self._budget.wait_ns(self._clock_ns()):
             raise DecodeProcessError(
-                f"the decoder keeps dying: it starts again in {wait_ns / 1e9:.0f} s; frames stay in the record"
+                f"the decoder keeps crashing: it starts again in {wait_ns / 1e9:.0f} s; frames stay in the record"
             )
         self._budget.spend(self._clock_ns())
         self._channel, there = ProcessChannel.pair()

@@ -88,7 +88,7 @@ class LedgerWriter:
         arrived_utc_ns = self._clock.utc_ns()
         recorder = self._recording.recorder
         if index is None:
-            reason = f"{name} came without a shot: kept as a stray"
+            reason = f"{name} arrived without a shot: kept as a stray"
             stray = recorder.record_stray(name, blob, reason, arrived_utc_ns=arrived_utc_ns)
             raise DappledError(f"{reason} in {stray.name}")
         frame = recorder.record(index, name, blob, arrived_utc_ns=arrived_utc_ns)

@@ -68,7 +68,7 @@ def add_missing(flight: Path, utc_ns: Callable[[], int]) -> list[int]:
     if not missing:
         return []
     if not closed:
-        raise DappledError(f"{flight} is still recorded, or was never closed: the next `dappled run` puts it in order")
+        raise DappledError(f"{flight} is still being recorded, or was never closed: the next `dappled run` repairs it")
     facts = layout.read_facts(folder)
     if "settings" not in facts or "names" not in facts:
         raise DappledError(f"{folder.settings} lacks the settings that the flight was flown with")

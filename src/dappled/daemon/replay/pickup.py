@@ -24,7 +24,7 @@ from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
 from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching, in_order, match
 from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups
-from dappled.errors import DappledError
+from dappled.errors import DappledError, counted
 from dappled.flight import FlightsLock, Frame, ImageIndex, Ledger, LedgerReader, Recorder, ShotRow, layout
 from dappled.flight.index import IndexEntry
 
@@ -76,7 +76,7 @@ def propose(flight: Path, source: FileSource, choice: Choice) -> Proposal:
     folder = layout.open_folder(flight)
     with LedgerReader.open(folder.ledger) as ledger:
         if "closed_utc_ns" not in ledger.facts():
-            raise PickupError(f"{flight} is still recorded, or was never closed: stop the daemon first")
+            raise PickupError(f"{flight} is still being recorded, or was never closed: stop the daemon first")
         rows = {row.shot.index: row for row in ledger.shots()}
         frames = ledger.frames()
     found = groups(source.list())
@@ -183,12 +183,10 @@ def _chosen(choice: Choice, fresh: list[FileGroup], rows: Mapping[int, ShotRow])
                 f"--pair {index}={name}: shot {index} {'has its frame' if row else 'is not in the flight'}"
             )
         if row.fired_called_monotonic_ns is None:
-            raise PickupError(
-                f"--pair {index}={name}: shot {index} never fired, as far as the flight knows: {row.reason}"
-            )
+            raise PickupError(f"--pair {index}={name}: shot {index} never fired, according to the flight: {row.reason}")
         fitting = [group for group in fresh if name in (group.main.name, group.main.base)]
         if len(fitting) != 1:
-            raise PickupError(f"--pair {index}={name}: {len(fitting)} new files are called so; give its whole name")
+            raise PickupError(f"--pair {index}={name}: {len(fitting)} new files have this name; give the full name")
         chosen[index] = fitting[0]
     return chosen
 
@@ -198,7 +196,7 @@ def _matched(shots: list[FiredShot], files: list[DatedFile], choice: Choice, off
         pairs = in_order(shots, files)
         if pairs is None:
             raise PickupError(
-                f"--by-order needs as many files as shots: {len(shots)} shots wait for {len(files)} files"
+                f"--by-order needs as many files as shots: {counted(len(shots), 'shot')}, {counted(len(files), 'file')}"
             )
         return Matching(pairs, (), (), ())
     plausible_s = math.inf if choice.any_clock else PLAUSIBLE_S

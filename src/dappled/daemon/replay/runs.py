@@ -43,7 +43,11 @@ class RunWriter:
             facts, runs = ledger.facts(), ledger.runs()
         if "closed_utc_ns" not in facts:
             held = layout.is_locked(flight.absolute().parent)
-            what = "is still recorded: wait for its end" if held else "was never closed: the next `dappled run` does it"
+            what = (
+                "is still being recorded: wait for its end"
+                if held
+                else "was never closed: the next `dappled run` closes it"
+            )
             raise DappledError(f"{flight} {what}, or replay it without another recipe")
         if run.name in runs or _fact(run.name) in facts:
             raise DappledError(f"{flight} has a run {run.name!r} already: give another name with --run")
@@ -72,7 +76,7 @@ def of_flight(flight: Path, name: str) -> Run:
     told = facts.get(_fact(name))
     if told is None:
         runs = sorted(key.removeprefix("run:") for key in facts if key.startswith("run:"))
-        raise DappledError(f"{flight} has no run {name!r}; it has {', '.join(runs) or 'none but the flight itself'}")
+        raise DappledError(f"{flight} has no run {name!r}; it has {', '.join(runs) or 'only the flight itself'}")
     return Run(name, Recipe(**{**told["recipe"], **_absolute(told["recipe"], flight)}), Names(**told["names"]))
 
 

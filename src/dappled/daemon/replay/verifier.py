@@ -112,7 +112,7 @@ class ReplayVerifier:
         """All differences, and what the replay did not come to compare. `decoded`: whether the flight was decoded as it
         flew; if not, only frames with recorded slices must have some again. Nor must those that it left undecoded."""
         missing = [
-            f"frame {index}: its {what} did not come out of the replay"
+            f"frame {index}: the replay made no {what}"
             for index, one in self._expected.items()
             if one.frame is not None
             for what in ("pose", "tag", "slices")
@@ -126,4 +126,4 @@ class ReplayVerifier:
         if recorded is None:
             self.differences.append(f"frame {index}: the record holds no hash of its {what}")
         elif recorded != found:
-            self.differences.append(f"frame {index}: its {what} came out different")
+            self.differences.append(f"frame {index}: its {what} differs")

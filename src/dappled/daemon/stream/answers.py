@@ -69,7 +69,7 @@ class Answers:
     def answer(self, request: Mapping[str, Any], reply: Reply) -> None:
         """Queue a question of `Publisher`. Raises WireError when too many wait already."""
         if not self._worker.put((request, reply)):
-            raise WireError(f"{WAITING} questions wait already: ask again later")
+            raise WireError(f"{WAITING} questions are waiting already: ask again later")
 
     def _work(self, item: tuple[Mapping[str, Any], Reply]) -> None:
         request, reply = item

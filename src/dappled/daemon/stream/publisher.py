@@ -321,7 +321,7 @@ class Publisher:
             return request
         frame = self._frame_of.get(request["seq"])
         if frame is None:
-            raise WireError(f"seq {request['seq']} of slices was not sent, or too long ago: ask by frame")
+            raise WireError(f"seq {request['seq']} of slices was never sent, or was sent too long ago: ask by frame")
         return {**request, "frame": frame}
 
     def _reply_to(self, peer: bytes, asked: Mapping[str, Any] | None) -> Reply:

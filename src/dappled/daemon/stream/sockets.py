@@ -128,7 +128,7 @@ def prepare(endpoint: str, *, keyed: bool = False) -> None:
     elif url.scheme == "tcp":
         if not keyed and not is_loopback(url.hostname or ""):
             raise WireError(
-                f"{endpoint} would be open to the network without keys: make some with `dappled keys make`, and name "
+                f"{endpoint} would be open to the network without keys: make them with `dappled keys make`, and name "
                 "them in publish.keys and publish.clients; or use ipc:// or tcp://127.0.0.1:PORT"
             )
     else:

@@ -169,7 +169,7 @@ class _SubscriberCore:
 
     def _send(self, request: Mapping[str, Any]) -> Any:
         if self._dealer is None:
-            raise WireError("no endpoint to ask was given")
+            raise WireError("no endpoint for questions was given")
         return self._dealer.send(json.dumps(request).encode())
 
     def _receive(self, timeout_s: float) -> _Steps:

@@ -53,13 +53,13 @@ class Message:
                 found[entry["name"]] = np.frombuffer(data[start : start + size], dtype).reshape(shape)
                 start += size
         except (KeyError, TypeError, ValueError) as error:
-            raise WireError(f"the arrays of {self.topic} are not described as they are: {error}") from None
+            raise WireError(f"the arrays of {self.topic} don't match their description: {error}") from None
         return found
 
 
 def _shape(sides: Sequence[int]) -> tuple[int, ...]:
     if min(sides, default=0) < 0:
-        raise ValueError("a side is less than nothing")
+        raise ValueError("a side is negative")
     return tuple(sides)
 
 
@@ -223,14 +223,14 @@ def parse_question(payload: Sequence[bytes]) -> dict[str, Any]:
     if not isinstance(request, dict):
         raise WireError('a question is one JSON object such as {"get": "slices", "frame": 42}')
     if request.get("get") not in CAN_BE_ASKED:
-        raise WireError(f'a question\'s "get" is one of {", ".join(CAN_BE_ASKED)}')
+        raise WireError(f'a question\'s "get" must be one of {", ".join(CAN_BE_ASKED)}')
     if request["get"] != "start":
         number = request.get("frame", request.get("seq"))
         if not isinstance(number, int) or isinstance(number, bool) or number < 0:
-            raise WireError("a question names a frame (or, for slices, a seq) by a whole number from 0")
+            raise WireError("a question must name a frame (or, for slices, a seq) by a whole number, 0 or more")
     flight = request.get("flight")
     if flight is not None and not (isinstance(flight, str) and len(flight) <= _FLIGHT_CHARACTERS):
-        raise WireError("a question's flight is a name")
+        raise WireError("a question's flight must be a name")
     return {name: request[name] for name in QUESTION_KEYS if name in request}
 
 

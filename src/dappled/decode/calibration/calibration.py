@@ -134,11 +134,11 @@ class Calibration:
             )
             law, pupil, verdict = values["law"], float(values.get("pupil_mm", 0.0)), str(values.get("verdict", ""))
         except (KeyError, TypeError, ValueError) as error:
-            raise DecodeError(f"the calibration is incomplete or wrong ({error}): make it anew") from error
+            raise DecodeError(f"the calibration is incomplete or wrong ({error}): calibrate again") from error
         if law not in LAWS:
             raise DecodeError(f"the calibration names the law {law!r}; known are {', '.join(LAWS)}")
         if not fits or any(len(f.transfer) != len(mask.half_orders()) for f in fits):
-            raise DecodeError("the calibration's transfer doesn't fit its mask: make it anew")
+            raise DecodeError("the calibration's transfer doesn't fit its mask: calibrate again")
         return cls((int(shape[0]), int(shape[1])), law, mask, sensor, fits, pupil, verdict)
 
 

@@ -141,7 +141,9 @@ def _fit_of(
     usable[0] = False
     orders = [order for order, use in zip(shown.orders, usable, strict=True) if use]
     if np.linalg.matrix_rank(orders) < 2:
-        raise DecodeError("too few carriers show at this aperture: calibrate on a frame at an eighth of the widest")
+        raise DecodeError(
+            "too few carriers are visible at this aperture: calibrate on a frame at an eighth of the widest"
+        )
     origin, phase_residual = origin_of(orders, measured[usable])
     magnitudes = (measured * np.conj(transfer(shown.orders, np.ones(len(shown.orders)), origin))).real
     known = dict(zip(shown.orders, np.nan_to_num(magnitudes), strict=True))

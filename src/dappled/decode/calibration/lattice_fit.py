@@ -144,14 +144,14 @@ def _verified(
         found = [(c, m) for c, m in zip(looked, peaks, strict=True) if m is not None]
         if len(found) < min(3, len(looked)) or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in found]) < 2:
             raise DecodeError(
-                f"only {len(found)} of {len(looked)} carriers show: calibrate on a frame at a small aperture "
+                f"only {len(found)} of {len(looked)} carriers are visible: calibrate on a frame at a small aperture "
                 "(an eighth of the widest)"
             )
         lattice = fit(found)
     carriers = lattice.carriers([(c.ky, c.kx) for c, _ in found])
     if residual_bins(carriers, [m for _, m in found], spectrum) > _ALIKE_BINS:
         raise DecodeError(
-            f"{len(found)} peaks stand near the prediction, but on no common lattice: calibrate on a frame at a small "
+            f"{len(found)} peaks lie near the prediction, but not on a common lattice: calibrate on a frame at a small "
             "aperture (an eighth of the widest), and check mask, camera and focal length"
         )
     return lattice, found, len(found) / len(looked)

@@ -130,7 +130,8 @@ def as_text(found: Calibration, mask_distance_mm: float) -> str:
         ]
     for law in law_fits(found, mask_distance_mm):
         words = (
-            f"{law.law}: mask {law.mask_distance_mm:.4f} mm before the sensor, anisotropy {100 * law.anisotropy:+.2f} %"
+            f"{law.law}: mask {law.mask_distance_mm:.4f} mm in front of the sensor, "
+            f"anisotropy {100 * law.anisotropy:+.2f} %"
         )
         if law.offset_bins is not None:
             words += f", offset {law.offset_bins[0]:+.2f} rows {law.offset_bins[1]:+.2f} columns"

@@ -61,12 +61,12 @@ class Search:
     def __post_init__(self) -> None:
         """Raises DecodeError for an empty range or an unusable window."""
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high and self.step > 0):
-            raise DecodeError(f"disparities from {self.low:g} to {self.high:g} by {self.step:g} are no range")
+            raise DecodeError(f"disparities from {self.low:g} to {self.high:g} by {self.step:g} are not a range")
         if (self.high - self.low) / self.step > _MOST_DISPARITIES:
             count = (self.high - self.low) / self.step
             raise DecodeError(f"{count:.0f} disparities are too many: narrow {self.low:g} to {self.high:g}")
         if self.window < 3 or self.window % 2 == 0:
-            raise DecodeError(f"a window of {self.window} px won't do: it must be odd, and 3 or more")
+            raise DecodeError(f"a window of {self.window} px can't be used: it must be odd, and 3 or more")
 
     def disparities(self) -> NDArray[np.float64]:
         """All of them, at least five, rising."""

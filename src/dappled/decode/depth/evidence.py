@@ -62,7 +62,7 @@ def of_views(stack: ViewStack, noise_rms: float | None = None) -> Evidence:
     needs_parallax(stack, "depth")
     grey = stack.grey()
     if not np.isfinite(grey.views).all():
-        raise DecodeError("the views hold values that are no numbers: decode the frame again")
+        raise DecodeError("the views hold values that are not numbers: decode the frame again")
     variance = _LEAST_NOISE + (noise_rms**2 if noise_rms is not None else view_noise(grey.views))
     count = grey.views.shape[0] * grey.views.shape[1]
     return Evidence(grey, grey.views / np.float32(variance), np.eye(count) / variance, white=noise_rms is not None)

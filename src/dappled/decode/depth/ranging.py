@@ -43,7 +43,10 @@ class Ranging:
     def __post_init__(self) -> None:
         """Raises DecodeError for numbers that no lens has."""
         if not (math.isfinite(self.gain_px_m) and self.gain_px_m > 0 and math.isfinite(self.offset_px)):
-            raise DecodeError(f"a gain of {self.gain_px_m:g} px·m and an offset of {self.offset_px:g} px are no lens")
+            raise DecodeError(
+                f"a gain of {self.gain_px_m:g} px·m and an offset of {self.offset_px:g} px describe no lens: "
+                "calibrate with targets again"
+            )
 
     @classmethod
     def of_lens(cls, focal_length_mm: float, f_number: float, pixel_mm: float, focus_m: float = math.inf) -> Ranging:
@@ -51,7 +54,7 @@ class Ranging:
         if not (focal_length_mm > 0 and f_number > 0 and pixel_mm > 0 and focus_m > focal_length_mm * 1e-3):
             raise DecodeError(
                 f"focal length {focal_length_mm:g} mm, f/{f_number:g}, pixels of {pixel_mm:g} mm and a focus at "
-                f"{focus_m:g} m are no camera"
+                f"{focus_m:g} m describe no camera"
             )
         sensor_m = 1e-3 / (1 / focal_length_mm - 1e-3 / focus_m)  # Eq 3
         gain = focal_length_mm / f_number * sensor_m / pixel_mm
@@ -122,7 +125,7 @@ class Ranging:
                 str(values.get("source", "calibration")), float(values.get("gain_sigma_share", 0.0)), length,
             )  # fmt: skip
         except (KeyError, TypeError, ValueError) as error:
-            raise DecodeError(f"the ranging is incomplete or wrong ({error}): calibrate with targets anew") from error
+            raise DecodeError(f"the ranging is incomplete or wrong ({error}): calibrate with targets again") from error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,11 +171,11 @@ def fit_targets(
     inverse = np.array([1 / t.distance_m for t in targets])
     shifts = np.array([t.shift_px for t in targets])
     if not np.all(np.isfinite(inverse) & (inverse > 0)):
-        raise DecodeError("targets must stand at distances above 0 m")
+        raise DecodeError("targets must be at distances above 0 m")
     if inverse.max() / inverse.min() < _FRESH_DISTANCES:
         if lens is None:
             raise DecodeError(
-                "targets at one distance tell where the focus is, not the scale: add one at another distance"
+                "targets at a single distance give the focus but not the scale: add one at another distance"
             )
         gain = lens.gain_px_m
         offset = float(np.mean(shifts - gain * inverse))
@@ -213,5 +216,5 @@ def target_shift(depth: DepthMap, stack: ViewStack, share: float = 0.25, window:
 
 def _scale(stack: ViewStack) -> float:
     if stack.sensor_px_per_disparity is None:
-        raise DecodeError("views from a folder have no sensor: only relative depth is to be had from them")
+        raise DecodeError("views from a folder have no sensor, so they give only relative depth")
     return stack.sensor_px_per_disparity

@@ -137,5 +137,5 @@ def _even(steps: NDArray[np.float64]) -> float:
         return 0.0
     gaps = np.diff(steps)
     if np.ptp(gaps) > 1e-6 * max(float(np.abs(gaps).max()), 1e-9):
-        raise DecodeError("the views don't stand at even distances: refocus by shift and add instead")
+        raise DecodeError("the views are not evenly spaced: refocus by shift and add instead")
     return float(gaps.mean())

@@ -61,7 +61,9 @@ class ViewStack:
         if self.views.ndim not in (4, 5) or (self.views.ndim == 5 and self.views.shape[4] != 3):
             raise DecodeError(f"views of shape {self.views.shape}: they must be (V, U, h, w), or (V, U, h, w, 3)")
         if 0 in self.views.shape:
-            raise DecodeError("there are no views: decode the frame with a calibration, or with carriers to be seen")
+            raise DecodeError(
+                "there are no views: decode the frame with a calibration, or take one whose carriers are visible"
+            )
         if (len(self.row_steps), len(self.column_steps)) != self.views.shape[:2]:
             raise DecodeError(
                 f"{len(self.row_steps)} × {len(self.column_steps)} places for "
@@ -84,7 +86,7 @@ class ViewStack:
         on_rows = np.abs(offsets[..., 0] - down[:, None]).max(), np.abs(offsets[..., 1] - across[None, :]).max()
         count = max(values.shape[:2])
         if max(on_rows) > _REGULAR / count:
-            raise DecodeError("the light field's views don't stand on rows and columns of the aperture")
+            raise DecodeError("the light field's views are not on rows and columns of the aperture")
         cameras = bool(field.attributes.get(CAMERAS))
         sign = -1.0 if cameras or field.attributes.get("lenslet_pitch_px") else 1.0
         row_px, column_px = float(np.hypot(*field.grid[:, 0])), float(np.hypot(*field.grid[:, 1]))
@@ -126,7 +128,7 @@ def centred(count: int) -> NDArray[np.float64]:
 def needs_parallax(stack: ViewStack, what: str) -> None:
     """Raises DecodeError for views that all stand on one spot."""
     if stack.reach == 0:
-        raise DecodeError(f"{what} needs views from several places, and this light field's stand on one spot")
+        raise DecodeError(f"{what} needs views from several places, and this light field's are all from one")
 
 
 def slice_mosaic(

@@ -192,7 +192,9 @@ def eyes(
     """Two synthetic apertures `separation` apart, `pupil` wide (shares of the whole aperture), converging on a
     disparity. Raises DecodeError where there is only one column of views."""
     if not 0 < separation <= 1:
-        raise DecodeError(f"eyes {separation:g} of the aperture apart don't fit into it: give more than 0, at most 1")
+        raise DecodeError(
+            f"eyes {separation:g} of the aperture apart don't fit into it: give more than 0 and at most 1"
+        )
     if np.ptp(stack.column_steps) == 0:
         raise DecodeError("a stereo pair needs views from several columns of the aperture")
     # A point nearer than the focus is seen further to the right by the view with the larger step: that is the left eye.

@@ -132,9 +132,7 @@ class Lattice:
             if height * width > best[0] * best[1]:
                 best = (math.floor(height + 1e-6), math.floor(width + 1e-6))
         if min(best) < 2:
-            raise DecodeError(
-                "the carriers lie too close together to cut slices: is this the right mask and focal length?"
-            )
+            raise DecodeError("the carriers lie too close together to cut slices: check mask and focal length")
         return _fast_down(min(best[0], padded[0])), _fast_down(min(best[1], padded[1]))
 
     def _cell_corners(self) -> NDArray[np.float64]:

@@ -121,16 +121,14 @@ def density_curve(levels: Sequence[float], densities: Sequence[float], *, top_le
         within("level", float(level), "", 0, top_level)
         within("density", float(density), "", -0.05, 6)
     if np.any(np.diff(x) <= 0):
-        raise DecodeError("a density curve has one density a level: a level stands in it twice")
+        raise DecodeError("a density curve has one density per level: one level is in it twice")
     if x[0] > 0.1 * top_level or x[-1] < 0.9 * top_level:
         raise DecodeError(f"the wedge's levels go from {x[0]:g} to {x[-1]:g}: measure it from 0 to {top_level:g}")
     sign = 1.0 if d[-1] >= d[0] else -1.0
     smooth = np.maximum.accumulate(sign * d)
     back = smooth - sign * d
     if back.max() > _NOISE_DENSITY:
-        raise DecodeError(
-            f"the density turns back by {back.max():.2f} at level {x[int(back.argmax())]:g}: measure again"
-        )
+        raise DecodeError(f"the density reverses by {back.max():.2f} at level {x[int(back.argmax())]:g}: measure again")
     if smooth[-1] - smooth[0] < 0.05:
         raise DecodeError(
             f"the film's density only changes by {smooth[-1] - smooth[0]:.2f}: no mask can be printed on it"
@@ -270,7 +268,7 @@ class MaskImage:
             tile = self._pattern(axes[0][:, start : start + 256], axes[1])
             low, high = min(low, float(tile.min())), max(high, float(tile.max()))
         if not high - low > 1e-9:
-            raise DecodeError("this mask is one even grey at the printer's pixels: its periods all fold to nothing")
+            raise DecodeError("this mask prints as one even grey: its periods all fold to zero; choose finer film")
         return low, high
 
     def _pattern(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -174,7 +174,7 @@ def judge(
             return BenchVerdict("as designed", fitted, rms, len(seen), text)
         shown = scale if scale in (0.5, 2.0, 1 / 3, 3.0, 0.25, 4.0) else fitted
         text = (
-            f"printed at scale {shown:.2g}: the spots stand at {fitted:.3f} of the expected distance, so the periods "
+            f"printed at scale {shown:.2g}: the spots are at {fitted:.3f} of the expected distance, so the periods "
             f"on film are {1 / fitted:.2f} times the design's; the printer scaled the picture"
         )
         return BenchVerdict("scaled", fitted, rms, len(seen), text)

@@ -183,12 +183,13 @@ def _finish(wanted: DesignRequirements, law: str, mask: Mask, distance_mm: float
     )
     failed = [c.sentence for c in conditions if not c.met]
     if min(shape) < 8:
-        failed.append(f"views of {shape[0]} × {shape[1]} px, fewer than 8 a side")
+        failed.append(f"views of {shape[0]} × {shape[1]} px, fewer than 8 per side")
     problem = None
     if failed:
         problem = (
-            f"no mask of {wanted.views} × {wanted.views} views does it at {distance_mm:.3g} mm from the sensor: "
-            f"{'; '.join(failed)}. Take fewer views, a smaller f-number, finer film, or more room for the mask"
+            f"no mask of {wanted.views} × {wanted.views} views meets every condition at "
+            f"{distance_mm:.3g} mm from the sensor: {'; '.join(failed)}. "
+            "Take fewer views, a smaller f-number, finer film, or more room for the mask"
         )
     pitch_mm = wanted.sensor.size_mm[1] / max(shape[1], 1)
     baseline = wanted.aperture_mm / wanted.views

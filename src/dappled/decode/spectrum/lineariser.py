@@ -374,7 +374,7 @@ def levels_of(
         return levels, None
     gains = np.asarray(balance, dtype=np.float64)
     if gains.shape != (colours,) or not np.all(np.isfinite(gains) & (gains > 0)):
-        raise DecodeError(f"the white balance needs {colours} positive gains, one per colour, and is {balance}")
+        raise DecodeError(f"the white balance needs {colours} positive gains, one per colour, not {balance}")
     return levels, gains
 
 

@@ -142,7 +142,7 @@ def camera_profile(recipe: Recipe, model: str) -> CameraProfile:
     found = profiles.camera_for_model(model)
     if found is None:
         named = f"the frame says {model!r}" if model else "the frame names no camera"
-        raise DarkroomError(f"which camera? {named}, and no profile knows it: name one with --camera")
+        raise DarkroomError(f"{named}, and no profile fits it: name one with --camera")
     return found
 
 

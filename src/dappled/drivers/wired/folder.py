@@ -24,7 +24,7 @@ def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
     check_options(settings, _KNOWN)
     folder = text_option(settings, "pickup").removeprefix("folder:")
     if not folder:
-        raise CameraError("which folder? set camera.pickup to the one that the other program fills")
+        raise CameraError("camera.pickup is not set: name the folder that the other program writes to")
     path = Path(folder).expanduser()
     if not path.is_dir():
         raise CameraError(f"camera.pickup = {folder!r} is not a folder: make it, or correct the path")

@@ -66,7 +66,7 @@ def match(
     shots = sorted(shots, key=lambda shot: (shot.fired_s, shot.index))
     dated = sorted((f for f in files if f.taken_s is not None), key=lambda f: (f.taken_s, f.name))
     doubts = [
-        f"{f.name} has no time: name its shot with --pair, or take all by --by-order"
+        f"{f.name} has no time: name its shot with --pair, or pair all files with --by-order"
         for f in files
         if f.taken_s is None
     ]

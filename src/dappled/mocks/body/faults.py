@@ -51,7 +51,7 @@ class BodyFaults:
                 self._left[name] = int(rest[0]) if rest else 1
         else:
             known = ", ".join((*LASTING, *COUNTED, "drop", "clear"))
-            raise ValueError(f"there is no fault {name!r}; the body knows {known}")
+            raise ValueError(f"there is no fault {name!r}; known are {known}")
 
     def lasts(self, name: str) -> bool:
         """Whether a lasting fault is in force now."""

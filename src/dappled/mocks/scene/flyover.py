@@ -61,7 +61,7 @@ class TerrainScene:
         where the horizon is in the picture.
         """
         if pose is None:
-            raise ValueError("the terrain can only be seen from somewhere: give the camera a path")
+            raise ValueError("a scene of terrain needs a path of the camera")
         hits = _centre_hits(self.ground, rays, pose)
         surface = _Surface.under(self.ground, hits)
         radiance = np.empty((len(rays.aperture_mm), 3, len(rays.y_mm), len(rays.x_mm)), dtype=np.float32)

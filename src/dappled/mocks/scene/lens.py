@@ -68,7 +68,7 @@ class Optics:
         slope = shift_per_view_mm * views / self.aperture_mm
         inverse = slope / (self.focal_length_mm * 1e-3) + 1 / self.focus_m
         if inverse <= 0:
-            raise ValueError(f"no depth makes a shift of {shift_per_view_mm:g} mm a view")
+            raise ValueError(f"no depth makes a shift of {shift_per_view_mm:g} mm per view")
         return 1 / inverse
 
 

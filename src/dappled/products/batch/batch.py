@@ -274,7 +274,7 @@ class Manifest:
     """The manifest of an output folder, locked by one batch at a time. Use as a context manager."""
 
     def __init__(self, output: Path) -> None:
-        """Raises ManifestError where another batch works in this folder, or the disk refuses."""
+        """Raises ManifestError where another batch is writing to this folder, or the disk refuses."""
         self.path = output / MANIFEST
         try:
             durable.make_folder(output)
@@ -283,7 +283,9 @@ class Manifest:
                 fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 os.close(self._fd)
-                raise ManifestError(f"another batch works in {output}: wait for it, or choose another -o") from None
+                raise ManifestError(
+                    f"another batch is writing to {output}: wait for it, or choose another -o"
+                ) from None
         except OSError as error:
             raise ManifestError(f"cannot keep a manifest in {output}: {error.strerror}") from None
         self.done = self._read()
@@ -322,7 +324,8 @@ class Manifest:
                 done = _done(json.loads(line))
             except (ValueError, TypeError, KeyError):
                 raise ManifestError(
-                    f"{self.path}, line {number} is not a line of a manifest: move it away, and everything is made anew"
+                    f"{self.path}, line {number} is not a line of a manifest: move the file away, "
+                    "and everything will be made again"
                 ) from None
             known[done.key] = done
         return known

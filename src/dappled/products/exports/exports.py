@@ -244,7 +244,7 @@ def rerun(
     """
     rr = _rerun()
     if path.suffix != ".rrd":
-        raise ExportError(f"{path}: a Rerun recording is written as .rrd; name it so")
+        raise ExportError(f"{path}: the name of a Rerun recording must end in .rrd")
     recording = rr.RecordingStream("dappled")
     recording.save(str(path))
     stack = ViewStack.of(field)

@@ -57,7 +57,7 @@ def write(
     writers = {".png": _write_png, ".tif": _write_tiff, ".tiff": _write_tiff}
     writer = writers.get(path.suffix.lower())
     if writer is None:
-        raise MaskFileError(f"{path}: a mask is written as .png or .tif; name it so")
+        raise MaskFileError(f"{path}: the name of a mask image must end in .png or .tif")
     part = path.with_name(path.name + ".part")
     try:
         writer(part, _Picture(shape, bits, px_per_mm, tile, progress))

@@ -87,7 +87,7 @@ def write(path: Path, cloud: PointCloud) -> None:
     """Write .ply (binary) or .las, .laz (needs laspy). Raises PointCloudError."""
     writers: dict[str, Callable[[Path, PointCloud], None]] = {".ply": _ply, ".las": _las, ".laz": _las}
     if path.suffix.lower() not in writers:
-        raise PointCloudError(f"{path}: points are written as .ply, .las or .laz; name it so")
+        raise PointCloudError(f"{path}: the name of a file of points must end in .ply, .las or .laz")
     if len(cloud.points) == 0:
         raise PointCloudError(
             f"no point of {path.name} is known well enough ({cloud.withheld} withheld): allow a larger σ"

@@ -101,7 +101,7 @@ def mosaic(pictures: Sequence[Bytes], captions: Sequence[str] = (), columns: int
 def save(path: Path, picture: Bytes | NDArray[np.uint16]) -> None:
     """Write a PNG, JPEG or TIFF under its name, whole or not at all. Raises PrintError."""
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
-        raise PrintError(f"{path}: a picture is written as .png, .jpg or .tif; name it so")
+        raise PrintError(f"{path}: the name of a picture must end in .png, .jpg or .tif")
     part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
     try:
         Image.fromarray(np.ascontiguousarray(picture)).save(part)

@@ -30,7 +30,7 @@ def read(folder: Path) -> LightField:
     files = [p for p in files if p.name.startswith("input_Cam")] or files
     side = math.isqrt(len(files))
     if side == 0 or side * side != len(files):
-        raise ViewFolderError(f"{folder} holds {len(files)} pictures: a light field needs n × n, one a view")
+        raise ViewFolderError(f"{folder} holds {len(files)} pictures: a light field needs n × n, one per view")
     pictures = [_linear(path) for path in files]
     shapes = {picture.shape for picture in pictures}
     if len(shapes) > 1:

@@ -51,7 +51,7 @@ def write(path: Path, content: str, *, force: bool = False) -> None:
     try:
         if not force and path.exists() and f'xmp:CreatorTool="{_MARK}"' not in path.read_text("utf-8", "replace"):
             raise SidecarError(
-                f"{path} was written by another program, perhaps with somebody's edits: "
+                f"{path} was written by another program, and may have been edited by hand: "
                 "move it away, write elsewhere with --output, or replace it with --force"
             )
         durable.write_file(path, content.encode())

@@ -62,7 +62,7 @@ def of_heights(first: TerrainModel, second: TerrainModel) -> MapDifference:
     values = (other - a.height_m).astype(np.float32)
     known = np.isfinite(values)
     if not known.any():
-        raise DifferenceError("no height is known to both flights: they need common ground, each seen twice")
+        raise DifferenceError("the flights share no known heights: both need overlapping frames of the same ground")
     return MapDifference(a.grid, values, float(known.mean()))
 
 

@@ -89,7 +89,7 @@ def geoid(given: str | None) -> Geoid:
                 return Geoid(grid=folder / name)
     raise EarthError(
         f"no geoid grid is on this machine (looked for {', '.join(_GEOID_GRIDS)}): install Debian's proj-data, "
-        "or say with --geoid how many metres mean sea level stands above the ellipsoid here"
+        "or say with --geoid how many metres mean sea level is above the ellipsoid here"
     )
 
 

@@ -215,9 +215,7 @@ def level_of(stations: Sequence[Station], options: Options) -> float:
         return options.ground_m
     homes = [one.ground_m for one in stations if one.ground_m is not None]
     if not homes and options.terrain is None:
-        raise DappledError(
-            "the flight doesn't know how high it flew: give the ground's height with --ground or --terrain"
-        )
+        raise DappledError("the flight has no height above ground: give the ground's height with --ground or --terrain")
     return float(np.median(homes)) if homes else min(one.camera.altitude_msl_m for one in stations) - 1.0
 
 

@@ -152,7 +152,7 @@ def load(
     try:
         with rasterio.open(path) as source:
             if source.crs is None or source.transform.is_identity:
-                raise GroundError(f"the terrain {path} doesn't say where it lies: give one with a coordinate system")
+                raise GroundError(f"the terrain {path} has no coordinates: give one with a coordinate system")
             target = projection.crs.to_wkt()
             step = _step(source, projection, bounds)
             margin = 4 * step

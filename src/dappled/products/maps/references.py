@@ -86,7 +86,7 @@ class BaseMap:
             raise BaseMapError(f"the base map {self.path} can't be read: {error}") from None
         if source.crs is None or source.transform.is_identity:
             source.close()
-            raise BaseMapError(f"the base map {self.path} doesn't say where it lies: give a GeoTIFF or the like")
+            raise BaseMapError(f"the base map {self.path} has no coordinates: give a GeoTIFF or the like")
         return source
 
     def _step(self, source: Any, points: Floats) -> float:
