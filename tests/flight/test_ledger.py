@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Result, ShotRow, ShotState, Stray
-from dappled.flight.ledger import TRANSITIONS, IllegalTransitionError, advance
+from dappled.flight.ledger import IllegalTransitionError, advance
+from dappled.flight.stored_rows import ledger_damage
+from dappled.flight.tables import TRANSITIONS
 from tests.flight.makers import shot, tag
 
 
@@ -64,8 +66,10 @@ def test_everything_comes_back_as_it_was_noted(tmp_path: Path) -> None:
             (77, "stray", None),
             (77, "camera", None),
         ]
-        assert reader.facts() == {"telemetry_packets": 2}
-        assert reader.damage() == []
+        facts = reader.facts()
+        assert facts.pop("chain") == {"flight": tmp_path.name, "rows_before": 0}
+        assert facts == {"telemetry_packets": 2}
+        assert ledger_damage(path) is None
         for sha256, text in (*reader.digests("poses").values(), *reader.digests("tags").values()):
             assert hashlib.sha256(text.encode()).hexdigest() == sha256
         with pytest.raises(ValueError, match="no digests"):
@@ -165,10 +169,9 @@ def test_a_damaged_page_is_told(tmp_path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[8192:] = os.urandom(len(data) - 8192)
     path.write_bytes(data)
-    with LedgerReader.open(path) as reader:
-        assert reader.damage()
-        with pytest.raises(FlightError, match="damaged"):
-            [*reader.shots(), *reader.frames(), *reader.events(), *reader.facts()]
+    assert ledger_damage(path) is not None
+    with LedgerReader.open(path) as reader, pytest.raises(FlightError, match="damaged"):
+        [*reader.shots(), *reader.frames(), *reader.events(), *reader.facts()]
 
 
 def test_a_record_that_is_no_record_is_told(tmp_path: Path) -> None:

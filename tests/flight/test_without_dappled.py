@@ -14,7 +14,7 @@ import pytest
 
 from dappled.decode.geometry import Pose
 from dappled.flight import LedgerReader, Tag, recording
-from dappled.flight.ledger import SCHEMA
+from dappled.flight.tables import SCHEMA
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, flip, pose, request, tag
 
@@ -35,8 +35,8 @@ def flight(flights: Path) -> Path:
     return begun.folder.path
 
 
-def read(flight: Path) -> list[str]:
-    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+def read(flight: Path, example: int = 0) -> list[str]:
+    code = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)[example]
     command = [sys.executable, "-I", "-S", "-c", code, str(flight)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 0, done.stderr
@@ -52,6 +52,22 @@ def test_the_reader_in_the_document_reads_a_flight(flight: Path) -> None:
     assert third == "     2 failed: the camera was gone"
     flip(flight / "frames" / "000001.cr2", 2)
     assert read(flight)[1].endswith("CHANGED")
+
+
+def test_the_second_reader_follows_the_chain(flight: Path) -> None:
+    with LedgerReader.open(flight / "flight.sqlite") as ledger:
+        head = ledger.last_link()
+    assert head is not None
+    (line,) = read(flight, 1)
+    assert line.endswith(f"rows, the last link is {head.link}")
+    with sqlite3.connect(flight / "flight.sqlite") as db:
+        db.execute("UPDATE shots SET wished_utc_ns = 9 WHERE idx = 1")
+        db.execute("DELETE FROM events WHERE number = 1")
+        db.execute("UPDATE chain SET key = '[9]' WHERE number = 30")
+    db.close()
+    said = read(flight, 1)
+    assert {"changed, added or removed: shots [1]", "changed, added or removed: events [1]"} <= set(said)
+    assert "link 30 does not follow" in said
 
 
 def test_the_document_names_every_table_and_every_key(flight: Path) -> None:

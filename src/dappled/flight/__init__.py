@@ -1,11 +1,12 @@
 """The flight folder: journal, ledger, recorded frames, recovery, checks, index, offload."""
 
+from dappled.flight.chain import canonical, digest
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.index import ImageIndex
 from dappled.flight.layout import FlightFolder, FlightsLock
 from dappled.flight.ledger import LIVE, Ledger, LedgerReader
 from dappled.flight.recording import Recorder, Recording
-from dappled.flight.records import Cause, Frame, Result, Shot, ShotRow, ShotState, Stray, Tag, canonical, digest
+from dappled.flight.records import Cause, Frame, Result, Shot, ShotRow, ShotState, Stray, Tag
 
 __all__ = [
     "LIVE", "Cause", "FlightError", "FlightFolder", "FlightsLock", "Frame", "ImageIndex", "Ledger", "LedgerReader",

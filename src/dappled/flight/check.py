@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.confined import OutsideError
-from dappled.flight import durable, layout, logs, provenance
-from dappled.flight.errors import FlightError
+from dappled.errors import DappledError
+from dappled.flight import check_chain, durable, layout, logs, provenance
+from dappled.flight.check_chain import ChainFindings
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.recovery import SIDECAR
+from dappled.flight.stored_rows import StoredRows
+
+_WITHOUT_CHAIN = (
+    "the flight was recorded before ledgers had a chain: a change of frames, telemetry, poses, tags, flight.toml or "
+    "inputs would be seen, a change of shots, times, events, facts or results would not"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,38 +41,78 @@ class CheckReport:
         return not self.problems
 
 
+@dataclass(slots=True)
+class _Counts:
+    """How much was read: files with a row and their bytes, and telemetry packets."""
+
+    files: int = 0
+    size: int = 0
+    packets: int = 0
+
+
 def check(path: Path) -> CheckReport:
     """Read a whole flight and compare its parts. Raises FlightError when it is not a flight."""
     folder = layout.open_folder(path)
     problems: list[str] = []
     notes: list[str] = []
-    files = size = packets = 0
-    try:
+    counts = _Counts()
+    with _examining("flight.toml", problems):
         layout.read_facts(folder)
-    except FlightError as error:
-        problems.append(str(error))
+    with _examining("the ledger", problems):
+        chained = _chained(folder, problems)
+        notes += [_WITHOUT_CHAIN] if chained.links is None else chained.notes
+    with _examining("the flight", problems), LedgerReader.open(folder.ledger) as ledger:
+        _compare(folder, ledger, counts, problems, notes)
+    return CheckReport(folder.name, counts.files, counts.size, counts.packets, tuple(problems), tuple(notes))
+
+
+def _compare(
+    folder: FlightFolder, ledger: LedgerReader, counts: _Counts, problems: list[str], notes: list[str]
+) -> None:
+    """Compare files, journal and telemetry with the ledger. Raises FlightError where that can't be read."""
+    facts = ledger.facts()
+    closed = "closed_utc_ns" in facts
+    if not closed:
+        (notes if layout.is_locked(folder.path.parent) else problems).append(
+            "the flight is still being recorded, or was never closed: the next `dappled run` repairs it"
+        )
+    gone = facts.get("offloaded")
+    if gone is not None:
+        notes.append(f"its {gone['files']} frames were offloaded to {gone['destination']}, and removed here")
+    with _examining("the files", problems):
+        for size, problem in _files(folder, ledger, pruned=gone is not None):
+            counts.files, counts.size = counts.files + 1, counts.size + size
+            problems += [problem] if problem else []
+        problems += _names(folder, ledger, closed)
+    with _examining("the inputs", problems):
+        problems += provenance.problems(folder, ledger)
+    with _examining("the shot journal", problems):
+        problems += _shots(folder, ledger, notes)
+    with _examining("the telemetry", problems):
+        counts.packets = _telemetry(folder, ledger, problems, notes)
+    with _examining("the tags", problems):
+        problems += _tags(ledger)
+
+
+@contextmanager
+def _examining(what: str, problems: list[str]) -> Iterator[None]:
+    """Whatever a damaged value leads to is a finding, and the rest is examined all the same."""
     try:
-        with LedgerReader.open(folder.ledger) as ledger:
-            problems += [f"the ledger is damaged: {text}" for text in ledger.damage()]
-            closed = "closed_utc_ns" in ledger.facts()
-            if not closed:
-                (notes if layout.is_locked(path.parent) else problems).append(
-                    "the flight is still being recorded, or was never closed: the next `dappled run` repairs it"
-                )
-            gone = ledger.facts().get("offloaded")
-            if gone is not None:
-                notes.append(f"its {gone['files']} frames were offloaded to {gone['destination']}, and removed here")
-            for file_size, problem in _files(folder, ledger, pruned=gone is not None):
-                files, size = files + 1, size + file_size
-                problems += [problem] if problem else []
-            problems += provenance.problems(folder, ledger)
-            problems += _names(folder, ledger, closed)
-            problems += _shots(folder, ledger, notes)
-            problems += _records(ledger)
-            packets = _telemetry(folder, ledger, problems, notes)
-    except FlightError as error:
+        yield
+    except DappledError as error:
         problems.append(str(error))
-    return CheckReport(folder.name, files, size, packets, tuple(problems), tuple(notes))
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError, OSError) as error:
+        problems.append(f"{what} can't be compared, a value in it is damaged: {error}")
+
+
+def _chained(folder: FlightFolder, problems: list[str]) -> ChainFindings:
+    """What SQLite, the records' own digests, and the chain say about the ledger. Raises FlightError."""
+    with StoredRows.open(folder.ledger) as stored:
+        problems += [f"the ledger is damaged: {text}" for text in stored.damage()]
+        found = check_chain.compare(stored)
+        problems += found.problems
+        problems += _records(stored)
+    return found
 
 
 def _files(folder: FlightFolder, ledger: LedgerReader, *, pruned: bool) -> Iterator[tuple[int, str | None]]:
@@ -122,20 +171,25 @@ def _shots(folder: FlightFolder, ledger: LedgerReader, notes: list[str]) -> Iter
             yield f"shot {index} is {row.state}, but the ledger has {'a' if index in framed else 'no'} frame for it"
 
 
-def _records(ledger: LedgerReader) -> Iterator[str]:
-    """Poses and tags against their digests, results against their hashes, and tags against frames."""
+def _records(stored: StoredRows) -> Iterator[str]:
+    """Poses and tags against their digests, and results against their hashes."""
     for table in ("poses", "tags"):
-        for index, (sha256, text) in ledger.digests(table).items():
-            if hashlib.sha256(text.encode()).hexdigest() != sha256:
-                yield f"the {table[:-1]} of frame {index} was changed: its SHA-256 is not the one noted"
+        for (index,), (_, sha256, text) in stored.keyed_rows(table):
+            if hashlib.sha256(str(text).encode("utf-8", "surrogateescape")).hexdigest() != sha256:
+                yield f"the {table[:-1]} of frame {index!r} was changed: its SHA-256 is not the one noted"
+    for (index, run), (_, _, sha256, text) in stored.keyed_rows("results"):
+        try:
+            noted = json.loads(str(text))["slices_sha256"]
+        except (ValueError, TypeError, KeyError, RecursionError):
+            noted = None
+        if noted != sha256:
+            yield f"the result of frame {index!r} in run {run!s} has two different hashes"
+
+
+def _tags(ledger: LedgerReader) -> Iterator[str]:
+    """Tags that are about other bytes than their frame's."""
     frames = {frame.index: frame.sha256 for frame in ledger.frames()}
-    try:
-        yield from ledger.contradictions()
-        tags = ledger.tags()
-    except FlightError as error:
-        yield str(error)
-        return
-    for index, tag in tags.items():
+    for index, tag in ledger.tags().items():
         if frames.get(index) != tag.frame_sha256:
             yield f"the tag of frame {index} is about other bytes than the frame's"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import sqlite3
 from pathlib import Path
 
 from dappled.errors import DappledError
@@ -36,3 +37,29 @@ def disk_error(doing: str, path: Path, error: OSError) -> FlightError:
     number = error.errno or 0
     why = _REMEDIES.get(number) or f"{os.strerror(number) if number else error}; check the disk"
     return FlightError(f"cannot {doing} {path}: {why}")
+
+
+_LEDGER_REASONS = {
+    "SQLITE_NOTADB": "it is damaged, or no SQLite file; move it away, the frames and shots.jsonl beside it are intact",
+    "SQLITE_CORRUPT": "it is damaged; move it away, the frames and shots.jsonl beside it are intact",
+    "SQLITE_FULL": "the disk is full; free some space or set record.directory to another disk",
+    "SQLITE_READONLY": "the disk or the file is read-only; make it writable or set record.directory elsewhere",
+    "SQLITE_CANTOPEN": "it can't be opened; check that its folder exists and is accessible",
+    "SQLITE_BUSY": "another program holds it; close that program",
+    "SQLITE_IOERR": "the disk reports an input/output error, or is full; check the disk (df, dmesg)",
+}
+
+
+def ledger_error(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> FlightError:
+    """The sentence for an SQLite error in a ledger: what can't be done, why, and what to do."""
+    code = getattr(error, "sqlite_errorname", "") or ""
+    if isinstance(error, UnicodeDecodeError):  # SQLite quotes damaged text in the words of its error
+        code = "SQLITE_CORRUPT"
+    if isinstance(error, sqlite3.ProgrammingError):
+        return FlightError(f"the ledger {path} was used after it was closed or in a wrong way: {error}")
+    if code.startswith("SQLITE_CONSTRAINT"):
+        return FlightError(f"the ledger {path} refuses a row that contradicts the others: {error}")
+    for start, why in _LEDGER_REASONS.items():
+        if code.startswith(start):
+            return FlightError(f"cannot use the ledger {path}: {why}")
+    return FlightError(f"cannot use the ledger {path}: {error}; check the disk and the file")

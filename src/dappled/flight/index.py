@@ -69,7 +69,7 @@ class ImageIndex(Database):
         if empty:
             self._db.executescript(_SCHEMA)
 
-    def _sentence(self, error: sqlite3.Error) -> FlightError:
+    def _sentence(self, error: sqlite3.Error | UnicodeDecodeError) -> FlightError:
         if getattr(error, "sqlite_errorname", "") == "SQLITE_CANTOPEN":
             return FlightError(f"cannot open the index {self.path}: {error}; check its folder")
         return FlightError(f"cannot use the index {self.path}: {error}; move it away, it is made anew")

@@ -12,83 +12,24 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
 from dappled.decode.geometry import Gnss, Pose
-from dappled.flight.errors import FlightError
-from dappled.flight.records import (
-    Cause,
-    Frame,
-    LedgerEvent,
-    Result,
-    Shot,
-    ShotRow,
-    ShotState,
-    Stray,
-    Tag,
-    canonical,
-    digest,
-)
+from dappled.flight import chain
+from dappled.flight.chain import ChainLink, Column, canonical, digest
+from dappled.flight.errors import FlightError, ledger_error
+from dappled.flight.records import Cause, Frame, LedgerEvent, Result, Shot, ShotRow, ShotState, Stray, Tag
+from dappled.flight.tables import APPLICATION_ID, CHAIN, DEFINITIONS, KEYS, SCHEMA, SCHEMA_VERSION, TRANSITIONS
 
 LIVE = "live"
-_APPLICATION_ID = 0x4450504C  # "DPPL"
-_SCHEMA_VERSION = 1
-
-SCHEMA = """
-CREATE TABLE shots (
-    idx INTEGER PRIMARY KEY,           -- the image index, going on over flights
-    source TEXT NOT NULL, kind TEXT NOT NULL, sequence INTEGER,
-    wished_utc_ns INTEGER NOT NULL, wished_monotonic_ns INTEGER NOT NULL,
-    state TEXT NOT NULL CHECK (state IN ('wished', 'fired', 'safe', 'failed')),
-    reason TEXT,
-    fired_called_monotonic_ns INTEGER, fired_returned_monotonic_ns INTEGER
-) STRICT;
-CREATE TABLE frames (
-    idx INTEGER PRIMARY KEY REFERENCES shots (idx),
-    name TEXT NOT NULL UNIQUE,         -- relative to the flight folder
-    camera_name TEXT NOT NULL, size INTEGER NOT NULL, sha256 TEXT NOT NULL, arrived_utc_ns INTEGER NOT NULL
-) STRICT;
-CREATE TABLE strays (
-    name TEXT PRIMARY KEY, camera_name TEXT NOT NULL, size INTEGER NOT NULL, sha256 TEXT NOT NULL,
-    arrived_utc_ns INTEGER NOT NULL, reason TEXT NOT NULL
-) STRICT;
-CREATE TABLE companions (             -- the JPEG beside a raw frame
-    name TEXT PRIMARY KEY, idx INTEGER NOT NULL REFERENCES frames (idx),
-    camera_name TEXT NOT NULL, size INTEGER NOT NULL, sha256 TEXT NOT NULL, arrived_utc_ns INTEGER NOT NULL
-) STRICT;
-CREATE TABLE poses (idx INTEGER PRIMARY KEY REFERENCES frames (idx), sha256 TEXT NOT NULL, record TEXT NOT NULL) STRICT;
-CREATE TABLE tags (idx INTEGER PRIMARY KEY REFERENCES frames (idx), sha256 TEXT NOT NULL, record TEXT NOT NULL) STRICT;
-CREATE TABLE results (
-    idx INTEGER NOT NULL REFERENCES frames (idx), run TEXT NOT NULL,
-    slices_sha256 TEXT NOT NULL, record TEXT NOT NULL,
-    PRIMARY KEY (idx, run)
-) STRICT;
-CREATE TABLE events (
-    number INTEGER PRIMARY KEY, utc_ns INTEGER NOT NULL, kind TEXT NOT NULL, idx INTEGER, text TEXT NOT NULL
-) STRICT;
-CREATE TABLE facts (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
-"""
 _BUSY_S = 10.0
-# The life of a shot: wished → fired → safe | failed. A file is proof of an exposure: it makes a shot safe even when the
-# trigger call was not seen to return, and even when the shot had been given up. What is safe stays safe.
-TRANSITIONS: dict[ShotState, frozenset[ShotState]] = {
-    "wished": frozenset({"fired", "safe", "failed"}),
-    "fired": frozenset({"safe", "failed"}),
-    "failed": frozenset({"safe"}),
-    "safe": frozenset(),
+_ROW_OF = {
+    table: f"SELECT * FROM {table} WHERE {' AND '.join(f'{column} = ?' for column in key)}"  # noqa: S608  constants
+    for table, key in KEYS.items()
 }
 _Record = TypeVar("_Record")
-_REASONS = {
-    "SQLITE_NOTADB": "it is damaged, or no SQLite file; move it away, the frames and shots.jsonl beside it are intact",
-    "SQLITE_CORRUPT": "it is damaged; move it away, the frames and shots.jsonl beside it are intact",
-    "SQLITE_FULL": "the disk is full; free some space or set record.directory to another disk",
-    "SQLITE_READONLY": "the disk or the file is read-only; make it writable or set record.directory elsewhere",
-    "SQLITE_CANTOPEN": "it can't be opened; check that its folder exists and is accessible",
-    "SQLITE_BUSY": "another program holds it; close that program",
-    "SQLITE_IOERR": "the disk reports an input/output error, or is full; check the disk (df, dmesg)",
-}
 
 
 class IllegalTransitionError(FlightError):
@@ -136,7 +77,7 @@ class Database(ABC):
         """Check that the file is ours; set up a new one. Raises FlightError and sqlite3.Error."""
 
     @abstractmethod
-    def _sentence(self, error: sqlite3.Error) -> FlightError:
+    def _sentence(self, error: sqlite3.Error | UnicodeDecodeError) -> FlightError:
         """The error for a person: what can't be done, why, and what to do."""
 
     def _identity(self) -> tuple[bool, int, int]:
@@ -153,7 +94,7 @@ class Database(ABC):
     def _speaking(self) -> Iterator[None]:
         try:
             yield
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             raise self._sentence(error) from error
 
 
@@ -241,15 +182,6 @@ class LedgerReader(Database):
         rows = self._rows("SELECT record FROM results WHERE idx = ? AND run = ?", index, run)
         return self._load(_result, rows[0][0]) if rows else None
 
-    def contradictions(self) -> list[str]:
-        """A sentence for each result whose record and column hold different hashes."""
-        rows = self._rows("SELECT idx, run, slices_sha256, record FROM results ORDER BY idx, run")
-        return [
-            f"the result of frame {index} in run {run} has two different hashes"
-            for index, run, sha256, text in rows
-            if self._load(_result, text).slices_sha256 != sha256
-        ]
-
     def runs(self) -> dict[str, int]:
         """The number of results of each run; "live" is the flight itself."""
         return dict(self._rows("SELECT run, count(*) FROM results GROUP BY run ORDER BY min(rowid)"))
@@ -261,12 +193,23 @@ class LedgerReader(Database):
         rows = self._rows(f"SELECT idx, sha256, record FROM {table} ORDER BY idx")  # noqa: S608  one of two words
         return {index: (sha256, text) for index, sha256, text in rows}
 
+    def keyed_rows(self, table: str) -> list[tuple[tuple[Column, ...], tuple[Column, ...]]]:
+        """(primary key, whole row) of each row of a table that the chain covers."""
+        key = KEYS[table]
+        rows = self._rows(f"SELECT {', '.join(key)}, * FROM {table} ORDER BY {', '.join(key)}")  # noqa: S608  constants
+        return [(row[: len(key)], row[len(key) :]) for row in rows]
+
+    def last_link(self) -> ChainLink | None:
+        """The head of the chain. Raises FlightError in a ledger that was written before there were chains."""
+        rows = self._rows("SELECT number, subject, key, sha256, link FROM chain ORDER BY number DESC LIMIT 1")
+        return ChainLink(*rows[0]) if rows else None
+
     def events(self) -> list[LedgerEvent]:
         return [LedgerEvent(*row) for row in self._rows("SELECT * FROM events ORDER BY number")]
 
     def facts(self) -> dict[str, Any]:
         """Values that hold for the whole flight: telemetry_sha256, closed_utc_ns …"""
-        return {key: json.loads(value) for key, value in self._rows("SELECT key, value FROM facts")}
+        return {key: self._load(_anything, value) for key, value in self._rows("SELECT key, value FROM facts")}
 
     def utc_correction_ns(self) -> int | None:
         """What to add to every `utc_ns` of this flight to get UTC: 0 where the machine knew UTC, None where it never
@@ -276,54 +219,26 @@ class LedgerReader(Database):
             return int(facts["utc_correction"]["correction_ns"])
         return 0 if facts.get("utc_known", True) else None
 
-    def damage(self) -> list[str]:
-        """What SQLite's integrity check finds wrong; empty when the file is intact."""
-        try:
-            found = [str(row[0]) for row in self._rows("PRAGMA integrity_check(10)")]
-            return [] if found == ["ok"] else found
-        except FlightError as error:
-            return [str(error)]
-
-    def _load(self, build: Callable[[dict[str, Any]], _Record], text: str) -> _Record:
+    def _load(self, build: Callable[[Any], _Record], text: str) -> _Record:
         try:
             return build(json.loads(text))
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             raise FlightError(f"a record in the ledger {self.path} can't be read: {error}") from error
 
-    def _sentence(self, error: sqlite3.Error) -> FlightError:
-        code = getattr(error, "sqlite_errorname", "") or ""
-        if isinstance(error, sqlite3.ProgrammingError):
-            return FlightError(f"the ledger {self.path} was used after it was closed or in a wrong way: {error}")
-        if code.startswith("SQLITE_CONSTRAINT"):
-            return FlightError(f"the ledger {self.path} refuses a row that contradicts the others: {error}")
-        for start, why in _REASONS.items():
-            if code.startswith(start):
-                return FlightError(f"cannot use the ledger {self.path}: {why}")
-        return FlightError(f"cannot use the ledger {self.path}: {error}; check the disk and the file")
+    def _sentence(self, error: sqlite3.Error | UnicodeDecodeError) -> FlightError:
+        return ledger_error(self.path, error)
 
     def _identify(self) -> None:
         empty, application, version = self._identity()
         if empty and self._create and application == 0:
             return
-        if application != _APPLICATION_ID:
+        if application != APPLICATION_ID:
             raise FlightError(f"{self.path} is not a dappled ledger; give a flight folder that dappled recorded")
-        if version != _SCHEMA_VERSION:
+        if version != SCHEMA_VERSION:
             raise FlightError(
-                f"the ledger {self.path} has version {version}, this dappled reads version {_SCHEMA_VERSION}; "
+                f"the ledger {self.path} has version {version}, this dappled reads version {SCHEMA_VERSION}; "
                 "use the dappled that recorded it, or a newer one"
             )
-
-
-def ledger_damage(path: Path) -> str | None:
-    """What SQLite finds wrong with the content of a ledger; None where it is intact, missing, or can't be read."""
-    if not path.is_file():
-        return None
-    try:
-        with LedgerReader.open(path) as ledger:
-            return next(iter(ledger.damage()), None)
-    except FlightError as error:
-        code = getattr(error.__cause__, "sqlite_errorname", "") or ""
-        return str(error) if code.startswith(("SQLITE_NOTADB", "SQLITE_CORRUPT")) else None
 
 
 class Ledger(LedgerReader):
@@ -332,17 +247,14 @@ class Ledger(LedgerReader):
     def __init__(self, path: Path, utc_ns: Callable[[], int]) -> None:
         """Open a flight's ledger, or make it. `utc_ns` stamps the events."""
         self._utc_ns = utc_ns
+        self._written: dict[tuple[str, tuple[Column, ...]], None] = {}  # (table, key) of rows that need a link
         super().__init__(path, uri=f"{path.absolute().as_uri()}?mode=rwc", create=True)
         try:
             with self._speaking():
                 self._db.execute("PRAGMA journal_mode=WAL")
                 self._db.execute("PRAGMA synchronous=FULL")
                 self._db.execute("PRAGMA foreign_keys=ON")
-                if self._db.execute("PRAGMA application_id").fetchone()[0] == 0:
-                    self._db.executescript(
-                        f"BEGIN IMMEDIATE; PRAGMA application_id={_APPLICATION_ID};"
-                        f"PRAGMA user_version={_SCHEMA_VERSION};{SCHEMA}COMMIT;"
-                    )
+            self._set_up()
         except BaseException:
             self._db.close()
             raise
@@ -353,10 +265,15 @@ class Ledger(LedgerReader):
             if self.shot(shot.index) is not None:
                 raise FlightError(f"shot {shot.index} is in the ledger {self.path} already")
             cause = shot.cause
-            self._db.execute(
-                "INSERT INTO shots VALUES (?, ?, ?, ?, ?, ?, 'wished', NULL, NULL, NULL)",
-                (shot.index, cause.source, cause.kind, cause.sequence, shot.wished_utc_ns, shot.wished_monotonic_ns),
+            values = (
+                shot.index,
+                cause.source,
+                cause.kind,
+                cause.sequence,
+                shot.wished_utc_ns,
+                shot.wished_monotonic_ns,
             )
+            self._insert("shots", (shot.index,), *values, "wished", None, None, None)
 
     def fired(self, index: int, called_monotonic_ns: int, returned_monotonic_ns: int) -> None:
         """Note that the trigger call was made between these times."""
@@ -377,8 +294,9 @@ class Ledger(LedgerReader):
         """Acknowledge a frame whose bytes and name are durable."""
         with self._transaction():
             before = self._advance(frame.index, "safe")
-            values = (frame.index, frame.name, frame.camera_name, frame.size, frame.sha256, frame.arrived_utc_ns)
-            self._db.execute("INSERT INTO frames VALUES (?, ?, ?, ?, ?, ?)", values)
+            one = frame
+            values = (one.index, one.name, one.camera_name, one.size, one.sha256, one.arrived_utc_ns)
+            self._insert("frames", (frame.index,), *values)
             if before == "failed":
                 self._event("late", f"the file {frame.camera_name} came after the shot had been given up", frame.index)
 
@@ -393,29 +311,26 @@ class Ledger(LedgerReader):
         with self._transaction():
             one = companion
             values = (one.name, one.index, one.camera_name, one.size, one.sha256, one.arrived_utc_ns)
-            self._db.execute("INSERT INTO companions VALUES (?, ?, ?, ?, ?, ?)", values)
+            self._insert("companions", (one.name,), *values)
 
     def add_stray(self, stray: Stray) -> None:
         """Add a file that belongs to no shot, or is a second one; it is durable under its name."""
         with self._transaction():
             values = (stray.name, stray.camera_name, stray.size, stray.sha256, stray.arrived_utc_ns, stray.reason)
-            self._db.execute("INSERT INTO strays VALUES (?, ?, ?, ?, ?, ?)", values)
+            self._insert("strays", (stray.name,), *values)
             self._event("stray", stray.reason, None)
 
     def add_tag(self, tag: Tag) -> None:
         """Add a frame's tag and, with a digest of its own, the pose in it."""
         with self._transaction():
             for table, record in (("poses", tag.pose), ("tags", tag)):
-                self._db.execute(
-                    f"INSERT INTO {table} VALUES (?, ?, ?)",  # noqa: S608  one of two words
-                    (tag.index, digest(record), canonical(asdict(record)).decode()),
-                )
+                self._insert(table, (tag.index,), tag.index, digest(record), canonical(asdict(record)).decode())
 
     def add_result(self, result: Result) -> None:
         """Add the result of decoding a frame; once for each run."""
         with self._transaction():
             values = (result.index, result.run, result.slices_sha256, canonical(asdict(result)).decode())
-            self._db.execute("INSERT INTO results VALUES (?, ?, ?, ?)", values)
+            self._insert("results", (result.index, result.run), *values)
 
     def add_event(self, kind: str, text: str, index: int | None = None) -> None:
         with self._transaction():
@@ -424,11 +339,22 @@ class Ledger(LedgerReader):
     def set_fact(self, key: str, value: object) -> None:
         """Store a value that holds for the whole flight; replaces an earlier one."""
         with self._transaction():
-            self._db.execute("INSERT OR REPLACE INTO facts VALUES (?, ?)", (key, canonical(value).decode()))
+            self._fact(key, value)
+
+    def _fact(self, key: str, value: object) -> None:
+        self._insert("facts", (key,), key, canonical(value).decode())
 
     def _event(self, kind: str, text: str, index: int | None) -> None:
         values = (self._utc_ns(), kind, index, text)
-        self._db.execute("INSERT INTO events (utc_ns, kind, idx, text) VALUES (?, ?, ?, ?)", values)
+        row = self._db.execute("INSERT INTO events (utc_ns, kind, idx, text) VALUES (?, ?, ?, ?)", values)
+        self._written["events", (row.lastrowid,)] = None
+
+    def _insert(self, table: str, key: tuple[Column, ...], *values: Column) -> None:
+        """Add a row; only a fact may replace an earlier one."""
+        verb = "INSERT OR REPLACE" if table == "facts" else "INSERT"
+        marks = ", ".join("?" * len(values))
+        self._db.execute(f"{verb} INTO {table} VALUES ({marks})", values)
+        self._written[table, key] = None
 
     def _advance(self, index: int, new: ShotState, reason: str | None = None) -> ShotState:
         row = self.shot(index)
@@ -436,19 +362,58 @@ class Ledger(LedgerReader):
             raise FlightError(f"no shot {index} is in the ledger {self.path}: it was never requested")
         advance(index, row.state, new)
         self._db.execute("UPDATE shots SET state = ?, reason = ? WHERE idx = ?", (new, reason, index))
+        self._written["shots", (index,)] = None
         return row.state
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
+        """Commit the rows written meanwhile together with their links, or neither."""
         with self._lock, self._speaking():
             self._db.execute("BEGIN IMMEDIATE")
             try:
                 yield
+                self._chain()
                 self._db.execute("COMMIT")
             except BaseException:
                 if self._db.in_transaction:
                     self._db.execute("ROLLBACK")
                 raise
+            finally:
+                self._written.clear()
+
+    def _chain(self) -> None:
+        """Add a link for each row that this transaction has written, as the row is now."""
+        head = self.last_link()
+        for table, key in self._written:
+            head = self._link(head, table, key, self._db.execute(_ROW_OF[table], key).fetchone())
+
+    def _link(self, last: ChainLink | None, subject: str, key: Sequence[Column], row: Sequence[Column]) -> ChainLink:
+        link = chain.follow(last, subject, chain.json_array(key), chain.row_digest(row))
+        self._db.execute("INSERT INTO chain VALUES (?, ?, ?, ?, ?)", astuple(link))
+        return link
+
+    def _set_up(self) -> None:
+        """Make the tables of a new ledger. A ledger that was written before there were chains gets one from here on: it
+        covers its rows as they are now, and the fact `chain` tells how many these were."""
+        with self._transaction():
+            found = {row[0] for row in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            if "chain" in found:
+                return
+            for statement in (CHAIN if found else SCHEMA).split(";\n"):
+                self._db.execute(statement)
+            if not found:
+                self._db.execute(f"PRAGMA application_id={APPLICATION_ID}")
+                self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
+            last = None
+            for row in self._db.execute("SELECT name, type, tbl_name, sql FROM sqlite_master ORDER BY name").fetchall():
+                last = self._link(last, DEFINITIONS, row[:1], row)
+            rows_before = 0
+            for table in KEYS if found else ():
+                if table in found:
+                    for key, row in self.keyed_rows(table):
+                        last = self._link(last, table, key, row)
+                        rows_before += 1
+            self._fact("chain", {"flight": self.path.absolute().parent.name, "rows_before": rows_before})
 
 
 def _shot_row(row: Sequence[Any]) -> ShotRow:
@@ -456,6 +421,11 @@ def _shot_row(row: Sequence[Any]) -> ShotRow:
     index, source, kind, sequence, utc_ns, monotonic_ns, state, reason, called, returned = row
     shot = Shot(index, Cause(source, kind, sequence), utc_ns, monotonic_ns)
     return ShotRow(shot, cast(ShotState, state), reason, called, returned)
+
+
+def _anything(value: Any) -> Any:
+    """A value of `facts`."""
+    return value
 
 
 def _pose(value: dict[str, Any]) -> Pose:

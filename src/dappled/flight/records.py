@@ -6,10 +6,8 @@ on over restarts. A shot that failed keeps its index.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from dappled.decode.geometry import Pose
@@ -64,20 +62,6 @@ class Tag:
     mask: str
     frame_sha256: str
     pose: Pose
-
-
-def canonical(value: Any) -> bytes:
-    """Encode a value so that equal values give equal bytes: JSON, sorted keys, no spaces, shortest round-trip floats.
-
-    Raises ValueError for NaN and infinities.
-    """
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
-
-
-def digest(record: Pose | Tag | Mapping[str, Any]) -> str:
-    """SHA-256 (hex) of a record's canonical form."""
-    value = record if isinstance(record, Mapping) else asdict(record)
-    return hashlib.sha256(canonical(value)).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)

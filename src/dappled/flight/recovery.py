@@ -17,9 +17,10 @@ from dappled.flight import durable, layout, logs
 from dappled.flight.errors import disk_error
 from dappled.flight.index import ImageIndex
 from dappled.flight.layout import FlightFolder
-from dappled.flight.ledger import Ledger, ledger_damage
+from dappled.flight.ledger import Ledger
 from dappled.flight.logs import ShotJournal
 from dappled.flight.records import Frame, Stray
+from dappled.flight.stored_rows import ledger_damage
 
 SIDECAR = ".xmp"
 _JPEG = (".jpg", ".jpeg")
