@@ -20,6 +20,14 @@ def sentence(error: BaseException) -> str:
     return str(error) if isinstance(error, DappledError) else f"unexpected {type(error).__name__}: {error}"
 
 
+def first_line(error: BaseException) -> str:
+    """What a library says of an error, on one line of at most 200 characters; its kind where it says nothing."""
+    said = error.args[0] if error.args else ""
+    text = (said.decode("ascii", "replace") if isinstance(said, bytes) else str(error)).strip()
+    line = text.splitlines()[0] if text else type(error).__name__
+    return line if len(line) <= 200 else f"{line[:199]}…"
+
+
 def counted(count: int, noun: str, width: int = 0) -> str:
     """A number with its noun: 1 frame, 2 frames."""
     return f"{count:{width}d} {noun}" + ("" if count == 1 else "s")

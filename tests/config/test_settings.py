@@ -62,6 +62,25 @@ def test_missing_and_broken_files_are_named(tmp_path: Path) -> None:
         settings.load(broken)
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a = " + "[" * 100_000, "nests more than 64 deep"),
+        ("[mavlink]\ncomponent_id = " + "1" * 5000, "more than 20 digits"),
+        ("[mavlink]\ncomponent_id = " + "1" * 26, "beyond 64 bits"),
+        ("[camera]\nport = '" + "a" * 5_000_000 + "'", "longer than 4.19 MB"),
+        ("[mavlink]\nurl = [[" + "1, " * 100_000 + "]]", "must be text in quotes"),
+    ],
+)
+def test_hostile_files_are_named_in_a_short_sentence(tmp_path: Path, text: str, words: str) -> None:
+    file = tmp_path / "hostile.toml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=words) as caught:
+        settings.load(file)
+    assert "hostile.toml" in str(caught.value)
+    assert len(str(caught.value)) < 500
+
+
 def test_relative_paths_stand_beside_the_file(tmp_path: Path) -> None:
     file = tmp_path / "sub" / "dappled.toml"
     file.parent.mkdir()

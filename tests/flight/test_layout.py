@@ -108,9 +108,10 @@ def test_free_space_is_a_number_or_a_sentence(tmp_path: Path) -> None:
 
 def test_unreadable_facts_are_told(flights: Path) -> None:
     folder = layout.create(flights, START_UTC_NS)
-    folder.settings.write_text("a = = 1")
-    with pytest.raises(FlightError, match=r"flight\.toml is not readable as TOML"):
-        layout.read_facts(folder)
+    for text in ("a = = 1", "a = " + "[" * 100_000, "a = " + "1" * 5000, "a" + ".a" * 100_000 + " = 1"):
+        folder.settings.write_text(text)
+        with pytest.raises(FlightError, match=r"flight\.toml is not readable as TOML"):
+            layout.read_facts(folder)
     folder.settings.unlink()
     with pytest.raises(FlightError, match="does not exist"):
         layout.read_facts(folder)

@@ -76,6 +76,16 @@ def test_a_line_that_is_not_a_shot_is_reported(tmp_path: Path, line: bytes) -> N
     assert logs.read_journal(path) == logs.JournalContents((), (f"line 1 of {path} is not a shot",))
 
 
+@pytest.mark.parametrize("index", ["9" * 26, "9" * 5000, "[" * 100_000])
+def test_a_number_beyond_64_bits_is_no_shot(tmp_path: Path, index: str) -> None:
+    path = tmp_path / "shots.jsonl"
+    line = '{"cause":{"kind":"k","sequence":null,"source":"s"},"index":%s,"wished_monotonic_ns":1,"wished_utc_ns":1}\n'
+    path.write_text(line % "7" + line % index)
+    found = logs.read_journal(path)
+    assert [shot.index for shot in found.shots] == [7]
+    assert found.problems == (f"line 2 of {path} is not a shot",)
+
+
 def test_a_shot_noted_twice_is_told(tmp_path: Path) -> None:
     path = tmp_path / "shots.jsonl"
     journal = logs.ShotJournal(path)

@@ -6,12 +6,13 @@ import dataclasses
 import difflib
 import math
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from dappled.bounds.claims import ClaimError
+from dappled.bounds.parsing import parse_toml, read_bytes
 from dappled.errors import DappledError
 
 Record = TypeVar("Record")
@@ -75,14 +76,16 @@ class TomlSource:
 def read_toml(path: Path) -> tuple[dict[str, Any], TomlSource]:
     """Read a TOML file: its tables and its source. Raises ConfigError when it can't be read or isn't TOML."""
     try:
-        text = path.read_text(encoding="utf-8")
+        words = read_bytes(path).decode("utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise ConfigError(f"{path} can't be read: {error}") from None
     try:
-        return tomllib.loads(text), TomlSource(str(path), text)
-    except tomllib.TOMLDecodeError as error:
+        return parse_toml(words), TomlSource(str(path), words)
+    except ClaimError as error:
+        raise ConfigError(f"{path} can't be read: {error}") from None
+    except ValueError as error:
         raise ConfigError(f"{path} is not valid TOML: {error}") from None
 
 
@@ -116,13 +119,13 @@ def _convert(value: Any, wanted: Any, rule: Rule, where: str) -> Any:
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
-        raise ConfigError(f"{where} = {value!r} must be {_kind(wanted)}")
+        raise ConfigError(f"{where} = {_shown(value)} must be {_kind(wanted)}")
     if isinstance(value, int | float) and not isinstance(value, bool):
         unit = f" {rule.unit}" if rule.unit else ""
         if not math.isfinite(value) or not rule.low <= value <= rule.high:
             raise ConfigError(f"{where} = {value} must lie between {rule.low:g} and {rule.high:g}{unit}")
     if rule.choices and value not in rule.choices:
-        raise ConfigError(f"{where} = {value!r} must be one of {', '.join(rule.choices)}")
+        raise ConfigError(f"{where} = {_shown(value)} must be one of {', '.join(rule.choices)}")
     return value
 
 
@@ -131,8 +134,14 @@ def _convert_tuple(value: Any, arguments: tuple[Any, ...], rule: Rule, where: st
     if arguments[-1] is Ellipsis:
         return tuple(_convert(v, arguments[0], rule, where) for v in values)
     if len(values) != len(arguments):
-        raise ConfigError(f"{where} = {value!r} must be a list of {len(arguments)} values")
+        raise ConfigError(f"{where} = {_shown(value)} must be a list of {len(arguments)} values")
     return tuple(_convert(v, a, rule, where) for v, a in zip(values, arguments, strict=True))
+
+
+def _shown(value: Any) -> str:
+    """A value as a sentence shows it: a long one is cut."""
+    shown = repr(value)
+    return shown if len(shown) <= 80 else f"{shown[:79]}…"
 
 
 def _kind(wanted: type) -> str:

@@ -11,7 +11,6 @@ import os
 import re
 import secrets
 import shutil
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -21,6 +20,7 @@ from typing import Any, Self
 import tomli_w
 
 from dappled import confined
+from dappled.bounds.parsing import parse_toml, read_bytes
 from dappled.flight import durable
 from dappled.flight.errors import FlightError, disk_error
 
@@ -197,10 +197,10 @@ def facts_as_toml(facts: Mapping[str, Any]) -> bytes:
 def read_facts(folder: FlightFolder) -> dict[str, Any]:
     """Read flight.toml. Raises FlightError."""
     try:
-        return tomllib.loads(folder.settings.read_text("utf-8"))
+        return parse_toml(read_bytes(folder.settings).decode("utf-8"))
     except OSError as error:
         raise disk_error("read", folder.settings, error) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise FlightError(f"{folder.settings} is not readable as TOML: {error}") from error
 
 

@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from dappled.bounds.parsing import parse_json
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.records import Cause, Shot
 
@@ -206,9 +207,9 @@ def read_journal(path: Path) -> JournalContents:
 
 def _parse(line: bytes) -> Shot | None:
     try:
-        value: Any = json.loads(line)
+        value: Any = parse_json(line, _LINE_BYTES)
         shot = Shot(**{**value, "cause": Cause(**value["cause"])})
-    except (ValueError, TypeError, KeyError, RecursionError):
+    except (ValueError, TypeError, KeyError):
         return None
     numbers = (shot.index, shot.wished_utc_ns, shot.wished_monotonic_ns)
     words = (shot.cause.source, shot.cause.kind)
@@ -217,6 +218,7 @@ def _parse(line: bytes) -> Shot | None:
     return shot if whole and shot.index >= 0 and (sequence is None or type(sequence) is int) else None
 
 
+_LINE_BYTES = 1 << 16  # of the journal; a shot takes some 200
 _MAVLINK_1, _MAVLINK_2 = 0xFE, 0xFD
 _SIGNED = 0x01
 _LOGGING = "log telemetry in"

@@ -57,6 +57,34 @@ def test_arrays_come_back_as_they_were_described() -> None:
         Message("slices", {"arrays": entries}, a.tobytes()).arrays()
 
 
+@pytest.mark.parametrize(
+    "question",
+    [
+        '{"get": "slices", "frame": ' + "9" * 26 + "}",
+        '{"get": "slices", "frame": ' + "9" * 5000 + "}",
+        '{"get": "slices", "frame": 2147483648}',
+        '{"get": "slices", "frame": 1, "seq": ' + "[" * 500 + "]" * 500 + "}",
+        '{"get": "slices", "frame": 1, "seq": [[1]]}',
+        '{"get": "slices", "seq": true}',
+        "[" * 100_000,
+        '{"get": "start", "flight": "' + "a" * 5000 + '"}',
+    ],
+)
+def test_a_question_beyond_the_limits_is_refused(question: str) -> None:
+    with pytest.raises(WireError, match="a question"):
+        wire.parse_question([question.encode()])
+
+
+@pytest.mark.parametrize("dtype", ["O", "V0", "V99999999999", "(2,)f4", "f4,f8", "U9", "<c8" * 9999, 5, None])
+@pytest.mark.parametrize("shape", [[1], [10**12], [2**63], [-1], "12", 7])
+def test_arrays_that_claim_what_is_not_there(dtype: object, shape: object) -> None:
+    for entry in ({"name": "a", "dtype": dtype, "shape": [1]}, {"name": "a", "dtype": "<f4", "shape": shape}):
+        if entry["dtype"] == "<f4" and shape == [1]:
+            continue
+        with pytest.raises(WireError, match=r"don't match their description|ends inside array"):
+            Message("slices", {"arrays": [entry]}, bytes(100)).arrays()
+
+
 @given(
     st.binary(max_size=200)
     | st.builds(

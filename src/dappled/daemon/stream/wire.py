@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -16,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled import __version__
+from dappled.bounds import claims
+from dappled.bounds.parsing import parse_json
 from dappled.config.settings import PublishSettings
 from dappled.errors import DappledError
 from dappled.flight import Frame, Tag
@@ -25,6 +28,9 @@ TOPICS = ("start", "frame", "slices", "depth", "preview", "health", "end")
 CAN_BE_ASKED = ("start", "frame", "slices")
 QUESTION_KEYS = ("get", "frame", "seq", "flight")
 _FLIGHT_CHARACTERS = 200
+_LAST_FRAME = 2**31 - 1  # MAVLink's image index
+_HEADER_BYTES, _QUESTION_BYTES = 1 << 20, 1 << 12
+_NUMBERS = re.compile(r"[<>|=]?[fciub](1|2|4|8|16)")
 
 
 class WireError(DappledError):
@@ -46,8 +52,8 @@ class Message:
         data = memoryview(self.body or b"").cast("B")
         try:
             for entry in self.header.get("arrays", []):
-                dtype, shape = np.dtype(entry["dtype"]), _shape(entry["shape"])
-                size = dtype.itemsize * math.prod(shape)
+                dtype, shape = _number_type(entry["dtype"]), tuple(entry["shape"])
+                size = dtype.itemsize * claims.count(shape, str(entry["name"])[:40])
                 if start + size > len(data):
                     raise WireError(f"the body of {self.topic} ends inside array {entry['name']!r}")
                 found[entry["name"]] = np.frombuffer(data[start : start + size], dtype).reshape(shape)
@@ -57,10 +63,10 @@ class Message:
         return found
 
 
-def _shape(sides: Sequence[int]) -> tuple[int, ...]:
-    if min(sides, default=0) < 0:
-        raise ValueError("a side is negative")
-    return tuple(sides)
+def _number_type(name: object) -> np.dtype[Any]:
+    if not isinstance(name, str) or not _NUMBERS.fullmatch(name):
+        raise ValueError("a dtype is not of numbers")
+    return np.dtype(name)
 
 
 def describe_array(name: str, array: NDArray[Any], unit: str) -> dict[str, Any]:
@@ -203,8 +209,8 @@ def encode(header: Mapping[str, Any]) -> bytes:
 def decode(parts: Sequence[Any]) -> Message:
     """A message from its parts. Raises WireError for anything else."""
     try:
-        topic, header = bytes(parts[0]).decode(), json.loads(bytes(parts[1]))
-    except (IndexError, ValueError, RecursionError) as error:  # ValueError: no UTF-8, no JSON, a number without end
+        topic, header = bytes(parts[0]).decode(), parse_json(parts[1], _HEADER_BYTES)
+    except (IndexError, ValueError) as error:  # ValueError: no UTF-8, no JSON, or more than is read
         raise WireError(f"not a dappled message: {error}") from None
     if not isinstance(header, dict):
         raise WireError("not a dappled message: the header is not a JSON object")
@@ -217,22 +223,18 @@ def parse_question(payload: Sequence[bytes]) -> dict[str, Any]:
     Returns its known keys only, because the answer's header repeats them. Raises WireError.
     """
     try:
-        request = json.loads(payload[0], parse_constant=_refuse_constant) if len(payload) == 1 else None
-    except (ValueError, RecursionError):
+        request = parse_json(payload[0], _QUESTION_BYTES) if len(payload) == 1 else None
+    except ValueError:
         request = None
     if not isinstance(request, dict):
         raise WireError('a question is one JSON object such as {"get": "slices", "frame": 42}')
     if request.get("get") not in CAN_BE_ASKED:
         raise WireError(f'a question\'s "get" must be one of {", ".join(CAN_BE_ASKED)}')
     if request["get"] != "start":
-        number = request.get("frame", request.get("seq"))
-        if not isinstance(number, int) or isinstance(number, bool) or number < 0:
+        numbers = [request[name] for name in ("frame", "seq") if name in request]
+        if not numbers or not all(type(number) is int and 0 <= number <= _LAST_FRAME for number in numbers):
             raise WireError("a question must name a frame (or, for slices, a seq) by a whole number, 0 or more")
     flight = request.get("flight")
     if flight is not None and not (isinstance(flight, str) and len(flight) <= _FLIGHT_CHARACTERS):
         raise WireError("a question's flight must be a name")
     return {name: request[name] for name in QUESTION_KEYS if name in request}
-
-
-def _refuse_constant(text: str) -> object:
-    raise ValueError(text)  # NaN and Infinity

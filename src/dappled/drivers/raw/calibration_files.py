@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import tomli_w
 
+from dappled.bounds.arrays import read_npz
+from dappled.bounds.parsing import parse_toml
 from dappled.config.schema import ConfigError, read_toml
 from dappled.decode import DecodeError
 from dappled.decode.calibration import Calibration
+from dappled.errors import first_line
 
 _TEXT = "calibration_toml"
 
@@ -41,12 +42,13 @@ def tables(path: Path) -> dict[str, Any]:
     if path.suffix.lower() != ".npz":
         return read_toml(path)[0]
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return tomllib.loads(str(arrays[_TEXT]))
+        return parse_toml(str(read_npz(path, [_TEXT])[_TEXT]))
     except FileNotFoundError as error:
         raise ConfigError(f"no calibration at {path}: check the path") from error
-    except (OSError, ValueError, KeyError, BadZipFile, EOFError) as error:
-        raise ConfigError(f"{path} is not a calibration: make one with dappled calibrate ({error})") from error
+    except Exception as error:  # zipfile and numpy raise anything on damaged bytes
+        raise ConfigError(
+            f"{path} is not a calibration: make one with dappled calibrate ({first_line(error)})"
+        ) from error
 
 
 def load(path: Path) -> Calibration:

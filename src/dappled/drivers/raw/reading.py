@@ -23,6 +23,8 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from dappled.bounds.arrays import read_npy
+from dappled.bounds.claims import ClaimError
 from dappled.drivers.raw import lytro
 from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, Source, positive, read_exif
 from dappled.errors import DappledError
@@ -47,7 +49,7 @@ def read(source: Source, name: str | None = None) -> RawFile:
         start = file.read(16)
         file.seek(0)
         if start.startswith(b"\x93NUMPY"):
-            return _plain(np.load(file, allow_pickle=False), ExposureSettings())
+            return _plain(read_npy(file, _length(file), "array"), ExposureSettings())
         if start.startswith((b"\x89PNG", b"\xff\xd8\xff")):
             return _read_picture(file)
         if start.startswith(_TIFF_STARTS) and _is_plain_tiff(file, label):
@@ -117,12 +119,20 @@ def _sentences(label: str) -> Iterator[None]:
         raise RawFileError(
             f"{label} is not a frame that can be read (camera raw, DNG, Lytro, TIFF, PNG, JPEG or NPY), or is cut short"
         ) from error
+    except ClaimError as error:
+        raise RawFileError(f"{label} can't be read as a frame: {error}") from error
     except Image.DecompressionBombError as error:
         raise RawFileError(f"{label} claims to be larger than any frame: {error}") from error
     except Exception as error:  # the readers raise anything on damaged bytes
         raise RawFileError(
             f"{label} can't be read as a frame, it may be damaged or cut short: {_words(error)}"
         ) from error
+
+
+def _length(file: BinaryIO) -> int:
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    return size
 
 
 def _words(error: BaseException) -> str:

@@ -11,7 +11,6 @@ import json
 import os
 import secrets
 import shutil
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,9 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled import confined
+from dappled.bounds.arrays import read_npz
+from dappled.bounds.claims import ClaimError
+from dappled.bounds.parsing import parse_json
 from dappled.decode.lightfield import LightField
-from dappled.errors import DappledError
+from dappled.errors import DappledError, first_line
 from dappled.flight import durable
+from dappled.products.exports import packed_arrays
 
 _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "slices": (np.complex64, 3),
@@ -32,6 +35,8 @@ _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "grid": (np.float64, 2),
 }
 _ATTRIBUTES = "attributes"
+_NUMBERS = ("focal_length_mm", "f_number", "lenslet_pitch_px", "noise_rms")
+_WORDS = ("camera", "mask", "law", "aperture")
 
 
 class LightFileError(DappledError):
@@ -61,18 +66,26 @@ def save(path: Path, field: LightField, *, overwrite: bool = False) -> None:
 
 
 def load(path: Path) -> LightField:
-    """Read a light field that `save` wrote. Raises LightFileError."""
+    """Read a light field that `save` wrote. What it claims is judged first: a damaged or hostile file takes no memory.
+
+    Raises LightFileError.
+    """
     read = _of(path, {".zarr": _load_zarr, ".npz": _load_npz, ".h5": _load_h5})
     if not path.exists():
         raise LightFileError(f"there is no light field {path}; check the path")
     try:
         arrays, attributes = read(path)
-    except LightFileError:
+    except DappledError:
         raise
+    except ClaimError as error:
+        raise LightFileError(f"{path}: {error}") from error
     except KeyError as error:
         raise LightFileError(f"{path} is not a light field: it lacks {error}") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, TypeError) as error:
-        raise LightFileError(f"{path} is not a light field, or is damaged: {error}") from error
+    except MemoryError as error:
+        raise LightFileError(f"{path} needs more memory than is free: close other programs") from error
+    except Exception as error:  # the readers raise anything on damaged bytes
+        raise LightFileError(f"{path} is not a light field, or is damaged: {first_line(error)}") from error
+    _check_attributes(path, attributes)
     _fits(path, arrays)
     for name, (kind, _) in _ARRAYS.items():
         if arrays[name].dtype != kind:
@@ -105,6 +118,21 @@ def _fits(path: Path, arrays: _Arrays) -> None:
             )
 
 
+def _check_attributes(path: Path, attributes: Any) -> None:
+    """Check what readers calculate with: numbers, words and the frame's shape. Raises LightFileError."""
+    if not isinstance(attributes, dict):
+        raise LightFileError(f"{path} is not a light field: its attributes are not a JSON object")
+    kinds: dict[str, tuple[type, ...]] = {**dict.fromkeys(_NUMBERS, (int, float)), **dict.fromkeys(_WORDS, (str,))}
+    for name, kind in kinds.items():
+        value = attributes.get(name)
+        if value is not None and (not isinstance(value, kind) or isinstance(value, bool)):
+            what = "a text" if kind == (str,) else "a number"
+            raise LightFileError(f"{path}: its attribute {name} is not {what}; decode the frame again")
+    shape = attributes.get("shape", [1, 1])
+    if not (isinstance(shape, list) and len(shape) == 2 and all(type(side) is int and side > 0 for side in shape)):
+        raise LightFileError(f"{path}: its attribute shape is not rows and columns; decode the frame again")
+
+
 def _json(path: Path, attributes: Mapping[str, Any]) -> dict[str, Any]:
     def plain(value: object) -> Any:
         if isinstance(value, np.ndarray | np.generic):
@@ -135,14 +163,10 @@ def _save_zarr(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
 def _load_zarr(path: Path) -> tuple[_Arrays, dict[str, Any]]:
     zarr = _zarr(path)
     confined.refuse_links(path, f"the light field {path}")
-    group = zarr.open_group(store=path, mode="r")
-    arrays: _Arrays = {}
-    for name in _ARRAYS:
-        array = group[name]
-        if not isinstance(array, zarr.Array):
-            raise LightFileError(f"{path} is not a light field: {name} is not an array")
-        arrays[name] = np.asarray(array[...])
-    return arrays, dict(group.attrs)
+    attributes = packed_arrays.zarr_attributes(path, {name: kind for name, (kind, _) in _ARRAYS.items()})
+    # Without consolidated metadata: it would replace what was judged.
+    group = zarr.open_group(store=path, mode="r", zarr_format=3, use_consolidated=False)
+    return {name: np.asarray(group[name][...]) for name in _ARRAYS}, attributes
 
 
 def _save_npz(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
@@ -151,8 +175,8 @@ def _save_npz(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
 
 
 def _load_npz(path: Path) -> tuple[_Arrays, dict[str, Any]]:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in _ARRAYS}, json.loads(str(file[_ATTRIBUTES]))
+    found = read_npz(path, [*_ARRAYS, _ATTRIBUTES])
+    return found, parse_json(str(found.pop(_ATTRIBUTES)))
 
 
 def _save_h5(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
@@ -165,16 +189,9 @@ def _save_h5(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
 
 
 def _load_h5(path: Path) -> tuple[_Arrays, dict[str, Any]]:
-    h5py = _h5py(path)
-    with h5py.File(path, "r") as file:
-        for name in _ARRAYS:
-            link = file.get(name, getlink=True)
-            elsewhere = link is not None and not isinstance(link, h5py.HardLink)
-            if elsewhere or (link is not None and (file[name].is_virtual or file[name].external)):
-                raise LightFileError(
-                    f"{path}: {name} stands in another file, which is not followed; use a file that holds it itself"
-                )
-        return {name: np.asarray(file[name]) for name in _ARRAYS}, json.loads(file.attrs[_ATTRIBUTES])
+    with _h5py(path).File(path, "r") as file:
+        packed_arrays.check_h5(file, list(_ARRAYS), _ATTRIBUTES)
+        return {name: np.asarray(file[name]) for name in _ARRAYS}, parse_json(file.attrs[_ATTRIBUTES])
 
 
 def _zarr(path: Path) -> Any:
