@@ -16,73 +16,58 @@ import os
 import queue
 import shutil
 import statistics
+import sys
 import tempfile
 import threading
 import time
-from collections import deque
-from dataclasses import dataclass
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # sink and poses are the tests' own
+
+from tests.daemon.fakes import FlightSink, NoPoses
+
 from dappled.clock import SystemClock
-from dappled.daemon.navigation import BodyLatency, ExposureTime
-from dappled.daemon.navigation.navigation import unknown_pose
+from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
 from dappled.daemon.pipeline.decode_process import DecodedFrame
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
-from dappled.decode.geometry import Pose
-from dappled.drivers.camera import (
-    Arrival,
-    Blob,
-    CameraEvent,
-    Companion,
-    Fired,
-    Identity,
-    Setting,
-    SettingName,
-    StateChanged,
-    check_change,
-)
-from dappled.flight import Shot, check, flight_report, recording
+from dappled.drivers.camera import Arrival, Blob, CameraEvent, Fired, Identity, PlainCamera, StateChanged
+from dappled.flight import check, flight_report, recording
 
 QUEUE = 4
 
 
-class SteadyCamera:
-    """Brings a file of `size` bytes for each shot, different each time."""
+class SteadyCamera(PlainCamera):
+    """Brings a file of `size` bytes for each shot, different each time; it is made when the pipeline looks for it."""
+
+    identity = Identity("benchmark", "steady", "", "")
 
     def __init__(self, size: int) -> None:
+        super().__init__()
         self._picture = bytearray(os.urandom(size))
         self._shots: queue.SimpleQueue[int] = queue.SimpleQueue()
-        self.identity = Identity("benchmark", "steady", "", "")
-        self._events: deque[CameraEvent] = deque([StateChanged("ready", "", time.monotonic_ns(), self.identity)])
 
-    def start(self) -> None: ...
+    def start(self) -> None:
+        self.report(StateChanged("ready", "", time.monotonic_ns(), self.identity))
 
     def fire(self, shot: int) -> None:
         self._shots.put(shot)
 
     def next_event(self, timeout_s: float) -> CameraEvent | None:
-        if not self._events:
-            try:
-                shot = self._shots.get(timeout=timeout_s)
-            except queue.Empty:
-                return None
-            now_ns = time.monotonic_ns()
-            self._picture[:8] = shot.to_bytes(8, "big")
-            blob = Blob.of(memoryview(self._picture))
-            self._events += [Fired(shot, now_ns, now_ns), Arrival(shot, f"IMG_{shot:04d}.CR2", blob, now_ns)]
-        return self._events.popleft()
-
-    def release(self, arrival: Arrival | Companion) -> None: ...
-
-    def settings(self) -> tuple[Setting, ...]:
-        return ()
-
-    def change(self, name: SettingName, value: str) -> None:
-        check_change((), name, value)
+        event = super().next_event(0.0)
+        if event is not None:
+            return event
+        try:
+            shot = self._shots.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+        now_ns = time.monotonic_ns()
+        self._picture[:8] = shot.to_bytes(8, "big")
+        self.report(Arrival(shot, f"IMG_{shot:04d}.CR2", Blob.of(memoryview(self._picture)), now_ns))
+        return Fired(shot, now_ns, now_ns)
 
     def stop(self) -> None: ...
 
@@ -98,33 +83,6 @@ class SlowDecoder:
         body = mmap.mmap(-1, 1 << 20)
         unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
         return DecodedFrame(body, "0" * 64, [], [[0.0] * 4], "predicted", 1, 1, "geometric", unit, b"", (0, 0))
-
-
-@dataclass(frozen=True)
-class Sink:
-    """Notes each shot in the flight and hands it to the camera."""
-
-    flight: recording.Recording
-    shots: PendingShots
-
-    def obstacle(self) -> None:
-        """There is none."""
-
-    def note(self, shot: Shot) -> None:
-        self.flight.journal.note(shot)
-
-    def fire(self, shot: Shot) -> None:
-        self.shots.fire(shot)
-
-    def refused(self, request: CaptureRequest, reason: str) -> None:
-        raise AssertionError(reason)
-
-
-class NoPoses:
-    """A PoseSource without telemetry."""
-
-    def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
-        return exposure, unknown_pose(exposure.utc_ns, 0)
 
 
 class Ends(Observer):
@@ -168,7 +126,7 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
     flight = recording.begin(root, clock.utc_ns, {})
     camera = SteadyCamera(size)
     shots = PendingShots(camera)
-    shutter = Shutter(Sink(flight, shots), clock, next_index=0, capacity=1000)
+    shutter = Shutter(FlightSink(flight, shots), clock, next_index=0, capacity=1000)
     ends = Ends(shutter)
     pipeline = Pipeline(
         camera,

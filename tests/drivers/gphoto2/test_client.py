@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -73,6 +74,16 @@ def ready(make: Make) -> Make:
         return camera
 
     return ready
+
+
+@contextmanager
+def running(camera: GPhoto2Camera) -> Iterator[GPhoto2Camera]:
+    """The camera, started; stopped at the end."""
+    camera.start()
+    try:
+        yield camera
+    finally:
+        camera.stop()
 
 
 class TestContractToTheCard(CameraContract):
@@ -154,14 +165,10 @@ def test_only_the_body_with_the_serial_number_is_taken(make: Make) -> None:
 def test_without_a_camera_it_says_what_to_do_and_keeps_looking() -> None:
     with SimulatedBody.start(BodyOptions(picture="pattern:1000:jpg")) as gone:
         port = gone.port
-    camera = open_camera({"port": port, "timeouts": {"retry_s": 0.05}})
-    camera.start()
-    try:
+    with running(open_camera({"port": port, "timeouts": {"retry_s": 0.05}})) as camera:
         assert port in until_state(camera, "absent").reason
         camera.fire(1)
         assert port in failed(camera, 1)
-    finally:
-        camera.stop()
 
 
 def test_a_camera_held_by_another_program_is_named_and_taken_when_it_is_free(make: Make, body: SimulatedBody) -> None:
@@ -202,18 +209,16 @@ def test_a_refused_release_fails_the_shot_and_takes_the_next(ready: Make, body: 
 
 
 def test_a_full_card_fails_the_shot_with_a_hint() -> None:
-    with SimulatedBody.start(BodyOptions(picture="pattern:1000:cr2", card_bytes=1500)) as body:
-        camera = open_camera({"port": body.port})
-        camera.start()
-        try:
-            until_state(camera, "ready")
-            camera.fire(1)
-            camera.fire(2)
-            events = _ended(until_shot_ends(camera, 2))
-            assert of_shots(events) == [(Fired, 1), (Arrival, 1), (ShotFailed, 2)]
-            assert "card" in events[-1].reason
-        finally:
-            camera.stop()
+    with (
+        SimulatedBody.start(BodyOptions(picture="pattern:1000:cr2", card_bytes=1500)) as body,
+        running(open_camera({"port": body.port})) as camera,
+    ):
+        until_state(camera, "ready")
+        camera.fire(1)
+        camera.fire(2)
+        events = _ended(until_shot_ends(camera, 2))
+        assert of_shots(events) == [(Fired, 1), (Arrival, 1), (ShotFailed, 2)]
+        assert "card" in events[-1].reason
 
 
 def test_a_lost_event_s_file_is_found_on_the_card(ready: Make, body: SimulatedBody) -> None:
@@ -276,19 +281,17 @@ def test_a_link_dropped_in_mid_transfer_loses_no_file_on_the_card(ready: Make, b
 
 
 def test_a_link_dropped_in_mid_exposure_loses_no_file_on_the_card() -> None:
-    with SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", delay_s=0.5)) as body:
-        camera = open_camera({"port": body.port})
-        camera.start()
-        try:
-            until_state(camera, "ready")
-            camera.fire(1)
-            until(camera, lambda event: isinstance(event, Fired))
-            body.fault("drop")
-            arrival = arrived(camera, 1)
-            assert content(arrival) == pattern(1, SIZE)
-            assert body.releases == 1
-        finally:
-            camera.stop()
+    with (
+        SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", delay_s=0.5)) as body,
+        running(open_camera({"port": body.port})) as camera,
+    ):
+        until_state(camera, "ready")
+        camera.fire(1)
+        until(camera, lambda event: isinstance(event, Fired))
+        body.fault("drop")
+        arrival = arrived(camera, 1)
+        assert content(arrival) == pattern(1, SIZE)
+        assert body.releases == 1
 
 
 @pytest.mark.slow
@@ -345,9 +348,7 @@ def _recorded(
 def test_a_crash_of_the_process_fails_its_shots_and_is_made_good(body: SimulatedBody) -> None:
     body.fault("no-event")
     started: list[subprocess.Popen[bytes]] = []
-    camera = GPhoto2Camera(parse_settings({"port": body.port}), spawn=_recorded(started))
-    camera.start()
-    try:
+    with running(GPhoto2Camera(parse_settings({"port": body.port}), spawn=_recorded(started))) as camera:
         until_state(camera, "ready")
         camera.fire(1)
         camera.fire(2)
@@ -358,16 +359,12 @@ def test_a_crash_of_the_process_fails_its_shots_and_is_made_good(body: Simulated
         camera.fire(3)
         assert of_shots(_ended(until_shot_ends(camera, 3))) == [(Fired, 3), (Arrival, 3)]
         assert len(started) == 2
-    finally:
-        camera.stop()
 
 
 def test_what_a_dead_process_had_fired_is_fetched_by_the_next_one(body: SimulatedBody) -> None:
     """Also when its file was on the card before the next process looked there for the first time."""
     started: list[subprocess.Popen[bytes]] = []
-    camera = GPhoto2Camera(parse_settings({"port": body.port}), spawn=_recorded(started))
-    camera.start()
-    try:
+    with running(GPhoto2Camera(parse_settings({"port": body.port}), spawn=_recorded(started))) as camera:
         until_state(camera, "ready")
         camera.fire(1)
         _ended(until_shot_ends(camera, 1))
@@ -381,8 +378,6 @@ def test_what_a_dead_process_had_fired_is_fetched_by_the_next_one(body: Simulate
         camera.fire(3)
         arrival = arrived(camera, 3)
         assert content(arrival) == pattern(3, SIZE)
-    finally:
-        camera.stop()
 
 
 @pytest.mark.slow
@@ -394,13 +389,11 @@ def test_a_process_that_keeps_dying_is_not_started_for_ever(body: SimulatedBody)
         process.kill()
         return process, channel
 
-    camera = GPhoto2Camera(parse_settings({"port": body.port}), spawn=spawn, budget=RestartBudget(2, 3600.0))
-    camera.start()
-    try:
+    with running(
+        GPhoto2Camera(parse_settings({"port": body.port}), spawn=spawn, budget=RestartBudget(2, 3600.0))
+    ) as camera:
         until(camera, lambda event: isinstance(event, StateChanged) and "too often" in event.reason)
         assert len(started) == 3  # the first start and two restarts
-    finally:
-        camera.stop()
 
 
 def test_the_process_dies_with_its_parent(body: SimulatedBody) -> None:
@@ -455,26 +448,24 @@ def _ended(events: list[Any]) -> list[Any]:
 
 @pytest.mark.parametrize("target", ["card", "ram"])
 def test_raw_and_jpeg_are_one_frame_and_its_companion(target: str) -> None:
-    with SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", pairs=True)) as body:
-        camera = open_camera({"port": body.port, "capture_target": target, "delete_after_download": True})
-        camera.start()
-        try:
-            until_state(camera, "ready")
-            for shot in (1, 2):
-                camera.fire(shot)
-                events = until(camera, lambda event: isinstance(event, Companion))
-                assert of_shots(events) == [(Fired, shot), (Arrival, shot), (Companion, shot)]
-                raw, jpeg = [event for event in events if isinstance(event, Arrival | Companion)]
-                assert [one.name.lower().endswith(end) for one, end in ((raw, ".cr2"), (jpeg, ".jpg"))] == [True] * 2
-                assert content(raw) == pattern(shot, SIZE)
-                assert content(jpeg) == thumbnail(shot)
-                camera.release(raw)
-                camera.release(jpeg)
-            camera.fire(3)  # commands are obeyed in order: the deletions come first
-            _ended(until(camera, lambda event: isinstance(event, Companion)))
-            assert body.card == (["IMG_0003.CR2", "IMG_0003.JPG"] if target == "card" else [])
-        finally:
-            camera.stop()
+    with (
+        SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", pairs=True)) as body,
+        running(open_camera({"port": body.port, "capture_target": target, "delete_after_download": True})) as camera,
+    ):
+        until_state(camera, "ready")
+        for shot in (1, 2):
+            camera.fire(shot)
+            events = until(camera, lambda event: isinstance(event, Companion))
+            assert of_shots(events) == [(Fired, shot), (Arrival, shot), (Companion, shot)]
+            raw, jpeg = [event for event in events if isinstance(event, Arrival | Companion)]
+            assert [one.name.lower().endswith(end) for one, end in ((raw, ".cr2"), (jpeg, ".jpg"))] == [True] * 2
+            assert content(raw) == pattern(shot, SIZE)
+            assert content(jpeg) == thumbnail(shot)
+            camera.release(raw)
+            camera.release(jpeg)
+        camera.fire(3)  # commands are obeyed in order: the deletions come first
+        _ended(until(camera, lambda event: isinstance(event, Companion)))
+        assert body.card == (["IMG_0003.CR2", "IMG_0003.JPG"] if target == "card" else [])
 
 
 def test_no_focus_fails_the_shot_soon_and_takes_the_next(ready: Make, body: SimulatedBody) -> None:
@@ -500,18 +491,14 @@ def test_of_two_bodies_of_one_model_the_one_with_the_serial_number_is_taken(want
     with (
         SimulatedBody.start(BodyOptions(picture="pattern:1000:cr2", serial=numbers[0])) as one,
         SimulatedBody.start(BodyOptions(picture="pattern:1000:cr2", serial=numbers[1])) as other,
+        running(open_camera({"port": f"{one.port},{other.port}", "serial": wanted})) as camera,
     ):
-        camera = open_camera({"port": f"{one.port},{other.port}", "serial": wanted})
-        camera.start()
-        try:
-            until_state(camera, "ready")
-            assert camera.identity is not None
-            assert camera.identity.serial == wanted
-            camera.fire(1)
-            _ended(until_shot_ends(camera, 1))
-            assert [one.releases, other.releases] == [int(wanted == number) for number in numbers]
-        finally:
-            camera.stop()
+        until_state(camera, "ready")
+        assert camera.identity is not None
+        assert camera.identity.serial == wanted
+        camera.fire(1)
+        _ended(until_shot_ends(camera, 1))
+        assert [one.releases, other.releases] == [int(wanted == number) for number in numbers]
 
 
 @pytest.mark.slow
@@ -521,9 +508,7 @@ def test_after_a_break_the_same_body_is_taken_again_and_not_its_twin() -> None:
         SimulatedBody.start(BodyOptions(picture="pattern:1000:cr2", serial="0000000002")) as other,
     ):
         one.fault("unplug")
-        camera = open_camera({"port": f"{one.port},{other.port}", "timeouts": {"retry_s": 0.1}})
-        camera.start()
-        try:
+        with running(open_camera({"port": f"{one.port},{other.port}", "timeouts": {"retry_s": 0.1}})) as camera:
             until_state(camera, "ready")
             assert camera.identity is not None
             assert camera.identity.serial == "0000000002"
@@ -532,8 +517,6 @@ def test_after_a_break_the_same_body_is_taken_again_and_not_its_twin() -> None:
             until_state(camera, "faulted")
             until_state(camera, "ready")
             assert camera.identity.serial == "0000000002"
-        finally:
-            camera.stop()
 
 
 def test_a_process_that_can_t_be_started_now_is_tried_again(body: SimulatedBody) -> None:
@@ -544,37 +527,31 @@ def test_a_process_that_can_t_be_started_now_is_tried_again(body: SimulatedBody)
             raise problems.pop(0)
         return spawn_process(settings, carryover)
 
-    camera = GPhoto2Camera(parse_settings({"port": body.port}), spawn=spawn)
-    camera.start()
-    try:
+    with running(GPhoto2Camera(parse_settings({"port": body.port}), spawn=spawn)) as camera:
         assert "Too many open files" in until_state(camera, "faulted").reason
         camera.fire(1)
         assert of_shots(until_shot_ends(camera, 1)) == [(ShotFailed, 1)]
         until_state(camera, "ready")
         camera.fire(2)
         _ended(until_shot_ends(camera, 2))
-    finally:
-        camera.stop()
 
 
 def test_a_body_that_comes_back_under_another_address_is_found() -> None:
-    with SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", addresses=2)) as body:
-        camera = open_camera({"port": body.port, "timeouts": {"retry_s": 0.1}})
-        camera.start()
-        try:
-            until_state(camera, "ready")
-            before = camera.identity
-            body.ask("move")
-            until_state(camera, "faulted")
-            until_state(camera, "ready")
-            assert before is not None
-            assert camera.identity is not None
-            assert before.serial == camera.identity.serial
-            assert before.port != camera.identity.port
-            camera.fire(1)
-            _ended(until_shot_ends(camera, 1))
-        finally:
-            camera.stop()
+    with (
+        SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", addresses=2)) as body,
+        running(open_camera({"port": body.port, "timeouts": {"retry_s": 0.1}})) as camera,
+    ):
+        until_state(camera, "ready")
+        before = camera.identity
+        body.ask("move")
+        until_state(camera, "faulted")
+        until_state(camera, "ready")
+        assert before is not None
+        assert camera.identity is not None
+        assert before.serial == camera.identity.serial
+        assert before.port != camera.identity.port
+        camera.fire(1)
+        _ended(until_shot_ends(camera, 1))
 
 
 @pytest.mark.slow
@@ -582,9 +559,7 @@ def test_a_silent_body_on_usb_has_its_port_reset(body: SimulatedBody, monkeypatc
     resets: list[str] = []
     monkeypatch.setattr(usb_bus, "reset", resets.append)
     settings = parse_settings({"port": body.port, "timeouts": {"answer_s": 1.5}})
-    camera = GPhoto2Camera(settings)
-    camera.start()
-    try:
+    with running(GPhoto2Camera(settings)) as camera:
         until_state(camera, "ready")
         body.fault("silence")
         camera.fire(1)
@@ -595,8 +570,6 @@ def test_a_silent_body_on_usb_has_its_port_reset(body: SimulatedBody, monkeypatc
         assert resets == ["usb:001,005"]
         body.fault("clear")
         until_state(camera, "ready")
-    finally:
-        camera.stop()
 
 
 STARVED = """
