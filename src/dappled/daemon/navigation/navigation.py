@@ -11,7 +11,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 from dappled.clock import Clock
 from dappled.daemon.live_settings import LiveSettings
@@ -25,7 +25,7 @@ from dappled.daemon.navigation.clocks import (
     reach_ns,
     refine,
 )
-from dappled.daemon.navigation.samples import HALF_MS_NS, AttitudeSample, GnssSample, PositionSample
+from dappled.daemon.navigation.samples import HALF_MS_NS, AttitudeSample, PositionSample
 from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, USED_MESSAGES, Around, Counts, VehicleHistory
 from dappled.decode.geometry import (
     Gnss,
@@ -298,8 +298,9 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) ->
     age_s = min(abs(sample.boot_ns - at.boot_ns) for sample in at.positions) / 1e9
     blur_s = sigma_s if len(at.positions) == 2 else math.hypot(sigma_s, age_s)
     north, east, down = found.velocity_ned_m_s
-    across_m = _receiver_sigma_m(at.gnss, at.gnss.horizontal_accuracy_m, at.gnss.hdop) if at.gnss else None
-    upright_m = _receiver_sigma_m(at.gnss, at.gnss.vertical_accuracy_m, at.gnss.vdop) if at.gnss else None
+    receiver = at.gnss.reported if at.gnss else None
+    across_m = _receiver_sigma_m(receiver, receiver.horizontal_accuracy_m, receiver.hdop) if receiver else None
+    upright_m = _receiver_sigma_m(receiver, receiver.vertical_accuracy_m, receiver.vdop) if receiver else None
     covariance = None
     if across_m is not None and upright_m is not None:
         across = (across_m**2 + across_doubt_m**2) / 2  # of each axis
@@ -418,11 +419,10 @@ def _gimbal(at: Around, vehicle: Quaternion | None) -> tuple[Quaternion | None, 
 def _gnss(at: Around) -> Gnss | None:
     if at.gnss is None:
         return None
-    told = {name: value for name, value in asdict(at.gnss).items() if name not in ("number", "stamp_ns")}
-    return Gnss(**told, age_ms=abs(at.utc_ns - at.gnss.stamp_ns) / 1e6)
+    return replace(at.gnss.reported, age_ms=abs(at.utc_ns - at.gnss.stamp_ns) / 1e6)
 
 
-def _receiver_sigma_m(receiver: GnssSample, accuracy_m: float | None, dilution: float | None) -> float | None:
+def _receiver_sigma_m(receiver: Gnss, accuracy_m: float | None, dilution: float | None) -> float | None:
     """The receiver's own accuracy, else what its dilution of precision suggests."""
     each_m = METRES_PER_DOP.get(receiver.fix_type)
     return accuracy_m or (None if dilution is None or each_m is None else dilution * each_m)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from dappled.decode.geometry import Quaternion, Vector3, from_euler, normalised
+from dappled.decode.geometry import Gnss, Quaternion, Vector3, from_euler, normalised
 from dappled.drivers.mavlink import Message, mavlink
 
 HALF_MS_NS = 500_000  # time_boot_ms is cut to whole milliseconds: the middle is used
@@ -47,17 +47,11 @@ class AttitudeSample:
 
 @dataclass(frozen=True, slots=True)
 class GnssSample:
-    """One GPS_RAW_INT; what the receiver doesn't report is None. Accuracies are one sigma."""
+    """One GPS_RAW_INT, of age 0; what the receiver doesn't report is None."""
 
     number: int
     stamp_ns: int
-    fix_type: int
-    satellites: int | None
-    hdop: float | None
-    vdop: float | None
-    horizontal_accuracy_m: float | None
-    vertical_accuracy_m: float | None
-    velocity_accuracy_m_s: float | None
+    reported: Gnss
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +117,7 @@ def attitude(number: int, stamp_ns: int, message: Message) -> AttitudeSample | N
 
 def gnss(number: int, stamp_ns: int, message: Message) -> GnssSample:
     """A GPS_RAW_INT."""
-    return GnssSample(
-        number,
-        stamp_ns,
+    reported = Gnss(
         int(message.fix_type),
         None if message.satellites_visible == 255 else int(message.satellites_visible),
         _scaled(message.eph, 2**16 - 1, 100),
@@ -133,7 +125,9 @@ def gnss(number: int, stamp_ns: int, message: Message) -> GnssSample:
         _scaled(message.h_acc, 2**32 - 1, 1000),
         _scaled(message.v_acc, 2**32 - 1, 1000),
         _scaled(message.vel_acc, 2**32 - 1, 1000),
+        age_ms=0.0,
     )
+    return GnssSample(number, stamp_ns, reported)
 
 
 def gimbal(number: int, stamp_ns: int, message: Message, epoch: int = 0) -> GimbalSample | None:
