@@ -29,10 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config.settings import PublishSettings, RecordSettings, Settings
-from dappled.daemon.pipeline.memory import reuse_large_blocks
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher
-from dappled.daemon.stream.subscriber import Subscriber
+from dappled.daemon.stream.subscriber import Subscriber, reuse_large_blocks
 from dappled.daemon.stream.wire import Message
 
 SHAPE = (13, 572, 566)

@@ -17,6 +17,8 @@ import pytest
 
 from dappled.drivers.camera import CameraError
 from dappled.drivers.child_process import (
+    CONSOLE_GOES,
+    DECODER_GOES,
     ChannelError,
     MessageSizeError,
     ProcessChannel,
@@ -117,6 +119,20 @@ def test_the_restart_budget_allows_its_limit_in_any_window() -> None:
     assert budget.wait_ns(60 * second) == 0
     budget.spend(60 * second)
     assert budget.wait_ns(61 * second) == 9 * second
+
+
+def test_looking_goes_before_decoding_and_decoding_before_the_rest() -> None:
+    program = (
+        "from dappled.drivers.child_process import *; goes_first({}); print(open('/proc/self/oom_score_adj').read())"
+    )
+    own = int(Path("/proc/self/oom_score_adj").read_text(encoding="ascii"))
+    scores = [own]
+    for score in (DECODER_GOES, CONSOLE_GOES):
+        done = subprocess.run(
+            [sys.executable, "-c", program.format(score)], capture_output=True, text=True, check=True, timeout=60
+        )
+        scores.append(int(done.stdout))
+    assert scores == [own, 500, 800]
 
 
 # --- messages

@@ -8,10 +8,9 @@ from pathlib import Path
 
 from dappled.cli.arguments import seconds, whole
 from dappled.cli.status import stream_endpoint
-from dappled.daemon.pipeline.memory import reuse_large_blocks
 from dappled.daemon.stream import watch
 from dappled.daemon.stream.curve import ClientKeys, KeyFileError, load_own, load_public
-from dappled.daemon.stream.subscriber import Subscriber
+from dappled.daemon.stream.subscriber import Subscriber, reuse_large_blocks
 from dappled.daemon.stream.wire import Message
 from dappled.errors import counted
 

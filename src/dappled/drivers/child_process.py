@@ -26,6 +26,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from dappled.clock import Clock, SystemClock
@@ -41,6 +42,7 @@ _PR_SET_PDEATHSIG = 1
 _REAL_TIME_US = 1_000_000
 _RR_PRIORITY = 1
 NICENESS = -10
+DECODER_GOES, CONSOLE_GOES = 500, 800  # of 1000: looking before decoding, decoding before recording
 _DEAD_S = 0.5
 
 
@@ -310,3 +312,10 @@ def raise_priority() -> None:
     except (PermissionError, ValueError):
         with contextlib.suppress(PermissionError):
             os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+
+
+def goes_first(score: int) -> None:
+    """Let the kernel, when it is short of memory, end this process before those with a lower score (proc(5),
+    oom_score_adj); children inherit it. What the system does not allow stays as it is."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(str(score), encoding="ascii")

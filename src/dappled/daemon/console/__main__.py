@@ -24,8 +24,8 @@ from dappled.daemon.console.feed import Feed, Hub
 from dappled.daemon.console.process import DaemonChannel
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import systemd
-from dappled.daemon.pipeline.memory import CONSOLE_GOES, goes_first, reuse_large_blocks
-from dappled.drivers.child_process import ProcessChannel
+from dappled.daemon.stream.subscriber import reuse_large_blocks
+from dappled.drivers.child_process import CONSOLE_GOES, ProcessChannel, goes_first
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
 

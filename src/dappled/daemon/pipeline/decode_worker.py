@@ -16,14 +16,13 @@ import numpy as np
 from PIL import Image
 
 from dappled.daemon.pipeline.decode_process import NICENESS, serve
-from dappled.daemon.pipeline.memory import DECODER_GOES, goes_first
 from dappled.daemon.stream import wire
 from dappled.decode import DecodeError
 from dappled.decode.depth import RANGING, DepthMap, Ranging, estimate, evidence
 from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield.light_field import slice_mosaic
 from dappled.drivers.camera import Blob
-from dappled.drivers.child_process import ChannelMessage, end_with_parent
+from dappled.drivers.child_process import DECODER_GOES, ChannelMessage, end_with_parent, goes_first
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import sentence
 
