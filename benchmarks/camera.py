@@ -108,7 +108,7 @@ def file_move(repeats: int, place: Path) -> dict[str, Any]:
     clock = SystemClock()
     source = place / "source.cr2"
     source.write_bytes(os.urandom(SIZE))
-    flight = recording.begin(place / "flights", clock.utc_ns, {})
+    flight = recording.begin(place / "flights", clock, {})
     ours: list[float] = []
     plain: list[float] = []
     with (

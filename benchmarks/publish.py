@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.clock import TimeOfDayClock
 from dappled.config.settings import PublishSettings, RecordSettings, Settings
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher
@@ -161,7 +162,7 @@ def hung(root: Path, rounds: int) -> dict[str, float]:
     from dappled.drivers.camera import Blob  # noqa: PLC0415  # the subscribers' processes load none of it
     from dappled.flight import Cause, Shot, recording  # noqa: PLC0415  # as above
 
-    flight = recording.begin(root / "flights", time.time_ns)
+    flight = recording.begin(root / "flights", TimeOfDayClock())
     data = os.urandom(RAW_BYTES)
     times: dict[str, list[float]] = {"alone": [], "crowd": []}
     notes: dict[str, list[float]] = {"alone": [], "crowd": []}

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import sustained
 
+from dappled.clock import TimeOfDayClock
 from dappled.drivers.camera import Blob
 from dappled.flight import Cause, Shot, recording
 
@@ -53,7 +54,7 @@ def measure(root: Path, size: int, rounds: int, pause_s: float) -> dict[str, flo
     discards deleted blocks does so in the next fsync.
     """
     data = os.urandom(size)
-    flight = recording.begin(root, time.time_ns)
+    flight = recording.begin(root, TimeOfDayClock())
     plain: list[int] = []
     durable: list[int] = []
     row, note = [], []

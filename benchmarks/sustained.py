@@ -123,7 +123,7 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
     """Counts, milliseconds and megabytes, as the names say. `lost` counts shots without an intact frame, and frames
     neither decoded nor noted as not decoded. Memory: the growth from the second quarter to the last."""
     clock, notes_ms = SystemClock(), []
-    flight = recording.begin(root, clock.utc_ns, {})
+    flight = recording.begin(root, clock, {})
     camera = SteadyCamera(size)
     shots = PendingShots(camera)
     shutter = Shutter(FlightSink(flight, shots), clock, next_index=0, capacity=1000)

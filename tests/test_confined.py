@@ -15,6 +15,7 @@ import pytest
 
 from dappled import confined
 from dappled.cli import main
+from dappled.clock import RecordedClock
 from dappled.confined import OutsideError
 from dappled.daemon.camera_protocol import camera_status
 from dappled.daemon.replay import replay, runs
@@ -51,7 +52,7 @@ SECRET = b"somebody else's file"
 @pytest.fixture
 def flight(tmp_path: Path) -> Path:
     """A closed flight of two tagged frames and a stray; `victim.txt` stands beside it."""
-    begun = recording.begin(tmp_path / "flights", lambda: START_UTC_NS, {"settings": {}, "names": {}})
+    begun = recording.begin(tmp_path / "flights", RecordedClock(START_UTC_NS), {"settings": {}, "names": {}})
     for index in range(2):
         request(begun, index)
         begun.ledger.add_tag(tag(deliver(begun, index, b"raw %d" % index)))
@@ -169,7 +170,7 @@ def test_check_names_it_and_goes_on(flight: Path, table: str) -> None:
 
 
 def test_check_confines_the_inputs_too(flight: Path) -> None:
-    with Ledger(flight / "flight.sqlite", lambda: START_UTC_NS) as ledger:
+    with Ledger(flight / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
         ledger.set_fact("sha256:../victim.txt", [durable.hash_file(flight.parent / "victim.txt")])
     assert any("names '../victim.txt'" in text for text in check.check(flight).problems)
 
@@ -181,30 +182,30 @@ def test_a_flight_whose_own_parts_are_links_is_refused(flight: Path, tmp_path: P
     with pytest.raises(OutsideError, match=f"{part} is a link"):
         layout.open_folder(flight)
     with pytest.raises(OutsideError, match=f"{part} is a link"):
-        recovery.recover_flight(FlightFolder(flight), lambda: START_UTC_NS)
+        recovery.recover_flight(FlightFolder(flight), RecordedClock(START_UTC_NS))
 
 
 def test_recovery_adopts_no_link_and_removes_nothing_behind_one(tmp_path: Path) -> None:
-    flight = recording.begin(tmp_path / "flights", lambda: START_UTC_NS)
+    flight = recording.begin(tmp_path / "flights", RecordedClock(START_UTC_NS))
     request(flight, 0)
     frames, folder = flight.folder.frames, flight.folder
     flight.close()
     (tmp_path / "victim.cr2").write_bytes(SECRET)
     (tmp_path / ".victim.part").write_bytes(SECRET)
     (frames / "000000.cr2").symlink_to(tmp_path / "victim.cr2")
-    report = recovery.recover_flight(folder, lambda: START_UTC_NS)
+    report = recovery.recover_flight(folder, RecordedClock(START_UTC_NS))
     assert "frames/000000.cr2 is a link: it is not followed, and is the frame of no shot" in report
     (frames / "000000.cr2").unlink()
     frames.rmdir()
     frames.symlink_to(tmp_path)
     with pytest.raises(OutsideError, match="frames is a link"):
-        recovery.recover_flight(folder, lambda: START_UTC_NS)
+        recovery.recover_flight(folder, RecordedClock(START_UTC_NS))
     assert (tmp_path / ".victim.part").read_bytes() == SECRET
 
 
 def test_a_run_s_recipe_names_files_of_the_flight_only(flight: Path) -> None:
     recipe = {"camera": "inputs/spring/cameras/a.toml", "mask": "mask-1", "white": "/etc/hostname"}
-    with Ledger(flight / "flight.sqlite", lambda: START_UTC_NS) as ledger:
+    with Ledger(flight / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
         ledger.set_fact("run:spring", {"recipe": recipe, "names": {"camera": "a", "mask": "b", "law": ""}})
     with pytest.raises(OutsideError, match="names '/etc/hostname'"):
         runs.of_flight(flight, "spring")
@@ -212,7 +213,7 @@ def test_a_run_s_recipe_names_files_of_the_flight_only(flight: Path) -> None:
 
 def test_a_run_s_camera_may_not_lead_out_either(flight: Path) -> None:
     recipe = {"camera": "../victim.toml", "mask": "mask-1"}
-    with Ledger(flight / "flight.sqlite", lambda: START_UTC_NS) as ledger:
+    with Ledger(flight / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
         ledger.set_fact("run:spring", {"recipe": recipe, "names": {"camera": "a", "mask": "b", "law": ""}})
     with pytest.raises(OutsideError, match=r"names '../victim.toml'"):
         runs.of_flight(flight, "spring")

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from dappled.cli import main
+from dappled.clock import RecordedClock
 from dappled.decode.depth.ranging import Ranging
 from dappled.decode.geometry import camera_pose
 from dappled.flight import recording
@@ -123,7 +124,7 @@ def test_points_lie_where_the_flights_own_mount_looks(
     laspy = pytest.importorskip("laspy", reason="LAS is an extra")
     facts = {"settings": {"pose": {"mount": mount.ravel().tolist(), "lever_arm_m": [0.0, 0.0, 2.0]}}}
     level = replace(pose(), latitude_rad=0.72, longitude_rad=-1.6, altitude_msl_m=215.0, attitude=(1.0, 0.0, 0.0, 0.0))
-    begun = recording.begin(tmp_path / "flights", lambda: 1_795_256_103_000_000_000, facts)
+    begun = recording.begin(tmp_path / "flights", RecordedClock(1_795_256_103_000_000_000), facts)
     request(begun, 0)
     begun.ledger.add_tag(replace(tag(deliver(begun, 0, b"a frame")), pose=level))
     begun.close()

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from dappled.cli import main
+from dappled.clock import RecordedClock
 from dappled.flight import recording
 
 
@@ -23,7 +24,7 @@ from dappled.flight import recording
 def test_what_is_for_folders_is_refused_for_a_flight(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flight = recording.begin(tmp_path / "flights", lambda: 1_790_000_000 * 10**9)
+    flight = recording.begin(tmp_path / "flights", RecordedClock(1_790_000_000 * 10**9))
     flight.close()
     assert main(["replay", str(flight.folder.path), *words]) == 1
     err = capsys.readouterr().err

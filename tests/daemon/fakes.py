@@ -260,7 +260,7 @@ def rig(
 ) -> Iterator[Rig]:
     """A street at work on a new flight in `flights`; stopped and closed at the end."""
     clock = SystemClock()
-    flight = recording.begin(flights, clock.utc_ns, {})
+    flight = recording.begin(flights, clock, {})
     writer = LedgerWriter(flight, clock)
     camera = camera or FakeCamera(script)
     decoder = FakeDecoder() if decode else None

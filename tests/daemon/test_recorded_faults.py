@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.daemon.navigation import BodyLatency, Telemetry, clocks
 from dappled.daemon.pipeline import tagging
 from dappled.daemon.pipeline.tagging import FrameSettings
@@ -47,7 +48,7 @@ def with_a_reboot() -> Packets:
 
 def fly(flights: Path, packets: Packets, exposures_s: list[float]) -> Path:
     """Record what the daemon would: every packet, and a frame for each trigger call, tagged 0.4 s afterwards."""
-    begun = recording.begin(flights, lambda: START_NS)
+    begun = recording.begin(flights, RecordedClock(START_NS))
     decode = PacketParser()
     telemetry, waiting = Telemetry(), list(enumerate(exposures_s))
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.flight import Recording, recording
 
 
@@ -19,7 +20,7 @@ def flights(tmp_path: Path) -> Path:
 @pytest.fixture
 def flight(flights: Path) -> Iterator[Recording]:
     """A flight being recorded; closed at the end if the test did not."""
-    begun = recording.begin(flights, lambda: START_UTC_NS, {"camera": {"driver": "none"}})
+    begun = recording.begin(flights, RecordedClock(START_UTC_NS), {"camera": {"driver": "none"}})
     yield begun
     if not begun.closed:
         begun.close()

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.flight import FlightFolder, Frame, Ledger, LedgerReader, Recording, Result, Stray
 from dappled.flight.check import check
 from dappled.flight.tables import KEYS
@@ -161,7 +162,7 @@ def test_a_link_that_does_not_follow_is_named_once(recorded: FlightFolder) -> No
 
 
 def test_rows_of_a_transaction_that_failed_leave_no_link(tmp_path: Path) -> None:
-    with Ledger(tmp_path / "flight.sqlite", lambda: 77) as ledger:
+    with Ledger(tmp_path / "flight.sqlite", RecordedClock(77)) as ledger:
         ledger.add_event("camera", "it is ready")
         before = ledger.last_link()
         with pytest.raises(Exception, match="never requested"):
@@ -189,7 +190,7 @@ def test_a_flight_without_a_chain_says_what_is_not_vouched_for(recorded: FlightF
 
 def test_later_work_on_a_flight_without_a_chain_begins_one(recorded: FlightFolder) -> None:
     without_chain(recorded)
-    with Ledger(recorded.ledger, lambda: 78) as ledger:
+    with Ledger(recorded.ledger, RecordedClock(78)) as ledger:
         ledger.add_event("tagged late", "as told")
     with LedgerReader.open(recorded.ledger) as reader:
         assert reader.facts()["chain"]["rows_before"] > 20

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.flight import FlightError, Frame, Recording, durable, layout, recording
 from dappled.flight.check import check
 from tests.flight.conftest import START_UTC_NS
@@ -27,7 +28,7 @@ MB = 1_000_000
 
 def whole(flights: Path, safe: dict[int, str]) -> None:
     """The next flight begins, every acknowledged frame is there byte for byte, and all flights are in order."""
-    after = recording.begin(flights, lambda: LATER_UTC_NS)
+    after = recording.begin(flights, RecordedClock(LATER_UTC_NS))
     try:
         for index, sha256 in safe.items():
             entry = after.index.lookup(index)
@@ -45,6 +46,7 @@ def whole(flights: Path, safe: dict[int, str]) -> None:
 IN_NAMESPACE = """
 import json, os, subprocess, sys
 from pathlib import Path
+from dappled.clock import RecordedClock
 from dappled.flight import recording
 from dappled.flight.check import check
 from dappled.flight.errors import FlightError
@@ -52,7 +54,7 @@ from tests.flight.makers import deliver, request
 mount = lambda *words: subprocess.run(["mount", *words], check=True)
 disk = Path(sys.argv[1])
 mount("-t", "tmpfs", "-o", "size=8m", "dappled", str(disk))
-flight = recording.begin(disk / "flights", lambda: 1795256103000000000)
+flight = recording.begin(disk / "flights", RecordedClock(1795256103000000000))
 told, safe = [], []
 def shoot(index, size=2_500_000):
     request(flight, index)
@@ -178,7 +180,7 @@ def ext4(tmp_path: Path) -> Iterator[Image]:
 def test_a_disk_that_the_kernel_makes_read_only(ext4: Image) -> None:
     """The journal, the ledger and the frames are refused, each in a sentence; what was safe is there after a repair."""
     flights = ext4.mounted / "flights"
-    flight = recording.begin(flights, lambda: START_UTC_NS)
+    flight = recording.begin(flights, RecordedClock(START_UTC_NS))
     request(flight, 0)
     safe = {0: deliver(flight, 0, os.urandom(MB)).sha256}
     request(flight, 1)
@@ -214,7 +216,7 @@ def test_a_power_cut_on_a_real_file_system(ext4: Image, tmp_path: Path, monkeypa
 
     for name in ("fsync", "rename", "sendfile"):
         monkeypatch.setattr(os, name, partial(watched, getattr(os, name)))
-    flight = recording.begin(ext4.mounted / "flights", lambda: START_UTC_NS)
+    flight = recording.begin(ext4.mounted / "flights", RecordedClock(START_UTC_NS))
     for index in range(2):
         request(flight, index)
         cut()
@@ -239,7 +241,7 @@ def test_a_power_cut_on_a_real_file_system(ext4: Image, tmp_path: Path, monkeypa
 @pytest.fixture
 def flown(flights: Path) -> Recording:
     """A closed flight of six frames."""
-    flight = recording.begin(flights, lambda: START_UTC_NS)
+    flight = recording.begin(flights, RecordedClock(START_UTC_NS))
     for index in range(6):
         request(flight, index)
         flight.ledger.add_tag(tag(deliver(flight, index, b"raw %d" % index)))
@@ -267,7 +269,7 @@ def test_a_corrupted_page_of_a_closed_ledger_is_found_and_harms_no_frame(flights
         spoil(flown.folder.ledger, page)
         report = check(flown.folder.path)
         assert not report.intact, f"page {page}"
-        after = recording.begin(flights, lambda: LATER_UTC_NS)
+        after = recording.begin(flights, RecordedClock(LATER_UTC_NS))
         assert after.next_index == 6
         entry = after.index.lookup(3)
         assert entry is not None
@@ -278,7 +280,7 @@ def test_a_corrupted_page_of_a_closed_ledger_is_found_and_harms_no_frame(flights
 
 def test_a_corrupted_ledger_of_a_crashed_flight_is_made_anew(flights: Path) -> None:
     """Frames and journal say what the ledger can't any more; the damaged file stays beside them."""
-    flight = recording.begin(flights, lambda: START_UTC_NS)
+    flight = recording.begin(flights, RecordedClock(START_UTC_NS))
     frames: list[Frame] = []
     for index in range(6):
         request(flight, index)
@@ -291,7 +293,7 @@ def test_a_corrupted_ledger_of_a_crashed_flight_is_made_anew(flights: Path) -> N
     index_file.close()
     for page in range(pages(flight.folder.ledger)):
         spoil(flight.folder.ledger, page)
-    after = recording.begin(flights, lambda: LATER_UTC_NS)
+    after = recording.begin(flights, RecordedClock(LATER_UTC_NS))
     told = "\n".join(after.recovered)
     assert f"flight {name}: the ledger was damaged" in told
     assert "flight.sqlite.damaged" in told

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
+from dappled.clock import RecordedClock
 from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Result, ShotRow, ShotState, Stray
 from dappled.flight.ledger import IllegalTransitionError, advance
 from dappled.flight.stored_rows import ledger_damage
@@ -20,7 +21,7 @@ from tests.flight.makers import shot, tag
 
 
 def ledger_at(path: Path) -> Ledger:
-    return Ledger(path, lambda: 77)
+    return Ledger(path, RecordedClock(77))
 
 
 def frame(index: int) -> Frame:

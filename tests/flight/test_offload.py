@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from dappled.cli import main
+from dappled.clock import RecordedClock
 from dappled.flight import FlightError, Ledger, Recording, durable, layout, offload
 from dappled.flight.check import check
 from tests.flight.conftest import START_UTC_NS
@@ -45,7 +46,7 @@ def test_pruning_is_refused_before_anything_is_done(closed: Path, tmp_path: Path
 
 
 def test_a_flight_pruned_by_an_earlier_version_is_not_copied_again(closed: Path, tmp_path: Path) -> None:
-    with Ledger(closed / "flight.sqlite", lambda: START_UTC_NS) as ledger:
+    with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
         ledger.set_fact("offloaded", {"destination": "/media/disk", "utc_ns": START_UTC_NS, "files": 2})
     for name in os.listdir(closed / "frames"):
         os.unlink(closed / "frames" / name)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.flight import durable, layout, recording
 from dappled.flight.check import check
 from tests.flight.lossy_disk import Call, Left, LossyDisk, listing, record
@@ -23,9 +24,10 @@ FRAME_BYTES = 20_000
 FLIGHT = """
 import os, sys, time
 from pathlib import Path
+from dappled.clock import RecordedClock
 from dappled.flight import recording
 from tests.flight.makers import deliver, mavlink_2, shot, tag
-flight = recording.begin(Path(sys.argv[1]), lambda: 1795256103000000000)
+flight = recording.begin(Path(sys.argv[1]), RecordedClock(1795256103000000000))
 for index in range(flight.next_index, flight.next_index + 3):
     flight.journal.note(shot(index))
     os.write(1, b"noted %d" % index)
@@ -105,7 +107,7 @@ def states(calls: list[Call], flights: Path, target: Path, ways: list[tuple[Left
 
 def put_in_order(flights: Path, told: Told) -> None:
     """The next flight begins on what is left; nothing acknowledged is lost, and every flight is whole."""
-    after = recording.begin(flights, lambda: 1_795_256_104_000_000_000)
+    after = recording.begin(flights, RecordedClock(1_795_256_104_000_000_000))
     try:
         assert after.next_index > max(told.noted, default=-1)
         for index in told.noted:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Recording, Stray, durable
 from dappled.flight.check import check
 from dappled.flight.recording import StrayFileError
@@ -180,9 +181,10 @@ def test_the_blob_stays_open_and_its_offset_stays(flight: Recording) -> None:
 WRITER = """
 import sys, itertools
 from pathlib import Path
+from dappled.clock import RecordedClock
 from dappled.flight import recording
 from tests.flight.makers import deliver, mavlink_2, shot
-flight = recording.begin(Path(sys.argv[1]), lambda: 1795256103000000000)
+flight = recording.begin(Path(sys.argv[1]), RecordedClock(1795256103000000000))
 for index in itertools.count(flight.next_index):
     flight.journal.note(shot(index))
     print("noted", index, flush=True)
@@ -220,7 +222,7 @@ def test_kill_9_loses_nothing_that_was_acknowledged(flights: Path, seed: int, co
     from dappled.flight import layout, recording  # noqa: PLC0415  only what the check afterwards needs
 
     said = [line for moment in some_moments(seed, count) for line in killed_after(flights, *moment)]
-    ended = recording.begin(flights, lambda: 1_795_256_104_000_000_000)
+    ended = recording.begin(flights, RecordedClock(1_795_256_104_000_000_000))
     indices = [int(line[1]) for line in said if line[0] == "noted"]
     assert indices == sorted(set(indices))
     assert ended.next_index > max(indices)

@@ -12,6 +12,7 @@ from types import ModuleType
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.flight import (
     FlightError,
     ImageIndex,
@@ -43,7 +44,7 @@ def crash(flight: Recording) -> None:
 
 
 def begin_later(flights: Path) -> Recording:
-    return recording.begin(flights, lambda: LATER_UTC_NS)
+    return recording.begin(flights, RecordedClock(LATER_UTC_NS))
 
 
 def test_a_flight_from_first_to_last(flights: Path, flight: Recording) -> None:
@@ -127,7 +128,7 @@ def test_a_crash_is_put_in_order_before_the_next_flight(flights: Path, flight: R
         assert [frame.name for frame in ledger.frames()] == ["frames/000000.cr2", "frames/000001.cr2"]
         assert [stray.name for stray in ledger.strays()] == ["frames/000007.cr2"]
     assert check(flight.folder.path).problems == ()
-    again = recovery.recover_flight(flight.folder, lambda: LATER_UTC_NS)
+    again = recovery.recover_flight(flight.folder, RecordedClock(LATER_UTC_NS))
     assert again == [f"the last line of {flight.folder.journal} is torn (8 bytes)"]
     second.close()
     third = begin_later(flights)
@@ -238,7 +239,8 @@ def test_two_daemons_in_one_folder(flights: Path, flight: Recording) -> None:
         begin_later(flights)
     assert layout.is_locked(flights)
     code = (
-        f"from dappled.flight import recording; from pathlib import Path; recording.begin(Path({str(flights)!r}), int)"
+        "from dappled.clock import SystemClock; from dappled.flight import recording; from pathlib import Path; "
+        f"recording.begin(Path({str(flights)!r}), SystemClock())"
     )
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
     assert "another dappled" in other.stderr
@@ -258,7 +260,7 @@ def test_a_beginning_that_fails_leaves_no_lock_no_flight_and_no_thread(
     monkeypatch.setattr(*at, refuse)
     threads = set(threading.enumerate())
     with pytest.raises(FlightError, match="no"):
-        recording.begin(flights, lambda: START_UTC_NS)
+        recording.begin(flights, RecordedClock(START_UTC_NS))
     assert not layout.is_locked(flights)
     assert layout.flights(flights) == []
     assert set(threading.enumerate()) <= threads
@@ -267,7 +269,7 @@ def test_a_beginning_that_fails_leaves_no_lock_no_flight_and_no_thread(
 def test_a_file_in_place_of_the_flights_folder_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(FlightError, match=r"not a folder|in the way"):
-        recording.begin(tmp_path / "file", lambda: START_UTC_NS)
+        recording.begin(tmp_path / "file", RecordedClock(START_UTC_NS))
 
 
 def test_strays_are_told_apart_from_what_is_adopted(flights: Path, flight: Recording) -> None:
@@ -282,7 +284,7 @@ def test_strays_are_told_apart_from_what_is_adopted(flights: Path, flight: Recor
 
 def test_a_flight_without_utc_is_named_by_boot_and_put_right_later(flights: Path) -> None:
     uptime_ns = 60 * 10**9  # this machine thinks that it is 1970
-    flight = recording.begin(flights, lambda: uptime_ns, utc_known=False)
+    flight = recording.begin(flights, RecordedClock(uptime_ns), utc_known=False)
     name = flight.folder.name
     assert name.startswith("boot")
     request(flight, 0)
@@ -309,7 +311,7 @@ def test_a_flight_without_utc_is_named_by_boot_and_put_right_later(flights: Path
 
 
 def test_a_flight_that_never_learnt_utc_says_so(flights: Path) -> None:
-    flight = recording.begin(flights, lambda: 5, utc_known=False)
+    flight = recording.begin(flights, RecordedClock(5), utc_known=False)
     flight.close()
     assert flight_report.balance(flight.folder.path).began_utc_ns is None
     assert flight_report.show(flight.folder.path).utc_correction_ns is None
@@ -321,7 +323,7 @@ def test_flights_stand_in_the_order_they_were_flown_when_the_clock_was_stepped(f
     """The image index goes on, and the last flight is the last one flown."""
     names = []
     for number in range(3):
-        begun = recording.begin(flights, lambda step=number: START_UTC_NS + step * step_s * 10**9)  # type: ignore[misc]  # bound now
+        begun = recording.begin(flights, RecordedClock(START_UTC_NS + number * step_s * 10**9))
         request(begun, begun.next_index)
         deliver(begun, begun.next_index, b"raw")
         begun.close()

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.decode.geometry import Pose
 from dappled.flight import LedgerReader, Tag, recording
 from dappled.flight.tables import SCHEMA
@@ -24,7 +25,7 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "flight-data.md"
 @pytest.fixture
 def flight(flights: Path) -> Path:
     """Two frames, of which one has a position; and a failed shot."""
-    begun = recording.begin(flights, lambda: START_UTC_NS)
+    begun = recording.begin(flights, RecordedClock(START_UTC_NS))
     for index in range(3):
         request(begun, index)
     known = tag(deliver(begun, 0, b"raw 0"))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from dappled.clock import RecordedClock
 from dappled.decode.geometry import Pose, Quaternion, camera_pose, metres_per_radian
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.flight import Tag, recording
@@ -76,7 +77,7 @@ def fly(
         camera = replace(camera, sensor=replace(camera.sensor, shot_noise=False, read_noise_e=0.0))
     scene = camera.scene
     assert isinstance(scene, TerrainScene)
-    begun = recording.begin(folder / "flights", lambda: START_NS)
+    begun = recording.begin(folder / "flights", RecordedClock(START_NS))
     truths = []
     for index, time_s in enumerate(times_s):
         exposure = camera.expose(time_s, index, f_number=F_NUMBER)

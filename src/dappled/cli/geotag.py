@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from dappled.clock import TimeOfDayClock
 from dappled.daemon.replay import late_tags
 from dappled.decode.geometry import camera_pose
 from dappled.errors import DappledError, counted
@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _tag_late(flight: Path) -> list[int]:
     """Tag the frames that a crash left untagged. If that fails, print why, and go on with the others."""
     try:
-        added = late_tags.add_missing(flight, time.time_ns)
+        added = late_tags.add_missing(flight, TimeOfDayClock())
     except DappledError as error:
         print(f"frames without a tag stay without one: {error}", file=sys.stderr)
         return []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from datetime import UTC, datetime
@@ -13,6 +12,7 @@ from typing import Any
 
 from dappled.cli.arguments import positive, seconds
 from dappled.cli.terminal import frame_json, frame_line
+from dappled.clock import TimeOfDayClock
 from dappled.config import settings as configuration
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline import recipes
@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
         keep = None
         if is_flight and recipe and (arguments.run_name or _changed(arguments)) and not arguments.verify:
             name = arguments.run_name or datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-            results = stack.enter_context(RunWriter(arguments.flight, Run(name, recipe, names), time.time_ns))
+            results = stack.enter_context(RunWriter(arguments.flight, Run(name, recipe, names), TimeOfDayClock()))
             recipe, keep = results.run.recipe, results.decoded
             print(f"storing the results beside the old ones, as run {name}", file=sys.stderr)
         writer = replay.verifier(recording, keep)

@@ -140,7 +140,7 @@ class Service:
             "decode_in_flight": recipe is not None,
         }
         directory = Path(settings.record.directory)
-        self._recording = flights.begin(directory, clock.utc_ns, facts, utc_known=self._utc_known)
+        self._recording = flights.begin(directory, clock, facts, utc_known=self._utc_known)
         stack.callback(self._remove_unused_flight)
         stack.callback(_close, self._recording)
         stack.callback(self._links.stop)  # before the recording closes: packets are logged there

@@ -16,6 +16,7 @@ from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
+from dappled.clock import Clock
 from dappled.decode.geometry import Gnss, Pose
 from dappled.flight import chain
 from dappled.flight.chain import ChainLink, Column, canonical, digest
@@ -244,9 +245,9 @@ class LedgerReader(Database):
 class Ledger(LedgerReader):
     """Write a ledger. Every method is one short transaction, durable when it returns, and may raise FlightError."""
 
-    def __init__(self, path: Path, utc_ns: Callable[[], int]) -> None:
-        """Open a flight's ledger, or make it. `utc_ns` stamps the events."""
-        self._utc_ns = utc_ns
+    def __init__(self, path: Path, clock: Clock) -> None:
+        """Open a flight's ledger, or make it. `clock` stamps the events."""
+        self._clock = clock
         self._written: dict[tuple[str, tuple[Column, ...]], None] = {}  # (table, key) of rows that need a link
         super().__init__(path, uri=f"{path.absolute().as_uri()}?mode=rwc", create=True)
         try:
@@ -345,7 +346,7 @@ class Ledger(LedgerReader):
         self._insert("facts", (key,), key, canonical(value).decode())
 
     def _event(self, kind: str, text: str, index: int | None) -> None:
-        values = (self._utc_ns(), kind, index, text)
+        values = (self._clock.utc_ns(), kind, index, text)
         row = self._db.execute("INSERT INTO events (utc_ns, kind, idx, text) VALUES (?, ?, ?, ?)", values)
         self._written["events", (row.lastrowid,)] = None
 

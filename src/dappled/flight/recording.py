@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
+from dappled.clock import Clock
 from dappled.flight import durable, layout, provenance, recovery
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.index import ImageIndex, IndexEntry, open_or_rebuild
@@ -137,7 +138,7 @@ class Recording:
     next_index: int
     recovered: tuple[str, ...]
     _lock: FlightsLock
-    _utc_ns: Callable[[], int]
+    _clock: Clock
     _ended: threading.Event = field(default_factory=threading.Event)
 
     @property
@@ -183,18 +184,16 @@ class Recording:
             self.journal.close()
             telemetry = self.telemetry.close()
             report = [text for text in (self.journal.problem, self.telemetry.problem) if text is not None]
-            recovery.close_ledger(self.folder, self.ledger, self._utc_ns(), telemetry, report)
-            report += recovery.recover_flight(self.folder, self._utc_ns)
+            recovery.close_ledger(self.folder, self.ledger, self._clock.utc_ns(), telemetry, report)
+            report += recovery.recover_flight(self.folder, self._clock)
             report += self.index.take_in(self.folder, seal=True)
         return report
 
 
-def begin(
-    root: Path, utc_ns: Callable[[], int], facts: Mapping[str, Any] | None = None, *, utc_known: bool = True
-) -> Recording:
+def begin(root: Path, clock: Clock, facts: Mapping[str, Any] | None = None, *, utc_known: bool = True) -> Recording:
     """Lock the flights folder, repair earlier flights, and begin a new one.
 
-    `utc_ns` stamps the events. `facts` goes to flight.toml. With `utc_known` False, `utc_ns` counts from an arbitrary
+    `clock` stamps the events. `facts` goes to flight.toml. With `utc_known` False, its UTC counts from an arbitrary
     time, the flight is named by boot, and `learn_utc` may give the correction later. Raises FlightError when another
     daemon records there, or the disk refuses.
     """
@@ -203,13 +202,13 @@ def begin(
         stack.callback(lock.close)
         index, recovered = open_or_rebuild(root)
         stack.callback(index.close)
-        recovered += recovery.recover(root, index, utc_ns)
+        recovered += recovery.recover(root, index, clock)
         next_index = index.next_index()
-        began_utc_ns = utc_ns()
+        began_utc_ns = clock.utc_ns()
         start_utc_ns = began_utc_ns if utc_known else None
         folder = layout.create(root, start_utc_ns, facts)
         stack.callback(shutil.rmtree, folder.path, ignore_errors=True)  # a flight that could not begin
-        ledger = Ledger(folder.ledger, utc_ns)
+        ledger = Ledger(folder.ledger, clock)
         stack.callback(ledger.close)
         ledger.set_fact("began_utc_ns", began_utc_ns)
         ledger.set_fact("utc_known", utc_known)
@@ -224,7 +223,7 @@ def begin(
             ledger.add_event("recovery", text)
         recorder = Recorder(folder, ledger)
         opened = Recording(
-            folder, journal, ledger, recorder, telemetry, index, next_index, tuple(recovered), lock, utc_ns
+            folder, journal, ledger, recorder, telemetry, index, next_index, tuple(recovered), lock, clock
         )
         stack.pop_all()
     return opened

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
+from dappled.clock import Clock
 from dappled.errors import DappledError
 from dappled.flight import durable, layout, logs
 from dappled.flight.errors import disk_error
@@ -27,7 +27,7 @@ _JPEG = (".jpg", ".jpeg")
 LOST = "the recording ended before its file came"
 
 
-def recover(root: Path, index: ImageIndex, utc_ns: Callable[[], int]) -> list[str]:
+def recover(root: Path, index: ImageIndex, clock: Clock) -> list[str]:
     """Repair all flights that were not closed, and index them. The caller holds the flights' lock.
 
     A flight that can't be repaired is reported and left as it is; the next flight can begin all the same. Returns
@@ -42,21 +42,21 @@ def recover(root: Path, index: ImageIndex, utc_ns: Callable[[], int]) -> list[st
         if folder.name in sealed:
             continue
         try:
-            report += [f"flight {folder.name}: {text}" for text in recover_flight(folder, utc_ns)]
+            report += [f"flight {folder.name}: {text}" for text in recover_flight(folder, clock)]
             report += index.take_in(folder, seal=True)
         except (DappledError, OSError) as error:
             report.append(f"flight {folder.name} could not be put in order: {error}")
     return report
 
 
-def recover_flight(folder: FlightFolder, utc_ns: Callable[[], int]) -> list[str]:
+def recover_flight(folder: FlightFolder, clock: Clock) -> list[str]:
     """Repair one flight and close it; a second call finds nothing to do. Returns sentences.
 
     Raises FlightError or OSError when ledger or disk don't allow it, OutsideError when a part of it is a link.
     """
     folder.refuse_links()
     report = _remove_parts(folder) + _move_damaged_ledger(folder)
-    with Ledger(folder.ledger, utc_ns) as ledger:
+    with Ledger(folder.ledger, clock) as ledger:
         report += _add_noted_shots(folder, ledger)
         report += _adopt(folder, ledger)
         for row in ledger.shots():
@@ -64,7 +64,7 @@ def recover_flight(folder: FlightFolder, utc_ns: Callable[[], int]) -> list[str]
                 ledger.failed(row.shot.index, f"shot {row.shot.index} is lost: {LOST}")
                 report.append(f"shot {row.shot.index} was {row.state}, and is lost: {LOST}")
         if "closed_utc_ns" not in ledger.facts():
-            close_ledger(folder, ledger, utc_ns(), None, report)
+            close_ledger(folder, ledger, clock.utc_ns(), None, report)
             report.append("it was not closed; it is now")
         for text in report:
             ledger.add_event("recovery", text)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from dappled.cli import main
+from dappled.clock import RecordedClock
 from dappled.flight import Recording, Result, recording
 from tests.flight.makers import deliver, flip, request, tag
 
@@ -18,7 +19,7 @@ START_UTC_NS = 1_795_256_103_000_000_000  # 2026-11-21T10:15:03Z
 
 def fly(flights: Path) -> Recording:
     """Shot 0 safe, tagged and decoded, shot 1 failed."""
-    begun = recording.begin(flights, lambda: START_UTC_NS, {"camera": {"driver": "none"}})
+    begun = recording.begin(flights, RecordedClock(START_UTC_NS), {"camera": {"driver": "none"}})
     for index in range(2):
         request(begun, index)
     begun.ledger.add_tag(tag(deliver(begun, 0, bytes(2_000_000))))

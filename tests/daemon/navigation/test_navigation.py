@@ -38,7 +38,7 @@ class TurningClock:
 )
 def test_without_telemetry_the_wait_is_bounded(tmp_path: Path, ahead_ns: int, waited_ns: int) -> None:
     clock, settings = TurningClock(), Settings(pose=PoseSettings(wait_ms=300.0))
-    flight = recording.begin(tmp_path, clock.utc_ns, {})
+    flight = recording.begin(tmp_path, clock, {})
     try:
         navigation = Navigation(LiveSettings(settings), clock, flight, utc_known=True)
         exposure = ExposureTime(NOW_NS + ahead_ns, 10**6, "test")

@@ -85,7 +85,7 @@ def test_following_the_vehicle_that_is_followed_already_forgets_nothing() -> Non
 def test_a_change_of_vehicle_that_could_not_be_recorded_is_recorded_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flight = recording.begin(tmp_path, SystemClock().utc_ns)
+    flight = recording.begin(tmp_path, SystemClock())
     navigation = Navigation(LiveSettings(Settings()), SystemClock(), flight, utc_known=True)
 
     def full(key: str, value: object) -> None:

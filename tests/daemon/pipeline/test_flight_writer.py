@@ -30,7 +30,7 @@ def recorded(writer: LedgerWriter, index: int | None, data: bytes = DATA) -> Fra
 
 
 def test_a_shot_is_entered_fired_and_recorded(tmp_path: Path) -> None:
-    flight = recording.begin(tmp_path, SystemClock().utc_ns)
+    flight = recording.begin(tmp_path, SystemClock())
     writer = LedgerWriter(flight, SystemClock())
     flight.journal.note(SHOT)
     writer.requested(SHOT)
@@ -50,7 +50,7 @@ def test_a_shot_is_entered_fired_and_recorded(tmp_path: Path) -> None:
 def test_a_frame_is_safe_even_when_the_index_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    flight = recording.begin(tmp_path, SystemClock().utc_ns)
+    flight = recording.begin(tmp_path, SystemClock())
     writer = LedgerWriter(flight, SystemClock())
     flight.journal.note(SHOT)
     writer.requested(SHOT)
@@ -66,7 +66,7 @@ def test_a_frame_is_safe_even_when_the_index_is_not(
 
 
 def test_a_file_without_a_shot_is_kept_and_told(tmp_path: Path) -> None:
-    flight = recording.begin(tmp_path, SystemClock().utc_ns)
+    flight = recording.begin(tmp_path, SystemClock())
     writer = LedgerWriter(flight, SystemClock())
     with pytest.raises(DappledError, match="stray"):
         recorded(writer, None)

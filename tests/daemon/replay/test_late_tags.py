@@ -7,13 +7,13 @@ import math
 import shutil
 import tempfile
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from dappled.cli import main
+from dappled.clock import TimeOfDayClock
 from dappled.config import settings as configuration
 from dappled.config.settings import MavlinkSettings, PoseSettings, PublishSettings, RecordSettings, Settings
 from dappled.daemon import service as module
@@ -93,7 +93,7 @@ def tags(flight: Path) -> list[int]:
 def test_a_frame_that_a_kill_left_untagged_is_tagged_by_geotag(
     killed: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recovery.recover_flight(layout.open_folder(killed), time.time_ns)
+    recovery.recover_flight(layout.open_folder(killed), TimeOfDayClock())
     assert tags(killed) == [0]
     assert main(["geotag", str(killed), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -114,7 +114,7 @@ def test_without_the_ledger_s_times_the_wish_s_time_stands(killed: Path, capsys:
     for suffix in ("-wal", "-shm"):
         (killed / f"flight.sqlite{suffix}").unlink(missing_ok=True)
     (killed / "flight.sqlite").write_bytes(b"rotten" * 1000)
-    recovery.recover_flight(layout.open_folder(killed), time.time_ns)
+    recovery.recover_flight(layout.open_folder(killed), TimeOfDayClock())
     assert tags(killed) == []
     assert main(["geotag", str(killed)]) == 0
     assert "tagged 2 frames that the recording had left without a tag" in capsys.readouterr().err
@@ -124,7 +124,7 @@ def test_without_the_ledger_s_times_the_wish_s_time_stands(killed: Path, capsys:
 
 
 def test_while_a_daemon_records_there_nothing_is_tagged(killed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recovery.recover_flight(layout.open_folder(killed), time.time_ns)
+    recovery.recover_flight(layout.open_folder(killed), TimeOfDayClock())
     with FlightsLock(killed.parent):
         assert main(["geotag", str(killed)]) == 0
     assert "frames without a tag stay without one: another dappled" in capsys.readouterr().err

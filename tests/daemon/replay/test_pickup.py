@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.daemon.replay import pickup
 from dappled.daemon.replay.pickup import Choice, PickupError
 from dappled.drivers.wired.ptp_source import PtpSource
@@ -17,7 +18,7 @@ from tests.flight.makers import request, shot
 
 def test_a_file_is_no_frame_of_a_shot_that_never_fired(tmp_path: Path) -> None:
     """Shot 0 was fired and its file stayed at the camera; shot 1 found no camera."""
-    flight = recording.begin(tmp_path / "flights", lambda: START_UTC_NS)
+    flight = recording.begin(tmp_path / "flights", RecordedClock(START_UTC_NS))
     request(flight, 0)
     flight.journal.note(shot(1))
     flight.ledger.add_shot(shot(1))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.replay import runs
 from dappled.daemon.replay.runs import Run, RunWriter
@@ -25,7 +26,7 @@ NAMES = Names("reference-36mm", "reference-5x5", "geometric")
 @pytest.fixture
 def flight(tmp_path: Path) -> Iterator[Recording]:
     """One decoded frame."""
-    begun = recording.begin(tmp_path / "flights", lambda: 10**18)
+    begun = recording.begin(tmp_path / "flights", RecordedClock(10**18))
     request(begun, 0)
     begun.ledger.add_tag(tag(deliver(begun, 0, b"raw")))
     begun.ledger.add_result(RESULT)
@@ -44,7 +45,7 @@ def recipe(tmp_path: Path) -> Recipe:
 def test_a_run_stands_beside_the_flight_and_can_be_had_again(flight: Recording, recipe: Recipe, tmp_path: Path) -> None:
     flight.close()
     folder = flight.folder.path
-    with RunWriter(folder, Run("second", recipe, NAMES), lambda: 5) as writer:
+    with RunWriter(folder, Run("second", recipe, NAMES), RecordedClock(5)) as writer:
         writer.decoded(replace(RESULT, slices_sha256="b" * 64))
         assert writer.run.recipe.white == str(folder / "inputs" / "second" / "white.npy")
     with LedgerReader.open(flight.folder.ledger) as ledger:
@@ -65,19 +66,19 @@ def test_a_run_stands_beside_the_flight_and_can_be_had_again(flight: Recording, 
 
 def test_a_run_replaces_nothing(flight: Recording, recipe: Recipe) -> None:
     flight.close()
-    with RunWriter(flight.folder.path, Run("second", recipe, NAMES), lambda: 5):
+    with RunWriter(flight.folder.path, Run("second", recipe, NAMES), RecordedClock(5)):
         pass
     with pytest.raises(DappledError, match="has a run 'second' already"):
-        RunWriter(flight.folder.path, Run("second", recipe, NAMES), lambda: 5)
+        RunWriter(flight.folder.path, Run("second", recipe, NAMES), RecordedClock(5))
 
 
 @pytest.mark.parametrize("name", ["live", "", "../x", "a b", "-x"])
 def test_a_name_that_is_none(flight: Recording, recipe: Recipe, name: str) -> None:
     flight.close()
     with pytest.raises(DappledError, match="can't name a run"):
-        RunWriter(flight.folder.path, Run(name, recipe, NAMES), lambda: 5)
+        RunWriter(flight.folder.path, Run(name, recipe, NAMES), RecordedClock(5))
 
 
 def test_a_flight_that_is_still_recorded_gets_no_run(flight: Recording, recipe: Recipe) -> None:
     with pytest.raises(DappledError, match="still being recorded"):
-        RunWriter(flight.folder.path, Run("second", recipe, NAMES), lambda: 5)
+        RunWriter(flight.folder.path, Run("second", recipe, NAMES), RecordedClock(5))

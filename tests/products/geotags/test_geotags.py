@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from dappled.cli import main
+from dappled.clock import RecordedClock
 from dappled.decode.geometry import Gnss, Pose, camera_pose, from_euler
 from dappled.decode.geometry.camera_pose import FORWARD, NADIR, Angles
 from dappled.drivers.raw.raw_file import read_exif
@@ -39,7 +40,7 @@ START_NS = 1_795_256_103_000_000_000
 @pytest.fixture
 def flight(tmp_path: Path) -> Path:
     """Three frames: one with a pose, one without a position, one without a tag."""
-    begun = recording.begin(tmp_path / "flights", lambda: START_NS)
+    begun = recording.begin(tmp_path / "flights", RecordedClock(START_NS))
     for index in range(3):
         request(begun, index)
         frame = deliver(begun, index, b"raw %d" % index)
@@ -132,7 +133,7 @@ def rtk(**changed: Any) -> Pose:
 
 
 def one_frame(root: Path, frame: bytes, name: str, where: Pose, *, utc_known: bool = True) -> Path:
-    begun = recording.begin(root / "flights", lambda: START_NS, utc_known=utc_known)
+    begun = recording.begin(root / "flights", RecordedClock(START_NS), utc_known=utc_known)
     request(begun, 0)
     begun.ledger.add_tag(replace(tag(deliver(begun, 0, frame, name)), pose=where, utc_ns=START_NS + 123_456_789))
     if not utc_known:

@@ -16,6 +16,7 @@ import rasterio
 from numpy.typing import NDArray
 
 from dappled.cli import main
+from dappled.clock import RecordedClock
 from dappled.config.profiles import CameraProfile
 from dappled.decode.geometry import camera_pose, from_euler
 from dappled.decode.lightfield.light_field import LightField
@@ -163,7 +164,7 @@ def misplaced_m(flight: Flown, made: Survey, one: Photograph, truth: Truth) -> N
 @pytest.fixture
 def later_flight(short_flight: Flown, tmp_path: Path) -> Path:
     """The first frame alone, as frame 7 of another flight: numbers go on over flights."""
-    begun = recording.begin(tmp_path / "later", lambda: flown.START_NS)
+    begun = recording.begin(tmp_path / "later", RecordedClock(flown.START_NS))
     raw = sorted((short_flight.folder / "frames").iterdir())[0].read_bytes()
     request(begun, 7)
     frame = deliver(begun, 7, raw, "IMG_7.DNG")
@@ -253,7 +254,7 @@ def test_frames_that_cant_be_placed_are_named_and_the_flight_goes_on(tmp_path: P
     good = flown.as_recorded(true_pose(short_flight))
     level = from_euler(0.0, math.radians(85), 0.0)
     poses = [None, replace(good, latitude_rad=None), replace(good, attitude=level), replace(good, attitude=None), good]
-    begun = recording.begin(tmp_path / "flights", lambda: flown.START_NS)
+    begun = recording.begin(tmp_path / "flights", RecordedClock(flown.START_NS))
     for index, one in enumerate(poses):
         request(begun, index)
         frame = deliver(begun, index, raw, f"IMG_{index}.DNG")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from pathlib import Path
 
 from tqdm import tqdm
 
+from dappled.clock import TimeOfDayClock
 from dappled.daemon.replay import pickup
 from dappled.daemon.replay.pickup import Choice, Picked, Proposal
 from dappled.drivers.wired.ptp_source import PtpSource
@@ -46,7 +46,7 @@ def run(flight: Path, arguments: argparse.Namespace) -> int:
         if not arguments.dry_run:
             total = sum(group.main.size for _, group in proposal.pairs)
             with tqdm(total=total, unit="B", unit_scale=True, disable=None, delay=1.0) as bar:
-                picked = pickup.bring(flight, source, proposal, time.time_ns, bar.update)
+                picked = pickup.bring(flight, source, proposal, TimeOfDayClock(), bar.update)
     finally:
         source.close()
     (_print_json if arguments.json else _print)(flight, proposal, picked)

@@ -5,11 +5,11 @@ Trigger calls, telemetry and frames are all in the record, so the tag is the one
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+from dappled.clock import Clock
 from dappled.config import settings as configuration
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import PendingShots
@@ -56,7 +56,7 @@ class MissingTagWriter(ReplayVerifier):
         return one.frame is not None and one.tag_sha256 is None
 
 
-def add_missing(flight: Path, utc_ns: Callable[[], int]) -> list[int]:
+def add_missing(flight: Path, clock: Clock) -> list[int]:
     """Tag the frames of a closed flight that have no tag; their image indices.
 
     Raises DappledError where that can't be done now: a flight that is still recorded, a record that can't be written.
@@ -78,7 +78,7 @@ def add_missing(flight: Path, utc_ns: Callable[[], int]) -> list[int]:
     progress, time = ReplayProgress(), replay.clock(recording)
     with ExitStack() as stack:
         stack.enter_context(FlightsLock(flight.absolute().parent))
-        ledger = stack.enter_context(Ledger(folder.ledger, utc_ns))
+        ledger = stack.enter_context(Ledger(folder.ledger, clock))
         writer = MissingTagWriter(recording, ledger)
         camera = ReplayCamera(recording.files, Identity("dappled", "recording", "", str(flight)), time)
         shots = PendingShots(camera)

@@ -15,6 +15,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from dappled.clock import Clock
 from dappled.config import settings as configuration
 from dappled.daemon.navigation import BodyLatency, clocks, recorded_vehicles
 from dappled.daemon.pipeline import tagging
@@ -114,9 +115,7 @@ def propose(flight: Path, source: FileSource, choice: Choice) -> Proposal:
     )
 
 
-def bring(
-    flight: Path, source: FileSource, proposal: Proposal, utc_ns: Callable[[], int], progress: Callable[[int], Any]
-) -> Picked:
+def bring(flight: Path, source: FileSource, proposal: Proposal, clock: Clock, progress: Callable[[int], Any]) -> Picked:
     """Record, tag and index what was proposed. `progress` is told the bytes of each file. What was brought when an
     error comes stays; doing it again brings the rest. Raises FlightError, CameraError."""
     folder = layout.open_folder(flight)
@@ -135,13 +134,13 @@ def bring(
     with ExitStack() as stack:
         stack.enter_context(FlightsLock(flight.parent))
         index = stack.enter_context(ImageIndex(flight.parent))
-        ledger = stack.enter_context(Ledger(folder.ledger, utc_ns))
+        ledger = stack.enter_context(Ledger(folder.ledger, clock))
         recorder = Recorder(folder, ledger)
         for number, group in proposal.pairs:
-            frame = _record(recorder, source, number, group.main, utc_ns())
+            frame = _record(recorder, source, number, group.main, clock.utc_ns())
             ledger.add_event("picked up", f"{group.main.name}: {proposal.reasons[number]}", number)
             for other in group.companions:
-                _accompany(recorder, source, number, other, utc_ns())
+                _accompany(recorder, source, number, other, clock.utc_ns())
                 companions += 1
             row = ledger.shot(number)
             assert row is not None

@@ -7,11 +7,12 @@ it can be verified and repeated. What was recorded, and what other runs found, i
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
+from dappled.clock import Clock
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.recipes import Names
 from dappled.drivers.raw.darkroom import FILES, Recipe
@@ -33,7 +34,7 @@ class Run:
 class RunWriter:
     """Writes one run's results into a closed flight's ledger."""
 
-    def __init__(self, flight: Path, run: Run, utc_ns: Callable[[], int]) -> None:
+    def __init__(self, flight: Path, run: Run, clock: Clock) -> None:
         """Begin a run: its inputs are copied, and the ledger says what it is. Raises DappledError: no such name, one
         that is there already, a flight that is still recorded, a disk that refuses."""
         folder = layout.open_folder(flight)
@@ -53,10 +54,10 @@ class RunWriter:
             raise DappledError(f"{flight} has a run {run.name!r} already: give another name with --run")
         kept = recipes.keep(run.recipe, flight, run.name)
         self.run = replace(run, recipe=kept)
-        self._ledger = Ledger(folder.ledger, utc_ns)
+        self._ledger = Ledger(folder.ledger, clock)
         provenance.note(folder, self._ledger, f"{recipes.FOLDER}/{run.name}")
         told = {"recipe": _relative(kept, flight), "names": asdict(run.names), "software": recipes.versions()}
-        self._ledger.set_fact(_fact(run.name), {**told, "utc_ns": utc_ns()})
+        self._ledger.set_fact(_fact(run.name), {**told, "utc_ns": clock.utc_ns()})
 
     def __enter__(self) -> Self:
         return self
