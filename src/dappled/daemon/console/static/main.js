@@ -50,7 +50,7 @@ function showVerdict(verdict, checks) {
   $("verdict").dataset.state = verdict;
   $("verdict-word").textContent = verdict === "no-go" ? "No-go" : "Go";
   const names = (list) => list.map((one) => one.name.toLowerCase()).join(", ");
-  $("verdict-text").textContent = verdict === "no-go" ? names(bad) : verdict === "caution" ? `with caution: ${names(cautions)}` : `all ${checks.length} checks`;
+  $("verdict-text").textContent = verdict === "no-go" ? names(bad) : verdict === "caution" ? `with caution: ${names(cautions)}` : `all ${checks.length} checks pass`;
 }
 
 function showCounters(health) {
