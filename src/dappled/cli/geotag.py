@@ -121,7 +121,7 @@ def _copies(flight: Path, folder: Path, mounting: Mounting, geoid: Geoid | None)
 
 
 def _mounting(arguments: argparse.Namespace, facts: dict[str, Any]) -> Mounting:
-    """The flight's own mounting, with what the arguments give instead. Raises DappledError for a wrong one."""
+    """The flight's mounting, with the values that the arguments replace. Raises DappledError for a wrong one."""
     mounting = Mounting.of(facts)
     if arguments.lever_arm is not None:
         forward, right, down = arguments.lever_arm

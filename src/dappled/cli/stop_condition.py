@@ -19,8 +19,8 @@ class Asker(Protocol):
 class StopCondition:
     """The end of a run: `frames` shots have ended, or `seconds` have passed since the first flight began.
 
-    None means no such end. `ask` starts the ground station that asks for the frames, once the camera is `ready`. When
-    it has nothing more to ask and all that it requested has ended, the run ends too.
+    None means no such end. `ask` starts the ground station that asks for the frames, once the camera is `ready`. The
+    run ends when it has no more requests to send and all of its shots have ended.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class StopCondition:
 
     @property
     def short(self) -> bool:
-        """Whether good frames are missing of those wanted."""
+        """Whether fewer good frames were taken than requested."""
         return self._frames is not None and self._tally.good < self._frames
 
     def begin(self, requested: Callable[[], int]) -> None:

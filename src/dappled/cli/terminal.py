@@ -56,7 +56,7 @@ class _Line:
 class FrameLines:
     """Prints a line for each frame: on standard output, or in the journal unless `as_json`.
 
-    A thread of its own prints, so that a terminal that stands still holds up nothing else.
+    It prints in a separate thread, so that a blocked terminal does not delay anything else.
     """
 
     def __init__(self, *, as_json: bool = False) -> None:
@@ -72,7 +72,7 @@ class FrameLines:
         self._lines.put(_Line(text, level, {name: value for name, value in fields.items() if value != ""}))
 
     def close(self) -> None:
-        """Print what is waiting, for a second at most."""
+        """Print the waiting lines, for a second at most."""
         self._lines.stop(1.0)
 
     def _print(self, line: _Line) -> None:
@@ -111,7 +111,7 @@ class Tally:
         self._lock = threading.Lock()
 
     def add(self, one: PendingShot) -> None:
-        """A shot has come to its end."""
+        """Count a shot that has ended."""
         with self._lock:
             self.count += 1
             self.safe += one.frame is not None
@@ -189,7 +189,7 @@ _SHORT = {"wish to trigger": "request", "trigger call": "call", "trigger to file
 
 
 def frame_line(pending: PendingShot) -> str:
-    """One line: index, source, time, position, attitude, focal length, carriers, size, milliseconds a stage."""
+    """One line: index, source, time, position, attitude, focal length, carriers, size, milliseconds per stage."""
     cause = pending.shot.cause
     sequence = "" if cause.sequence is None else f" #{cause.sequence}"
     words = [f"{pending.shot.index:06d}", f"{cause.kind}{sequence} from {cause.source}"]

@@ -41,7 +41,8 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class CameraProfile:
-    """What predicting carriers needs to know of a body. `law` is a name in `dappled.decode.optics.carriers.LAWS`."""
+    """The properties of a body that the prediction of carriers needs. `law` is a name in
+    `dappled.decode.optics.carriers.LAWS`."""
 
     name: str
     description: str

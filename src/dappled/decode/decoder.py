@@ -1,7 +1,7 @@
-"""Decode planes of a masked camera to slices and views, and report which carriers were used, and why.
+"""Decode planes of a masked camera to slices and views, and report which carriers were used and why.
 
-A decoder is a value: it holds what all frames of a camera share, and nothing of the frames. The same plane gives the
-same bytes.
+A decoder is a value: it holds what is common to all frames of a camera, and no data of a single frame. The same plane
+gives the same bytes.
 """
 
 from __future__ import annotations

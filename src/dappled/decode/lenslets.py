@@ -40,7 +40,7 @@ class White:
 @dataclass(frozen=True, slots=True, eq=False)
 class LensletDecoder:
     """Decodes lenslet frames. With a white frame the lattice, its origin and the vignetting of the views are the
-    white frame's; without one each frame's own lattice is found anew (half a second on ten megapixels).
+    white frame's; without one, the lattice is found again in each frame (half a second for ten megapixels).
 
     `rolloff` in cycles/pixel (`MOSAIC_ROLLOFF` for colour mosaics) reduces the noise and chroma of far carriers.
     `views_per_axis` odd; None: as many as the seen orders carry, no more than the pixels under a lenslet, and 15.
@@ -57,7 +57,7 @@ class LensletDecoder:
     def with_white(
         cls, white_plane: Source, *, views_per_axis: int | None = None, workers: int = 1, rolloff: float | None = None
     ) -> LensletDecoder:
-        """A decoder that knows a white frame (float32 (H, W)). Raises NoLattice where that shows no lenslets."""
+        """A decoder with a white frame (float32 (H, W)). Raises NoLattice where that shows no lenslets."""
         shape = (white_plane.shape[0], white_plane.shape[1])
         spectrum = transform(white_plane, workers=workers)
         found = find_lattice(spectrum)

@@ -2,8 +2,8 @@
 
 `dappled run --simulate` puts the same camera behind libgphoto2 and PTP/IP.
 
-`[camera.options]`: seed, scale, scene and law as in `reference_camera`; f_number; and folder, for what the simulation
-knows of each shot.
+`[camera.options]`: seed, scale, scene and law as in `reference_camera`; f_number; and folder, for the truth about each
+shot.
 """
 
 from __future__ import annotations

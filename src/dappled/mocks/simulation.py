@@ -1,7 +1,7 @@
 """Simulate everything around the daemon: a masked camera in a PTP/IP body, an autopilot, a ground station.
 
-The daemon reaches them as it reaches real ones: libgphoto2 over TCP, MAVLink over UDP. The seed draws how the mask is
-installed, and the daemon doesn't know it; the calibration comes from a bench frame, as a user would make it.
+The daemon reaches them as it reaches real ones: libgphoto2 over TCP, MAVLink over UDP. The seed determines how the mask
+is installed, and the daemon is not given it; the calibration comes from a bench frame, as a user would make it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LATENCY_MS, LATENCY_SIGMA_MS = 60.0, 15.0 / 3**0.5  # the body's is spread evenl
 @dataclass(frozen=True, slots=True)
 class World:
     """What is simulated. `scale` is the sensor's side as a share of the reference camera's 2776 × 3688 px; `f_number`
-    0 opens the lens; `truth`, for tests, is a folder for what the simulation knows."""
+    0 opens the lens; `truth`, for tests, is a folder for the true values."""
 
     seed: int = 1
     scale: float = 0.5

@@ -1,4 +1,4 @@
-"""Arguments that the mask's actions share: which mask stands how far before which sensor, and by which law."""
+"""Arguments that the actions of `mask` share: the mask, its distance from the sensor, the camera and the law."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calibrations: what the frames of each focal length showed, and the lattice at any focal length."""
+"""Calibrations: the measurements at each focal length, and the lattice at any focal length."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class LatticeFit:
 class Calibration:
     """A camera and mask as fitted; one or more focal lengths, rising. `shape` is the frames'.
 
-    `pupil_mm` is how far behind the focal length the exit pupil stands, v(f) = f + pupil, under `geometric`; `verdict`
+    `pupil_mm` is the distance of the exit pupil beyond the focal length, v(f) = f + pupil, under `geometric`; `verdict`
     says which law explains the frames.
     """
 
@@ -113,7 +113,7 @@ class Calibration:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Calibration:
-        """The inverse of `to_dict`. Raises DecodeError with the name of what is missing or wrong."""
+        """The inverse of `to_dict`. Raises DecodeError, which names the missing or wrong value."""
         if values.get("kind") != "dappled calibration" or values.get("version") != 1:
             raise DecodeError("this is not a calibration of version 1: make one with `dappled calibrate`")
         try:

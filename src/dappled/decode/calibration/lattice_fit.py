@@ -82,7 +82,8 @@ def frame_lattice(
 def _located(
     spectrum: Spectrum, *, sensor: Sensor, mask: Mask, law: str, mask_distance_mm: float, focal_length_mm: float
 ) -> tuple[Lattice, list[tuple[Carrier, Measured]]]:
-    """The lattice that most of the mask's carriers stand on, and those; the law's own prediction is tried first."""
+    """The lattice on which most of the mask's carriers lie, and those carriers; the law's own prediction is tried
+    first."""
     best: tuple[Lattice, list[tuple[Carrier, Measured]]] | None = None
     most = 0.0
     first = ""
@@ -135,7 +136,7 @@ def _guesses(
 def _verified(
     spectrum: Spectrum, lattice: Lattice, mask: Mask
 ) -> tuple[Lattice, list[tuple[Carrier, Measured]], float]:
-    """A lattice fitted to the carriers that stand near it, those, and what share of them all they are."""
+    """A lattice fitted to the carriers near it, those carriers, and their share of all."""
     found: list[tuple[Carrier, Measured]] = []
     looked: list[Carrier] = []
     for radius in (4.0, 2.0, 2.0):

@@ -27,9 +27,9 @@ class LawFit:
     """A law as fitted.
 
     `anisotropy` is rows' scale over columns', less 1. `offset_bins` (rows, columns) is a constant beside `fd`'s 1/f,
-    `pupil_mm` how far behind the focal length the exit pupil stands under `geometric`, v(f) = f + pupil: None where
-    there are too few focal lengths to tell. `rms_bins` is what it leaves of the carriers, `explains` whether that and
-    the distance are believable.
+    `pupil_mm` the distance of the exit pupil beyond the focal length under `geometric`, v(f) = f + pupil: None where
+    there are too few focal lengths to tell. `rms_bins` is the residual of the carriers, `explains` whether that and the
+    distance are plausible.
     """
 
     law: str
@@ -116,7 +116,8 @@ def _fit_fd(
 def _fit_geometric(
     lengths_mm: NDArray[np.float64], steps: NDArray[np.float64], *, sensor: Sensor, mask: Mask, stated_mm: float
 ) -> LawFit:
-    """step = scale · f_m · (1 − d/(f + pupil)), each axis with a scale of its own, as the printer or glue made it.
+    """step = scale · f_m · (1 − d/(f + pupil)), each axis with its own scale, because printing or gluing may have
+    stretched it.
 
     From too few focal lengths only the axes' ratio is fitted beside the distance.
     """
@@ -150,7 +151,7 @@ def _fit_geometric(
 
 
 def _rms(left_bins: NDArray[np.float64], mask: Mask) -> float:
-    """Rms distance in bins of all carriers, for what is left of one step along rows and columns."""
+    """Rms distance in bins over all carriers, from the residual of one step along rows and columns."""
     orders = np.array([order for order in mask.half_orders() if order != (0, 0)], dtype=np.float64)
     return float(np.sqrt(np.mean((left_bins[:, None, :] * orders[None]) ** 2) * 2))
 

@@ -50,15 +50,15 @@ def rows(found: Calibration, fit: LatticeFit, law: str, mask_distance_mm: float)
 
 
 def law_fits(found: Calibration, mask_distance_mm: float) -> tuple[LawFit, ...]:
-    """Both laws fitted to what the calibration saw."""
+    """Both laws, fitted to the calibration's measurements."""
     steps = [(fit.focal_length_mm, steps_bins(fit.lattice, found.sensor)) for fit in found.fits]
     return judge(steps, sensor=found.sensor, mask=found.mask, stated_mm=mask_distance_mm, asked=found.law).fits
 
 
 def pupils_mm(found: Calibration, mask_distance_mm: float) -> list[tuple[float, float | None]]:
-    """(focal length, v) in mm: where the exit pupil stands for each, were the mask where it is stated to be.
+    """(focal length, v) in mm: the position of the exit pupil for each, if the mask were at its stated distance.
 
-    v = d / (1 − f_sensor/f_m); None where the carriers lie beyond the mask's own frequency, as no pupil explains.
+    v = d / (1 − f_sensor/f_m); None where the carriers lie beyond the mask's own frequency, which no position explains.
     """
     found_mm: list[tuple[float, float | None]] = []
     for fit in found.fits:

@@ -52,7 +52,7 @@ def depth(evidence: Evidence, search: Search) -> DepthMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """A log-likelihood (D, h, w), of so many samples a pixel; `spread` as in `windowed`."""
+    """A log-likelihood (D, h, w), of the given number of samples per pixel; `spread` as in `windowed`."""
 
     likelihood: Volume
     spread: float
@@ -113,7 +113,7 @@ def differences(stack: ViewStack, disparities: NDArray[np.float64], *, limit: fl
     used. Behind an edge one side of them sees something else and the other side doesn't: of each pair of opposite arms
     the better one counts, so near edges stay where they are.
 
-    Grey views; each squared difference counts up to `limit` at most. Arms that don't exist count nothing.
+    Grey views; each squared difference counts up to `limit` at most. Missing arms do not count.
     """
     views = ndimage.gaussian_filter(stack.views, (0, 0, _SMOOTH_PX, _SMOOTH_PX))
     v0, u0 = (int(np.argmin(np.abs(steps))) for steps in (stack.row_steps, stack.column_steps))

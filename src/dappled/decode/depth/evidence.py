@@ -1,4 +1,4 @@
-"""Evidence for depth: what a frame measures of its light field, and with which noise.
+"""Evidence for depth: the measurements of a light field that a frame contains, and their noise.
 
 Everything measured is linear in the light field: B = K·L + noise of variance n, L being the views that a perfect
 camera would see. Of plain views K is the identity. Of a masked frame B are its slices over their transfers: angular
@@ -29,8 +29,9 @@ _LEAST_NOISE = 1e-9  # variance: float32
 class Evidence:
     """`images` Q float32 (V, U, h, w) and `weights` W (V·U, V·U) of the views in `stack` (grey).
 
-    `stack.views` are the views without any shrinking: unbiased, and noisier than those for the eye. `white` says that
-    n is the frame's own white noise and each sample a measurement of its own; else it is a guess from the views.
+    `stack.views` are the views without any shrinking: unbiased, and noisier than the views made for display. `white`
+    says that n is the frame's own white noise and each sample a measurement of its own; else it is a guess from the
+    views.
     """
 
     stack: ViewStack
@@ -39,7 +40,7 @@ class Evidence:
     white: bool
 
     def lags(self) -> NDArray[np.float64]:
-        """(2V−1, 2U−1) sums of W over pairs of views that stand equally far apart."""
+        """(2V−1, 2U−1) sums of W over pairs of views with the same separation."""
         v, u = self.stack.views.shape[:2]
         total = np.zeros((2 * v - 1, 2 * u - 1))
         rows, columns = np.divmod(np.arange(v * u), u)
@@ -57,7 +58,7 @@ class Evidence:
 def of_views(stack: ViewStack, noise_rms: float | None = None) -> Evidence:
     """Evidence of plain views. `noise_rms` of a view's pixel; None: what the views' finest detail has.
 
-    Raises DecodeError where all views stand on one spot, or hold values that are no numbers.
+    Raises DecodeError where all views are at one place, or hold values that are not numbers.
     """
     needs_parallax(stack, "depth")
     grey = stack.grey()
@@ -111,7 +112,7 @@ def view_noise(views: NDArray[np.float32]) -> float:
 
 
 def _plain_views(images: NDArray[np.float32], weights: NDArray[np.float64]) -> NDArray[np.float32]:
-    """(J, pixels) the least-squares views W⁻¹Q; what no measurement tells stays at the mean of the views."""
+    """(J, pixels) the least-squares views W⁻¹Q; components without a measurement stay at the mean of the views."""
     values, vectors = np.linalg.eigh(weights)
     kept = values > 1e-9 * values[-1]
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T

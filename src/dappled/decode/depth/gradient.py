@@ -104,7 +104,7 @@ def _dot(a: Image, b: Image) -> Image:
 
 
 def _moved(image: Image, by: tuple[float, float]) -> Image:
-    """The image moved by (rows, columns): what stood at p stands at p + by."""
+    """The image moved by (rows, columns): content at p moves to p + by."""
     if by == (0.0, 0.0):
         return image
     made: Image = ndimage.shift(image, by, order=1, mode="nearest", prefilter=False)

@@ -41,7 +41,7 @@ class Ranging:
     focal_length_mm: float | None = None
 
     def __post_init__(self) -> None:
-        """Raises DecodeError for numbers that no lens has."""
+        """Raises DecodeError for numbers that are impossible for a lens."""
         if not (math.isfinite(self.gain_px_m) and self.gain_px_m > 0 and math.isfinite(self.offset_px)):
             raise DecodeError(
                 f"a gain of {self.gain_px_m:g} px·m and an offset of {self.offset_px:g} px describe no lens: "
@@ -64,7 +64,8 @@ class Ranging:
         """The same lens at another f-number.
 
         Raises DecodeError for another focal length, or where only one of the two is known: a zoom changes gain and
-        offset in ways that Eq 5 alone doesn't tell. What rounding may hide (half a millimetre) goes into the gain's σ.
+        offset in a way that Eq 5 alone doesn't describe. A difference that rounding may hide (half a millimetre) is
+        added to the gain's σ.
         """
         made = replace(self, gain_sigma_share=math.hypot(self.gain_sigma_share, self._zoom_share(focal_length_mm)))
         if self.f_number is None or f_number is None:
@@ -161,10 +162,10 @@ def fit_targets(
     focal_length_mm: float | None = None,
     lens: Ranging | None = None,
 ) -> Ranging:
-    """The ranging that targets at known distances show, least squares in 1/Z.
+    """The ranging fitted to targets at known distances, by least squares in 1/Z.
 
-    The gain's σ is what the targets' own leave of it, or what their misfit shows where that is more. One distance
-    alone tells the offset (the focus); the gain is then that of `lens`. Raises DecodeError without it.
+    The gain's σ follows from the targets' σ, or from their misfit where that is larger. A single distance gives only
+    the offset (the focus); the gain is then that of `lens`. Raises DecodeError without it.
     """
     if not targets:
         raise DecodeError("no target was seen")

@@ -128,7 +128,7 @@ def _reduced(shift: Image, enlarge: int, shape: tuple[int, ...]) -> Image:
 
 
 def _agreed(maps: NDArray[np.float32]) -> DepthMap:
-    """The median of what the pairs found; its error from their spread, its confidence from how many agree with it."""
+    """The median of the pairs' results; its error from their spread, its confidence from how many agree with it."""
     ordered = np.sort(maps, axis=0)
     count = np.isfinite(maps).sum(axis=0)
     low = np.take_along_axis(ordered, np.maximum((count - 1) // 2, 0)[None], axis=0)[0]

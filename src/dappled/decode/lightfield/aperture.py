@@ -44,7 +44,7 @@ class Aperture:
     """How light comes through the aperture in the model: N views an axis over its full width, each one cell of it.
 
     "beams": through the middle of each cell. "filled": through the whole of each cell. "round": through what of each
-    cell lies in the circle; a view whose cell lies outside keeps its place, and shows what the others say about it.
+    cell lies in the circle; a view whose cell lies outside keeps its place, and is estimated from the others.
     """
 
     views: int

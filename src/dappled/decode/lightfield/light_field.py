@@ -100,7 +100,7 @@ class ViewStack:
 
     @property
     def reach(self) -> float:
-        """The largest step: so many pixels does the outermost view move for a disparity of 1."""
+        """The largest step: how many pixels the outermost view moves for a disparity of 1."""
         return float(max(np.abs(self.row_steps).max(), np.abs(self.column_steps).max()))
 
     @property
@@ -126,7 +126,7 @@ def centred(count: int) -> NDArray[np.float64]:
 
 
 def needs_parallax(stack: ViewStack, what: str) -> None:
-    """Raises DecodeError for views that all stand on one spot."""
+    """Raises DecodeError if all views are at one place."""
     if stack.reach == 0:
         raise DecodeError(f"{what} needs views from several places, and this light field's are all from one")
 

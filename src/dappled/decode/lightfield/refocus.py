@@ -162,7 +162,7 @@ def focal_stack(
 def all_in_focus(stack: FocalStack, *, least_contrast: float = 1e-4) -> AllInFocus:
     """The sharpest of the stack at every pixel: the largest local energy of the Laplacian.
 
-    `least_contrast` (rms of the Laplacian, of white 1.0): what is smoother has no sharpest picture.
+    `least_contrast` (rms of the Laplacian, of white 1.0): smoother areas have no sharpest picture.
     """
     pictures = np.nan_to_num(stack.pictures)
     grey = pictures.mean(axis=3) if pictures.ndim == 4 else pictures
@@ -180,7 +180,7 @@ def all_in_focus(stack: FocalStack, *, least_contrast: float = 1e-4) -> AllInFoc
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoPair:
-    """What the left and the right eye see, float32 (h, w) or (h, w, 3)."""
+    """The pictures for the left and the right eye, float32 (h, w) or (h, w, 3)."""
 
     left: Image
     right: Image

@@ -88,7 +88,7 @@ def view_variance(
 
 def finest_detail(image: NDArray[np.complexfloating]) -> float:
     """The variance of white noise that would explain what a complex image (h, w) holds against the mask
-    [1 −2 1]ᵀ[1 −2 1] (Immerkær 1996): blind to planes and slow changes. 0 for images under 3 × 3."""
+    [1 −2 1]ᵀ[1 −2 1] (Immerkær 1996): planes and slow changes do not affect it. 0 for images under 3 × 3."""
     if min(image.shape) < 3:
         return 0.0
     rows = image[:-2] - 2 * image[1:-1] + image[2:]
@@ -123,8 +123,8 @@ def from_slices(
 
     `slices` complex64 (K, h, w) with DC first and no carrier together with its conjugate; `transfers` (K,) their T_k
     (T_0 = 1); `noise_variance` of a slice pixel; `model_error` the relative error of what all views share, in a
-    coefficient (None: what the frame's end rings). With `colours` the frame was a colour mosaic: what chroma a band
-    holds is guessed from its finest detail and counts as noise, and where orders tell nothing views fall back to the
+    coefficient (None: what the frame's end rings). With `colours` the frame was a colour mosaic: the chroma in a band
+    is estimated from its finest detail and counts as noise; where the orders carry no information, the views are the
     image that they share. The offsets are shares of the frame's own aperture.
     """
     angular = angular_frequencies(orders, kappa_cycles, rotation_rad)

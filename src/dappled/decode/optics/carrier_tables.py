@@ -1,7 +1,7 @@
 """Tabulate predicted carriers over focal lengths (Tables 11, 14), with what an installed mask adds to a law.
 
-An installed mask is turned, makes crossed orders that its pattern does not ask for, and loses contrast on the way to
-the sensor.
+An installed mask is turned, makes crossed orders that are not in its pattern, and loses contrast by diffraction on the
+way to the sensor.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dappled.decode.optics.lenses import focal_length, within
 
 @dataclass(frozen=True, slots=True)
 class HarmonicPlace:
-    """Where one harmonic of a mask stands at one focal length.
+    """The position of one harmonic of a mask at one focal length.
 
     `horizontal_px` and `vertical_px` are bins of the frame's DFT from its centre; the `_mm` are those distances on a
     DFT drawn as large as the sensor (the thesis' f' of Table 11, for which the `fd` law gives one value on both axes).
@@ -52,7 +52,7 @@ class FocalRow:
 def lattice_of(
     law: str, mask: Mask, sensor: Sensor, mask_distance_mm: float, focal_length_mm: float, *, rotation_rad: float = 0.0
 ) -> Lattice:
-    """The lattice by a law's name, of a mask that sits turned by `rotation_rad` (from the row axis to the column axis).
+    """The lattice by a law's name, of a mask turned by `rotation_rad` (from the row axis to the column axis).
 
     The laws are linear in the mask's frequency vector, so a turned mask's steps are mixtures of the upright one's; on
     pixels that are not square the result is not `Lattice.rotated`. Raises DecodeError for nonsense in any value.
@@ -72,7 +72,7 @@ def lattice_of(
 
 
 def lattice_rotation(lattice: Lattice, sensor: Sensor) -> float:
-    """How far a mask sits turned, rad from the row axis to the column axis: the mean turn of its two steps in mm."""
+    """The rotation of a mask, rad from the row axis to the column axis: the mean turn of its two steps in mm."""
     to_sensor = np.array([sensor.row_mm, sensor.column_mm])  # (row, column) steps as (y, x) mm
     per_mm = lattice.matrix() @ np.linalg.inv(to_sensor).T  # rows: cycles/mm along y and x
     turns = math.atan2(per_mm[0, 1], per_mm[0, 0]), math.atan2(-per_mm[1, 0], per_mm[1, 1])
@@ -80,7 +80,8 @@ def lattice_rotation(lattice: Lattice, sensor: Sensor) -> float:
 
 
 def contrast(mask_distance_mm: float, frequency_per_mm: float, wavelength_nm: float = 550.0) -> float:
-    """What diffraction from mask to sensor leaves of a cosine (Eq 30): cos(π·λ·d·f²), 1 at the mask, −1 reversed."""
+    """The contrast of a cosine that is left after diffraction from mask to sensor (Eq 30): cos(π·λ·d·f²), 1 at the
+    mask, −1 reversed."""
     return math.cos(math.pi * fresnel_number(mask_distance_mm, frequency_per_mm, wavelength_nm))
 
 
@@ -92,9 +93,9 @@ def fresnel_number(mask_distance_mm: float, frequency_per_mm: float, wavelength_
 
 
 def crossed_orders(mask: Mask) -> list[Order]:
-    """Orders between the mask's harmonics that its pattern does not ask for, rising; seen in Tables 12, 13, 15 and 16.
+    """Orders between the mask's harmonics that are not in its pattern, rising; seen in Tables 12, 13, 15 and 16.
 
-    None for a full pattern, which asks for them all.
+    None for a full pattern, which contains them all.
     """
     asked = set(mask.orders())
     axis = sorted({0, *mask.multiples, *(-m for m in mask.multiples)})

@@ -28,9 +28,9 @@ Window = Literal["box", "cell"]
 class Mask:
     """A mask of cosines.
 
-    `frequency_per_mm` is the fundamental at the mask's own plane. `p` counts harmonics: `linear` ones stand at
-    1, 2, 3 … p times the fundamental (Fig 14), `octave` ones at 1, 2, 4, 8 … (the thesis' text; the same for p = 2).
-    `full` is the product of Eq 11, (2p+1)² carriers; `diagonal` is Fig 14's sum of cos·cos, 4p+1 carriers.
+    `frequency_per_mm` is the fundamental at the mask's own plane. `p` counts harmonics: `linear` ones are 1, 2, 3 … p
+    times the fundamental (Fig 14), `octave` ones 1, 2, 4, 8 … (the thesis' text; the same for p = 2). `full` is the
+    product of Eq 11, (2p+1)² carriers; `diagonal` is Fig 14's sum of cos·cos, 4p+1 carriers.
     """
 
     frequency_per_mm: float

@@ -145,7 +145,7 @@ def wedge_levels(steps: int) -> NDArray[np.float64]:
 def wedge(shape: tuple[int, int], steps: int = 21) -> NDArray[np.float64]:
     """(rows, columns) levels 0 to 1: steps of equal width from 0 at the left to 1 at the right.
 
-    A thin line of the opposite level stands between the steps, so that they can be counted on the film.
+    A thin line of the opposite level separates the steps, so that they can be counted on the film.
     """
     rows, columns = shape
     if columns < 4 * steps:
@@ -161,7 +161,7 @@ def wedge(shape: tuple[int, int], steps: int = 21) -> NDArray[np.float64]:
 class Harmonic:
     """One cosine of a mask as a printer sees it: `multiple` of the fundamental, and its period in printer's pixels.
 
-    `period_px` is the shorter of the two axes'. A period under two pixels can't be drawn: sampled, it comes out as
+    `period_px` is the shorter of the two axes'. A period under two pixels can't be drawn: sampled, it appears as
     another frequency.
     """
 
@@ -180,8 +180,8 @@ class MaskImage:
     """What to print. Values run from 0 (opaque) to 1 (clear).
 
     `period_px` is (vertical, horizontal), of the fundamental. `negative` prints 1 − value, as black-and-white negative
-    film needs (Eq 13); with a `curve` of that film the levels follow from what the film did to a wedge, and `negative`
-    is not used. `drawable_only` leaves out harmonics finer than two pixels, which Fig 14 draws as other frequencies.
+    film needs (Eq 13); with a `curve` of that film the levels follow from a wedge printed on it, and `negative` is not
+    used. `drawable_only` leaves out harmonics finer than two pixels, which Fig 14 draws as other frequencies.
     """
 
     mask: Mask
@@ -212,7 +212,7 @@ class MaskImage:
         return tuple(h.multiple for h in self.harmonics() if h.drawable or not self.drawable_only)
 
     def warnings(self) -> list[str]:
-        """One sentence for each thing that will not come out as designed."""
+        """One sentence for each property that will differ from the design."""
         found = []
         for h in self.harmonics():
             if not h.drawable:
@@ -235,7 +235,7 @@ class MaskImage:
         return (self._pattern(self._cosines(0)[:, rows], self._cosines(1)[:, columns]) - low) / (high - low)
 
     def levels(self, rows: slice, columns: slice) -> NDArray[np.unsignedinteger]:
-        """(h, w) uint8 or uint16 of one tile, as they stand in the file."""
+        """(h, w) uint8 or uint16 of one tile, as in the file."""
         values = np.clip(self.transmittance(rows, columns), 0, 1)
         top = 2**self.bits - 1
         if self.curve is not None:
@@ -248,7 +248,7 @@ class MaskImage:
         return levels
 
     def orders_drawn(self) -> dict[Order, tuple[float, float]]:
-        """Every order of the picture and where it stands in its DFT, (fy, fx) in cycles/pixel, −0.5 to 0.5.
+        """Every order of the picture and its position in the DFT, (fy, fx) in cycles/pixel, −0.5 to 0.5.
 
         What is finer than two pixels appears folded to another frequency.
         """

@@ -143,10 +143,10 @@ def judge(
 ) -> BenchVerdict:
     """Compare measured spots (x, y), mm from the centre of the pattern, with the mask's impulses.
 
-    A scale fits when each measured spot belongs to one impulse of its own, none that should lie inside the outermost
-    measured spot is missing, the rms over an axis is within `tolerance_mm` and no spot is off by more than twice that.
-    1 is tried first, then 1/2, 2, 1/3, 3, 1/4, 4, then any scale from 0.1 to 10. A scale other than 1 is only believed
-    on two harmonics or more: a single ring of spots fits at some scale always. Raises DecodeError without any spot.
+    A scale fits if each measured spot belongs to a different impulse, no spot inside the outermost measured one is
+    missing, the rms over an axis is within `tolerance_mm` and no spot is off by more than twice that. 1 is tried first,
+    then 1/2, 2, 1/3, 3, 1/4, 4, then any scale from 0.1 to 10. A scale other than 1 is only accepted with two harmonics
+    or more: a single ring of spots fits at some scale always. Raises DecodeError without any spot.
     """
     within("tolerance", tolerance_mm, "mm", 1e-3, 100)
     expected = np.array([i.landing_mm(wavelength_nm, distance_m) for i in impulses(mask)[1:]])

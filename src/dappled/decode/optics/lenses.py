@@ -125,10 +125,10 @@ def plan_survey(
     view_columns: int | None = None,
     sideways: bool = False,
 ) -> SurveyPlan:
-    """What a flight at this altitude above ground and speed over ground asks for.
+    """Plan a flight at this altitude above ground and speed over ground.
 
     `overlap` and `sidelap` are shares of the footprint, `view_columns` the pixels of a decoded view across.
-    `longest_exposure_s` blurs by one frame pixel. Raises DecodeError for nonsense in any value.
+    `longest_exposure_s` blurs by one frame pixel. Raises DecodeError for an impossible value.
     """
     within("ground speed", speed_m_s, "m/s", 0.01, 200, hint="is it in metres a second?")
     within("overlap", overlap, "", 0, 0.99, hint="a share, not percent")

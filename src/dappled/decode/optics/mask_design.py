@@ -1,6 +1,6 @@
 """Design a mask and its place for a sensor, a lens and an altitude, or say in a sentence why this is impossible.
 
-Both laws are supported, each by its own rules (`DESIGNS`, by the law's name):
+Both laws are supported, each with its own rules (`DESIGNS`, by the law's name):
   - `geometric`: N = 2p + 1 views are separated at f_m = v / (d·A), A the aperture's diameter, so the ideal f-number
     of a mask is f_m·d, whatever the lens. Three conditions bound d from below: the slices stay under the sensor's
     Nyquist frequency, the film draws the highest harmonic with two pixels, and diffraction stays at
@@ -95,7 +95,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """A mask for a wanted. `problem` is None where it works, else the sentence why it does not.
+    """A mask for the requirements `wanted`. `problem` is None if it meets them, else a sentence that says why not.
 
     `view_shape` (rows, columns) of one view, `bandwidth_per_mm` (±, on the sensor) of one view, `spectrum_used` the
     share of the frame's spectrum that slices cover, `baseline_mm` between neighbouring views on the aperture,

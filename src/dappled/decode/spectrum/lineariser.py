@@ -1,7 +1,7 @@
 """Make a camera's mosaics linear row by row, so that the whole plane need not lie in memory before its transform.
 
 `lineariser(...)` holds what all frames of a camera share. `Lineariser.apply(mosaic)` finds the frame's own colour gains
-in one sweep and returns `LinearRows`, which convert rows when the transform asks for them. The result is that of
+in one sweep and returns `LinearRows`, which convert rows when the transform reads them. The result is that of
 `plane.to_plane` followed by the local evening of colours, to the rounding of float32.
 """
 

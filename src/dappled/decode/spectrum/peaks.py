@@ -30,7 +30,7 @@ class Measured:
     Frequency in cycles/pixel, signed. `strength` is the amplitude as a share of the plane's mean, `phase_rad` the
     phase at pixel (0, 0). `phase_pattern` says how well the four bins around the peak agree with what one sinusoid
     between bins does (neighbours all but opposite, diagonals equal): 1 fully, 0 not at all, −1 the contrary.
-    `suspect` marks simple fractions of the sampling frequency, where sensor artefacts stand (`is_suspect`).
+    `suspect` marks simple fractions of the sampling frequency, where sensor artefacts occur (`is_suspect`).
     """
 
     fy: float

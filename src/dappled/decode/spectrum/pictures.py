@@ -73,8 +73,8 @@ def around(
 ) -> Colour:
     """uint8 RGB (S, S, 3): the `bins` × `bins` bins around a frequency (fy, fx), each a square (Fig 35).
 
-    No window lies on the plane: where a carrier stands between bins, diagonal neighbours have one phase and direct
-    ones opposite phases.
+    No window lies on the plane: if a carrier lies between bins, diagonal neighbours have the same phase and direct ones
+    opposite phases.
     """
     centred = _centred(plane, windowed=False)
     height, width = centred.shape
@@ -117,7 +117,8 @@ def _pictured(centred: NDArray[np.complex64], look: Look, longest_side: int) -> 
 
 
 def _above_neighbours(size: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The Laplacian of the magnitude where it is negative, turned positive: bins that stand above their neighbours."""
+    """The Laplacian of the magnitude where it is negative, turned positive: bins that are larger than their
+    neighbours."""
     ring = sum(np.roll(size, step, axis) for step in (1, -1) for axis in (0, 1))
     return np.asarray(np.maximum(4 * size - ring, 0), dtype=np.float32)
 

@@ -110,9 +110,10 @@ def white_gain(white_plane: Plane, cell_px: float) -> Plane:
 
 
 def find_defects(dark: NDArray[Any], period: Period = (1, 1)) -> Places:
-    """(rows, columns) of pixels that stand out of a dark frame (H, W), each place of the colour pattern by itself.
+    """(rows, columns) of pixels that are bright in a dark frame (H, W), judged separately for each place of the colour
+    pattern.
 
-    None where more than a fiftieth do: that is a pattern, which goes when the dark frame is taken off.
+    None where more than a fiftieth are: that is a pattern, which subtracting the dark frame removes.
     """
     found = np.zeros(dark.shape, dtype=bool)
     for row in range(period[0]):
@@ -159,9 +160,9 @@ def spread(plane: Plane) -> Plane:
     """Spread a staggered plane (H, W) out to float32 (H, 2W): sample (r, c) to column 2c + (r mod 2), doubled, rest 0.
 
     For chips whose every second row sits half a column to the right: the 45° lattice of a Super CCD, as it is stored.
-    Read as a rectangle such a frame is sampled unevenly, and each carrier gets a false twin. Spread out, every sample
-    stands where it was taken, and half of the places are empty. Those repeat the spectrum around (½, ½) cycles/pixel,
-    which a 45° lattice does by nature: what lies within |fy| + |fx| < ½ is free of it. Local means do not change.
+    Read as a rectangle such a frame is sampled unevenly, and each carrier gets a false twin. After spreading, every
+    sample is where it was taken, and half of the places are empty. Those repeat the spectrum around (½, ½)
+    cycles/pixel, as every 45° lattice does; within |fy| + |fx| < ½ there is no repetition. Local means do not change.
     """
     wide = np.zeros((plane.shape[0], 2 * plane.shape[1]), dtype=np.float32)
     np.multiply(plane[0::2], 2, out=wide[0::2, 0::2])
@@ -174,7 +175,7 @@ def local_colours(
 ) -> NDArray[np.float32]:
     """(len(colours), rows, columns): local means of colours, over the mean of the reference colours', 1 for grey.
 
-    The cells are `cell_px` on a side and stand for the whole frame: a lenslet, or half a mask period. Finer chroma is
+    The cells are `cell_px` on a side and cover the whole frame: a lenslet, or half a mask period. Finer chroma is
     indistinguishable from other carriers' bands.
     """
     pattern = np.asarray(cfa, dtype=np.intp)

@@ -51,11 +51,11 @@ def extract(
     """The slices of these carriers.
 
     `size` is (height, width) of the band in bins, by default `lattice.slice_size`; otherwise the lattice is only
-    needed for the window "cell". With `wrap` a band goes on cyclically past the edge of the spectrum (sampled lenslet
-    arrays), else what lies beyond Nyquist is 0. `taper` is the share of the band, 0 to 1, that falls off towards its
-    edges as a raised cosine (Tukey's window; 1 is Hann's): less ringing, less detail. Scaled so that the slice of
-    (0, 0) has the plane's local mean. Phases are those at pixel (0, 0), with the fraction of a bin compensated
-    exactly. The slices end where the frame ends. Raises DecodeError for a size, a taper or columns out of range.
+    needed for the window "cell". With `wrap` a band continues cyclically past the edge of the spectrum (sampled lenslet
+    arrays); otherwise values beyond Nyquist are 0. `taper` is the share of the band, 0 to 1, that falls off towards its
+    edges as a raised cosine (Tukey's window; 1 is Hann's): less ringing, less detail. The scale makes the DC slice the
+    plane's local mean. Phases are those at pixel (0, 0), with the fraction of a bin compensated exactly. The slices end
+    where the frame ends. Raises DecodeError for a size, a taper or columns out of range.
     """
     bands = _bands(
         spectrum.shape,

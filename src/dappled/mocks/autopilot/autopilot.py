@@ -1,4 +1,4 @@
-"""A simulated autopilot that flies `FlightPath`, with a boot clock of its own, over real MAVLink.
+"""A simulated autopilot that flies `FlightPath`, with its own boot clock, over real MAVLink.
 
 `python -m dappled.mocks.autopilot.autopilot --url udpout:127.0.0.1:14550 --seed 1 --start-monotonic-ns N`
 """

@@ -42,7 +42,7 @@ class BodyOptions:
     `picture`: "simulated" (the reference camera's raw files), "pattern:SIZE:EXTENSION" (bytes that `pattern` makes),
     or a file's path (its bytes, every time). `start_monotonic_ns`: when the simulation's time began (None: when the
     body starts). `scale`: share of the reference sensor that is rendered. `scene`, `law`: as
-    `reference_camera` has them. `truth`: a folder for what the simulated camera knows of each shot (000001.npz, and its
+    `reference_camera` has them. `truth`: a folder for the simulated camera's truth about each shot (000001.npz, and its
     times in seconds since the simulation's start in 000001.json). `delay_s`: how long a pattern or
     file takes to expose. `card_bytes`: the card's size; a full one refuses to shoot. `clock_offset_s`: how far the
     body's own clock is wrong. `pairs`: raw and JPEG of each picture. `addresses`: how many ports it has.

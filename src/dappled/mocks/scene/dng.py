@@ -1,6 +1,6 @@
 """Write a raw file that LibRaw opens: an uncompressed DNG with one Bayer plane and the EXIF of the shot.
 
-No library is used, because the EXIF values must be in a folder of their own, where cameras put them. Adobe DNG 1.4,
+No library is used, because the EXIF values must be in their own directory, as in files of real cameras. Adobe DNG 1.4,
 TIFF 6, EXIF 2.3; little endian.
 """
 
@@ -120,7 +120,7 @@ def _text(tag: int, value: str) -> _Entry:
 
 
 def _folder(entries: list[_Entry], at: int) -> bytes:
-    """A TIFF folder to stand at offset `at`, with its longer values behind it."""
+    """A TIFF directory for offset `at`, followed by its longer values."""
     head, tail = struct.pack("<H", len(entries)), b""
     behind = at + 2 + 12 * len(entries) + 4
     for entry in entries:

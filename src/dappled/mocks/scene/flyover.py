@@ -208,7 +208,7 @@ def _look(plane: Floats, at: NDArray[np.floating]) -> Floats:
 
 
 def finest_period_m(height_m: float, pitch_mm: float, focal_length_mm: float, pass_cycles_per_pixel: float) -> float:
-    """The ground period that a slice can just carry at this height: what the texture is limited to."""
+    """The ground period that a slice can just carry at this height: the limit of the texture."""
     if not (height_m > 0 and math.isfinite(height_m)):
         raise ValueError(f"height must be positive, not {height_m:g} m")
     return height_m / focal_length_mm * pitch_mm / pass_cycles_per_pixel

@@ -28,8 +28,8 @@ Floats = NDArray[np.float32]
 class Optics:
     """The nominal lens and mask: what a person would write in a profile.
 
-    `focal_length_mm` is v too: the lens' exit pupil stands there when it is focused at infinity. `aperture_mm` is the
-    side of the full (square) aperture and `f_number` what the body reports for it; stopped down to N, the side is
+    `focal_length_mm` is v too: the distance of the lens' exit pupil when it is focused at infinity. `aperture_mm` is
+    the side of the full (square) aperture and `f_number` what the body reports for it; stopped down to N, the side is
     `aperture_mm` · `f_number` / N. The aperture is `aperture_samples`² points at the centres of as many equal cells.
     `law` (a name in `decode.carriers.LAWS`) places the carriers on the sensor; the angular frequencies are the
     geometric ones under any law.
@@ -190,7 +190,7 @@ def angular_phases(
 
 
 def peak_over_mean(optics: Optics, installation: Installation, points_mm: NDArray[np.float64]) -> float:
-    """How far a white frame's brightest pixel stands above its mean: 1 where the aperture averages the mask away."""
+    """The ratio of a white frame's brightest pixel to its mean: 1 where the aperture averages the mask away."""
     weights = modulation(optics.mask)
     orders = list(weights)
     held = np.abs(angular_phases(optics, installation, orders, points_mm).mean(axis=1))

@@ -280,7 +280,7 @@ class Truth:
     `views` float32 (n, n, h, w, 3): what each aperture point saw, band-limited to a slice, in the plane's scale
     (1.0 = sensor white), scaled so that their mean is the frame's local mean. `aperture_points_mm` (n, n, 2) are
     those points (θy, θx). `depth_m` (h, w) along the axis and `disparity_mm_per_mm` (h, w), dx/dθ on the sensor, are
-    None where the scene does not know them. `grid` (2, 3) leads from (y, x, 1) of a view to sensor (row, column).
+    None where the scene does not define them. `grid` (2, 3) leads from (y, x, 1) of a view to sensor (row, column).
     `kappa` = f_m·α·A: the used aperture in periods of the mask; 1 is the ideal. `lattice`: where the carriers lie.
     """
 

@@ -1,4 +1,4 @@
-"""Fly a long simulated flight in which something goes wrong every few seconds, and check what is left of it.
+"""Fly a long simulated flight in which something goes wrong every few seconds, and check the recording afterwards.
 
 The daemon runs in a process of its own as a service manager would run it (restarted when it dies), in front of the
 simulated body, autopilot and ground station. At the end every request that was acknowledged is exactly one shot, every
@@ -63,7 +63,7 @@ class SoakReport:
 
 
 def soak(plan: SoakPlan, folder: Path, tell: Callable[[str], None] = lambda _: None) -> SoakReport:
-    """Fly the plan in `folder`, and compare what the ground heard with what was recorded."""
+    """Fly the plan in `folder`, and compare the ground station's reports with the recording."""
     chance = random.Random(plan.seed)  # noqa: S311  # which fault comes when: no secret
     root = folder / "flights"
     settings = configuration.load(None)

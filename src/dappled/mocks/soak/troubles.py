@@ -27,7 +27,7 @@ class Troubles:
     """Faults of camera, link, disk, subscribers, console, and processes. Use as a context manager."""
 
     def __init__(self, simulation: Simulation, daemon: Supervised, config: Path, chance: random.Random) -> None:
-        """`config` is the daemon's: it names the stream and the console, and is written anew to fill the disk."""
+        """`config` is the daemon's: it names the stream and the console, and is rewritten to fill the disk."""
         self._simulation, self._daemon, self._config = simulation, daemon, config
         settings = configuration.load(config)
         self._stream, self._console = settings.publish.slices, settings.console.bind

@@ -23,8 +23,8 @@ class ViewFolderError(DappledError):
 def read(folder: Path) -> LightField:
     """All pictures of a folder in the order of their names, row by row from the top left camera. sRGB is made linear.
 
-    The light field has no slices, and `cameras` among its attributes. Where HCI's `input_Cam….png` stand, other
-    pictures are left out. Raises ViewFolderError.
+    The light field has no slices, and `cameras` among its attributes. If the folder contains HCI's `input_Cam….png`,
+    other pictures are ignored. Raises ViewFolderError.
     """
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _ENDINGS)
     files = [p for p in files if p.name.startswith("input_Cam")] or files

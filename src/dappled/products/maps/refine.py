@@ -141,8 +141,8 @@ def _closer(
     base: BaseMap,
     ground: Ground,
 ) -> list[Marks | Ties]:
-    """Replace each group of features on the base map that held by many patches of the frame, found in the base map as
-    the adjusted eye would see it."""
+    """Replace each group of features on the base map that stayed consistent with many patches of the frame, which are
+    found in the base map as the adjusted eye would see it."""
     made: list[Marks | Ties] = []
     for group, inside in zip(groups, solution.inliers, strict=True):
         if isinstance(group, Ties) or group.by_hand or int(inside.sum()) < LEAST_INLIERS:
