@@ -1,18 +1,50 @@
-"""A flight brought to another disk, and the faults on the way."""
+"""A flight brought to another disk: what is proved before anything is removed, and the faults on the way.
+
+The destinations here are on the disk of the source, so that `--same-device` insists; `tests/flight/test_places.py` has
+other devices, bind mounts and file systems.
+"""
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
+import sqlite3
+import subprocess
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from dappled.cli import main
 from dappled.clock import RecordedClock
-from dappled.flight import FlightError, Ledger, Recording, durable, layout, offload
+from dappled.confined import OutsideError
+from dappled.flight import (
+    FlightError,
+    FlightsLock,
+    Ledger,
+    LedgerReader,
+    Recording,
+    Stray,
+    durable,
+    layout,
+    offload,
+    places,
+    pruning,
+    read_back,
+    recording,
+)
+from dappled.flight import check as checks
 from dappled.flight.check import check
+from dappled.flight.trees import Tree
 from tests.flight.conftest import START_UTC_NS
-from tests.flight.makers import deliver, flip, mavlink_2, request
+from tests.flight.makers import deliver, flip, held, mavlink_2, request
+
+
+@pytest.fixture(autouse=True)
+def disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The temporary folder is believed to be on ext4, wherever it is."""
+    monkeypatch.setattr(places, "file_system", lambda fd: "ext4")
 
 
 @pytest.fixture
@@ -26,29 +58,295 @@ def closed(flight: Recording) -> Path:
 
 
 def go(flight: Path, there: Path, *, prune: bool = False) -> offload.Offloaded:
-    return offload.offload(flight, there, prune=prune)
+    return offload.offload(flight, there, prune=prune, same_device=True, clock=RecordedClock(START_UTC_NS))
+
+
+def frames(flight: Path) -> list[str]:
+    return sorted(os.listdir(flight / "frames"))
+
+
+TWO = ["000000.cr2", "000001.cr2"]
 
 
 def test_a_flight_is_copied_and_verified(closed: Path, tmp_path: Path) -> None:
     done = go(closed, tmp_path / "disk")
     assert done.destination == tmp_path / "disk" / closed.name
-    assert (done.copied, done.there_already) == (6, 0)
+    assert (done.copied, done.there_already, done.pruned) == (6, 0, 0)
     assert check(done.destination).problems == check(closed).problems == ()
     again = go(closed, tmp_path / "disk")
     assert (again.copied, again.there_already) == (0, 6)
+    assert frames(closed) == TWO
 
 
-def test_pruning_is_refused_before_anything_is_done(closed: Path, tmp_path: Path) -> None:
-    with pytest.raises(FlightError, match="--prune is switched off"):
+def test_the_manifest_is_one_that_sha256sum_reads(closed: Path, tmp_path: Path) -> None:
+    go(closed, tmp_path / "disk")
+    sums = tmp_path / "disk" / f"{closed.name}.sha256"
+    subprocess.run(["/usr/bin/sha256sum", "--check", "--strict", "--quiet", sums.name], cwd=sums.parent, check=True)
+    assert len(sums.read_text().splitlines()) == 6
+
+
+def test_prune_removes_the_frames_and_check_says_where_they_are(closed: Path, tmp_path: Path) -> None:
+    done = go(closed, tmp_path / "disk", prune=True)
+    assert done.pruned == 2
+    assert frames(closed) == []
+    assert (done.destination / "frames" / "000001.cr2").read_bytes() == b"raw 1" * 1000
+    assert check(done.destination).problems == ()
+    report = check(closed)
+    assert (report.problems, report.files, report.offloaded) == ((), 0, 2)
+    (note,) = report.notes
+    assert f"2 files (frames/000000.cr2 to frames/000001.cr2) were offloaded to {done.destination}" in note
+    with LedgerReader.open(closed / "flight.sqlite") as ledger:
+        (event,) = [event for event in ledger.events() if event.kind == "offloaded"]
+    assert f"2 files (frames/000000.cr2 to frames/000001.cr2) were copied to {done.destination}" in event.text
+    rows = [json.loads(line) for line in (closed / "offloaded.jsonl").read_text().splitlines()]
+    assert [row["name"] for row in rows] == ["frames/000000.cr2", "frames/000001.cr2"]
+    assert not (done.destination / "offloaded.jsonl").exists()
+
+
+def test_the_verdict_does_not_call_a_pruned_flight_intact_as_if_nothing_had_happened(
+    closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    go(closed, tmp_path / "disk", prune=True)
+    assert main(["flight", "check", str(closed)]) == 0
+    note, verdict = capsys.readouterr().out.splitlines()
+    assert note.startswith("note:  2 files (frames/000000.cr2 to frames/000001.cr2) were offloaded to ")
+    assert ": intact, of what is still here: 0 files" in verdict
+    assert verdict.endswith("2 files offloaded and not read")
+
+
+def test_image_indices_go_on_after_a_prune(closed: Path, tmp_path: Path) -> None:
+    go(closed, tmp_path / "disk", prune=True)
+    os.unlink(closed.parent / "index.sqlite")
+    later = recording.begin(closed.parent, RecordedClock(START_UTC_NS))
+    assert later.next_index == 2
+    later.close()
+
+
+def test_a_second_prune_finds_nothing_to_do_and_proves_the_copy_again(closed: Path, tmp_path: Path) -> None:
+    go(closed, tmp_path / "disk", prune=True)
+    again = go(closed, tmp_path / "disk", prune=True)
+    assert (again.pruned, again.copied) == (0, 1)  # the ledger, which tells of the first prune
+    assert check(closed).problems == check(again.destination).problems == ()
+    flip(again.destination / "frames" / "000001.cr2", 7)
+    with pytest.raises(FlightError, match=r"000001.cr2 differs from what the ledger says"):
+        go(closed, tmp_path / "disk", prune=True)
+
+
+@pytest.mark.parametrize("forged", ["a line less", "no event"])
+def test_check_believes_a_record_that_the_ledger_vouches_for_alone(closed: Path, tmp_path: Path, forged: str) -> None:
+    go(closed, tmp_path / "disk", prune=True)
+    if forged == "no event":
+        with closing(sqlite3.connect(closed / "flight.sqlite")) as ledger, ledger:
+            ledger.execute("DELETE FROM events WHERE kind = 'offloaded'")
+    else:
+        lines = (closed / "offloaded.jsonl").read_bytes().splitlines(keepends=True)
+        (closed / "offloaded.jsonl").write_bytes(lines[0])
+    problems = check(closed).problems
+    assert any("offloaded.jsonl was changed: the ledger has no event with its SHA-256" in text for text in problems)
+    assert any("000001.cr2 is in the ledger, but the file is missing" in text for text in problems)
+
+
+def test_a_frame_that_came_after_the_copy_is_copied_before_it_is_pruned(closed: Path, tmp_path: Path) -> None:
+    """Reproduced 1c: names were read from the source's ledger anew, and what came after the copy was removed."""
+    go(closed, tmp_path / "disk")
+    with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger, held(b"late" * 99) as blob:
+        recorder = recording.Recorder(layout.open_folder(closed), ledger)
+        stray = recorder.record_stray("LATE.CR2", blob, "it came late", arrived_utc_ns=1)
+    done = go(closed, tmp_path / "disk", prune=True)
+    assert done.pruned == 3
+    assert (done.destination / stray.name).read_bytes() == b"late" * 99
+    with LedgerReader.open(done.destination / "flight.sqlite") as ledger:
+        assert [one.name for one in ledger.strays()] == [stray.name]
+
+
+def test_a_frame_that_comes_between_copy_and_prune_stays(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reproduced 1c: a program that takes no lock puts a file and its row there while the copy is proved."""
+    whole = check
+
+    def meanwhile(path: Path) -> object:
+        (closed / "frames" / "stray-000000.cr2").write_bytes(b"late")
+        with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
+            ledger.add_stray(Stray("frames/stray-000000.cr2", "LATE.CR2", 4, "ab", 1, "it came late"))
+        return whole(path)
+
+    monkeypatch.setattr(checks, "check", meanwhile)
+    assert go(closed, tmp_path / "disk", prune=True).pruned == 2
+    assert frames(closed) == ["stray-000000.cr2"]
+
+
+@pytest.mark.parametrize("change", ["bytes", "another file"])
+def test_a_frame_that_changes_between_copy_and_prune_stays(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
+) -> None:
+    whole = check
+    frame = closed / "frames" / "000001.cr2"
+
+    def meanwhile(path: Path) -> object:
+        stamp = frame.stat()
+        data = frame.read_bytes()
+        if change == "bytes":
+            flip(frame, 3)
+        else:
+            frame.rename(closed / "kept.cr2")
+            frame.write_bytes(data)
+        os.utime(frame, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+        return whole(path)
+
+    monkeypatch.setattr(checks, "check", meanwhile)
+    with pytest.raises(FlightError, match=r"000001.cr2 is not the file any more that was copied: it stays"):
+        go(closed, tmp_path / "disk", prune=True)
+    assert frames(closed) == ["000001.cr2"]
+
+
+def test_what_is_there_already_is_read_back_from_the_disk_too(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reproduced 1d: files that were there already were hashed through the page cache and never synced."""
+    go(closed, tmp_path / "disk")
+    synced: set[tuple[int, int]] = set()
+    fsync = os.fsync
+
+    def watched(fd: int) -> None:
+        found = os.fstat(fd)
+        synced.add((found.st_dev, found.st_ino))
+        fsync(fd)
+
+    read: list[str] = []
+    direct = read_back.hash_on_disk
+
+    def reading(name: str, folder: int) -> tuple[str, read_back.ReadBack]:
+        read.append(name)
+        return direct(name, folder)
+
+    monkeypatch.setattr(os, "fsync", watched)
+    monkeypatch.setattr(read_back, "hash_on_disk", reading)
+    done = go(closed, tmp_path / "disk", prune=True)
+    monkeypatch.undo()
+    assert done.there_already == 6
+    copy = tmp_path / "disk" / closed.name
+    for path in (copy, *copy.rglob("*"), tmp_path / "disk"):
+        found = path.stat()
+        assert (found.st_dev, found.st_ino) in synced, path
+    assert sorted(read) == sorted(path.name for path in copy.rglob("*") if path.is_file())
+
+
+def test_a_copy_that_can_be_read_from_memory_only_proves_nothing(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(read_back, "_direct", lambda name, folder: None)
+    monkeypatch.setattr(read_back, "_in_memory", lambda fd, size: True)
+    done = go(closed, tmp_path / "disk")
+    assert done.read_back == ("page cache",)
+    assert "could only be read back from memory, which proves nothing about its disk" in done.doubts[0]
+    with pytest.raises(FlightError, match="nothing was removed; offload without --prune"):
+        go(closed, tmp_path / "disk", prune=True)
+    assert frames(closed) == TWO
+
+
+def test_a_stray_outside_the_flight_is_not_removed(closed: Path, tmp_path: Path) -> None:
+    """Reproduced 1e."""
+    victim = closed.parent / "victim.txt"
+    victim.write_bytes(b"somebody else's file")
+    with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
+        ledger.add_stray(Stray("../victim.txt", "A.CR2", 20, durable.hash_file(victim), 1, "a stray"))
+    with pytest.raises(OutsideError, match=r"names '../victim.txt', which does not stay inside"):
         go(closed, tmp_path / "disk", prune=True)
     assert not (tmp_path / "disk").exists()
-    assert len(os.listdir(closed / "frames")) == 2
+    assert victim.read_bytes() == b"somebody else's file"
+    assert frames(closed) == TWO
+
+
+def test_only_frames_are_removed_whatever_the_ledger_calls_a_stray(closed: Path, tmp_path: Path) -> None:
+    journal = closed / "shots.jsonl"
+    with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
+        stray = Stray("shots.jsonl", "A.CR2", journal.stat().st_size, durable.hash_file(journal), 1, "a stray")
+        ledger.add_stray(stray)
+    assert go(closed, tmp_path / "disk", prune=True).pruned == 2
+    assert journal.exists()
+
+
+@pytest.mark.parametrize("linked", ["frames", "frames/000000.cr2", ""])
+def test_a_destination_that_links_back_is_refused(closed: Path, tmp_path: Path, linked: str) -> None:
+    """Reproduced 1b: `DEST/N/frames` was a link to the source, and 4 of 4 frames were gone."""
+    copy = tmp_path / "disk" / closed.name
+    (copy / linked).parent.mkdir(parents=True)
+    (copy / linked).symlink_to(closed / linked)
+    with pytest.raises(FlightError, match="a link stands there, and links are not followed"):
+        go(closed, tmp_path / "disk", prune=True)
+    assert frames(closed) == TWO
+
+
+@pytest.mark.parametrize("linked", ["frames/000000.cr2", "telemetry.tlog"])
+def test_a_hard_link_to_the_source_is_no_copy(closed: Path, tmp_path: Path, linked: str) -> None:
+    copy = tmp_path / "disk" / closed.name
+    (copy / "frames").mkdir(parents=True)
+    os.link(closed / linked, copy / linked)
+    with pytest.raises(FlightError, match=r"is the same file as .* under another name"):
+        go(closed, tmp_path / "disk", prune=True)
+    assert frames(closed) == TWO
+
+
+def test_one_file_under_two_names_that_nothing_told_apart_is_put_back(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last line: the copy vanishes with the source's first file."""
+    unlink = Tree.unlink
+
+    def both(tree: Tree, name: str) -> None:
+        unlink(tree, name)
+        os.unlink(tmp_path / "disk" / closed.name / name)
+
+    monkeypatch.setattr(Tree, "unlink", both)
+    with pytest.raises(FlightError, match=r"vanished with .*one file under two names; it was put back here"):
+        go(closed, tmp_path / "disk", prune=True)
+    assert frames(closed) == TWO
+    assert (closed / "frames" / "000000.cr2").read_bytes() == b"raw 0" * 1000
+
+
+def test_a_link_in_the_flight_is_not_followed(closed: Path, tmp_path: Path) -> None:
+    (closed / "inputs").mkdir()
+    (closed / "inputs" / "white.npy").symlink_to("/etc/hostname")
+    with pytest.raises(FlightError, match=r"white.npy is a link, which is not followed: nothing was touched"):
+        go(closed, tmp_path / "disk")
+    assert not (tmp_path / "disk").exists()
+
+
+@pytest.mark.parametrize(("doing", "what"), [("records into", "stop it"), ("offloads from", "wait until it has ended")])
+def test_one_process_at_a_time(closed: Path, tmp_path: Path, doing: str, what: str) -> None:
+    """Reproduced 1c: no lock was taken."""
+    with (
+        FlightsLock(closed.parent, doing),
+        pytest.raises(FlightError, match=rf"another dappled \(process {os.getpid()}\) {doing} .*; {what}"),
+    ):
+        go(closed, tmp_path / "disk", prune=True)
+    assert not (tmp_path / "disk").exists()
+
+
+def test_the_lock_is_that_of_the_flight_itself_whatever_link_leads_to_it(closed: Path, tmp_path: Path) -> None:
+    (tmp_path / "today").symlink_to(closed)
+    with FlightsLock(closed.parent), pytest.raises(FlightError, match="another dappled"):
+        go(tmp_path / "today", tmp_path / "disk")
+    assert go(tmp_path / "today", tmp_path / "disk").destination == tmp_path / "disk" / closed.name
+
+
+def test_a_user_who_may_only_read_copies_without_the_lock(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(self: FlightsLock, root: Path, doing: str = "") -> None:
+        raise FlightError("cannot make the lock") from PermissionError(13, "denied")
+
+    monkeypatch.setattr(FlightsLock, "__init__", refused)
+    assert go(closed, tmp_path / "disk").copied == 6
+    with pytest.raises(FlightError, match="cannot make the lock"):
+        go(closed, tmp_path / "disk", prune=True)
 
 
 def test_a_flight_pruned_by_an_earlier_version_is_not_copied_again(closed: Path, tmp_path: Path) -> None:
     with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
         ledger.set_fact("offloaded", {"destination": "/media/disk", "utc_ns": START_UTC_NS, "files": 2})
-    for name in os.listdir(closed / "frames"):
+    for name in frames(closed):
         os.unlink(closed / "frames" / name)
     report = check(closed)
     assert report.problems == ()
@@ -57,31 +355,34 @@ def test_a_flight_pruned_by_an_earlier_version_is_not_copied_again(closed: Path,
         go(closed, tmp_path / "disk")
 
 
-def test_a_flight_that_is_recorded_is_refused(flight: Recording, tmp_path: Path) -> None:
-    with pytest.raises(FlightError, match="still being recorded"):
+def test_a_flight_that_was_never_closed_is_refused(flight: Recording, tmp_path: Path) -> None:
+    with pytest.raises(FlightError, match="another dappled"):
         go(flight.folder.path, tmp_path / "disk")
+    copy = shutil.copytree(flight.folder.path, tmp_path / "killed" / flight.folder.name)
+    with pytest.raises(FlightError, match="still being recorded, or was never closed"):
+        go(copy, tmp_path / "disk")
 
 
 @pytest.mark.parametrize("where", ["frames/000000.cr2", "telemetry.tlog"])
 def test_a_damaged_source_is_refused(closed: Path, tmp_path: Path, where: str) -> None:
     flip(closed / where, 5)
     with pytest.raises(FlightError, match="not intact"):
-        go(closed, tmp_path / "disk")
-    assert len(os.listdir(closed / "frames")) == 2
+        go(closed, tmp_path / "disk", prune=True)
+    assert frames(closed) == TWO
 
 
 def test_a_disk_that_lies_is_found(closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = durable.copy_in
+    whole = Tree.write
 
-    def lying(fd: int, size: int, path: Path) -> str:
-        sha256 = whole(fd, size, path)
-        flip(path, 3)
-        return sha256
+    def lying(tree: Tree, name: str, pieces: object) -> None:
+        whole(tree, name, pieces)  # type: ignore[arg-type]  # as it came
+        if name.endswith("000001.cr2"):
+            flip(tree.path / name, 3)
 
-    monkeypatch.setattr(durable, "copy_in", lying)
+    monkeypatch.setattr(Tree, "write", lying)
     with pytest.raises(FlightError, match="reads back different"):
-        go(closed, tmp_path / "disk")
-    assert len(os.listdir(closed / "frames")) == 2
+        go(closed, tmp_path / "disk", prune=True)
+    assert frames(closed) == TWO
 
 
 def test_another_file_of_that_name_is_not_overwritten(closed: Path, tmp_path: Path) -> None:
@@ -89,24 +390,64 @@ def test_another_file_of_that_name_is_not_overwritten(closed: Path, tmp_path: Pa
     there.parent.mkdir(parents=True)
     there.write_bytes(b"other")
     with pytest.raises(FlightError, match="differs from"):
-        go(closed, tmp_path / "disk")
+        go(closed, tmp_path / "disk", prune=True)
     assert there.read_bytes() == b"other"
+    assert frames(closed) == TWO
 
 
 def test_not_into_itself(closed: Path) -> None:
-    with pytest.raises(FlightError, match="into itself"):
-        go(closed, closed / "frames")
-    with pytest.raises(FlightError, match="into itself"):
+    for place in (closed / "frames", closed / "new" / "deep"):
+        with pytest.raises(FlightError, match=r"under another name|into itself"):
+            go(closed, place)
+    with pytest.raises(FlightError, match="is the same folder as"):
         go(closed, closed.parent)
+    assert not (closed / "new").exists()
+
+
+def test_a_copy_whose_ledger_has_grown_stays(closed: Path, tmp_path: Path) -> None:
+    """Frames are tagged in the copy; a later offload does not take that back."""
+    done = go(closed, tmp_path / "disk")
+    with Ledger(done.destination / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
+        ledger.add_event("tagged late", "in the copy")
+    assert go(closed, tmp_path / "disk").copied == 0
+    with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
+        ledger.add_event("picked up", "in the source")
+    with pytest.raises(FlightError, match="each holds what the other lacks"):
+        go(closed, tmp_path / "disk")
+
+
+def test_the_ledger_is_copied_with_what_stands_in_its_log(closed: Path, tmp_path: Path) -> None:
+    with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as reader:  # keeps the log from being folded in
+        reader.add_event("note", "in the log")
+        assert (closed / "flight.sqlite-wal").stat().st_size > 0
+        done = go(closed, tmp_path / "disk")
+    with LedgerReader.open(done.destination / "flight.sqlite") as ledger:
+        assert ledger.events()[-1].text == "in the log"
+    assert not list(done.destination.glob("flight.sqlite-*"))
+
+
+def test_a_ledger_without_a_log_is_copied_byte_for_byte(closed: Path, tmp_path: Path) -> None:
+    done = go(closed, tmp_path / "disk")
+    assert (done.destination / "flight.sqlite").read_bytes() == (closed / "flight.sqlite").read_bytes()
+
+
+def test_what_was_pruned_to_one_disk_is_missed_on_another(closed: Path, tmp_path: Path) -> None:
+    go(closed, tmp_path / "a", prune=True)
+    with pytest.raises(FlightError, match=rf"was offloaded to {tmp_path}/a/.* and removed here, and .*/b/.* lacks it"):
+        go(closed, tmp_path / "b")
 
 
 def test_the_command(closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["flight", "offload", str(tmp_path / "disk"), str(closed)]) == 0
-    assert "6 files copied and verified" in capsys.readouterr().out
+    words = ["flight", "offload", str(tmp_path / "disk"), str(closed), "--same-device"]
+    assert main([*words, "--prune"]) == 0
+    said = capsys.readouterr().out
+    assert "6 files copied and verified, 0 already there; read back from ext4 by O_DIRECT" in said
+    assert "2 files removed here" in said
     assert layout.flights(tmp_path / "disk")[0].name == closed.name
 
 
 def test_a_flight_without_a_frame_is_brought_home_too(flight: Recording, tmp_path: Path) -> None:
     flight.close()
-    done = go(flight.folder.path, tmp_path / "disk")
-    assert check(done.destination).problems == ()
+    done = go(flight.folder.path, tmp_path / "disk", prune=True)
+    assert (done.pruned, check(done.destination).problems) == (0, ())
+    assert pruning.removed(flight.folder) == {}

@@ -5,17 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from dappled.confined import OutsideError
-from dappled.errors import DappledError
-from dappled.flight import check_chain, durable, layout, logs, provenance
+from dappled.errors import DappledError, counted
+from dappled.flight import check_chain, durable, layout, logs, provenance, pruning
 from dappled.flight.check_chain import ChainFindings
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
+from dappled.flight.pruning import Removed
 from dappled.flight.recovery import SIDECAR
 from dappled.flight.stored_rows import StoredRows
 
@@ -27,7 +28,8 @@ _WITHOUT_CHAIN = (
 
 @dataclass(frozen=True, slots=True)
 class CheckReport:
-    """What was checked and what is wrong, in sentences. `notes` are not faults."""
+    """What was checked and what is wrong, in sentences. `notes` are not faults. `offloaded` counts the files that were
+    removed here after their copies were proved: they were not read."""
 
     flight: str
     files: int
@@ -35,6 +37,7 @@ class CheckReport:
     telemetry_packets: int
     problems: tuple[str, ...]
     notes: tuple[str, ...]
+    offloaded: int = 0
 
     @property
     def intact(self) -> bool:
@@ -43,11 +46,12 @@ class CheckReport:
 
 @dataclass(slots=True)
 class _Counts:
-    """How much was read: files with a row and their bytes, and telemetry packets."""
+    """How much was read: files with a row and their bytes, and telemetry packets; and which files are `elsewhere`."""
 
     files: int = 0
     size: int = 0
     packets: int = 0
+    elsewhere: Mapping[str, Removed] = field(default_factory=dict)
 
 
 def check(path: Path) -> CheckReport:
@@ -63,7 +67,9 @@ def check(path: Path) -> CheckReport:
         notes += [_WITHOUT_CHAIN] if chained.links is None else chained.notes
     with _examining("the flight", problems), LedgerReader.open(folder.ledger) as ledger:
         _compare(folder, ledger, counts, problems, notes)
-    return CheckReport(folder.name, counts.files, counts.size, counts.packets, tuple(problems), tuple(notes))
+    return CheckReport(
+        folder.name, counts.files, counts.size, counts.packets, tuple(problems), tuple(notes), len(counts.elsewhere)
+    )
 
 
 def _compare(
@@ -79,8 +85,11 @@ def _compare(
     gone = facts.get("offloaded")
     if gone is not None:
         notes.append(f"its {gone['files']} frames were offloaded to {gone['destination']}, and removed here")
+    with _examining("the offloaded files", problems):
+        counts.elsewhere = _elsewhere(folder, ledger)
+        notes += _where(counts.elsewhere)
     with _examining("the files", problems):
-        for size, problem in _files(folder, ledger, pruned=gone is not None):
+        for size, problem in _files(folder, ledger, counts.elsewhere, pruned=gone is not None):
             counts.files, counts.size = counts.files + 1, counts.size + size
             problems += [problem] if problem else []
         problems += _names(folder, ledger, closed)
@@ -115,9 +124,36 @@ def _chained(folder: FlightFolder, problems: list[str]) -> ChainFindings:
     return found
 
 
-def _files(folder: FlightFolder, ledger: LedgerReader, *, pruned: bool) -> Iterator[tuple[int, str | None]]:
-    """(bytes read, problem) for every file that the ledger acknowledges; in a pruned flight it may be gone."""
+def _elsewhere(folder: FlightFolder, ledger: LedgerReader) -> dict[str, Removed]:
+    """The files that were removed here after their copies were proved, as far as they are the ledger's and gone."""
+    removed = pruning.removed(folder)
+    rows = {row.name: row for row in ledger.files()}
+    return {
+        name: one
+        for name, one in removed.items()
+        if name in rows and one.sha256 == rows[name].sha256 and not folder.file(name).exists()
+    }
+
+
+def _where(elsewhere: Mapping[str, Removed]) -> Iterator[str]:
+    """A sentence for each folder that frames were offloaded to."""
+    for destination in sorted({one.destination for one in elsewhere.values()}):
+        names = sorted(name for name, one in elsewhere.items() if one.destination == destination)
+        which = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
+        yield (
+            f"{counted(len(names), 'file')} ({which}) were offloaded to {destination} and removed here: they were not "
+            f"read, check them there ({pruning.RECORD} names each)"
+        )
+
+
+def _files(
+    folder: FlightFolder, ledger: LedgerReader, elsewhere: Collection[str], *, pruned: bool
+) -> Iterator[tuple[int, str | None]]:
+    """(bytes read, problem) for every file that the ledger acknowledges and that was not offloaded `elsewhere`; in a
+    flight that an early version pruned, all may be gone."""
     for row in ledger.files():
+        if row.name in elsewhere:
+            continue
         try:
             path = folder.file(row.name)
             if pruned and not path.exists():

@@ -27,6 +27,7 @@ from dappled.flight.errors import FlightError, disk_error
 _FLIGHT_NAME = re.compile(r"(\d{8}T\d{6}Z|boot[0-9a-f]{8})-[0-9a-f]{8}")
 _FRAME_NAME = re.compile(r"(\d{6,})\.([a-z0-9]{1,8})")
 _LOCK = ".lock"
+RECORDS = "records into"  # what the daemon does in a flights folder
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
@@ -213,13 +214,16 @@ def _plain(value: Any) -> Any:
 
 
 class FlightsLock:
-    """The lock (flock) of the one daemon that records into a flights folder.
+    """The lock (flock) of the one process that works in a flights folder: the daemon, an offload, a pickup.
 
     Held from creation to `close`, or until the process ends in any way.
     """
 
-    def __init__(self, root: Path) -> None:
-        """Take the lock of `root`, which is made if missing. Raises FlightError when another process holds it."""
+    def __init__(self, root: Path, doing: str = RECORDS) -> None:
+        """Take the lock of `root`, which is made if missing. `doing` is what this process does there, as a verb.
+
+        Raises FlightError when another process holds it.
+        """
         path = root / _LOCK
         try:
             durable.make_folder(root)
@@ -229,13 +233,14 @@ class FlightsLock:
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.ftruncate(self._fd, 0)
-            os.pwrite(self._fd, f"{os.getpid()}\n".encode(), 0)
+            os.pwrite(self._fd, f"{os.getpid()} {doing}\n".encode(), 0)
         except BlockingIOError as error:
-            holder = os.pread(self._fd, 20, 0).decode("ascii", "replace").strip() or "unknown"
+            holder, _, does = os.pread(self._fd, 100, 0).decode("ascii", "replace").strip().partition(" ")
             os.close(self._fd)
+            records = (does or RECORDS) == RECORDS
+            what = "stop it, or set record.directory to another folder" if records else "wait until it has ended"
             raise FlightError(
-                f"another dappled (process {holder}) records into {root}; "
-                "stop it, or set record.directory to another folder"
+                f"another dappled (process {holder or 'unknown'}) {does or RECORDS} {root}; {what}"
             ) from error
         except OSError as error:
             os.close(self._fd)

@@ -220,6 +220,11 @@ class LedgerReader(Database):
             return int(facts["utc_correction"]["correction_ns"])
         return 0 if facts.get("utc_known", True) else None
 
+    def image(self) -> bytes:
+        """The ledger as one file would hold it now, what stands in its write-ahead log included."""
+        with self._lock, self._speaking():
+            return self._db.serialize()
+
     def _load(self, build: Callable[[Any], _Record], text: str) -> _Record:
         try:
             return build(json.loads(text))

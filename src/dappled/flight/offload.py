@@ -1,30 +1,48 @@
-"""Copy a flight to another disk, read it back and compare. Removing the source is refused for now."""
+"""Copy a flight to another disk, prove the copy, and on request remove the frames here by what was proved.
+
+The manifest is made from the copying itself: names, sizes and the SHA-256 of the bytes that were read. Every file of
+the copy is fsynced and read back past the page cache against it, also one that was there already. `prune` then removes
+frames by that manifest alone, one by one, each only while it is still the file that was copied.
+"""
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.flight import check, durable, layout
+from dappled.clock import Clock
+from dappled.flight import check, durable, layout, ledger_copies, places, pruning, read_back
 from dappled.flight.errors import FlightError, disk_error
-from dappled.flight.layout import FlightFolder
+from dappled.flight.layout import FlightFolder, FlightsLock
 from dappled.flight.ledger import LedgerReader
+from dappled.flight.pruning import Proved
+from dappled.flight.read_back import ReadBack
+from dappled.flight.records import Frame, Stray
+from dappled.flight.trees import FileIdentity, Tree, pieces
 
-FACT = "offloaded"
-_SHARED_MEMORY = "-shm"
+FACT = "offloaded"  # of flights that a version before 1.0 pruned
 
 
 @dataclass(frozen=True, slots=True)
 class Offloaded:
-    """What was done. `copied` and `there_already` count files; `size` is their total in bytes."""
+    """What was done. `copied` and `there_already` count files, `size` is their total in bytes; `pruned` counts the
+    files that were removed here. `file_system` is that of the copy, `read_back` how its files were read, and `doubts`
+    are sentences: what this copy can't prove."""
 
     flight: str
     destination: Path
     copied: int
     there_already: int
     size: int
+    pruned: int
+    file_system: str
+    read_back: tuple[ReadBack, ...]
+    doubts: tuple[str, ...]
 
 
 def offload(
@@ -32,86 +50,244 @@ def offload(
     destination: Path,
     *,
     prune: bool,
+    same_device: bool = False,
+    clock: Clock,
     progress: Callable[[int], object] = lambda size: None,
 ) -> Offloaded:
-    """Copy a closed flight to `destination/<its name>`. Every file is read back from there and compared by SHA-256 with
-    its source, and the copy is checked against its own ledger. A second call finishes what the first one left undone.
+    """Copy a closed flight to `destination/<its name>`, and prove the copy. A second call finishes what the first one
+    left undone. `prune` then removes the frames here; ledger, journal, telemetry, settings and inputs stay.
 
-    Nothing is ever removed: `prune` is refused, because a destination that is the same disk under another name would
-    pass every comparison and hold the only copy. Raises FlightError: `prune` asked for, flight open or not intact, copy
-    different, disk refuses. `progress` gets the bytes done.
+    Raises FlightError: another process works in the flights folder; the flight is open or not intact; the destination
+    is the same folder or, without `same_device`, on the same disk; the copy is different or, for `prune`, can't be
+    proved; a disk refuses. Each frame is then here, or at the destination, or in both. `progress` gets the bytes done.
     """
-    if prune:
-        raise FlightError(
-            f"--prune is switched off: it cannot prove yet that {destination} is another disk than {flight}, and might "
-            "delete the only copy; offload without it, and remove frames by hand once you have seen them there"
-        )
-    folder = layout.open_folder(flight)
-    gone = _offloaded_before(folder)
-    target = destination / flight.resolve().name
-    if target.resolve().is_relative_to(flight.resolve()):
-        raise FlightError(f"cannot offload {flight} into itself: {target}; give a folder on another disk")
-    if gone is not None:
-        raise FlightError(f"{folder.path} was offloaded to {gone} and pruned already")
-    copied = there = size = 0
-    for source in _files(flight):
-        goal = target / source.relative_to(flight)
-        done, length = _bring(source, goal)
-        copied, there, size = copied + done, there + (not done), size + length
-        progress(length)
-    durable.make_folder(FlightFolder(target).frames)  # also of a flight without a frame
-    found = check.check(target)
-    if found.problems:
-        raise FlightError(
-            f"the copy {target} is not intact ({found.problems[0]}): nothing was removed; "
-            f"run `dappled flight check {flight}`"
-        )
-    return Offloaded(folder.path.name, target, copied, there, size)
+    folder = layout.open_folder(flight.resolve())
+    with ExitStack() as stack:
+        stack.enter_context(_lock(folder.path.parent, needed=prune))
+        _refuse_unready(folder)
+        source = stack.enter_context(Tree(folder.path))
+        names = [name for name in source.walk() if not ledger_copies.is_part(name) and name != pruning.RECORD]
+        there = stack.enter_context(_open_copy(source, destination, same_device=same_device))
+        system = places.file_system(there.folders[""])
+        if prune:
+            _refuse_unprovable(there.path, system)
+        return _Copying(folder, source, there, system).run(names, prune=prune, clock=clock, progress=progress)
 
 
-def _offloaded_before(folder: FlightFolder) -> str | None:
-    """Where a closed flight's frames were copied to before they were pruned; None where they weren't."""
+class _Copying:
+    """One offload, between two open folders."""
+
+    def __init__(self, folder: FlightFolder, source: Tree, there: Tree, system: str) -> None:
+        self._folder, self._source, self._there, self._system = folder, source, there, system
+
+    def run(self, names: list[str], *, prune: bool, clock: Clock, progress: Callable[[int], object]) -> Offloaded:
+        """Copy, make durable, read back, check, and remove; see `offload`."""
+        # What stands on another machine can't be told apart from the source: it is written anew, which shows.
+        anew = prune and self._system in places.NETWORK
+        manifest: dict[str, Proved] = {}
+        fresh: set[str] = set()
+        for name in names:
+            found = self._there.stat(name)
+            self._refuse_in_the_way(name, found is not None)
+            if found is None or anew:
+                manifest[name] = self._copy(name)
+                fresh.add(name)
+            else:
+                manifest[name] = self._look(name)
+            progress(manifest[name].identity.size)
+        ledger = self._folder.ledger.name
+        written, manifest[ledger] = ledger_copies.bring(self._source, self._there, ledger)
+        fresh |= {ledger} if written else set()
+        self._there.sync()
+        self._there.sync_above()
+        ways = self._prove(manifest, fresh)
+        rows = self._acknowledged()
+        elsewhere = self._prove_removed(rows, manifest)
+        self._check()
+        _write_sums(self._there, {**manifest, **elsewhere})
+        doubts = tuple(_doubts(self._there.path, self._system, ways))
+        pruned = 0
+        if prune:
+            if "page cache" in ways:
+                raise FlightError(f"{doubts[0]}: nothing was removed; offload without --prune, or to another disk")
+            sure = {name: manifest[name] for name in rows if name.startswith("frames/") and name in manifest}
+            pruned = pruning.remove(self._folder, self._source, self._there, sure, clock)
+        size = sum(one.identity.size for one in manifest.values())
+        already = len(manifest) - len(fresh)
+        return Offloaded(
+            self._folder.name, self._there.path, len(fresh), already, size, pruned, self._system, ways, doubts
+        )
+
+    def _refuse_in_the_way(self, name: str, stands: bool) -> None:
+        """Raise FlightError where something in the copy is the source's own file, or no file."""
+        if not stands:
+            return
+        with self._source.reading(name) as mine, self._there.reading(name) as other:
+            same = os.path.sameopenfile(mine, other)
+        if same:
+            raise FlightError(
+                f"{self._there.path / name} is the same file as {self._source.path / name} under another name: nothing "
+                "was removed; give a folder on another disk"
+            )
+
+    def _copy(self, name: str) -> Proved:
+        """Copy a file; the hash is that of the bytes which were written."""
+        sha256 = hashlib.sha256()
+        with self._source.reading(name) as fd:
+            before = FileIdentity.of_fd(fd)
+            self._there.write(name, pieces(fd, before.size, sha256.update))
+            self._refuse_changed(name, before, FileIdentity.of_fd(fd))
+        return Proved(before, sha256.hexdigest())
+
+    def _look(self, name: str) -> Proved:
+        """The identity and hash of a file that the copy has already."""
+        with self._source.reading(name) as fd:
+            before = FileIdentity.of_fd(fd)
+            sha256 = durable.hash_descriptor(fd, before.size)
+            self._refuse_changed(name, before, FileIdentity.of_fd(fd))
+        return Proved(before, sha256)
+
+    def _refuse_changed(self, name: str, before: FileIdentity, after: FileIdentity) -> None:
+        if before != after:
+            raise FlightError(f"{self._source.path / name} changed while it was copied; try again")
+
+    def _prove(self, manifest: Mapping[str, Proved], fresh: set[str]) -> tuple[ReadBack, ...]:
+        """Read every file of the copy back and compare it with the manifest; in which ways they were read."""
+        ways: set[ReadBack] = set()
+        for name, one in manifest.items():
+            found, how = self._read_back(name)
+            ways.add(how)
+            if found == one.sha256:
+                continue
+            goal, origin = self._there.path / name, self._source.path / name
+            if name in fresh:
+                raise FlightError(f"{goal} reads back different from {origin}: check that disk; nothing was removed")
+            raise FlightError(f"{goal} is there already and differs from {origin}: move it away first")
+        return tuple(sorted(ways))
+
+    def _read_back(self, name: str) -> tuple[str, ReadBack]:
+        folder, _, last = name.rpartition("/")
+        try:
+            return read_back.hash_on_disk(last, self._there.folders[folder])
+        except OSError as error:
+            raise disk_error("read back", self._there.path / name, error) from error
+
+    def _acknowledged(self) -> dict[str, Frame | Stray]:
+        with LedgerReader.open(self._folder.ledger) as ledger:
+            return {row.name: row for row in ledger.files()}
+
+    def _prove_removed(self, rows: Mapping[str, Frame | Stray], manifest: Mapping[str, Proved]) -> dict[str, Proved]:
+        """Read back the files that an earlier prune removed here. Raises FlightError where this copy lacks one."""
+        gone = pruning.removed(self._folder)
+        proved: dict[str, Proved] = {}
+        for name in (name for name in rows if name in gone and name not in manifest):
+            self._folder.file(name)  # confined
+            found = self._there.stat(name)
+            if found is None:
+                raise FlightError(
+                    f"{name} was offloaded to {gone[name].destination} and removed here, and {self._there.path} lacks "
+                    "it: nothing was removed; give that destination, or copy its frames here first"
+                )
+            sha256, _ = self._read_back(name)
+            if sha256 != rows[name].sha256:
+                raise FlightError(f"{self._there.path / name} differs from what the ledger says: nothing was removed")
+            proved[name] = Proved(FileIdentity.of(found), sha256)
+        return proved
+
+    def _check(self) -> None:
+        found = check.check(self._there.path)
+        if found.problems:
+            raise FlightError(
+                f"the copy {self._there.path} is not intact ({found.problems[0]}): nothing was removed; "
+                f"run `dappled flight check {self._folder.path}`"
+            )
+
+
+def _lock(root: Path, *, needed: bool) -> AbstractContextManager[object]:
+    """The flights' lock. Where it can't be had because this user may only read there, a copy does without.
+
+    Raises FlightError when another process holds it.
+    """
+    try:
+        return FlightsLock(root, "offloads from")
+    except FlightError as error:
+        why = error.__cause__.errno if isinstance(error.__cause__, OSError) else None
+        if needed or why not in (errno.EACCES, errno.EROFS) or layout.is_locked(root):
+            raise
+        return nullcontext()
+
+
+def _refuse_unready(folder: FlightFolder) -> None:
+    """Raise FlightError for a flight that is not closed, or that an early version pruned, and OutsideError where the
+    ledger names a file outside it."""
     with LedgerReader.open(folder.ledger) as ledger:
         facts = ledger.facts()
+        for row in ledger.files():
+            folder.file(row.name)
     if "closed_utc_ns" not in facts:
         raise FlightError(
             f"{folder.path} is still being recorded, or was never closed: stop the daemon, or start it once to close it"
         )
-    return facts[FACT]["destination"] if FACT in facts else None
+    if FACT in facts:
+        raise FlightError(f"{folder.path} was offloaded to {facts[FACT]['destination']} and pruned already")
 
 
-def _files(flight: Path) -> Iterator[Path]:
-    """All files except SQLite's shared memory. The reader that was just closed has folded the WAL into the ledger."""
-    for root, folders, names in os.walk(flight):
-        folders.sort()
-        for name in sorted(names):
-            path = Path(root) / name
-            if not name.endswith(_SHARED_MEMORY) and path.is_file() and not path.is_symlink():
-                yield path
+def _open_copy(source: Tree, destination: Path, *, same_device: bool) -> Tree:
+    """Open the flight's folder at the destination with all folders of the source, made where they are missing.
 
-
-def _bring(source: Path, goal: Path) -> tuple[bool, int]:
-    """Copy a file; returns (whether it was copied, size). An equal file stays; a different one raises FlightError."""
+    Raises FlightError where one of them is the source's, before anything is written.
+    """
+    top = destination.resolve()
+    existing = next(path for path in (top, *top.parents) if path.is_dir())
+    with Tree(existing) as above:
+        places.refuse_same_place(source, above, same_device=same_device)
     try:
-        with source.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            if goal.exists():
-                if durable.hash_file(goal) != durable.hash_file(source):
-                    raise FlightError(f"{goal} is there already and differs from {source}: move it away first")
-                return False, size
-            durable.make_folder(goal.parent)
-            sha256 = durable.copy_in(file.fileno(), size, goal)
-        if _hash_on_disk(goal) != sha256:
-            raise FlightError(f"{goal} reads back different from {source}: check that disk; nothing was removed")
-    except EOFError as error:
-        raise FlightError(f"{source} changed while it was copied ({error}); try again") from error
+        durable.make_folder(top)
     except OSError as error:
-        raise disk_error(f"copy {source} to", goal, error) from error
-    return True, size
+        raise disk_error("make the folder", top, error) from error
+    with Tree(top) as parent:
+        places.refuse_same_place(source, parent, same_device=same_device)
+        parent.enter(source.path.name, make=True)
+    there = Tree(top / source.path.name)
+    try:
+        places.refuse_same_place(source, there, same_device=same_device)
+        for name in sorted(source.folders):
+            there.enter(name, make=True)
+            places.refuse_same_place(source, there, same_device=same_device)
+        there.enter("frames", make=True)  # also of a flight without a frame
+        places.refuse_reexport(source, there)
+    except BaseException:
+        there.close()
+        raise
+    return there
 
 
-def _hash_on_disk(path: Path) -> str:
-    """SHA-256 of a file as it is on the disk: its pages are dropped from memory first."""
-    with path.open("rb") as file:
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-        return durable.hash_descriptor(file.fileno(), os.fstat(file.fileno()).st_size)
+def _refuse_unprovable(there: Path, system: str) -> None:
+    """Raise FlightError where a file system is not known to keep what was fsynced."""
+    if system not in places.KEEPS_FSYNC | places.NETWORK:
+        raise FlightError(
+            f"--prune can't be sure of {there}: its file system is {system}, of which dappled doesn't know that an "
+            "fsync reaches a disk; nothing was copied; offload to ext4, xfs, btrfs, exfat or NFS, or without --prune"
+        )
+
+
+def _doubts(there: Path, system: str, ways: tuple[ReadBack, ...]) -> list[str]:
+    """What a copy can't prove, in sentences; the way of reading first."""
+    found = []
+    if "page cache" in ways:
+        found.append(f"{there} could only be read back from memory, which proves nothing about its disk ({system})")
+    if system in places.NETWORK:
+        found.append(f"{there} is on another machine ({system}), which is believed where it says what is on its disk")
+    elif system not in places.KEEPS_FSYNC:
+        found.append(f"{there} may not survive a power cut: its file system is {system}")
+    return found
+
+
+def _write_sums(there: Tree, manifest: Mapping[str, Proved]) -> None:
+    """Write the manifest beside the copy, as `sha256sum --check` reads it. Raises FlightError."""
+    path = there.path.with_name(f"{there.path.name}.sha256")
+    lines = [f"{one.sha256}  {there.path.name}/{name}\n" for name, one in sorted(manifest.items())]
+    try:
+        durable.write_file(path, "".join(lines).encode())
+    except OSError as error:
+        raise disk_error("write", path, error) from error

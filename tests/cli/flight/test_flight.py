@@ -123,11 +123,13 @@ def test_books_that_do_not_balance_are_a_failure(closed: Path, capsys: pytest.Ca
 
 def test_offload_says_what_it_did(closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     disk = tmp_path / "disk"
-    said = lines(["offload", str(disk), str(closed)], capsys)
-    count = sum(path.is_file() for path in disk.rglob("*"))
-    assert said == [f"{disk / closed.name}: {count} files copied and verified, 0 already there"]
-    assert main(["flight", "offload", str(disk), str(closed), "--json"]) == 0
+    said = lines(["offload", str(disk), str(closed), "--same-device"], capsys)
+    count = sum(path.is_file() for path in (disk / closed.name).rglob("*"))
+    assert said[0].startswith(
+        f"{disk / closed.name}: {count} files copied and verified, 0 already there; read back from "
+    )
+    assert main(["flight", "offload", str(disk), str(closed), "--same-device", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert (told["copied"], told["there_already"]) == (0, count)
-    assert main(["flight", "offload", str(disk), str(closed), "--prune"]) == 1
-    assert "--prune is switched off" in capsys.readouterr().err
+    assert (told["copied"], told["there_already"], told["pruned"]) == (0, count, 0)
+    assert main(["flight", "offload", str(disk), str(closed)]) == 1
+    assert "insist with --same-device" in capsys.readouterr().err

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from dappled.cli.arguments import Actions
 from dappled.cli.flight import lines as flight_lines
 from dappled.cli.flight import pickup
+from dappled.clock import SystemClock
 from dappled.config import settings
 from dappled.flight import FlightError, check, flight_report, index, offload
 
@@ -35,15 +36,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     away = actions.add(
         "offload",
-        "copy a flight to another disk and verify it by hash",
+        "copy a flight to another disk and prove the copy; remove the frames here on request",
         f"dappled flight offload /media/disk {_FLIGHT}",
+        f"dappled flight offload /media/disk {_FLIGHT} --prune",
     )
     bring = actions.add("pickup", pickup.HELP, *pickup.EXAMPLES)
     listing.add_argument(
         "folder", nargs="?", type=Path, metavar="FOLDER", help="flights folder (default: record.directory)"
     )
     away.add_argument("destination", type=Path, metavar="DEST", help="folder that will hold the flight's folder")
-    away.add_argument("--prune", action="store_true", help="refused: dappled can't yet prove that DEST is another disk")
+    away.add_argument("--prune", action="store_true", help="then remove the frames here, each by the proof of its copy")
+    away.add_argument("--same-device", action="store_true", help="insist on a DEST that is on the same disk")
     pickup.configure(bring)
     for one in (show, intact, report, away, bring):
         one.add_argument("flight", nargs="?", type=Path, metavar="FLIGHT", help="flight folder (default: the newest)")
@@ -59,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.action == "pickup":
         return pickup.run(flight, arguments)
     if arguments.action == "offload":
-        return _offload(flight, arguments.destination, arguments.prune, arguments.json)
+        return _offload(flight, arguments)
     return {"show": _show, "check": _check, "report": _report}[arguments.action](flight, arguments.json)
 
 
@@ -101,11 +104,18 @@ def _report(flight: Path, as_json: bool) -> int:
     return 0 if found.balanced else 1
 
 
-def _offload(flight: Path, destination: Path, prune: bool, as_json: bool) -> int:
+def _offload(flight: Path, arguments: argparse.Namespace) -> int:
     total = sum(path.stat().st_size for path in flight.rglob("*") if path.is_file())
     with tqdm(total=total, unit="B", unit_scale=True, disable=None, delay=1.0) as bar:
-        done = offload.offload(flight, destination, prune=prune, progress=bar.update)
-    return _said(_plain(done), flight_lines.of_offload(done), as_json)
+        done = offload.offload(
+            flight,
+            arguments.destination,
+            prune=arguments.prune,
+            same_device=arguments.same_device,
+            clock=SystemClock(),
+            progress=bar.update,
+        )
+    return _said(_plain(done), flight_lines.of_offload(done), arguments.json)
 
 
 def _said(values: Any, lines: Iterable[str], as_json: bool) -> int:

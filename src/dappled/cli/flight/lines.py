@@ -65,6 +65,9 @@ def of_check(found: CheckReport) -> Iterator[str]:
     word = "intact" if found.intact else "NOT INTACT"
     size = f"{found.size / 1e6:.1f} MB"
     packets = counted(found.telemetry_packets, "telemetry packet")
+    if found.offloaded:
+        word = f"{word}, of what is still here" if found.intact else word
+        packets += f"; {counted(found.offloaded, 'file')} offloaded and not read"
     yield f"{found.flight}: {word}: {counted(found.files, 'file')}, {size}, {packets}"
 
 
@@ -98,8 +101,12 @@ def _table(sources: Sequence[SourceReport]) -> Iterator[str]:
 
 
 def of_offload(done: Offloaded) -> Iterator[str]:
-    """How many files were copied and verified."""
-    yield f"{done.destination}: {counted(done.copied, 'file')} copied and verified, {done.there_already} already there"
+    """How many files were copied and proved, how, what is in doubt, and how many were removed here."""
+    counts = f"{counted(done.copied, 'file')} copied and verified, {done.there_already} already there"
+    yield f"{done.destination}: {counts}; read back from {done.file_system} by {' and '.join(done.read_back)}"
+    yield from (f"in doubt: {text}" for text in done.doubts)
+    if done.pruned:
+        yield f"{counted(done.pruned, 'file')} removed here; offloaded.jsonl names them, ledger and telemetry stay"
 
 
 def _utc(utc_ns: int) -> str:

@@ -160,7 +160,7 @@ def disk(settings: Settings, machine: Machine) -> list[Check]:
     free = layout.disk_space(place).available
     text = f"{free / 1e9:.1f} GB free at {folder}, room for about {counted(int(free / _FRAME_BYTES), 'frame')}"
     if free < settings.record.min_free_mb * 1e6:
-        mend = "`dappled flight offload`, then remove frames by hand"
+        mend = "`dappled flight offload DEST --prune` makes room"
         return [Check("disk", "no-go", f"{text}: below record.min_free_mb", mend)]
     return [Check("disk", "go", text)]
 

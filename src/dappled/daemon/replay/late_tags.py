@@ -77,7 +77,7 @@ def add_missing(flight: Path, clock: Clock) -> list[int]:
     recording = replace(recording, shots=[shot for shot in recording.shots if shot.index <= max(missing)])
     progress, time = ReplayProgress(), replay.clock(recording)
     with ExitStack() as stack:
-        stack.enter_context(FlightsLock(flight.absolute().parent))
+        stack.enter_context(FlightsLock(flight.resolve().parent, "tags frames in"))
         ledger = stack.enter_context(Ledger(folder.ledger, clock))
         writer = MissingTagWriter(recording, ledger)
         camera = ReplayCamera(recording.files, Identity("dappled", "recording", "", str(flight)), time)

@@ -130,10 +130,11 @@ def bring(flight: Path, source: FileSource, proposal: Proposal, clock: Clock, pr
     frames: list[Frame] = []
     zooms: list[str] = []
     companions = 0
+    root = flight.resolve().parent  # of the flight itself, whatever link leads to it
     zoom = Zoom()
     with ExitStack() as stack:
-        stack.enter_context(FlightsLock(flight.parent))
-        index = stack.enter_context(ImageIndex(flight.parent))
+        stack.enter_context(FlightsLock(root, "picks up files into"))
+        index = stack.enter_context(ImageIndex(root))
         ledger = stack.enter_context(Ledger(folder.ledger, clock))
         recorder = Recorder(folder, ledger)
         for number, group in proposal.pairs:

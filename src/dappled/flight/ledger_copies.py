@@ -1,0 +1,77 @@
+"""Copy a ledger as SQLite sees it, its write-ahead log included, and say which of two copies of it is the later one."""
+
+from __future__ import annotations
+
+import hashlib
+import sqlite3
+from contextlib import closing
+
+from dappled.flight.errors import FlightError
+from dappled.flight.ledger import LedgerReader
+from dappled.flight.pruning import Proved
+from dappled.flight.trees import FileIdentity, Tree
+
+_GROWS = ("chain", "frames", "companions", "strays", "poses", "tags", "results", "events")
+"""Tables whose rows are added and never changed. Of shots the state changes, of facts the value."""
+
+
+def is_part(name: str) -> bool:
+    """Whether a file of the flight belongs to the ledger: SQLite's own files, which are not copied as they are."""
+    return name in ("flight.sqlite", "flight.sqlite-wal", "flight.sqlite-shm")
+
+
+def bring(source: Tree, there: Tree, name: str) -> tuple[bool, Proved]:
+    """Copy the ledger; (whether it was written, what the copy is). A copy that is an earlier state of the source's is
+    replaced, a later one stays: rows were added to it there.
+
+    Raises FlightError where each has rows that the other lacks, or a disk refuses.
+    """
+    with LedgerReader.open(source.path / name) as ledger:
+        image = ledger.image()
+    goal = there.path / name
+    if there.stat(name) is not None:
+        with LedgerReader.open(goal) as held:
+            theirs = held.image()
+        if theirs == image:
+            return False, _proved(there, name, image)
+        if _within(image, theirs):
+            return False, _proved(there, name, theirs)
+        if not _within(theirs, image):
+            raise FlightError(
+                f"{goal} is there already and differs from {source.path / name}, and each holds what the other lacks: "
+                "move one away first"
+            )
+    there.write(name, [image])
+    return True, _proved(there, name, image)
+
+
+def _proved(there: Tree, name: str, image: bytes) -> Proved:
+    found = there.stat(name)
+    assert found is not None
+    return Proved(FileIdentity.of(found), hashlib.sha256(image).hexdigest())
+
+
+def _within(earlier: bytes, later: bytes) -> bool:
+    """Whether every row of one ledger is in the other."""
+    try:
+        with closing(_opened(earlier)) as one, closing(_opened(later)) as other:
+            return all(_rows(one, query) <= _rows(other, query) for query in _queries(one))
+    except sqlite3.Error:
+        return False
+
+
+def _opened(image: bytes) -> sqlite3.Connection:
+    connection = sqlite3.connect(":memory:")
+    # SQLite reads no WAL database from memory; bytes 18 and 19 of the header say how it is journalled
+    connection.deserialize(image[:18] + b"\1\1" + image[20:])
+    return connection
+
+
+def _queries(ledger: sqlite3.Connection) -> list[str]:
+    tables = {row[0] for row in ledger.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    whole = [f"SELECT * FROM {table}" for table in _GROWS if table in tables]  # noqa: S608  names of our own
+    return [*whole, "SELECT idx, source, kind, sequence, wished_utc_ns FROM shots", "SELECT key FROM facts"]
+
+
+def _rows(ledger: sqlite3.Connection, query: str) -> set[tuple[object, ...]]:
+    return set(ledger.execute(query))

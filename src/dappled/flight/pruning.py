@@ -1,0 +1,135 @@
+"""Remove frames whose copies are proved, and keep a record of which were removed here and where they are.
+
+The record, `offloaded.jsonl`, stands in the flight that was pruned and never in its copy; the ledger has its SHA-256 in
+an event. Both are durable before the first file is removed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from dappled.clock import Clock
+from dappled.errors import counted
+from dappled.flight import durable
+from dappled.flight.chain import canonical
+from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.layout import FlightFolder
+from dappled.flight.ledger import Ledger, LedgerReader
+from dappled.flight.trees import FileIdentity, Tree, pieces
+
+RECORD = "offloaded.jsonl"
+EVENT = "offloaded"
+_SHA256 = re.compile(r"offloaded\.jsonl \(SHA-256 ([0-9a-f]{64})\)")
+
+
+@dataclass(frozen=True, slots=True)
+class Proved:
+    """A file that was copied: which file it was, and the SHA-256 of its bytes, which the copy has on its disk."""
+
+    identity: FileIdentity
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Removed:
+    """A file that was removed here: its size and SHA-256, the folder that holds it, and when it was removed."""
+
+    name: str
+    size: int
+    sha256: str
+    destination: str
+    utc_ns: int
+
+
+def removed(folder: FlightFolder) -> dict[str, Removed]:
+    """The files that were removed from a flight, by name. Raises FlightError where the record is not the one that the
+    ledger vouches for."""
+    path = folder.file(RECORD)
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise disk_error("read", path, error) from error
+    with LedgerReader.open(folder.ledger) as ledger:
+        texts = [event.text for event in ledger.events() if event.kind == EVENT]
+    if hashlib.sha256(data).hexdigest() not in {found for text in texts for found in _SHA256.findall(text)}:
+        raise FlightError(f"{path} was changed: the ledger has no event with its SHA-256; use another copy of it")
+    try:
+        rows = [Removed(**json.loads(line)) for line in data.decode().splitlines()]
+    except (ValueError, TypeError) as error:
+        raise FlightError(f"{path} can't be read: {error}") from error
+    return {row.name: row for row in rows}
+
+
+def remove(folder: FlightFolder, source: Tree, there: Tree, sure: Mapping[str, Proved], clock: Clock) -> int:
+    """Remove files whose copies were read back from `there`; how many. Each must still be the file that was copied.
+
+    Raises FlightError where one isn't, a copy has vanished, or a disk refuses; the other files then stay.
+    """
+    if not sure:
+        return 0
+    _note(folder, there.path, sure, clock)
+    copies = {name: _copy_of(there, name) for name in sure}
+    for name, one in sure.items():
+        with source.reading(name) as fd:
+            _refuse_other(source, name, fd, one)
+            if _copy_of(there, name) != copies[name]:
+                raise FlightError(f"{there.path / name} is not the file any more that was read back: {name} stays here")
+            source.unlink(name)
+            if _copy_of(there, name) != copies[name]:  # one file under two names that nothing told apart
+                source.write(name, pieces(fd, one.identity.size, lambda _: None))
+                source.sync()
+                raise FlightError(
+                    f"{there.path / name} vanished with {source.path / name}: they are one file under two names; it "
+                    "was put back here, and nothing more was removed"
+                )
+    source.sync()
+    return len(sure)
+
+
+def _note(folder: FlightFolder, there: Path, sure: Mapping[str, Proved], clock: Clock) -> None:
+    """Write down what will be removed: the ledger's event first: an older record has one of its own."""
+    now = clock.utc_ns()
+    rows = removed(folder) | {
+        name: Removed(name, one.identity.size, one.sha256, str(there), now) for name, one in sure.items()
+    }
+    lines = [
+        canonical({"name": row.name, "size": row.size, "sha256": row.sha256, "destination": row.destination,
+                   "utc_ns": row.utc_ns}) + b"\n"
+        for _, row in sorted(rows.items())
+    ]  # fmt: skip
+    data = b"".join(lines)
+    sha256 = hashlib.sha256(data).hexdigest()
+    names = sorted(sure)
+    which = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
+    with Ledger(folder.ledger, clock) as ledger:
+        ledger.add_event(
+            EVENT,
+            f"{counted(len(sure), 'file')} ({which}) were copied to {there}, read back there, and are removed here; "
+            f"{RECORD} (SHA-256 {sha256}) names each",
+        )
+    try:
+        durable.write_file(folder.path / RECORD, data)
+    except OSError as error:
+        raise disk_error("write", folder.path / RECORD, error) from error
+
+
+def _refuse_other(source: Tree, name: str, fd: int, one: Proved) -> None:
+    """Raise FlightError where a file is not the one that was copied any more."""
+    named = source.stat(name)
+    same = FileIdentity.of_fd(fd) == one.identity and named is not None and FileIdentity.of(named) == one.identity
+    if not same or durable.hash_descriptor(fd, one.identity.size) != one.sha256:
+        raise FlightError(
+            f"{source.path / name} is not the file any more that was copied: it stays here; offload again"
+        )
+
+
+def _copy_of(there: Tree, name: str) -> FileIdentity | None:
+    found = there.stat(name)
+    return None if found is None else FileIdentity.of(found)

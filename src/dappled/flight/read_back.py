@@ -1,0 +1,83 @@
+"""Hash a file as it is on its disk, past the page cache: what was just written is in memory and always reads well.
+
+With O_DIRECT the kernel reads from the device itself. Where a file system refuses that, the file's pages are dropped,
+and a probe (preadv2 with RWF_NOWAIT) says whether they are gone. On a network this passes this machine's cache only.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import mmap
+import os
+from typing import Literal
+
+ReadBack = Literal["O_DIRECT", "dropped pages", "page cache"]
+"""How a file was read: past the cache in two ways, or from it, which proves nothing about the disk."""
+
+_REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
+_CHUNK = 1 << 20
+
+
+def hash_on_disk(name: str, folder: int) -> tuple[str, ReadBack]:
+    """fsync a file in an open folder and return its SHA-256 (hex), and how it was read. Raises OSError."""
+    fd = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
+    try:
+        os.fsync(fd)
+        os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
+        direct = _direct(name, folder)
+        if direct is not None:
+            return direct, "O_DIRECT"
+        size = os.fstat(fd).st_size
+        how: ReadBack = "page cache" if _in_memory(fd, size) else "dropped pages"
+        return _hash(fd), how
+    finally:
+        os.close(fd)
+
+
+def _direct(name: str, folder: int) -> str | None:
+    """The hash by O_DIRECT; None where the file system refuses it."""
+    try:
+        fd = os.open(name, os.O_RDONLY | os.O_DIRECT | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
+    except OSError as error:
+        if error.errno in _REFUSED:
+            return None
+        raise
+    try:
+        return _hash(fd)
+    except OSError as error:
+        if error.errno in _REFUSED:
+            return None
+        raise
+    finally:
+        os.close(fd)
+
+
+def _hash(fd: int) -> str:
+    """The hash of a whole file, read at aligned places into an aligned buffer, as O_DIRECT needs it."""
+    sha256 = hashlib.sha256()
+    with mmap.mmap(-1, _CHUNK) as buffer, memoryview(buffer) as view:
+        done = 0
+        while got := os.preadv(fd, [view], done):
+            sha256.update(view[:got])
+            done += got
+            if got % mmap.PAGESIZE:  # a file's end; a read from here on would not be aligned
+                break
+    return sha256.hexdigest()
+
+
+def _in_memory(fd: int, size: int) -> bool:
+    """Whether some page of a file is still in memory, or that can't be asked."""
+    byte = bytearray(1)
+    os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_RANDOM)  # a probe must not fetch the pages behind its own
+    for at in range(0, size, mmap.PAGESIZE):
+        try:
+            if os.preadv(fd, [byte], at, os.RWF_NOWAIT):
+                return True
+        except BlockingIOError:
+            continue
+        except OSError as error:
+            if error.errno in _REFUSED:
+                return True
+            raise
+    return False

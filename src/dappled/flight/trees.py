@@ -1,0 +1,220 @@
+"""Hold a folder and the folders below it open, and work on their files by descriptor, so that no link is ever followed.
+
+A path is looked up anew by each call: a link or a mount that is put there in between leads it elsewhere. A descriptor
+stays with its folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import stat
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from dappled.flight import durable
+from dappled.flight.errors import FlightError, disk_error
+
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+_READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+_WRITE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+
+
+@dataclass(frozen=True, slots=True)
+class FileIdentity:
+    """Which file this is, and whether it was written since: device, inode, size in bytes, time of the last change."""
+
+    device: int
+    inode: int
+    size: int
+    mtime_ns: int
+
+    @classmethod
+    def of(cls, found: os.stat_result) -> Self:
+        return cls(found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns)
+
+    @classmethod
+    def of_fd(cls, fd: int) -> Self:
+        """Of the file behind a descriptor. Raises OSError."""
+        return cls.of(os.fstat(fd))
+
+
+class Tree:
+    """A folder, open, and the folders below it that were opened or made. Names are relative to it, with "/" between."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a folder; a link at its end is not followed. Raises FlightError."""
+        self.path = path
+        self._folders: dict[str, int] = {}
+        with self._saying("open", ""):
+            self._folders[""] = os.open(path, _FOLDER)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        for fd in self._folders.values():
+            os.close(fd)
+        self._folders.clear()
+
+    @property
+    def folders(self) -> dict[str, int]:
+        """The descriptor of each open folder by its name; "" is the top."""
+        return dict(self._folders)
+
+    def enter(self, name: str, *, make: bool = False) -> None:
+        """Open a folder whose parent is open; `make` it, durably, where it is missing. Raises FlightError."""
+        if name in self._folders:
+            return
+        parent, last = self._at(name)
+        with self._saying("open the folder", name):
+            if make:
+                with contextlib.suppress(FileExistsError):
+                    os.mkdir(last, dir_fd=parent)
+                os.fsync(parent)  # also where an earlier attempt made it and was cut short
+            self._folders[name] = os.open(last, _FOLDER, dir_fd=parent)
+
+    def walk(self) -> list[str]:
+        """Open every folder below, and name all files, in order. Raises FlightError, also for a link or a device."""
+        found: list[str] = []
+        todo = [""]
+        while todo:
+            folder = todo.pop(0)
+            with self._saying("list", folder):
+                entries = sorted(os.scandir(self._folders[folder]), key=lambda entry: entry.name)
+            for entry in entries:
+                name = f"{folder}/{entry.name}" if folder else entry.name
+                if entry.is_dir(follow_symlinks=False):
+                    self.enter(name)
+                    todo.append(name)
+                elif entry.is_file(follow_symlinks=False):
+                    found.append(name)
+                else:
+                    kind = "a link, which is not followed" if entry.is_symlink() else "no file"
+                    raise FlightError(
+                        f"{self.path / name} is {kind}: nothing was touched; remove it, or put a file there"
+                    )
+        return sorted(found)
+
+    @contextmanager
+    def reading(self, name: str) -> Iterator[int]:
+        """A file's descriptor, open for reading. Raises FlightError, also for what is no file, and for an OSError or
+        EOFError in the block."""
+        parent, last = self._at(name)
+        with self._saying("read", name):
+            fd = os.open(last, _READ, dir_fd=parent)
+            try:
+                if not stat.S_ISREG(os.fstat(fd).st_mode):
+                    raise FlightError(f"{self.path / name} is no file: nothing was touched")
+                yield fd
+            except EOFError as error:
+                raise FlightError(f"{self.path / name} changed while it was read ({error}); try again") from error
+            finally:
+                os.close(fd)
+
+    def stat(self, name: str) -> os.stat_result | None:
+        """What stands under a name, a link itself; None where there is nothing. Raises FlightError."""
+        parent, last = self._at(name)
+        with self._saying("look at", name):
+            try:
+                return os.stat(last, dir_fd=parent, follow_symlinks=False)
+            except FileNotFoundError:
+                return None
+
+    def write(self, name: str, pieces: Iterable[bytes | memoryview]) -> None:
+        """Put a file under a name, whole or not at all; `sync` makes the name durable. Raises FlightError."""
+        parent, last = self._at(name)
+        part = durable.temporary(Path(last)).name
+        with self._saying("write", name):
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(part, dir_fd=parent)  # of an attempt that was cut short
+            try:
+                fd = os.open(part, _WRITE, 0o644, dir_fd=parent)
+                try:
+                    for piece in pieces:
+                        view = memoryview(piece)
+                        while view:
+                            view = view[os.write(fd, view) :]
+                    os.fsync(fd)
+                finally:
+                    os.close(fd)
+                os.rename(part, last, src_dir_fd=parent, dst_dir_fd=parent)
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    os.unlink(part, dir_fd=parent)
+                raise
+
+    def unlink(self, name: str) -> None:
+        """Remove a file. Raises FlightError."""
+        parent, last = self._at(name)
+        with self._saying("remove", name):
+            os.unlink(last, dir_fd=parent)
+
+    def sync(self) -> None:
+        """fsync every open folder, the inner ones first. Raises FlightError."""
+        for name in sorted(self._folders, reverse=True):
+            with self._saying("sync", name):
+                os.fsync(self._folders[name])
+
+    def sync_above(self) -> None:
+        """fsync the folders above, as far as they are on the same file system and may be opened. Raises FlightError."""
+        device = os.fstat(self._folders[""]).st_dev
+        for fd in self.above():
+            if os.fstat(fd).st_dev != device:
+                break
+            with self._saying("sync a folder above", ""):
+                os.fsync(fd)
+
+    def above(self) -> Iterator[int]:
+        """A descriptor of each folder above in turn, up to the root or one that may not be opened."""
+        fd = os.dup(self._folders[""])
+        try:
+            while True:
+                here = os.fstat(fd)
+                try:
+                    upper = os.open("..", _FOLDER, dir_fd=fd)
+                except PermissionError:
+                    return
+                os.close(fd)
+                fd = upper
+                if os.path.samestat(here, os.fstat(fd)):
+                    return
+                yield fd
+        finally:
+            os.close(fd)
+
+    def _at(self, name: str) -> tuple[int, str]:
+        """(descriptor of the folder, last part) of a name."""
+        folder, _, last = name.rpartition("/")
+        return self._folders[folder], last
+
+    @contextmanager
+    def _saying(self, doing: str, name: str) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            where = self.path / name
+            if error.errno == errno.ENOTDIR and where.is_symlink():
+                error.errno = errno.ELOOP  # what O_DIRECTORY says of a link
+            raise disk_error(doing, where, error) from error
+
+
+def pieces(fd: int, size: int, seen: Callable[[memoryview], object]) -> Iterator[memoryview]:
+    """The first `size` bytes of a file, piece by piece; `seen` gets each before it is given out. Raises OSError, and
+    EOFError where the file is shorter."""
+    buffer = memoryview(bytearray(1 << 20))
+    done = 0
+    while done < size:
+        got = os.preadv(fd, [buffer[: size - done]], done)
+        if got == 0:
+            raise EOFError(f"only {done} of {size} bytes came")
+        seen(buffer[:got])
+        yield buffer[:got]
+        done += got
