@@ -106,7 +106,7 @@ DOORS: dict[str, Callable[[Path, Path], object]] = {
     "copies": lambda flight, out: list(geotags.copies(flight, out, Mounting())),
     "replay": lambda flight, out: replay.of_flight(flight),
     "open": lambda flight, out: list(cast(OpenedFlight, opened.open(flight, camera=RECIPE.camera, mask=RECIPE.mask))),
-    "decode": lambda flight, out: georeference.develop(Darkroom(RECIPE), flight, _first(flight), None, Options()),
+    "decode": lambda flight, out: georeference.decode(Darkroom(RECIPE), flight, _first(flight), None, Options()),
 }
 
 

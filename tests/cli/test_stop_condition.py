@@ -8,6 +8,7 @@ import pytest
 
 from dappled.cli.stop_condition import StopCondition
 from dappled.cli.terminal import Tally
+from dappled.clock import RecordedClock
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.flight import Frame
 from tests.flight.makers import shot
@@ -27,37 +28,39 @@ class Asker:
 
 
 @dataclass
+class Flight:
+    requested: int
+
+
+@dataclass
 class World:
     """Everything that a goal looks at, turned by hand."""
 
     tally: Tally = field(default_factory=Tally)
     asker: Asker = field(default_factory=Asker)
     asked: int = 0
-    ready: bool = False
-    now_s: float = 100.0
+    asks: bool = False
+    is_ready: bool = False
+    clock: RecordedClock = field(default_factory=lambda: RecordedClock(10**11))
 
-    def ask(self) -> Asker:
-        self.asked += 1
-        return self.asker
+    def ready(self) -> bool:
+        return self.is_ready
 
-    def goal(self, frames: int | None = None, seconds: float | None = None, *, asks: bool = False) -> StopCondition:
-        return StopCondition(
-            self.tally,
-            frames,
-            seconds,
-            ask=self.ask if asks else None,
-            ready=lambda: self.ready,
-            clock_s=lambda: self.now_s,
-        )
+    def ground_station(self) -> Asker | None:
+        self.asked += self.asks
+        return self.asker if self.asks else None
+
+    def goal(self, frames: int | None = None, seconds: float | None = None) -> StopCondition:
+        return StopCondition(self.tally, frames, seconds, around=self, clock=self.clock)
 
 
 def test_without_a_goal_it_never_ends() -> None:
     world = World()
     goal = world.goal()
-    goal.begin(lambda: 0)
+    goal.begin(Flight(0))
     for index in range(5):
         world.tally.add(ended(index))
-    world.now_s += 1e6
+    world.clock.advance(1e6)
     assert not goal.reached()
     assert not goal.short
 
@@ -65,20 +68,20 @@ def test_without_a_goal_it_never_ends() -> None:
 def test_the_time_counts_from_the_first_flight() -> None:
     world = World()
     goal = world.goal(seconds=60.0)
-    world.now_s += 1000
+    world.clock.advance(1000)
     assert not goal.reached()
-    goal.begin(lambda: 0)
-    world.now_s += 59
-    goal.begin(lambda: 0)  # another flight has begun meanwhile
+    goal.begin(Flight(0))
+    world.clock.advance(59)
+    goal.begin(Flight(0))  # another flight has begun meanwhile
     assert not goal.reached()
-    world.now_s += 1
+    world.clock.advance(1)
     assert goal.reached()
 
 
 def test_so_many_shots_whatever_came_of_them() -> None:
     world = World()
     goal = world.goal(frames=3)
-    goal.begin(lambda: 3)
+    goal.begin(Flight(3))
     world.tally.add(ended(0))
     world.tally.add(ended(1, "the card is full"))
     assert not goal.reached()
@@ -89,14 +92,14 @@ def test_so_many_shots_whatever_came_of_them() -> None:
 
 
 def test_the_ground_station_asks_once_and_only_a_ready_camera() -> None:
-    world = World()
-    goal = world.goal(frames=2, asks=True)
-    goal.begin(lambda: 0)
+    world = World(asks=True)
+    goal = world.goal(frames=2)
+    goal.begin(Flight(0))
     assert not goal.reached()
     assert world.asked == 0
-    world.ready = True
+    world.is_ready = True
     assert not goal.reached()
-    world.ready = False
+    world.is_ready = False
     assert not goal.reached()
     assert world.asked == 1
 
@@ -104,11 +107,11 @@ def test_the_ground_station_asks_once_and_only_a_ready_camera() -> None:
 @pytest.mark.parametrize("earlier", [0, 2])
 def test_a_ground_station_that_gave_up_ends_it_when_all_it_wished_has_ended(earlier: int) -> None:
     """Wishes that failed were refused, say; those of flights before have ended and count no more."""
-    world = World(ready=True)
-    goal = world.goal(frames=8, asks=True)
+    world = World(asks=True, is_ready=True)
+    goal = world.goal(frames=8)
     for index in range(earlier):
         world.tally.add(ended(index))
-    goal.begin(lambda: 2)
+    goal.begin(Flight(2))
     assert not goal.reached()
     world.asker.busy = False
     world.tally.add(ended(earlier))

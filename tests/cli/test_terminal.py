@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, frame_line
+from dappled.clock import RecordedClock
 from dappled.daemon.health import systemd
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.drivers.camera import BodyState, StateChanged
@@ -64,7 +65,7 @@ def test_a_problem_is_said_once_each_time_it_comes_up() -> None:
     said: list[str] = []
     lines: list[str] = []
     problems: list[str] = []
-    now_s = 10.0
+    clock = RecordedClock(10**10)
 
     class Daemon:
         def health(self) -> Mapping[str, Any]:
@@ -78,20 +79,20 @@ def test_a_problem_is_said_once_each_time_it_comes_up() -> None:
         Daemon(),
         Manager(),
         say=lambda text, *_, **__: said.append(text),
-        clock_s=lambda: now_s,
+        clock=clock,
     )
     remarks.look()
     assert lines == []  # not yet a second old
     for here in (["b", "a"], ["a"], ["a", "b"]):
         problems[:] = here
-        now_s += 1.0
+        clock.advance(1)
         remarks.look()
         remarks.look()
     assert said == ["problem: a", "problem: b", "problem: b"]
     assert [line.split("; ", 1)[1] for line in lines] == ["b; a", "a", "a; b"]
     for here in (["disk: 12 MB left"], ["disk: 11 MB left"]):
         problems[:] = here
-        now_s += 1.0
+        clock.advance(1)
         remarks.look()
     assert said[3:] == ["problem: disk: 12 MB left"]  # numbers that change are no news
     problems[:] = ["the end"]

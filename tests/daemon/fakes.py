@@ -1,4 +1,4 @@
-"""A camera, a developer and a flight for tests of the street: small, and true to the protocols."""
+"""A camera, a decoder and a flight for tests of the pipeline: small, and true to the protocols."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class FakeDecoder:
         self.gate.set()
         self.seen: list[str] = []
 
-    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
+    def decode(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
         self.seen.append(path)
         assert self.gate.wait(20)
         if self.problem:

@@ -7,20 +7,24 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dappled.cli.arguments import seconds, whole
 from dappled.cli.stop_condition import Asker, StopCondition
 from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, RunObserver, Tally, remark
+from dappled.clock import SystemClock
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
 from dappled.daemon.flight_handover import FlightHandover, flights
 from dappled.daemon.health.systemd import Notifier
 from dappled.daemon.service import Service
 from dappled.errors import DappledError
+
+if TYPE_CHECKING:
+    from dappled.mocks.simulation import Simulation
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -63,16 +67,33 @@ def _run(arguments: argparse.Namespace) -> int:
         simulation = Simulation(World(seed=arguments.seed), settings, Path(folder))
         remark("simulating a masked camera, an autopilot and a ground station")
         with simulation as simulated:
-            ask = (lambda: simulation.ground_station(arguments.frames)) if arguments.frames else None
-            return _serve(simulated, arguments, ask)
+            return _serve(simulated, arguments, simulation)
 
 
-def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], Asker] | None) -> int:
+@dataclass(frozen=True, slots=True)
+class RunSurroundings:
+    """The camera, as it was reported last, and what is simulated around it; `frames` are asked for."""
+
+    camera: CameraRemarks
+    simulation: Simulation | None
+    frames: int | None
+
+    def ready(self) -> bool:
+        """See Surroundings."""
+        return self.camera.state == "ready"
+
+    def ground_station(self) -> Asker | None:
+        """See Surroundings."""
+        return self.simulation.ground_station(self.frames) if self.simulation and self.frames else None
+
+
+def _serve(settings: Settings, arguments: argparse.Namespace, simulation: Simulation | None) -> int:
     """Run the daemon, flight after flight, until a signal, --frames or --for ends it."""
     manager, camera, tally = Notifier(), CameraRemarks(), Tally()
     frames = FrameLines(as_json=arguments.json)
     asked, hung_up = threading.Event(), threading.Event()
-    goal = StopCondition(tally, arguments.frames, arguments.seconds, ask=ask, ready=lambda: camera.state == "ready")
+    around = RunSurroundings(camera, simulation, arguments.frames)
+    goal = StopCondition(tally, arguments.frames, arguments.seconds, around=around, clock=SystemClock())
 
     def fly(flown: Settings, after: FlightHandover) -> bool:
         """Run one flight. Returns whether another may follow."""
@@ -99,7 +120,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, ask: Callable[[], 
             remark(f"stream {flown.publish.slices}")
             if service.console_url:
                 remark(f"console {service.console_url}")
-            goal.begin(lambda: service.requested)
+            goal.begin(service)
             service.run(turn)
             problems.look(now=True)
             manager.working(time.monotonic_ns(), now=True)  # closing one flight and opening the next takes a while

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from typing import Protocol
 
 from dappled.cli.terminal import Tally
+from dappled.clock import Clock
 
 
 class Asker(Protocol):
@@ -16,11 +15,29 @@ class Asker(Protocol):
         """Whether it still asks, or waits for an answer."""
 
 
+class Surroundings(Protocol):
+    """What a run has around it: a camera, and perhaps a simulated ground station."""
+
+    def ready(self) -> bool:
+        """Whether the camera is ready."""
+
+    def ground_station(self) -> Asker | None:
+        """Start the ground station that asks for the frames; None where there is none to start."""
+
+
+class BegunFlight(Protocol):
+    """A flight that has begun."""
+
+    @property
+    def requested(self) -> int:
+        """Shots so far."""
+
+
 class StopCondition:
     """The end of a run: `frames` shots have ended, or `seconds` have passed since the first flight began.
 
-    None means no such end. `ask` starts the ground station that asks for the frames, once the camera is `ready`. The
-    run ends when it has no more requests to send and all of its shots have ended.
+    None means no such end. Where frames are wanted, a ground station that asks for them is started once the camera is
+    ready. The run ends when it has no more requests to send and all of its shots have ended.
     """
 
     def __init__(
@@ -29,36 +46,36 @@ class StopCondition:
         frames: int | None,
         seconds: float | None,
         *,
-        ask: Callable[[], Asker] | None,
-        ready: Callable[[], bool],
-        clock_s: Callable[[], float] = time.monotonic,
+        around: Surroundings,
+        clock: Clock,
     ) -> None:
         self._tally, self._frames, self._seconds = tally, frames, seconds
-        self._ask, self._ready, self._clock_s = ask, ready, clock_s
-        self._until_s: float | None = None
+        self._around, self._clock = around, clock
+        self._until_ns: int | None = None
         self._asker: Asker | None = None
-        self._requested: Callable[[], int] = lambda: 0
+        self._flight: BegunFlight | None = None
+        self._earlier = 0
 
     @property
     def short(self) -> bool:
         """Whether fewer good frames were taken than requested."""
         return self._frames is not None and self._tally.good < self._frames
 
-    def begin(self, requested: Callable[[], int]) -> None:
-        """A flight has begun: its `requested` comes on top of the shots of earlier flights, which have ended."""
-        if self._until_s is None and self._seconds is not None:
-            self._until_s = self._clock_s() + self._seconds
-        earlier = self._tally.count
-        self._requested = lambda: earlier + requested()
+    def begin(self, flight: BegunFlight) -> None:
+        """A flight has begun: its shots come on top of those of earlier flights, which have ended."""
+        if self._until_ns is None and self._seconds is not None:
+            self._until_ns = self._clock.monotonic_ns() + round(self._seconds * 1e9)
+        self._flight, self._earlier = flight, self._tally.count
 
     def reached(self) -> bool:
         """Whether it is time to end."""
-        if self._until_s is not None and self._clock_s() >= self._until_s:
+        if self._until_ns is not None and self._clock.monotonic_ns() >= self._until_ns:
             return True
         if self._frames is None:
             return False
-        if self._ask is not None and self._asker is None and self._ready():
-            self._asker = self._ask()
+        if self._asker is None and self._around.ready():
+            self._asker = self._around.ground_station()
         if self._tally.count >= self._frames:
             return True
-        return self._asker is not None and not self._asker.running() and self._tally.count >= self._requested()
+        requested = self._earlier + (0 if self._flight is None else self._flight.requested)
+        return self._asker is not None and not self._asker.running() and self._tally.count >= requested

@@ -11,12 +11,12 @@ import logging
 import os
 import sys
 import threading
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any, Protocol
 
+from dappled.clock import Clock, SystemClock
 from dappled.daemon.health.logbook import NewProblems
 from dappled.daemon.health.record import line as status_line
 from dappled.daemon.health.systemd import JournalHandler
@@ -27,7 +27,7 @@ from dappled.errors import counted
 from dappled.workers import Worker
 
 log = logging.getLogger("dappled.run")
-_PROBLEMS_EVERY_S = 1.0
+_PROBLEMS_EVERY_NS = 10**9
 
 
 class Say(Protocol):
@@ -164,17 +164,18 @@ class ProblemRemarks:
         manager: StatusLine,
         *,
         say: Say = remark,
-        clock_s: Callable[[], float] = time.monotonic,
+        clock: Clock | None = None,
     ) -> None:
-        self._daemon, self._manager, self._say, self._clock_s = daemon, manager, say, clock_s
+        self._daemon, self._manager, self._say, self._clock = daemon, manager, say, clock or SystemClock()
         self._problems = NewProblems()
-        self._due_s = clock_s() + _PROBLEMS_EVERY_S
+        self._due_ns = self._clock.monotonic_ns() + _PROBLEMS_EVERY_NS
 
     def look(self, *, now: bool = False) -> None:
         """Read the health record if a second has passed since the last time, or if `now`."""
-        if not now and self._clock_s() < self._due_s:
+        now_ns = self._clock.monotonic_ns()
+        if not now and now_ns < self._due_ns:
             return
-        self._due_s = self._clock_s() + _PROBLEMS_EVERY_S
+        self._due_ns = now_ns + _PROBLEMS_EVERY_NS
         record = self._daemon.health()
         for text in sorted(self._problems.among(record["problems"])):
             self._say(f"problem: {text}", logging.WARNING, problem=text)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from dappled.cli.arguments import seconds, whole
 from dappled.cli.status import stream_endpoint
+from dappled.clock import SystemClock
 from dappled.daemon.stream import watch
 from dappled.daemon.stream.curve import ClientKeys, KeyFileError, load_own, load_public
 from dappled.daemon.stream.subscriber import Subscriber, reuse_large_blocks
@@ -53,6 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
             new_frame=lambda message: watch.save(message, arguments.save) if arguments.save else None,
             count=arguments.count,
             silence_s=arguments.timeout,
+            clock=SystemClock(),
         )
         if not arguments.json:
             asked_again = f"{subscriber.recovered} after a repeated request"

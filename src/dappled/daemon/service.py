@@ -95,7 +95,7 @@ class Service:
         self._outside, self._after = observer or Observer(), after
         self._clock = clock or SystemClock()
         self._began_monotonic_ns = self._clock.monotonic_ns()
-        self._logbook = Logbook(self._clock.utc_ns)
+        self._logbook = Logbook(self._clock)
         self._alarms = Alarms()
         self._stack = ExitStack()
         self._stopping = threading.Event()
@@ -184,17 +184,18 @@ class Service:
             model=self._control,
             feedback_is_shot=settings.mavlink.feedback_is_shot,
         )
-        self._decoder = None if recipe is None else DecodeProcess(recipe)
+        self._decoder = None if recipe is None else DecodeProcess(recipe, clock=clock)
         self._depth = None
         if recipe is not None and settings.decode.depth:
             self._depth = LiveDepth(
-                DecodeProcess(recipe),
+                DecodeProcess(recipe, clock=clock),
                 writer,
                 shots,
                 self._publisher,
                 method=settings.decode.depth,
                 interval_s=settings.decode.depth_interval_s,
-                on_nearest=self._control.send_distance if settings.decode.depth_to_autopilot else None,
+                clock=clock,
+                nearest=self._control if settings.decode.depth_to_autopilot else None,
             )
         self._events = ShotEvents(
             recording,

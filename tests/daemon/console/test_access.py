@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dappled.clock import RecordedClock
 from dappled.daemon.console import access
 from dappled.daemon.console.access import Access, ConsoleRequest
 
@@ -94,8 +95,8 @@ def test_a_globe_brings_the_token_in_its_address(rules: Access) -> None:
 
 
 def test_guesses_are_few() -> None:
-    now = [0.0]
-    rules = Access(TOKEN, clock=lambda: now[0])
+    clock = RecordedClock(0)
+    rules = Access(TOKEN, clock=clock)
     codes = [
         refusal.status if (refusal := rules.try_token(f"guess {n}", "10.0.0.9")) else 200
         for n in range(access.GUESSES + 2)
@@ -104,7 +105,7 @@ def test_guesses_are_few() -> None:
     refusal = rules.try_token(TOKEN, "10.0.0.9")  # the right one waits too: else guesses went on
     assert refusal is not None
     assert refusal.status == 429
-    now[0] = access.GUESS_WINDOW_S + 1
+    clock.advance(access.GUESS_WINDOW_S + 1)
     assert rules.try_token(TOKEN, "10.0.0.9") is None
     assert rules.refused == access.GUESSES + 3
 

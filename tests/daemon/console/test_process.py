@@ -18,7 +18,7 @@ from typing import Any
 import httpx
 import pytest
 
-from dappled.clock import SystemClock
+from dappled.clock import RecordedClock, SystemClock
 from dappled.config.settings import ConsoleSettings, PublishSettings, Settings
 from dappled.daemon.console import process
 from dappled.daemon.console.process import Console, ConsoleError
@@ -192,7 +192,7 @@ def pipeline(tmp_path: Path) -> Any:
 
 
 def do(shutter: Shutter, **request: Any) -> dict[str, Any]:
-    return process.answer(request, shutter, Logbook(lambda: 0))
+    return process.answer(request, shutter, Logbook(RecordedClock(0)))
 
 
 def test_a_number_that_comes_twice_is_one_wish(pipeline: Rig) -> None:
@@ -224,7 +224,7 @@ def test_a_refusal_is_told(pipeline: Rig) -> None:
 
 
 def test_the_log_is_told_from_a_number_on(pipeline: Rig) -> None:
-    book = Logbook(lambda: 7)
+    book = Logbook(RecordedClock(7))
     book.add("one")
     book.add("two", "warning")
     told = process.answer({"do": "log", "after": 1}, pipeline.shutter, book)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.daemon.health.logbook import Logbook, NewProblems, battery_doubt, of_shot
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.drivers.camera import Setting
@@ -17,7 +18,7 @@ FRAME = Frame(7, "frames/000007.dng", "IMG.DNG", 5_100_000, "0" * 64, 0)
 
 
 def test_lines_are_numbered_and_bounded() -> None:
-    book = Logbook(lambda: 3, capacity=4)
+    book = Logbook(RecordedClock(3), capacity=4)
     for number in range(10):
         book.add(f"line {number}")
     assert [line["number"] for line in book.after(0)] == [7, 8, 9, 10]
@@ -26,14 +27,14 @@ def test_lines_are_numbered_and_bounded() -> None:
 
 
 def test_a_line_said_twice_stands_once() -> None:
-    book = Logbook(lambda: 0)
+    book = Logbook(RecordedClock(0))
     book.add("the camera is absent")
     book.add("the camera is absent")
     assert len(book.after(0)) == 1
 
 
 def test_warnings_of_the_loggers_are_kept_and_lesser_ones_not() -> None:
-    book = Logbook(lambda: 0)
+    book = Logbook(RecordedClock(0))
     logger = logging.Logger("dappled.test")
     logger.addHandler(book)
     logger.warning("link %s is gone", "a")

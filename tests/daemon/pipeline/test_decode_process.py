@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.daemon.pipeline.decode_process import DecodeProcess, DecodeProcessError, serve
 from dappled.drivers.child_process import ProcessChannel, RestartBudget
 from dappled.drivers.raw.darkroom import Recipe
@@ -47,10 +48,10 @@ def test_bad_frames_cost_nothing_but_themselves(decoder: DecodeProcess, frame: s
     junk.write_bytes(b"II*\0" + bytes(range(256)) * 100)
     for path in (str(junk), str(tmp_path / "nothing.dng"), str(tmp_path)):
         with pytest.raises(DecodeProcessError) as caught:
-            decoder.develop(path, None, None)
+            decoder.decode(path, None, None)
         assert path in str(caught.value)
         assert "\n" not in str(caught.value)
-    done = decoder.develop(frame, None, None)
+    done = decoder.decode(frame, None, None)
     assert hashlib.sha256(done.body).hexdigest() == done.sha256
     assert done.arrays[0]["shape"][0] == len(done.carriers)
     assert done.preview.startswith(b"\xff\xd8")
@@ -65,11 +66,11 @@ def test_a_recipe_that_can_t_work_is_told_at_the_warm_up() -> None:
 
 
 def test_a_worker_that_died_between_two_frames_is_replaced_unseen(decoder: DecodeProcess, frame: str) -> None:
-    first = decoder.develop(frame, None, None)
+    first = decoder.decode(frame, None, None)
     os.kill(pid(decoder), signal.SIGKILL)
     assert decoder._process is not None
     decoder._process.wait(5)
-    assert decoder.develop(frame, None, None).sha256 == first.sha256
+    assert decoder.decode(frame, None, None).sha256 == first.sha256
     assert decoder.restarts == 1
 
 
@@ -79,26 +80,26 @@ def test_a_worker_that_hangs_is_given_up_and_replaced(frame: str) -> None:
     os.kill(pid(decoder), signal.SIGSTOP)
     decoder._timeout_s = 0.2
     with pytest.raises(DecodeProcessError, match="given up"):
-        decoder.develop(frame, None, None)
+        decoder.decode(frame, None, None)
     decoder._timeout_s = 20.0
-    assert decoder.develop(frame, None, None).sha256
+    assert decoder.decode(frame, None, None).sha256
     decoder.close()
 
 
 def test_a_worker_that_keeps_dying_is_not_started_without_end(frame: str) -> None:
-    now_ns = [0]
+    clock = RecordedClock(0)
     budget = RestartBudget(limit=2, window_s=60.0)
-    decoder = DecodeProcess(RECIPE, budget=budget, clock_ns=lambda: now_ns[0])
+    decoder = DecodeProcess(RECIPE, budget=budget, clock=clock)
     for _ in range(2):
         decoder.warm_up()
         os.kill(pid(decoder), signal.SIGKILL)
         assert decoder._process is not None
         decoder._process.wait(5)
-    now_ns[0] = 20 * 10**9
+    clock.advance(20)
     with pytest.raises(DecodeProcessError, match="keeps crashing: it starts again in 40 s"):
-        decoder.develop(frame, None, None)
-    now_ns[0] = 61 * 10**9
-    assert decoder.develop(frame, None, None).sha256
+        decoder.decode(frame, None, None)
+    clock.advance(41)
+    assert decoder.decode(frame, None, None).sha256
     decoder.close()
 
 
@@ -109,20 +110,20 @@ def test_close_does_not_wait_for_a_frame_in_hand(frame: str) -> None:
     os.kill(pid(decoder), signal.SIGSTOP)
     problems: list[Exception] = []
 
-    def develop() -> None:
+    def decode() -> None:
         try:
-            decoder.develop(frame, None, None)
+            decoder.decode(frame, None, None)
         except DecodeProcessError as error:
             problems.append(error)
 
-    thread = threading.Thread(target=develop)
+    thread = threading.Thread(target=decode)
     thread.start()
     eventually(decoder._turn.locked, "it is at work")
     decoder.close()
     thread.join(5)
     assert len(problems) == 1
     with pytest.raises(DecodeProcessError, match="stopped"):
-        decoder.develop(frame, None, None)
+        decoder.decode(frame, None, None)
 
 
 STARVED = """
@@ -162,7 +163,7 @@ def test_without_descriptors_a_decoded_frame_waits_for_some(frame: str) -> None:
         "        time.sleep(0.01)\n"
         "    free()\n"
         "threading.Thread(target=free_when_it_waits).start()\n"
-        "assert decoder.develop(sys.argv[1], None, None).carriers\n",
+        "assert decoder.decode(sys.argv[1], None, None).carriers\n",
     )
 
 
@@ -171,13 +172,13 @@ def test_without_descriptors_for_long_one_frame_is_not_decoded_and_says_why(fram
     starved(
         frame,
         "try:\n"
-        "    decoder.develop(sys.argv[1], None, None)\n"
+        "    decoder.decode(sys.argv[1], None, None)\n"
         "except DecodeProcessError as error:\n"
         "    assert sys.argv[1] in str(error) and 'run out of file descriptors' in str(error), error\n"
         "else:\n"
         "    raise AssertionError('it was received')\n"
         "free()\n"
-        "assert decoder.develop(sys.argv[1], None, None).carriers\n",
+        "assert decoder.decode(sys.argv[1], None, None).carriers\n",
     )
 
 
@@ -187,11 +188,11 @@ def test_an_answer_that_is_too_long_is_a_sentence_and_the_next_one_comes() -> No
     worker = Loop("worker", lambda: serve(there, lambda _: (next(bodies), ())))
     worker.start()
     try:
-        here.send({"do": "develop", "path": "frame.cr2"})
+        here.send({"do": "decode", "path": "frame.cr2"})
         answer = here.receive(20.0)
         assert answer is not None
         assert "what frame.cr2 was decoded to can't be reported: a message of" in answer.body["error"]
-        here.send({"do": "develop", "path": "frame.cr2"})
+        here.send({"do": "decode", "path": "frame.cr2"})
         answer = here.receive(20.0)
         assert answer is not None
         assert answer.body == {"carriers": "x"}

@@ -10,6 +10,7 @@ import jsonschema
 import numpy as np
 import pytest
 
+from dappled.clock import RecordedClock
 from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.pipeline.capture import PendingShot, PendingShots
 from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcessError, FrameDepth
@@ -65,7 +66,7 @@ class Bench:
     """Live depth with a clock that the test turns, and what it published."""
 
     def __init__(self, interval_s: float = 5.0) -> None:
-        self.maker, self.now_s = FakeMaker(), 0.0
+        self.maker, self.clock = FakeMaker(), RecordedClock(0)
         self.published: list[tuple[str, dict[str, Any], Any]] = []
         self.nearest: list[tuple[float, float]] = []
         self.depth = LiveDepth(
@@ -75,9 +76,12 @@ class Bench:
             cast(Publisher, self),
             method="gradient",
             interval_s=interval_s,
-            on_nearest=self.nearest.append,
-            clock=lambda: self.now_s,
+            clock=self.clock,
+            nearest=self,
         )
+
+    def send_distance(self, nearest_m: tuple[float, float]) -> None:
+        self.nearest.append(nearest_m)
 
     def path(self, frame: Frame) -> str:
         return frame.name
@@ -112,7 +116,7 @@ def test_not_more_often_than_asked_for(bench: Bench) -> None:
     for index in range(5):
         bench.depth.offer(shot(index))
     eventually(lambda: len(bench.published) == 1, "the first")
-    bench.now_s = 5.0
+    bench.clock.advance(5)
     bench.depth.offer(shot(9))
     eventually(lambda: len(bench.published) == 2, "the next that is due")
     assert [path for path, _ in bench.maker.asked] == ["frames/0.dng", "frames/9.dng"]
@@ -121,7 +125,7 @@ def test_not_more_often_than_asked_for(bench: Bench) -> None:
 def test_a_slow_one_loses_the_older_frame(bench: Bench) -> None:
     bench.maker.gate.clear()
     for index in range(4):
-        bench.now_s += 10
+        bench.clock.advance(10)
         bench.depth.offer(shot(index))
         eventually(lambda: bench.maker.asked, "the first is in hand")
     bench.maker.gate.set()
@@ -143,7 +147,7 @@ def test_the_nearest_distance_is_told_where_it_is_known(bench: Bench) -> None:
     bench.depth.offer(shot(0))
     eventually(lambda: len(bench.published) == 1, "without metres")
     bench.maker.nearest_m = (7.5, 0.2)
-    bench.now_s = 10
+    bench.clock.advance(10)
     bench.depth.offer(shot(1))
     eventually(lambda: bench.nearest, "it is told")
     assert bench.nearest == [(7.5, 0.2)]

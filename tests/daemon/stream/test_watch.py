@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from dappled.clock import RecordedClock
 from dappled.daemon.stream import watch, wire
 from dappled.daemon.stream.watch import Watched
 from dappled.daemon.stream.wire import Message
@@ -36,10 +37,10 @@ class Script:
     def __init__(self, messages: Sequence[Message | None], owed: int = 0) -> None:
         self._messages = list(messages)
         self.waiting_for = owed
-        self.now_s = 0.0
+        self.clock = RecordedClock(0)
 
     def receive(self, timeout_s: float) -> Message | None:
-        self.now_s += timeout_s
+        self.clock.advance(timeout_s)
         assert self._messages, "it should have ended"
         message = self._messages.pop(0)
         if message is not None and message.header.get("asked"):
@@ -58,7 +59,7 @@ def watched(script: Script, **options: float) -> tuple[Watched, list[str], list[
         script,
         received=lambda message: heard.append(message.topic),
         new_frame=lambda message: new.append(message.header["frame"]),
-        clock_s=lambda: script.now_s,
+        clock=script.clock,
         **options,  # type: ignore[arg-type]  # count is whole
     )
     return seen, heard, new

@@ -5,15 +5,16 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import socket
-import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs
 
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from dappled.clock import Clock, SystemClock
 
 COOKIE = "dappled"
 GUESSES, GUESS_WINDOW_S = 10, 60.0  # from one address
@@ -56,12 +57,12 @@ class Access:
         token: str,
         names: Collection[str] = (),
         *,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Clock | None = None,
     ) -> None:
         own = socket.gethostname()
         self._token = token
         self._names = {name.lower() for name in (*names, "localhost", own, f"{own}.local")}
-        self._clock = clock
+        self._clock = clock or SystemClock()
         self._guesses: OrderedDict[str, deque[float]] = OrderedDict()
         self.refused = 0
 
@@ -79,7 +80,7 @@ class Access:
 
     def try_token(self, token: str, client: str) -> Refusal | None:
         """None for the right token. Wrong ones are limited for each address; other addresses are not affected."""
-        now, client = self._clock(), _network(client)
+        now, client = self._clock.monotonic_ns() / 1e9, _network(client)
         guesses = self._guesses.get(client, deque())
         if len(guesses) == GUESSES and now - guesses[0] < GUESS_WINDOW_S:
             self.refused += 1

@@ -6,10 +6,11 @@ import logging
 import re
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
+from dappled.clock import Clock
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.drivers.camera import Setting
 from dappled.errors import sentence
@@ -33,9 +34,9 @@ class LogLine:
 class Logbook(logging.Handler):
     """Keeps the last lines, for the console; as a handler of a logger also its warnings."""
 
-    def __init__(self, utc_ns: Callable[[], int], *, capacity: int = 200) -> None:
+    def __init__(self, clock: Clock, *, capacity: int = 200) -> None:
         super().__init__(logging.WARNING)
-        self._utc_ns = utc_ns
+        self._clock = clock
         self._lines: deque[LogLine] = deque(maxlen=capacity)
         self._guard = threading.Lock()
         self._count = 0
@@ -46,7 +47,7 @@ class Logbook(logging.Handler):
             if self._lines and self._lines[-1].text == text:
                 return
             self._count += 1
-            self._lines.append(LogLine(self._count, self._utc_ns(), level, text))
+            self._lines.append(LogLine(self._count, self._clock.utc_ns(), level, text))
 
     def after(self, number: int, limit: int = 50) -> list[dict[str, Any]]:
         """The newest lines with a higher number, oldest first, as JSON values; at most `limit`."""

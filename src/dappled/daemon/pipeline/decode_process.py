@@ -14,11 +14,11 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
+from dappled.clock import Clock, SystemClock
 from dappled.drivers.child_process import ChannelError, ChannelMessage, MessageSizeError, ProcessChannel, RestartBudget
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
@@ -90,7 +90,7 @@ class FrameDepth:
 class FrameDecoder(Protocol):
     """Decodes recorded frames, for the pipeline and for answers to subscribers."""
 
-    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
+    def decode(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
         """Decode the raw file at `path`. Raises DecodeProcessError."""
 
 
@@ -108,10 +108,10 @@ class DecodeProcess:
         timeout_s: float = 60.0,
         preview_px: int = 1024,
         budget: RestartBudget | None = None,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
+        clock: Clock | None = None,
     ) -> None:
         self._recipe, self._timeout_s, self._preview_px = recipe, timeout_s, preview_px
-        self._budget, self._clock_ns = budget or RestartBudget(limit=6, window_s=60.0), clock_ns
+        self._budget, self._clock = budget or RestartBudget(limit=6, window_s=60.0), clock or SystemClock()
         self._turn = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._channel: ProcessChannel | None = None
@@ -134,11 +134,11 @@ class DecodeProcess:
         except DecodeProcessError as error:
             log.warning("decoding will fail: %s", error)
 
-    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
+    def decode(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
         """See FrameDecoder."""
         with self._turn:
             return _decoded(
-                self._ask({"do": "develop", "path": path, "focal_length_mm": focal_length_mm, "f_number": f_number})
+                self._ask({"do": "decode", "path": path, "focal_length_mm": focal_length_mm, "f_number": f_number})
             )
 
     def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> FrameDepth:
@@ -196,11 +196,11 @@ class DecodeProcess:
         return answer
 
     def _begin(self) -> ProcessChannel:
-        if wait_ns := self._budget.wait_ns(self._clock_ns()):
+        if wait_ns := self._budget.wait_ns(self._clock.monotonic_ns()):
             raise DecodeProcessError(
                 f"the decoder keeps crashing: it starts again in {wait_ns / 1e9:.0f} s; frames stay in the record"
             )
-        self._budget.spend(self._clock_ns())
+        self._budget.spend(self._clock.monotonic_ns())
         self._channel, there = ProcessChannel.pair()
         with there:
             self._process = subprocess.Popen(

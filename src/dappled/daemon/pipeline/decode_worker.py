@@ -50,11 +50,11 @@ class DecodeWorker:
                 return {"ready": True}, ()
             if body["do"] == "depth":
                 return _depth(self._darkroom, body)
-            return self._develop(self._darkroom, body["path"], body["focal_length_mm"], body["f_number"])
+            return self._decode(self._darkroom, body["path"], body["focal_length_mm"], body["f_number"])
         except Exception as error:  # noqa: BLE001  # no frame may end the worker: the next one may be good
             return {"error": _naming(body.get("path"), error)}, ()
 
-    def _develop(self, darkroom: Darkroom, path: str, focal_length_mm: float | None, f_number: float | None) -> Reply:
+    def _decode(self, darkroom: Darkroom, path: str, focal_length_mm: float | None, f_number: float | None) -> Reply:
         done = darkroom.decode(path, focal_length_mm=focal_length_mm, f_number=f_number, views=False)
         field = done.light_field
         ms = dict(done.ms)

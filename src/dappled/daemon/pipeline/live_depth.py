@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from typing import Protocol
 
+from dappled.clock import Clock
 from dappled.daemon.pipeline.capture import PendingShot, PendingShots
 from dappled.daemon.pipeline.decode_process import FrameDepth
 from dappled.daemon.pipeline.flight_writer import FlightWriter
@@ -24,11 +23,18 @@ class DepthMaker(Protocol):
         """End, also in the middle of a frame."""
 
 
+class DistanceReceiver(Protocol):
+    """What takes the nearest distance: `FlightControl`."""
+
+    def send_distance(self, nearest_m: tuple[float, float]) -> None:
+        """Take a distance and its standard error in m."""
+
+
 class LiveDepth:
     """Takes at most one finished frame in `interval_s`, the newest, and publishes its depth as topic `depth`.
 
-    Owns `maker`: a decode process of its own, as depth takes longer than a frame may wait. `on_nearest` gets the
-    nearest distance and its standard error in m, where they are known.
+    Owns `maker`: a decode process of its own, as depth takes longer than a frame may wait. `nearest` gets the
+    nearest distance, where it is known.
     """
 
     def __init__(
@@ -40,12 +46,12 @@ class LiveDepth:
         *,
         method: str,
         interval_s: float,
-        on_nearest: Callable[[tuple[float, float]], object] | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Clock,
+        nearest: DistanceReceiver | None = None,
     ) -> None:
         self._maker, self._writer, self._shots, self._publisher = maker, writer, shots, publisher
-        self._method, self._interval_s, self._on_nearest, self._clock = method, interval_s, on_nearest, clock
-        self._last_s = -1e9
+        self._method, self._interval_s, self._clock, self._nearest = method, interval_s, clock, nearest
+        self._last_ns: int | None = None
         self._worker: Worker[PendingShot] = Worker("depth", self._work, capacity=1, policy="drop oldest")
 
     def start(self) -> None:
@@ -63,9 +69,10 @@ class LiveDepth:
 
     def offer(self, pending: PendingShot) -> None:
         """Take a finished frame, if one is due and it was decoded."""
-        now_s = self._clock()
-        if pending.decoded is not None and now_s - self._last_s >= self._interval_s:
-            self._last_s = now_s
+        now_ns = self._clock.monotonic_ns()
+        due = self._last_ns is None or now_ns - self._last_ns >= round(self._interval_s * 1e9)
+        if due and pending.decoded is not None:
+            self._last_ns = now_ns
             self._worker.put(pending)
 
     def _work(self, pending: PendingShot) -> None:
@@ -82,5 +89,5 @@ class LiveDepth:
             "arrays": found.arrays,
         }
         self._publisher.publish("depth", header, found.body)
-        if found.nearest_m is not None and self._on_nearest is not None:
-            self._on_nearest(found.nearest_m)
+        if found.nearest_m is not None and self._nearest is not None:
+            self._nearest.send_distance(found.nearest_m)

@@ -114,7 +114,7 @@ class Decoding:
         assert self._decoder is not None
         began = time.monotonic_ns()
         writer = self._ends.writer
-        decoded = self._decoder.develop(writer.path(frame), tag.focal_length_mm, tag.f_number)
+        decoded = self._decoder.decode(writer.path(frame), tag.focal_length_mm, tag.f_number)
         pending.decoded = decoded
         writer.decoded(decoded.result(frame.index, (time.monotonic_ns() - began) / 1e6))
         pending.ms["decode"] = (time.monotonic_ns() - began) / 1e6

@@ -38,7 +38,7 @@ class DecodedSlicesWithBody(DecodedSlices, Protocol):
 class SlicesDecoder(Protocol):
     """Decodes a recorded frame again."""
 
-    def develop(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedSlicesWithBody:
+    def decode(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedSlicesWithBody:
         """Decode the raw file at `path`. Raises DappledError."""
 
 
@@ -86,7 +86,7 @@ class Answers:
         if self._decoder is None:
             raise WireError("this flight is not decoded: no mask is configured")
         self._give_way()
-        decoded = self._decoder.develop(self._record.path(frame), tag.focal_length_mm, tag.f_number)
+        decoded = self._decoder.decode(self._record.path(frame), tag.focal_length_mm, tag.f_number)
         return Message("slices", slices_header(tag, decoded), decoded.body)
 
     def _failed(self, item: tuple[Mapping[str, Any], Reply], error: Exception) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from PIL import Image
 
+from dappled.clock import Clock
 from dappled.daemon.stream.wire import Message
 from dappled.decode.lightfield.light_field import slice_mosaic
 
@@ -50,20 +50,20 @@ def watch(
     new_frame: Callable[[Message], None],
     count: int | None = None,
     silence_s: float | None = None,
-    clock_s: Callable[[], float] = time.monotonic,
+    clock: Clock,
 ) -> Watched:
     """Receive until the slices of `count` frames have come, the flight has ended and no answer is outstanding, or no
     message came for `silence_s`. `received` gets every message, `new_frame` the first slices of each frame."""
     frames: set[tuple[str, int]] = set()
     ended = False
-    last_s = clock_s()
+    last_ns = clock.monotonic_ns()
     while not (ended and not stream.waiting_for) and (count is None or len(frames) < count):
         message = stream.receive(_LOOK_S)
         if message is None:
-            if silence_s and clock_s() - last_s > silence_s:
+            if silence_s and clock.monotonic_ns() - last_ns > silence_s * 1e9:
                 break
             continue
-        last_s = clock_s()
+        last_ns = clock.monotonic_ns()
         ended = ended or message.topic == "end"
         received(message)
         if message.topic == "slices":

@@ -150,7 +150,7 @@ def _made(job: Job) -> list[BatchOutput]:
     if drawn and job.station is None:
         raise DappledError(job.why)
     darkroom = _darkroom(job.recipe)
-    made = georeference.develop(darkroom, flight, job.frame, job.tag, job.options)
+    made = georeference.decode(darkroom, flight, job.frame, job.tag, job.options)
     outputs = []
     for kind in fields:
         path = beside.with_suffix(KINDS[kind])

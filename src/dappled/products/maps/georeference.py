@@ -94,7 +94,7 @@ def survey(flight: Path, recipe: Recipe, options: Options, progress: Progress, s
     for number, station in enumerate(stations):
         progress("decode", number, len(stations))
         try:
-            made = develop(darkroom, flight, station.frame, station.tag, options)
+            made = decode(darkroom, flight, station.frame, station.tag, options)
             one = place(station, made, darkroom, projection, options)
         except DappledError as error:
             left.append((station.frame.name, str(error)))
@@ -179,7 +179,7 @@ def refined(
     return replace(made, photographs=tuple(photos), facts=facts, notes=(*made.notes, *unseen, *kept))
 
 
-def develop(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, options: Options) -> DecodeResult:
+def decode(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, options: Options) -> DecodeResult:
     """Decode one frame of a flight. Raises DappledError."""
     return darkroom.decode(
         FlightFolder(flight).file(frame.name),
