@@ -150,7 +150,7 @@ def test_geotag_writes_through_no_link(flight: Path, tmp_path: Path, folder: str
     if folder == "frames":
         victim = flight.parent / "victim.txt"
         (flight / "frames" / ".000000.cr2.xmp.part").symlink_to(victim)
-        with pytest.raises(FlightError, match=r"000000.cr2.xmp: a link stands there"):
+        with pytest.raises(FlightError, match=r"000000.cr2.xmp: a link is in its place"):
             geotags.write(flight, Mounting())
         assert victim.read_bytes() == SECRET
     else:
@@ -194,7 +194,7 @@ def test_recovery_adopts_no_link_and_removes_nothing_behind_one(tmp_path: Path) 
     (tmp_path / ".victim.part").write_bytes(SECRET)
     (frames / "000000.cr2").symlink_to(tmp_path / "victim.cr2")
     report = recovery.recover_flight(folder, RecordedClock(START_UTC_NS))
-    assert "frames/000000.cr2 is a link: it is not followed, and is the frame of no shot" in report
+    assert "frames/000000.cr2 is a link: it is not followed, and is not the frame of any shot" in report
     (frames / "000000.cr2").unlink()
     frames.rmdir()
     frames.symlink_to(tmp_path)

@@ -139,7 +139,7 @@ def test_a_late_file_makes_a_failed_shot_safe(tmp_path: Path) -> None:
 def test_a_file_that_is_no_ledger_is_told(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "flight.sqlite"
     path.write_bytes(content)
-    with pytest.raises(FlightError, match=r"not a dappled ledger|no SQLite file"):
+    with pytest.raises(FlightError, match=r"not a dappled ledger|not an SQLite file"):
         LedgerReader.open(path)
 
 

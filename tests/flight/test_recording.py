@@ -113,7 +113,7 @@ def test_a_crash_is_put_in_order_before_the_next_flight(flights: Path, flight: R
         "the half-written file .000002.cr2.part was removed",
         "the last line of",
         "shot 3 was noted in the journal only",
-        "frames/000001.cr2 was whole but without a row; it is adopted as the frame of shot 1",
+        "frames/000001.cr2 was complete but had no row; it is adopted as the frame of shot 1",
         "frames/000007.cr2 belongs to no shot",
         "shot 2 was fired, and is lost",
         "shot 3 was wished, and is lost",

@@ -254,7 +254,7 @@ def check_options(given: Mapping[str, Any], known: Sequence[str], where: str = "
     """Raise CameraError for an option that the driver does not know."""
     unknown = [name for name in given if name not in known]
     if unknown:
-        raise CameraError(f"{where} has no setting {unknown[0]!r} for this driver; it knows {', '.join(known)}")
+        raise CameraError(f"{where} has no setting {unknown[0]!r} for this driver; it accepts {', '.join(known)}")
 
 
 def text_option(given: Mapping[str, Any], name: str) -> str:

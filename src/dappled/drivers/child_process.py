@@ -190,14 +190,16 @@ def _can_open(count: int) -> bool:
 
 def _shortage() -> str:
     limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    return f"dappled has run out of file descriptors (its limit is {limit}): raise LimitNOFILE, or end what holds them"
+    return (
+        f"dappled has run out of file descriptors (its limit is {limit}): raise LimitNOFILE, or close what holds them"
+    )
 
 
 def _parsed(raw: bytes, flags: int) -> dict[str, Any]:
     if not raw:
         raise ChannelError("the other process has ended")
     if flags & socket.MSG_TRUNC:
-        raise ChannelError("a message was longer than a message may be")
+        raise ChannelError("a message was longer than the limit")
     try:
         body = json.loads(raw)
     except ValueError as error:

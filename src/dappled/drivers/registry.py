@@ -18,7 +18,7 @@ def open_camera(settings: CameraSettings) -> Camera:
     found = {entry.name: entry for entry in entry_points(group=GROUP)}
     entry = found.get(settings.driver)
     if entry is None:
-        raise ConfigError(f"no camera driver is called {settings.driver!r}; installed: {', '.join(sorted(found))}")
+        raise ConfigError(f"there is no camera driver named {settings.driver!r}; installed: {', '.join(sorted(found))}")
     options = _options(settings)
     try:
         make = entry.load()

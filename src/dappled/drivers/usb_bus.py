@@ -90,7 +90,7 @@ def reset(port: str, backend: Any = None) -> None:
             finally:
                 usb.util.dispose_resources(device)
             return
-    raise UsbError(f"no device is at {port} any more")
+    raise UsbError(f"there is no device at {port} any more")
 
 
 def holders(node: Path, proc: Path = Path("/proc")) -> list[str]:

@@ -67,4 +67,4 @@ def _hex(value: object) -> str:
     """Bytes where the schema allows none: only a damaged file has them."""
     if isinstance(value, bytes):
         return value.hex()
-    raise TypeError(f"{type(value).__name__} is no column of a ledger")
+    raise TypeError(f"{type(value).__name__} is not a column of the ledger")

@@ -24,7 +24,7 @@ _REMEDIES = {
     errno.EIO: "the disk reports an input/output error; check the disk (dmesg) or set record.directory to another one",
     errno.ENOTDIR: "a part of this path is a file, not a folder; set record.directory to a folder",
     errno.EEXIST: "a file of this name is in the way; move it or set record.directory to another folder",
-    errno.ELOOP: "a link stands there, and links are not followed; remove it",
+    errno.ELOOP: "a link is in its place, and links are not followed; remove it",
     errno.EMFILE: "too many files are open; close other programs or raise the limit (ulimit -n)",
     errno.ENFILE: "too many files are open; close other programs",
     errno.ENOENT: "it does not exist; check the path",
@@ -40,8 +40,8 @@ def disk_error(doing: str, path: Path, error: OSError) -> FlightError:
 
 
 _LEDGER_REASONS = {
-    "SQLITE_NOTADB": "it is damaged, or no SQLite file; move it away, the frames and shots.jsonl beside it are intact",
-    "SQLITE_CORRUPT": "it is damaged; move it away, the frames and shots.jsonl beside it are intact",
+    "SQLITE_NOTADB": "it is damaged, or not an SQLite file; move it away: frames and shots.jsonl are intact",
+    "SQLITE_CORRUPT": "it is damaged; move it away: frames and shots.jsonl are intact",
     "SQLITE_FULL": "the disk is full; free some space or set record.directory to another disk",
     "SQLITE_READONLY": "the disk or the file is read-only; make it writable or set record.directory elsewhere",
     "SQLITE_CANTOPEN": "it can't be opened; check that its folder exists and is accessible",

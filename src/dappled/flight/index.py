@@ -72,7 +72,7 @@ class ImageIndex(Database):
     def _sentence(self, error: sqlite3.Error | UnicodeDecodeError) -> FlightError:
         if getattr(error, "sqlite_errorname", "") == "SQLITE_CANTOPEN":
             return FlightError(f"cannot open the index {self.path}: {error}; check its folder")
-        return FlightError(f"cannot use the index {self.path}: {error}; move it away, it is made anew")
+        return FlightError(f"cannot use the index {self.path}: {error}; move it away, and it will be rebuilt")
 
     def add_flight(self, name: str, start_utc_ns: int | None, utc_correction_ns: int | None = 0) -> None:
         """Add a flight that starts at this UTC. Where UTC is not known yet (None), call this again later with the start
@@ -169,7 +169,7 @@ def open_or_rebuild(root: Path) -> tuple[ImageIndex, list[str]]:
                 path.with_name(FILE_NAME + suffix).unlink(missing_ok=True)
         except OSError as second:
             raise disk_error("move away the damaged index", path, second) from second
-        return ImageIndex(root), [f"{error}; it was moved to {aside.name} and made anew from the flights"]
+        return ImageIndex(root), [f"{error}; it was moved to {aside.name} and rebuilt from the flights"]
 
 
 def in_order(root: Path) -> list[FlightFolder]:

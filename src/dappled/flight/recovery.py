@@ -45,7 +45,7 @@ def recover(root: Path, index: ImageIndex, clock: Clock) -> list[str]:
             report += [f"flight {folder.name}: {text}" for text in recover_flight(folder, clock)]
             report += index.take_in(folder, seal=True)
         except (DappledError, OSError) as error:
-            report.append(f"flight {folder.name} could not be put in order: {error}")
+            report.append(f"flight {folder.name} could not be repaired: {error}")
     return report
 
 
@@ -98,7 +98,7 @@ def _move_damaged_ledger(folder: FlightFolder) -> list[str]:
     for suffix in ("-wal", "-shm"):
         folder.ledger.with_name(folder.ledger.name + suffix).unlink(missing_ok=True)
     durable.sync_folder(folder.path)
-    lost = "it is made anew from shots.jsonl and frames, without poses, tags and times of firing"
+    lost = "it was rebuilt from shots.jsonl and frames, without poses, tags and times of firing"
     return [f"the ledger was damaged ({damage}) and moved to {aside.name}; {lost}"]
 
 
@@ -147,7 +147,7 @@ def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
             continue
         path = folder.frames / file_name
         if path.is_symlink():
-            report.append(f"{name} is a link: it is not followed, and is the frame of no shot")
+            report.append(f"{name} is a link: it is not followed, and is not the frame of any shot")
             continue
         try:
             stat = path.stat()
@@ -158,10 +158,10 @@ def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
         row = None if number is None else ledger.shot(number)
         if number is not None and row is not None and row.state != "safe":
             ledger.safe(Frame(number, name, file_name, stat.st_size, sha256, stat.st_mtime_ns))
-            report.append(f"{name} was whole but without a row; it is adopted as the frame of shot {number}")
+            report.append(f"{name} was complete but had no row; it is adopted as the frame of shot {number}")
         elif number is not None and file_name.endswith(_JPEG) and _has_raw_frame(ledger, number):
             ledger.add_companion(Frame(number, name, file_name, stat.st_size, sha256, stat.st_mtime_ns))
-            report.append(f"{name} was whole but without a row; it is adopted beside the frame of shot {number}")
+            report.append(f"{name} was complete but had no row; it is adopted beside the frame of shot {number}")
         else:
             reason = f"{name} belongs to no shot that waits for a file; it is kept as a stray"
             ledger.add_stray(Stray(name, file_name, stat.st_size, sha256, stat.st_mtime_ns, reason))

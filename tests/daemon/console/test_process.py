@@ -214,7 +214,7 @@ def test_an_interval_and_its_end() -> None:
     assert do(shutter, do="stop interval")["text"] == "the interval is stopped"
     assert do(shutter, do="stop interval")["text"] == "no interval was running"
     answer = do(shutter, do="interval", sequence=2, interval_s=-1, count=0)
-    assert (answer["ok"], answer["error"]) == (False, "an interval is 0 to 86400 s, and a count 0 or more")
+    assert (answer["ok"], answer["error"]) == (False, "an interval must be 0 to 86400 s, and a count 0 or more")
     shutter.stop()
 
 

@@ -294,5 +294,5 @@ def test_every_refusal_is_told() -> None:
     for sequence in (2, 3):
         shutter.request(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", sequence))
     assert len(sink.refusals) == shutter.statistics().refused == 2
-    assert "an interval is" in sink.refusals[0]
+    assert "an interval must be" in sink.refusals[0]
     assert "waiting for the camera" in sink.refusals[1]

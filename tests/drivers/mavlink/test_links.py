@@ -202,7 +202,7 @@ def test_a_port_in_use_is_reported_in_one_sentence() -> None:
     [
         ("/dev/ttyNowhere7", "there is no device /dev/ttyNowhere7"),
         ("/dev/null", "is not a serial device"),
-        ("/dev/null,12345", "no serial port runs at 12345 baud"),
+        ("/dev/null,12345", "a serial port can't run at 12345 baud"),
         ("udpin:203.0.113.7:0", "is not an address of this machine"),
     ],
 )

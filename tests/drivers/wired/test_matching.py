@@ -88,7 +88,7 @@ def test_of_two_shots_in_one_second_with_one_file_neither_is_chosen() -> None:
     del files[1]
     found = match(shots, files)
     assert found.pairs == ((2, "DSCF0003.RAF"), (3, "DSCF0004.RAF"))
-    assert found.doubts == ("DSCF0001.RAF may be of shot 0 or 1: order, count and time leave that open",)
+    assert found.doubts == ("DSCF0001.RAF may be of shot 0 or 1: order, count and time don't decide it",)
 
 
 def test_files_of_before_the_flight_are_left() -> None:

@@ -189,7 +189,7 @@ class CameraCommands:
         each such request gets the next image, from the first on."""
         count = self._shutter.statistics().next_index
         if len(self.wanted_images) >= OLD_IMAGES:
-            return CommandAnswer(REJECTED, words=f"{OLD_IMAGES} past images are being looked up: ask again")
+            return CommandAnswer(REJECTED, words=f"{OLD_IMAGES} past images are already being looked up: ask again")
         if math.isfinite(command.parameters[place - 1]):
             index = command.integer(place)
         else:
@@ -224,7 +224,7 @@ class CameraCommands:
     def _set_mode(self, command: Command) -> CommandAnswer:
         mode = command.integer(2, -1)
         if mode not in (mavlink.CAMERA_MODE_IMAGE, mavlink.CAMERA_MODE_IMAGE_SURVEY):
-            return CommandAnswer(DENIED, (self._status.settings(),), "this camera takes photographs only")
+            return CommandAnswer(DENIED, (self._status.settings(),), "this camera only takes photographs")
         self._status.mode = mode
         return CommandAnswer(ACCEPTED, (self._status.settings(),))
 

@@ -112,11 +112,13 @@ class Access:
         if origin not in (f"http://{host}", f"https://{host}"):
             return Refusal(403, "only the console's own page may ask for this")
         if request.headers.get("content-type", "").split(";")[0].strip() != "application/json":
-            return Refusal(415, "a request's body is JSON")
+            return Refusal(415, "a request's body must be JSON")
         length = request.headers.get("content-length", "")
         if not length.isascii() or not length.isdigit():
-            return Refusal(411, "a request says how long its body is")
-        return Refusal(413, f"a body is at most {BODY_BYTES} bytes") if int(length) > BODY_BYTES else None
+            return Refusal(411, "a request must give the length of its body")
+        return (
+            Refusal(413, f"a request's body may have at most {BODY_BYTES} bytes") if int(length) > BODY_BYTES else None
+        )
 
     def _known(self, request: ConsoleRequest) -> Refusal | None:
         guarded = request.path.startswith(("/api/", "/kml", "/metrics")) and request.path != "/api/login"

@@ -88,7 +88,7 @@ def sharpness(picture: NDArray[Any]) -> list[Check]:
     shown = ", ".join(f"{value:.2f} {name}" for name, value in along.items())
     sharp = any(along[name] >= SHARP[r * r + c * c] for name, (r, c) in _DIRECTIONS.items())
     if not sharp:
-        text = f"nothing in the picture is sharp (fineness {shown}): focus again"
+        text = f"the picture is not sharp anywhere (fineness {shown}): focus again"
         return [
             Check("focus", "no-go", text, measured=measured),
             Check("motion", "caution", "can't be judged without focus", measured=measured),
@@ -99,7 +99,7 @@ def sharpness(picture: NDArray[Any]) -> list[Check]:
         if along[soft] < ONE_WAY * along[fine]:
             text = f"detail is lost {soft} ({along[soft]:.2f} against {along[fine]:.2f} {fine}): shorten the exposure"
             return [focus, Check("motion", "no-go", text, measured=measured)]
-    return [focus, Check("motion", "go", "as sharp one way as the other", measured=measured)]
+    return [focus, Check("motion", "go", "equally sharp in both directions", measured=measured)]
 
 
 _DIRECTIONS = {"across": (0, 1), "along": (1, 0), "falling": (1, 1), "rising": (1, -1)}

@@ -187,7 +187,7 @@ class DecodeProcess:
             self._end()
             self.restarts += 1
             raise DecodeProcessError(
-                f"decoding {question.get('path', '')} took over {self._timeout_s:g} sand was given up"
+                f"decoding {question.get('path', '')} took over {self._timeout_s:g} s and was given up"
             )
         if "error" in answer.body:
             raise DecodeProcessError(str(answer.body["error"]))
@@ -233,7 +233,7 @@ def _mapped(fd: int) -> mmap.mmap:
     try:
         return mmap.mmap(fd, 0, prot=mmap.PROT_READ)
     except OSError as error:  # no descriptors, no memory
-        raise DecodeProcessError(f"what a frame was decoded to can't be mapped: {error.strerror}") from None
+        raise DecodeProcessError(f"a decoded frame can't be mapped into memory: {error.strerror}") from None
 
 
 def _decoded(answer: ChannelMessage) -> DecodedFrame:

@@ -132,7 +132,7 @@ class Shutter:
         if not (math.isfinite(interval_s) and 0 <= interval_s <= 86400) or count < 0:
             with self._lock:
                 self._requests += 1
-                return self._refuse(request, "an interval is 0 to 86400 s, and a count 0 or more")
+                return self._refuse(request, "an interval must be 0 to 86400 s, and a count 0 or more")
         request = replace(request, series=(interval_s, float(count)))
         with self._lock:
             decision = self._judge(request)

@@ -165,8 +165,10 @@ class Tagging:
         shown = clocks.camera_time(settings.taken)
         by_camera = shown and clocks.exposure_from_camera(self._camera_clock, *shown, settings.exposure_s)
         if by_camera:
-            self._ends.note("untimed", "the driver never said when it fired: the camera's clock is used", shot.index)
+            self._ends.note(
+                "untimed", "the driver did not report when it fired: the camera's clock is used", shot.index
+            )
             return by_camera
-        self._ends.note("untimed", "the driver never said when it fired: the request's time is used", shot.index)
+        self._ends.note("untimed", "the driver did not report when it fired: the request's time is used", shot.index)
         arrived_utc_ns = pending.frame.arrived_utc_ns if pending.frame else None
         return clocks.mid_exposure_by_request(shot.wished_utc_ns, arrived_utc_ns, self._latency, settings.exposure_s)

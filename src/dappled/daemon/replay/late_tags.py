@@ -98,5 +98,5 @@ def add_missing(flight: Path, clock: Clock) -> list[int]:
         stack.callback(pipeline.stop, 5.0)
         replay.play(recording, shots, progress, time=time, pace=None)
         for index in writer.added:
-            ledger.add_event("tagged late", "the recording ended before its tag was made; it is made now", index)
+            ledger.add_event("tagged late", "the recording ended before it was tagged; it is tagged now", index)
     return writer.added

@@ -252,7 +252,7 @@ class Publisher:
         header, body = message.header, None if message.body is None else memoryview(message.body)
         if body is not None and not self._unread_answers.admit(body):
             self._refused += 1
-            text = f"{UNREAD_ANSWERS} answers wait to be read already: ask again later"
+            text = f"{UNREAD_ANSWERS} answers are already waiting to be read: ask again later"
             message, body = Message("error", {}), None
             header = {**self._envelope(Message("error", {"error": text}), None), "asked": header["asked"]}
         parts = [peer, *_parts(message.topic, header, body)]

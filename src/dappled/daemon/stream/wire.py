@@ -227,7 +227,7 @@ def parse_question(payload: Sequence[bytes]) -> dict[str, Any]:
     except ValueError:
         request = None
     if not isinstance(request, dict):
-        raise WireError('a question is one JSON object such as {"get": "slices", "frame": 42}')
+        raise WireError('a question must be one JSON object such as {"get": "slices", "frame": 42}')
     if request.get("get") not in CAN_BE_ASKED:
         raise WireError(f'a question\'s "get" must be one of {", ".join(CAN_BE_ASKED)}')
     if request["get"] != "start":

@@ -218,7 +218,7 @@ class CameraLoop:
         except BusyError as error:
             self._sender.send(*state.trigger_busy(str(error), self._now_ns()))
         except RefusedError as error:
-            self._sender.send(*state.fail_current(f"{error}; look at focus, card and mode dial", self._now_ns()))
+            self._sender.send(*state.fail_current(f"{error}; check focus, card and mode dial", self._now_ns()))
         except LostError as error:
             self._sender.send(*state.trigger_lost(called_ns, str(error), self._now_ns()))
             raise

@@ -127,7 +127,7 @@ class CameraState:
         """The link broke in the trigger call: the shot has failed, and its file may still come."""
         assert self.current is not None
         self.current.fired_ns = called_ns
-        return self.fail_current(f"{reason}; the shutter may have opened all the same", now_ns, may_come=True)
+        return self.fail_current(f"{reason}; the shutter may have opened nevertheless", now_ns, may_come=True)
 
     def trigger_busy(self, reason: str, now_ns: int) -> list[CameraEvent]:
         """The camera was too busy to fire: fire again soon, or fail the shot when it was busy for `busy_s`."""

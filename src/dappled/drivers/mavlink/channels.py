@@ -132,7 +132,7 @@ def open_channel(address: Address) -> ByteChannel:
 def _sentence(address: Address, error: OSError) -> str:
     url = address.url
     if isinstance(error, socket.gaierror):
-        return f"MAVLink link {url}: no machine is called {address.host!r}; write an address such as 127.0.0.1"
+        return f"MAVLink link {url}: there is no machine named {address.host!r}; write an address such as 127.0.0.1"
     if error.errno == errno.EADDRINUSE:
         return (
             f"MAVLink link {url}: port {address.port} is in use; end the program that listens there or change the port"
@@ -143,7 +143,7 @@ def _sentence(address: Address, error: OSError) -> str:
         return f"MAVLink link {url}: there is no device {address.host}; plug it in or correct mavlink.url"
     if error.errno == errno.EACCES:
         return f"MAVLink link {url}: no permission to open {address.host}; add the user to the group of the device"
-    return f"MAVLink link {url}: {error.strerror or error}; correct mavlink.url or mend the connection"
+    return f"MAVLink link {url}: {error.strerror or error}; correct mavlink.url or repair the connection"
 
 
 def _bound(address: Address, kind: socket.SocketKind) -> socket.socket:
@@ -389,7 +389,7 @@ def over_serial(address: Address) -> ByteStream:
     speed = getattr(termios, f"B{address.port}", None)
     if speed is None:
         raise LinkError(
-            f"MAVLink link {address.url}: no serial port runs at {address.port} baud; write 57600, 115200 or 921600"
+            f"MAVLink link {address.url}: a serial port can't run at {address.port} baud; write 57600, 115200 or 921600"
         )
     fd = os.open(address.host, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:

@@ -195,7 +195,9 @@ class Darkroom:
         if self.recipe.calibration and self.recipe.mask != profiles.LENSLET:
             self._calibration()
         if self.recipe.taper and self.recipe.mask == profiles.LENSLET:
-            raise DarkroomError("a taper is for the bands of a printed mask; lenslets' bands tile the spectrum whole")
+            raise DarkroomError(
+                "a taper is for the bands of a printed mask; the bands of lenslets fill the whole spectrum"
+            )
         if not 0 <= self.recipe.taper <= 1:
             raise DarkroomError(f"the taper is {self.recipe.taper:g}: it must be a share of the band, from 0 to 1")
         for path in (self.recipe.white, self.recipe.dark):

@@ -78,7 +78,7 @@ def match(
     starts = _starts(offsets, offset_s, plausible_s)
     if not len(starts):
         days = abs(float(np.median(offsets))) / 86400
-        doubts.append(f"the camera's clock is {days:.0f} days away from the flight's: were these files made in it?")
+        doubts.append(f"the camera's clock is {days:.0f} days away from the flight's: do these files belong to it?")
         return _left(shots, files, (), doubts, None)
     sure, possible = _best(offsets, starts)
     doubts += _doubts(shots, dated, sure, possible)
@@ -189,7 +189,7 @@ def _doubts(
         candidates = [str(shots[int(i)].index) for i in np.nonzero(possible[:, j])[0]]
         if candidates:
             which = " or ".join(candidates[:4]) + (" …" if len(candidates) > 4 else "")
-            sentences.append(f"{one.name} may be of shot {which}: order, count and time leave that open")
+            sentences.append(f"{one.name} may be of shot {which}: order, count and time don't decide it")
     return sentences
 
 
