@@ -273,7 +273,7 @@ def test_a_destination_that_links_back_is_refused(closed: Path, tmp_path: Path, 
     copy = tmp_path / "disk" / closed.name
     (copy / linked).parent.mkdir(parents=True)
     (copy / linked).symlink_to(closed / linked)
-    with pytest.raises(FlightError, match="a link stands there, and links are not followed"):
+    with pytest.raises(FlightError, match="a link is in its place, and links are not followed"):
         go(closed, tmp_path / "disk", prune=True)
     assert frames(closed) == TWO
 
