@@ -56,7 +56,7 @@ class Film:
 
     @property
     def multiples(self) -> list[int]:
-        drawn = [2**q if self.harmonics == "octave" else q + 1 for q in range(self.p)]
+        drawn: list[int] = [2**q if self.harmonics == "octave" else q + 1 for q in range(self.p)]
         return [m for m in drawn if m * self.frequency_per_mm <= self.px_per_mm / 2]
 
     @cached_property
@@ -170,7 +170,7 @@ class Shot:
             f * (1 - self.film.anisotropy / 2),
         ]
         c, s = math.cos(math.radians(self.turn_deg)), math.sin(math.radians(self.turn_deg))
-        return k @ np.array([[c, s], [-s, c]])
+        return np.asarray(k @ np.array([[c, s], [-s, c]]))
 
     def sensor_per_mm(self, orders: list[Order]) -> Grid:
         """(k, 2) cycles/mm of orders on the sensor."""
@@ -279,7 +279,7 @@ class Shot:
         return self._on_pixels(total)
 
 
-def line_strength(plane: Grid, fy: float, fx: float) -> complex:
+def line_strength(plane: NDArray[np.floating], fy: float, fx: float) -> complex:
     """Amplitude of a plane wave of (fy, fx) cycles/pixel about the frame's centre, as a share of the mean; Hann."""
     rows, columns = np.arange(plane.shape[0]), np.arange(plane.shape[1])
     down = np.hanning(plane.shape[0]) * np.exp(-2j * np.pi * fy * (rows - (rows.size - 1) / 2))
@@ -288,10 +288,25 @@ def line_strength(plane: Grid, fy: float, fx: float) -> complex:
     return complex(down @ plane @ across / whole)
 
 
-def floor_at(plane: Grid, fy: float, fx: float, bins: int = 5) -> float:
-    """Median strength of the 11 × 11 bins around a frequency: what a line must exceed."""
-    around = range(-bins, bins + 1)
-    found = [
-        abs(line_strength(plane, fy + i / plane.shape[0], fx + j / plane.shape[1])) for i in around for j in around
-    ]
-    return float(np.median(found))
+def floors(plane: Grid, places: Grid, bins: int = 5) -> Grid:
+    """(k,) median strength of the 11 × 11 bins around (k, 2) frequencies: what a line there must exceed."""
+    window = np.outer(np.hanning(plane.shape[0]), np.hanning(plane.shape[1]))
+    spectrum = np.abs(np.fft.fft2(plane * window)) / float((plane * window).sum())
+    around = np.arange(-bins, bins + 1)
+    found = []
+    for place in places:
+        row, column = np.rint(np.array(place) * plane.shape).astype(int)
+        found.append(np.median(spectrum[np.ix_((row + around) % plane.shape[0], (column + around) % plane.shape[1])]))
+    return np.array(found)
+
+
+def orders_above_noise(shot: Shot, times: float = 15.0) -> int:
+    """How many orders of the whole plane are that many times stronger than the same frame without the film there."""
+    seen = shot.seen()
+    orders = [order for order in seen if order > (0, 0)]
+    level = (
+        floors(np.asarray(shot.without_film(), dtype=np.float64), np.array(orders) @ shot.lattice)
+        if orders
+        else np.zeros(0)
+    )
+    return 2 * sum(seen[order] > times * float(at) for order, at in zip(orders, level, strict=True))

@@ -189,7 +189,7 @@ def mask(name: str) -> MaskProfile:
     return MaskProfile(
         _stem(name),
         table.description,
-        Mask(frequency, table.p, table.pattern, table.harmonics),  # type: ignore[arg-type]  # the schema checked the choices
+        Mask(frequency, table.p, table.pattern, table.harmonics, table.film_px_per_mm),  # type: ignore[arg-type]  # the schema checked the choices
         table.period_px if table.film_px_per_mm is not None else None,
         table.film_px_per_mm if table.period_px is not None else None,
     )

@@ -321,7 +321,13 @@ class MaskDecoder:
             transfers = transfer(orders, [magnitudes[order] for order in orders], origin)
             rotation = known.rotation_rad
             width = used_aperture(
-                slices.values, transfers, orders, nominal_kappa=cycles, rotation_rad=rotation, aperture=aperture
+                slices.values,
+                transfers,
+                orders,
+                nominal_kappa=cycles,
+                rotation_rad=rotation,
+                aperture=aperture,
+                distance_known=known.distance_fitted,
             )
             cycles, aperture = width.kappa, width.aperture
             views_from: ViewsFrom = "calibration"

@@ -36,8 +36,7 @@ def test_a_stopped_down_frame_tells_all_that_is_hidden(seed: int) -> None:
     orders = np.array(MASK.half_orders())
     assert np.sqrt(np.mean(((orders @ off) ** 2).sum(axis=1))) < 0.05  # bins rms over the carriers
     assert fit.found == 13
-    assert fit.distance_fitted
-    assert fit.mask_distance_mm == pytest.approx(camera.distance_mm, rel=0.02)
+    assert not fit.distance_fitted  # at one focal length a print's scale would do as well
     assert fit.rotation_rad == pytest.approx(camera.rotation_rad, abs=2e-4)
     turns = np.array(camera.shift_mm) * MASK.frequency_per_mm - np.array(fit.origin)
     assert np.abs(turns - np.round(turns)).max() < 0.005
@@ -91,7 +90,7 @@ def test_bad_frames_and_files_are_refused_in_words() -> None:
         calibrate(frames, sensor=SENSOR, mask=MASK, law=law, mask_distance_mm=STATED_DISTANCE_MM)
 
     noise = np.random.default_rng(0).normal(0.5, 0.1, SENSOR.shape).astype(np.float32)
-    with pytest.raises(DecodeError, match="small aperture"):
+    with pytest.raises(DecodeError, match=r"should stand out at f/59\.\d+ and no lattice of this mask does"):
         attempt(CalibrationFrame(noise, FOCAL_MM, STOPPED_F))
     with pytest.raises(DecodeError, match="at least one"):
         attempt()
@@ -131,20 +130,15 @@ def _of_another_print(pattern: Pattern) -> tuple[Camera, Callable[[], Calibratio
     )
 
 
-def test_a_lattice_that_no_law_foresaw_is_found_and_called_so() -> None:
-    camera, calibration = _of_another_print("full")
+@pytest.mark.parametrize("pattern", ["full", "diagonal"])
+def test_a_lattice_that_no_law_foresaw_is_found_and_called_so(pattern: Pattern) -> None:
+    camera, calibration = _of_another_print(pattern)
     found = calibration()
     (fit,) = found.fits
     np.testing.assert_allclose(fit.lattice.matrix(), camera.lattice.matrix(), atol=1e-4)
     assert not fit.distance_fitted
     assert found.verdict.startswith("neither law explains")
-    assert len(fit.seen) == len(MASK.half_orders()) - 1
-
-
-def test_the_few_carriers_of_a_diagonal_mask_are_not_made_into_a_wrong_lattice() -> None:
-    _, calibration = _of_another_print("diagonal")
-    with pytest.raises(DecodeError, match="check mask, camera and focal length"):
-        calibration()
+    assert len(fit.seen) == len(found.mask.half_orders()) - 1
 
 
 def test_the_other_law_s_frames_are_found_too() -> None:

@@ -20,6 +20,10 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, at_centre, kappa, origin_of, transfer
 from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
 from dappled.decode.optics.carrier_tables import lattice_rotation
+from dappled.decode.optics.visibility import pattern_amplitudes
+
+_KNOWN = 0.05  # relative: a distance with a larger standard error is not used
+_LEAST_THROUGH = 0.05  # of a carrier: where the stop leaves less, the mask's transfer can't be measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +84,12 @@ def from_lattices(
     if choose_law and verdict.law is not None:
         law = verdict.law
     fitted = next(fit for fit in verdict.fits if fit.law == law)
-    several = fitted.explains and (fitted.pupil_mm is not None or fitted.offset_bins is not None)
+    sigma = fitted.distance_sigma_mm
+    several = fitted.explains and (
+        fitted.offset_bins is not None
+        if law != "geometric"
+        else sigma is not None and sigma <= _KNOWN * fitted.mask_distance_mm
+    )
     pupil = fitted.pupil_mm or 0.0 if several else 0.0
     fits = []
     for length in sorted({shown.focal_length_mm for shown in lattices}):
@@ -136,17 +145,19 @@ def _fit_of(
     rotation = lattice_rotation(shown.lattice, sensor)
     cycles = kappa(mask.frequency_per_mm, distance, shown.focal_length_mm, shown.f_number)
     through = aperture.transform(angular_frequencies(shown.orders, cycles, rotation)).real
-    measured = shown.relative / np.where(np.abs(through) < 0.05, np.nan, through)
-    usable = np.isfinite(measured)
-    usable[0] = False
+    seen = {(c.ky, c.kx) for c, _ in shown.found}
+    usable = np.array([order in seen for order in shown.orders]) & (np.abs(through) >= _LEAST_THROUGH)
     orders = [order for order, use in zip(shown.orders, usable, strict=True) if use]
-    if np.linalg.matrix_rank(orders) < 2:
-        raise DecodeError(
-            "too few carriers are visible at this aperture: calibrate on a frame at an eighth of the widest"
-        )
-    origin, phase_residual = origin_of(orders, measured[usable])
-    magnitudes = (measured * np.conj(transfer(shown.orders, np.ones(len(shown.orders)), origin))).real
-    known = dict(zip(shown.orders, np.nan_to_num(magnitudes), strict=True))
+    if orders and np.linalg.matrix_rank(orders) == 2:
+        measured = shown.relative / np.where(np.abs(through) < _LEAST_THROUGH, np.inf, through)
+        origin, phase_residual = origin_of(orders, measured[usable])
+        magnitudes = (measured * np.conj(transfer(shown.orders, np.ones(len(shown.orders)), origin))).real
+        known = dict(zip(shown.orders, magnitudes, strict=True))
+    else:  # the stop averages the carriers: they show where the mask is, and the pattern says what it passes
+        usable = np.array([order in seen for order in shown.orders])
+        orders = [order for order in shown.orders if order in seen]
+        origin, phase_residual = origin_of(orders, shown.relative[usable])
+        known = pattern_amplitudes(mask)
     return LatticeFit(
         focal_length_mm=shown.focal_length_mm,
         f_number=shown.f_number,
@@ -166,19 +177,19 @@ def _fit_of(
 def _distance(
     lattice: Lattice, focal_length_mm: float, *, sensor: Sensor, mask: Mask, law: str, stated_mm: float
 ) -> tuple[float, bool]:
-    """(mask distance in mm, whether it was fitted): from the lattice's size on the chip, by the law.
+    """(mask distance in mm, whether it was fitted): from the lattice's size at one focal length, by the law.
 
-    A distance far from the stated one means a mask whose printed frequency isn't the stated one: the stated distance
-    is kept then.
+    Under `geometric` a print a thousandth off its design looks like a distance far off: the stated one is kept, and
+    each frame's aperture is fitted over a wide range instead. Under `fd` a distance far from the stated one means a
+    print of another scale: the stated one is kept then, too.
     """
+    if law == "geometric":
+        return stated_mm, False
     to_sensor = np.array([sensor.row_mm, sensor.column_mm])  # (row, column) steps as (y, x) mm
     per_mm = lattice.matrix() @ np.linalg.inv(to_sensor).T  # rows: cycles/mm along y and x
     size = math.sqrt(abs(float(np.linalg.det(per_mm))))
-    if law == "geometric":
-        distance = (1 - size / mask.frequency_per_mm) * focal_length_mm
-    else:
-        expected = LAWS[law](mask, sensor, stated_mm, focal_length_mm).matrix() @ np.linalg.inv(to_sensor).T
-        distance = stated_mm * size / math.sqrt(abs(float(np.linalg.det(expected))))
+    expected = LAWS[law](mask, sensor, stated_mm, focal_length_mm).matrix() @ np.linalg.inv(to_sensor).T
+    distance = stated_mm * size / math.sqrt(abs(float(np.linalg.det(expected))))
     believed = abs(distance / stated_mm - 1) <= PLAUSIBLE
     return (distance if believed else stated_mm), believed
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +12,11 @@ from numpy.typing import NDArray
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.aperture import relative_transfer
 from dappled.decode.optics import LAWS, Carrier, Lattice, Mask, Order, Sensor
+from dappled.decode.optics.visibility import OrderStrength, order_strengths
 from dappled.decode.spectrum import Spectrum
-from dappled.decode.spectrum.lattice import candidates, find_lattice
-from dappled.decode.spectrum.peaks import FARTHER, Measured, fit, measure, residual_bins
+from dappled.decode.spectrum.lattice import find_lattice
+from dappled.decode.spectrum.mask_lattice import MaskLattice, PeakList, find_mask_lattice, should_stand
+from dappled.decode.spectrum.peaks import Measured, fit, measure, residual_bins
 from dappled.decode.spectrum.slices import extract
 from dappled.decode.spectrum.transform import transform
 
@@ -24,11 +24,22 @@ _ALIKE_BINS = 0.5  # rms from their lattice: peaks farther off belong to the sce
 _ENOUGH = 0.6  # of a mask's carriers: a prediction with so many peaks near it is the right one
 
 
+@dataclass(frozen=True, slots=True)
+class LawOdds:
+    """What a frame says about one law: the log odds (nats) that the mask's carriers stand where the law allows.
+
+    None where no two of the mask's carriers agree near the law's prediction.
+    """
+
+    law: str
+    nats: float | None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameLattice:
     """What one calibration frame shows: its lattice, the carriers seen, and each slice's factor on the mean's.
 
-    `relative` complex (K,) belongs to `orders`, DC first.
+    `relative` complex (K,) belongs to `orders`, DC first. `odds` is what the frame says of each law.
     """
 
     focal_length_mm: float
@@ -38,6 +49,7 @@ class FrameLattice:
     found: tuple[tuple[Carrier, Measured], ...]
     orders: tuple[Order, ...]
     relative: NDArray[np.complex128]
+    odds: tuple[LawOdds, ...] = ()
 
 
 def frame_lattice(
@@ -51,22 +63,23 @@ def frame_lattice(
     mask_distance_mm: float,
     workers: int = 1,
 ) -> FrameLattice:
-    """Find the mask's carriers in a frame: near the prediction of the law, near that of the other one, or anywhere."""
+    """Find the mask's carriers in a frame, near the prediction of either law. Raises DecodeError with the reason."""
     if plane.shape != sensor.shape:
         raise DecodeError(f"the calibration frame is {plane.shape}, the camera's are {sensor.shape}")
     spectrum = transform(plane, workers=workers)
-    lattice, found = _located(
+    located, odds = _located(
         spectrum,
         sensor=sensor,
         mask=mask,
         law=law,
         mask_distance_mm=mask_distance_mm,
         focal_length_mm=focal_length_mm,
+        f_number=f_number,
     )
-    orders = [(c.ky, c.kx) for c in lattice.carriers(mask.half_orders()) if c.on_sensor]
-    lattice = refine(spectrum, lattice, orders, workers)
+    lattice, found = _fitted(spectrum, located, mask)
+    lattice = refine(spectrum, lattice, [(0, 0), *((c.ky, c.kx) for c, _ in found)], workers)
     residual = residual_bins(lattice.carriers([(c.ky, c.kx) for c, _ in found]), [m for _, m in found], spectrum)
-    carriers = [c for c in lattice.carriers(orders) if c.on_sensor]
+    carriers = [c for c in lattice.carriers(mask.half_orders()) if c.on_sensor]
     values = extract(spectrum, carriers, lattice=lattice, workers=workers).values
     return FrameLattice(
         focal_length_mm,
@@ -76,115 +89,106 @@ def frame_lattice(
         tuple(found),
         tuple((c.ky, c.kx) for c in carriers),
         relative_transfer(values),
+        odds,
     )
 
 
 def _located(
-    spectrum: Spectrum, *, sensor: Sensor, mask: Mask, law: str, mask_distance_mm: float, focal_length_mm: float
-) -> tuple[Lattice, list[tuple[Carrier, Measured]]]:
-    """The lattice on which most of the mask's carriers lie, and those carriers; the law's own prediction is tried
-    first."""
-    best: tuple[Lattice, list[tuple[Carrier, Measured]]] | None = None
-    most = 0.0
-    first = ""
-    guesses = _guesses(
-        spectrum,
-        sensor=sensor,
-        mask=mask,
-        law=law,
-        mask_distance_mm=mask_distance_mm,
-        focal_length_mm=focal_length_mm,
-    )
-    for guess in guesses:
-        try:
-            lattice, found, share = _verified(spectrum, guess(), mask)
-        except DecodeError as error:
-            first = first or str(error)
-            continue
-        if share > _ENOUGH:
-            return lattice, found
-        if share > most:
-            best, most = (lattice, found), share
-    if best is None:
-        raise DecodeError(first)
-    return best
-
-
-def _guesses(
-    spectrum: Spectrum, *, sensor: Sensor, mask: Mask, law: str, mask_distance_mm: float, focal_length_mm: float
-) -> list[Callable[[], Lattice]]:
-    """Where to look for the lattice, the likeliest place first."""
-
-    def near(name: str) -> Lattice:
+    spectrum: Spectrum,
+    *,
+    sensor: Sensor,
+    mask: Mask,
+    law: str,
+    mask_distance_mm: float,
+    focal_length_mm: float,
+    f_number: float,
+) -> tuple[MaskLattice, tuple[LawOdds, ...]]:
+    """The lattice that the mask's carriers stand on, near the prediction of whichever law, and each law's odds."""
+    peaks = PeakList.of(spectrum)
+    odds: list[LawOdds] = []
+    asked: list[list[OrderStrength]] = []
+    best: MaskLattice | None = None
+    for name in (law, *(other for other in LAWS if other != law)):
         predicted = LAWS[name](mask, sensor, mask_distance_mm, focal_length_mm)
-        orders = [(c.ky, c.kx) for c in predicted.carriers(mask.half_orders()) if c.on_sensor]
-        return search(spectrum, predicted, orders)
-
-    def anywhere() -> Lattice:
-        found = find_lattice(spectrum).lattice
-        if mask.pattern == "full":
-            return found
-        (ay, ax), (by, bx) = found.ky, found.kx  # a diagonal mask's shortest steps are (1, 1) and (1, -1)
-        sums, differences = ((ay + by) / 2, (ax + bx) / 2), ((ay - by) / 2, (ax - bx) / 2)
-        ky, kx = sorted((sums, differences), key=lambda v: -abs(v[0]))
-        return Lattice(ky if ky[0] > 0 else (-ky[0], -ky[1]), kx if kx[1] > 0 else (-kx[0], -kx[1]))
-
-    others = [name for name in LAWS if name != law]
-    return [*(partial(near, name) for name in (law, *others)), anywhere]
-
-
-def _verified(
-    spectrum: Spectrum, lattice: Lattice, mask: Mask
-) -> tuple[Lattice, list[tuple[Carrier, Measured]], float]:
-    """A lattice fitted to the carriers near it, those carriers, and their share of all."""
-    found: list[tuple[Carrier, Measured]] = []
-    looked: list[Carrier] = []
-    for radius in (4.0, 2.0, 2.0):
-        looked = [c for c in lattice.carriers(mask.half_orders()) if c.on_sensor and (c.ky, c.kx) != (0, 0)]
-        peaks = measure(spectrum, looked, radius)
-        found = [(c, m) for c, m in zip(looked, peaks, strict=True) if m is not None]
-        if len(found) < min(3, len(looked)) or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in found]) < 2:
-            raise DecodeError(
-                f"only {len(found)} of {len(looked)} carriers are visible: calibrate on a frame at a small aperture "
-                "(an eighth of the widest)"
-            )
-        lattice = fit(found)
-    carriers = lattice.carriers([(c.ky, c.kx) for c, _ in found])
-    if residual_bins(carriers, [m for _, m in found], spectrum) > _ALIKE_BINS:
-        raise DecodeError(
-            f"{len(found)} peaks lie near the prediction, but not on a common lattice: calibrate on a frame at a small "
-            "aperture (an eighth of the widest), and check mask, camera and focal length"
-        )
-    return lattice, found, len(found) / len(looked)
-
-
-def search(spectrum: Spectrum, predicted: Lattice, orders: Sequence[Order], tolerance: float = FARTHER) -> Lattice:
-    """The lattice near a predicted one that most of a frame's peaks lie on: any small rotation, scale and shear.
-
-    Tries each pair of peaks near (0, 1) and (1, 0). Raises DecodeError where no such pair explains other orders.
-    """
-    peaks = candidates(spectrum, spacing_bins=11)[:400]
-    points = np.array([(c.row, c.column) for c in peaks] + [(-c.row, -c.column) for c in peaks]).reshape(-1, 2)
-    weights = np.array([c.prominence for c in peaks] * 2)
-    bins = np.array(spectrum.padded)
-    basis = predicted.matrix() * bins
-    around = [points[np.hypot(*(points - vector).T) < max(tolerance * math.hypot(*vector), 3.0)] for vector in basis]
-    wanted = np.array([order for order in orders if order != (0, 0)], dtype=np.float64)
-    best, best_score = None, 0.0
-    for a, b in itertools.product(*around):
-        expected = wanted @ np.array([a, b])
-        distance = np.hypot(*np.moveaxis(points[None, :, :] - expected[:, None, :], 2, 0))
-        allowed = 1.5 + 0.5 * np.abs(wanted).max(axis=1, keepdims=True)
-        score = float(np.where(distance < allowed, weights, 0.0).max(axis=1).sum())
-        if score > best_score:
-            best, best_score = np.array([a, b]) / bins, score
+        expected = order_strengths(mask, sensor, predicted, mask_distance_mm=mask_distance_mm, f_number=f_number)
+        found = find_mask_lattice(peaks, predicted, expected)
+        asked.append(expected)
+        odds.append(LawOdds(name, None if found is None else found.odds_nats))
+        if found is not None and found.sure and (best is None or found.odds_nats > best.odds_nats):
+            best = found
+    if best is None and mask.pattern == "full":
+        best = _anywhere(spectrum, mask)
     if best is None:
-        raise DecodeError(
-            "no carriers near the prediction: calibrate on a frame at a small aperture (an eighth of the widest), "
-            "and check mask, camera and focal length"
+        raise DecodeError(unseen(spectrum, asked, mask, mask_distance_mm, f_number))
+    return best, tuple(odds)
+
+
+def unseen(
+    spectrum: Spectrum,
+    predictions: Sequence[Sequence[OrderStrength]],
+    mask: Mask,
+    mask_distance_mm: float,
+    f_number: float,
+) -> str:
+    """Why a frame shows no lattice of its mask, in a sentence: which orders can't be seen, and which should be.
+
+    `predictions` are one or more laws'; the sentence is about the one under which most should be seen.
+    """
+    expected, above = max(
+        ((list(one), should_stand(spectrum, one)) for one in predictions), key=lambda pair: len(pair[1])
+    )
+    named = ", ".join(f"({ky}, {kx})" for ky, kx in (one.order for one in above[:4]))
+    causes: dict[str, list[str]] = {}
+    for one in expected:
+        if one not in above:
+            causes.setdefault(one.cause or "below the frame's own detail and noise", []).append(
+                f"({one.order[0]}, {one.order[1]})"
+            )
+    lost = "; ".join(f"{_some(orders)} {cause}" for cause, orders in causes.items())
+    if len(above) >= 2 and np.linalg.matrix_rank([one.order for one in above]) == 2:
+        more = f" (not expected: {lost})" if lost else ""
+        return (
+            f"no carriers: {named} should stand out at f/{f_number:g} and no lattice of this mask does{more}: check "
+            "mask, camera, focal length and f-number"
         )
-    (ay, ax), (by, bx) = best
-    return Lattice((float(ay), float(ax)), (float(by), float(bx)))
+    ideal = mask.frequency_per_mm * mask_distance_mm
+    return (
+        f"no carriers can be seen in this frame at f/{f_number:g}: {lost}. Calibrate on a white frame at a small "
+        f"aperture (f/{3 * ideal:.0f} or smaller for this mask; its ideal is f/{ideal:.1f})"
+    )
+
+
+def _some(orders: Sequence[str]) -> str:
+    return ", ".join(orders[:4]) + (f" and {len(orders) - 4} more" if len(orders) > 4 else "")
+
+
+def _anywhere(spectrum: Spectrum, mask: Mask) -> MaskLattice | None:
+    """The lattice of a full mask without a prediction, if the frame shows nearly all of its carriers."""
+    try:
+        lattice = find_lattice(spectrum).lattice
+    except DecodeError:
+        return None
+    looked = [c for c in lattice.carriers(mask.half_orders()) if c.on_sensor and (c.ky, c.kx) != (0, 0)]
+    found = [(c, m) for c, m in zip(looked, measure(spectrum, looked, 2.0), strict=True) if m is not None]
+    if (
+        len(found) <= _ENOUGH * len(looked)
+        or residual_bins([c for c, _ in found], [m for _, m in found], spectrum) > _ALIKE_BINS
+    ):
+        return None
+    return MaskLattice(lattice, tuple(found), 0.0, math.nan, math.nan)
+
+
+def _fitted(spectrum: Spectrum, at: MaskLattice, mask: Mask) -> tuple[Lattice, list[tuple[Carrier, Measured]]]:
+    """The lattice fitted to all of the mask's carriers that stand on it, and those."""
+    lattice, found = at.lattice, list(at.found)
+    for _ in range(2):
+        looked = [c for c in lattice.carriers(mask.half_orders()) if c.on_sensor and (c.ky, c.kx) != (0, 0)]
+        near = [(c, m) for c, m in zip(looked, measure(spectrum, looked, 1.0), strict=True) if m is not None]
+        known = {(c.ky, c.kx) for c, _ in near}
+        found = near + [(c, m) for c, m in at.found if (c.ky, c.kx) not in known]
+        lattice = fit(found)
+    carriers = {(c.ky, c.kx): c for c in lattice.carriers([(c.ky, c.kx) for c, _ in found])}
+    return lattice, [(carriers[c.ky, c.kx], m) for c, m in found]
 
 
 def refine(spectrum: Spectrum, lattice: Lattice, orders: Sequence[Order], workers: int = 1) -> Lattice:

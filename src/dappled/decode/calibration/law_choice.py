@@ -19,6 +19,11 @@ from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
 EXPLAINED_BINS = 2.0  # rms: the residual that a law may leave (the thesis' own readings scatter by 0 to 2)
 PLAUSIBLE = 0.35  # relative: a mask distance further from the stated one is not believed
 _PRINTED = 0.05  # relative: a print's frequency is not further off
+_PRINT_SIGMA = 0.01  # relative: what printers make of a size
+_DISTANCE_SIGMA = 0.1  # relative: how well a mask's distance is known before it was fitted
+_ANISOTROPY = 0.03  # of a print: more is another mask, or another law
+_DECISIVE = 0.5  # nats: a law asked for yields to a likelier one only beyond this
+_STEP_BINS = 0.02  # a lattice's step is known no better
 _FOR_PUPIL = 3  # focal lengths needed to fit a law's second constant, too
 
 
@@ -28,8 +33,10 @@ class LawFit:
 
     `anisotropy` is rows' scale over columns', less 1. `offset_bins` (rows, columns) is a constant beside `fd`'s 1/f,
     `pupil_mm` the distance of the exit pupil beyond the focal length under `geometric`, v(f) = f + pupil: None where
-    there are too few focal lengths to tell. `rms_bins` is the residual of the carriers, `explains` whether that and the
-    distance are plausible.
+    there are too few focal lengths to tell. `rms_bins` is the residual of the carriers, `explains` whether that, the
+    distance and the print are plausible. `print_scale` is the print's frequency over its design's. With one focal
+    length it is fitted for the stated distance, as the two can't be separated, and `print_scale_sigma` and
+    `distance_sigma_mm` are None. `deviation` is that of the print or the distance, in standard deviations.
     """
 
     law: str
@@ -39,6 +46,15 @@ class LawFit:
     pupil_mm: float | None
     rms_bins: float
     explains: bool
+    print_scale: float = 1.0
+    print_scale_sigma: float | None = None
+    distance_sigma_mm: float | None = None
+    deviation: float = 0.0
+
+    @property
+    def nats(self) -> float:
+        """The log likelihood of what the law asks of print and distance."""
+        return -0.5 * self.deviation**2
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,17 +90,31 @@ def judge(
         how(lengths, steps, sensor=sensor, mask=mask, stated_mm=stated_mm) for how in (_fit_fd, _fit_geometric)
     )
     able = [fit for fit in fits if fit.explains]
-    words = "; ".join(
-        f"{fit.law} with the mask at {fit.mask_distance_mm:.3f} mm leaves {fit.rms_bins:.2f} bins rms" for fit in fits
-    )
+    words = "; ".join(_words(fit) for fit in fits)
     if not able:
         return LawVerdict(fits, None, f"neither law explains these frames ({words}; stated are {stated_mm:g} mm)")
     if len(set(lengths.tolist())) < 2:
-        law = asked if asked in {fit.law for fit in able} else able[0].law
-        which = f"only {law} would do" if len(able) == 1 else "both would do"
-        return LawVerdict(fits, law, f"{which}, as far as one focal length tells the laws apart ({words})")
+        best = max(able, key=lambda fit: (fit.nats + (_DECISIVE if fit.law == asked else 0.0), fit.law == asked))
+        which = f"only {best.law} would do" if len(able) == 1 else f"both would do, {best.law} is taken"
+        return LawVerdict(
+            fits,
+            best.law,
+            f"{which}, as far as one focal length tells the laws, or scale and distance, apart ({words})",
+        )
     best = min(able, key=lambda fit: fit.rms_bins)
     return LawVerdict(fits, best.law, f"{best.law} explains these frames ({words})")
+
+
+def _words(fit: LawFit) -> str:
+    """A fit in words: what it takes for distance and print, with its errors, and what it leaves."""
+    sigma = "" if fit.distance_sigma_mm is None else f" ± {fit.distance_sigma_mm:.3f}"
+    printed = ""
+    if fit.law == "geometric":
+        error = "" if fit.print_scale_sigma is None else f" ± {fit.print_scale_sigma:.4f}"
+        printed = f" and a print of {fit.print_scale:.4f}{error} times its design"
+    return (
+        f"{fit.law} with the mask at {fit.mask_distance_mm:.3f}{sigma} mm{printed} leaves {fit.rms_bins:.2f} bins rms"
+    )
 
 
 def _fit_fd(
@@ -109,7 +139,8 @@ def _fit_fd(
         (float(offset[0]), float(offset[1])) if with_offset else None,
         None,
         rms,
-        _believed(distance, stated_mm, rms),
+        _believed(distance, stated_mm, rms, _ratio(scale)),
+        deviation=(distance / stated_mm - 1) / _DISTANCE_SIGMA,
     )
 
 
@@ -119,35 +150,62 @@ def _fit_geometric(
     """step = scale · f_m · (1 − d/(f + pupil)), each axis with its own scale, because printing or gluing may have
     stretched it.
 
-    From too few focal lengths only the axes' ratio is fitted beside the distance.
+    At one focal length scale and distance can't be told apart: the distance is the stated one, and the print's scale
+    takes up the rest. Two focal lengths give the distance, three the pupil too.
     """
     full = np.array([steps_bins(LAWS["geometric"](mask, sensor, 0.0, 1.0), sensor)])  # f_m itself
-    with_pupil = len(set(lengths_mm.tolist())) >= _FOR_PUPIL
+    several = len(set(lengths_mm.tolist()))
     shortest = float(lengths_mm.min())
+    free = [0, 1, *([2] if several > 1 else []), *([3] if several >= _FOR_PUPIL else [])]  # rows, columns, d, pupil
+    base = np.array([1.0, 1.0, min(stated_mm, 0.98 * shortest), 0.0])
 
     def left(constants: NDArray[np.float64]) -> NDArray[np.float64]:
-        distance, rows, columns, pupil = constants if with_pupil else (*constants, 2 - constants[1], 0.0)
+        rows, columns, distance, pupil = _with(base, free, constants)
         there = full * (1 - distance / (lengths_mm + pupil))[:, None] * np.array([rows, columns])
         return np.asarray((steps - there).ravel())
 
-    count = 4 if with_pupil else 2
-    start = [min(stated_mm, 0.98 * shortest), 1.0, 1.0, 0.0][:count]
-    lowest = [0.0, 1 - _PRINTED, 1 - _PRINTED, -0.9 * shortest][:count]
-    highest = [0.99 * shortest, 1 + _PRINTED, 1 + _PRINTED, 10 * shortest][:count]
-    scales = [stated_mm, 1e-3, 1e-3, 1.0][:count]
-    found = optimize.least_squares(left, start, bounds=(lowest, highest), x_scale=scales, ftol=1e-14, xtol=1e-14)
-    rms = _rms(left(found.x).reshape(steps.shape), mask)
-    distance, rows = float(found.x[0]), float(found.x[1])
-    columns = float(found.x[2]) if with_pupil else 2 - rows
-    return LawFit(
-        "geometric",
-        distance,
-        rows / columns - 1,
-        None,
-        float(found.x[3]) if with_pupil else None,
-        rms,
-        _believed(distance, stated_mm, rms),
+    lowest = np.array([0.5, 0.5, 0.0, -0.9 * shortest])[free]
+    highest = np.array([2.0, 2.0, 0.99 * shortest, 10 * shortest])[free]
+    scales = np.array([1e-3, 1e-3, stated_mm, 1.0])[free]
+    found = optimize.least_squares(
+        left, base[free], bounds=(lowest, highest), x_scale=scales, ftol=1e-14, xtol=1e-14, gtol=1e-14
     )
+    rows, columns, distance, pupil = (float(value) for value in _with(base, free, found.x))
+    residual = left(found.x)
+    rms = _rms(residual.reshape(steps.shape), mask)
+    sigma = _sigmas(found.jac, residual, free)
+    scale = math.sqrt(rows * columns)
+    printed = abs(scale - 1) <= _PRINTED
+    return LawFit(
+        law="geometric",
+        mask_distance_mm=distance,
+        anisotropy=rows / columns - 1,
+        offset_bins=None,
+        pupil_mm=pupil if several >= _FOR_PUPIL else None,
+        rms_bins=rms,
+        explains=printed and _believed(distance, stated_mm, rms, rows / columns - 1),
+        print_scale=scale,
+        print_scale_sigma=sigma[0] if several > 1 else None,
+        distance_sigma_mm=sigma[2] if several > 1 else None,
+        deviation=(scale - 1) / _PRINT_SIGMA if several == 1 else (distance / stated_mm - 1) / _DISTANCE_SIGMA,
+    )
+
+
+def _with(base: NDArray[np.float64], free: Sequence[int], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    whole = base.copy()
+    whole[list(free)] = values
+    return whole
+
+
+def _sigmas(jacobian: NDArray[np.float64], residual: NDArray[np.float64], free: Sequence[int]) -> list[float]:
+    """Standard errors of (rows, columns, d, pupil), NaN where not free; steps are known to `_STEP_BINS`."""
+    freedom = max(1, residual.size - len(free))
+    variance = max(_STEP_BINS**2, float((residual**2).sum()) / freedom)
+    covariance = np.linalg.pinv(jacobian.T @ jacobian) * variance
+    found = [math.nan] * 4
+    for at, which in enumerate(free):
+        found[which] = math.sqrt(float(covariance[at, at]))
+    return found
 
 
 def _rms(left_bins: NDArray[np.float64], mask: Mask) -> float:
@@ -156,8 +214,9 @@ def _rms(left_bins: NDArray[np.float64], mask: Mask) -> float:
     return float(np.sqrt(np.mean((left_bins[:, None, :] * orders[None]) ** 2) * 2))
 
 
-def _believed(distance_mm: float, stated_mm: float, rms_bins: float) -> bool:
-    return abs(distance_mm / stated_mm - 1) <= PLAUSIBLE and rms_bins <= EXPLAINED_BINS
+def _believed(distance_mm: float, stated_mm: float, rms_bins: float, anisotropy: float) -> bool:
+    believable = abs(distance_mm / stated_mm - 1) <= PLAUSIBLE and abs(anisotropy) <= _ANISOTROPY
+    return believable and rms_bins <= EXPLAINED_BINS
 
 
 def _ratio(scale: NDArray[np.float64]) -> float:

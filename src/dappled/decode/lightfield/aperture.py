@@ -33,6 +33,8 @@ Shape = Literal["beams", "filled", "round"]
 _PARTS = 15  # of a cell's side, where a circle cuts through cells
 ROUNDING = 0.05  # relative: f-numbers are off by no more (nominal f/22 is 22.6, f/3.5 is 3.56)
 _NOMINAL_SIGMA = 0.02  # relative: the error of an f-number
+UNKNOWN_DISTANCE = 0.35  # relative: how far κ is searched where the mask's distance was not fitted
+_UNKNOWN_SIGMA = 0.2  # relative: the error of κ then
 _TEXTURE = 1.5e-3  # of the mean: what the scene adds to the mean of a slice
 _EVIDENCE = 9.0  # squared deviations: less doesn't tell one shape from another (beams from filled cells never at κ = 1)
 SHAPES: tuple[Shape, ...] = ("beams", "filled", "round")
@@ -191,12 +193,15 @@ def used_aperture(
     nominal_kappa: float,
     rotation_rad: float,
     aperture: Aperture,
+    distance_known: bool = True,
 ) -> UsedAperture:
     """The aperture of a frame from its slices complex64 (K, h, w), DC first, and their known transfers T_k (K,).
 
-    The most probable κ near `nominal_kappa`. The nominal one where the means carry no information or fit no aperture.
+    The most probable κ near `nominal_kappa`, within `UNKNOWN_DISTANCE` of it where the mask's distance is not known but
+    to some percent (not `distance_known`). The nominal one where the means carry no information or fit no aperture.
     """
-    nominal = UsedAperture(nominal_kappa, _NOMINAL_SIGMA * nominal_kappa, False, aperture)
+    reach, sigma = (ROUNDING, _NOMINAL_SIGMA) if distance_known else (UNKNOWN_DISTANCE, _UNKNOWN_SIGMA)
+    nominal = UsedAperture(nominal_kappa, sigma * nominal_kappa, False, aperture)
     means = mean_of_slices(slices)
     known = np.abs(transfers) > 1e-3
     known[0] = False
@@ -206,7 +211,7 @@ def used_aperture(
     error = _TEXTURE / np.abs(transfers[known])
     wanted = [order for order, usable in zip(orders, known, strict=True) if usable]
 
-    shares = 1 + ROUNDING * np.linspace(-1, 1, 201)
+    shares = 1 + reach * np.linspace(-1, 1, 2 * round(100 * reach / ROUNDING) + 1)
     best: UsedAperture | None = None
     least = math.inf
     for shape in SHAPES:
@@ -217,6 +222,7 @@ def used_aperture(
             nominal_kappa * shares,
             rotation_rad=rotation_rad,
             aperture=Aperture(aperture.views, shape),
+            sigma=sigma,
         )
         if found is not None and cost + (_EVIDENCE if best else 0.0) < least:
             best, least = found, cost
@@ -231,13 +237,14 @@ def _fitted(
     *,
     rotation_rad: float,
     aperture: Aperture,
+    sigma: float,
 ) -> tuple[UsedAperture | None, float]:
     """The most probable of evenly spaced `kappas` (the nominal one in the middle), and its cost; None for no fit."""
     nominal = float(kappas[len(kappas) // 2])
     angular = [angular_frequencies(orders, float(kappa), rotation_rad) for kappa in kappas]
     there = np.array([aperture.transform(a).real for a in angular])
     deviations = ((there - seen) / error) ** 2
-    cost = deviations.sum(axis=1) + ((kappas / nominal - 1) / _NOMINAL_SIGMA) ** 2
+    cost = deviations.sum(axis=1) + ((kappas / nominal - 1) / sigma) ** 2
     best = int(np.argmin(cost))
     if best in (0, len(kappas) - 1) or float(deviations[best].mean()) > _AGREEMENT**2:
         return None, math.inf

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -30,13 +30,16 @@ class Mask:
 
     `frequency_per_mm` is the fundamental at the mask's own plane. `p` counts harmonics: `linear` ones are 1, 2, 3 … p
     times the fundamental (Fig 14), `octave` ones 1, 2, 4, 8 … (the thesis' text; the same for p = 2). `full` is the
-    product of Eq 11, (2p+1)² carriers; `diagonal` is Fig 14's sum of cos·cos, 4p+1 carriers.
+    product of Eq 11, (2p+1)² carriers; `diagonal` is Fig 14's sum of cos·cos, 4p+1 carriers. `film_px_per_mm` is the
+    printer's density, None where unknown: the film has no harmonic of less than two pixels a period. Masks that differ
+    in it alone are equal.
     """
 
     frequency_per_mm: float
     p: int
     pattern: Pattern = "full"
     harmonics: Harmonics = "linear"
+    film_px_per_mm: float | None = field(default=None, compare=False)
 
     @property
     def multiples(self) -> tuple[int, ...]:

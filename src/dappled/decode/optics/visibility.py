@@ -1,0 +1,158 @@
+"""Predict how strong each carrier of a mask is on the sensor, and what takes the strength of those that are not seen.
+
+The amplitude of order k, as a share of the plane's mean, is the product of what the pattern gives it, what the film
+keeps (its pixels' sinc; nothing beyond two pixels a period), what diffraction leaves on the way (Eq 30, at the order's
+own frequency, which is √2·k·f_m on a diagonal), the stop's average over κ·k cycles (sinc·sinc of a square one, jinc of
+a round one, with nulls and changes of sign), and what the sensor's pixels keep. A stop's shape is rarely known, and an
+f-number is rounded. So a strength is a range: over both shapes, and over `_ROUNDING` of the f-number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from dappled.decode.optics.carriers import Lattice, Mask, Order, Sensor
+
+_ROUNDING = 0.12  # relative: an f-number told in third stops, and nulls where only their neighbourhood counts
+_WAVELENGTHS_MM = np.array([450e-6, 500e-6, 550e-6, 600e-6, 650e-6])
+_LOST = 0.15  # a factor below this is named as the cause why a carrier is not seen
+
+
+@dataclass(frozen=True, slots=True)
+class OrderStrength:
+    """What is predicted of one order: where it stands, and how strong it is at least and at most.
+
+    `least` and `most` are shares of the plane's mean, over the stop's possible shapes and the f-number's rounding.
+    `pattern`, `film`, `diffraction`, `stop` and `pixels` are the factors whose product `most` is; `film_per_mm` the
+    order's frequency on the film, `per_mm` on the sensor.
+    """
+
+    order: Order
+    fy: float
+    fx: float
+    least: float
+    most: float
+    pattern: float
+    film: float
+    diffraction: float
+    stop: float
+    pixels: float
+    film_per_mm: float
+    per_mm: float
+
+    @property
+    def on_sensor(self) -> bool:
+        """Whether the carrier lies below the Nyquist frequency on both axes."""
+        return abs(self.fy) < 0.5 and abs(self.fx) < 0.5
+
+    @property
+    def cause(self) -> str | None:
+        """What takes this carrier's strength, in a few words; None where nothing takes much of it."""
+        if self.film == 0:
+            return f"at {self.film_per_mm:.0f} cycles/mm, which the film cannot draw"
+        if not self.on_sensor:
+            return "beyond the sensor's Nyquist frequency"
+        factors = {
+            "averaged out over the stop": self.stop,
+            "lost to diffraction between mask and sensor": self.diffraction,
+            "blurred by the film": self.film,
+            "blurred by the pixels": self.pixels,
+        }
+        worst = min(factors, key=factors.__getitem__)
+        return worst if factors[worst] < _LOST else None
+
+
+def order_strengths(
+    mask: Mask,
+    sensor: Sensor,
+    lattice: Lattice,
+    *,
+    mask_distance_mm: float,
+    f_number: float,
+    orders: Sequence[Order] | None = None,
+) -> list[OrderStrength]:
+    """The predicted strength of a mask's orders at a lattice, by default the half plane's without the mean."""
+    wanted = [order for order in (mask.half_orders() if orders is None else orders) if order != (0, 0)]
+    k = np.array(wanted, dtype=np.float64).reshape(-1, 2)
+    amplitudes = pattern_amplitudes(mask)
+    pattern = np.array([abs(amplitudes.get(order, 0.0)) for order in wanted])
+    on_film = k * mask.frequency_per_mm
+    per_mm = np.hypot(*on_film.T)
+    film = np.ones(len(k))
+    if mask.film_px_per_mm is not None:
+        drawn = np.abs(on_film).max(axis=1) <= mask.film_px_per_mm / 2 * (1 + 1e-9)
+        film = np.where(drawn, np.sinc(on_film / mask.film_px_per_mm).prod(axis=1), 0.0)
+    numbers = _WAVELENGTHS_MM * mask_distance_mm * per_mm[:, None] ** 2  # λ·d·f²
+    diffraction = np.sqrt((np.cos(np.pi * numbers) ** 2).mean(axis=1))
+    swept = mask.frequency_per_mm * mask_distance_mm / f_number * k  # κ·k cycles over the stop
+    stops = np.array(
+        [shape(swept * (1 + off)) for shape in (_round, _square) for off in np.linspace(-_ROUNDING, _ROUNDING, 9)]
+    )
+    frequencies = k @ lattice.matrix()
+    pixels = np.abs(np.sinc(frequencies).prod(axis=1))
+    stop_least, stop_most = np.abs(stops).min(axis=0), np.abs(stops).max(axis=0)
+    stop_least = np.where((stops.max(axis=0) > 0) & (stops.min(axis=0) < 0), 0.0, stop_least)  # a null in between
+    common = pattern * np.abs(film) * diffraction * pixels
+    to_mm = np.linalg.inv(np.array([sensor.row_mm, sensor.column_mm])).T
+    on_sensor = np.hypot(*(frequencies @ to_mm).T)
+    return [
+        OrderStrength(
+            order=order,
+            fy=float(frequencies[i, 0]),
+            fx=float(frequencies[i, 1]),
+            least=float(common[i] * stop_least[i]),
+            most=float(common[i] * stop_most[i]),
+            pattern=float(pattern[i]),
+            film=float(abs(film[i])),
+            diffraction=float(diffraction[i]),
+            stop=float(stop_most[i]),
+            pixels=float(pixels[i]),
+            film_per_mm=float(np.abs(on_film[i]).max()),
+            per_mm=float(on_sensor[i]),
+        )
+        for i, order in enumerate(wanted)
+    ]
+
+
+def pattern_amplitudes(mask: Mask) -> dict[Order, float]:
+    """Amplitude of each order as a share of the mean, for a film that is black where the pattern is lowest.
+
+    Harmonics that the film can't draw are left out of the pattern, as they come out as other frequencies.
+    """
+    drawn = [m for m in mask.multiples if _drawable(mask, m)] or list(mask.multiples[:1])
+    turns = 2 * np.pi * np.arange(2048) / 2048
+    axis = np.array([np.cos(m * turns) for m in drawn])
+    if mask.pattern == "full":
+        along = 1 + axis.sum(axis=0)
+        lowest = min(float(along.min() * along.max()), float(along.min() ** 2), float(along.max() ** 2))
+        mean = 1.0
+    else:
+        coarse = axis[:, ::4]
+        lowest, mean = float((coarse.T @ coarse).min()), 0.0
+    clear = mean - lowest
+    found = {(0, 0): 1.0}
+    for ky, kx in mask.orders():
+        if (ky, kx) == (0, 0) or not all(abs(n) in (0, *drawn) for n in (ky, kx)):
+            continue
+        found[ky, kx] = (0.5 if ky else 1.0) * (0.5 if kx else 1.0) / clear
+    return found
+
+
+def _drawable(mask: Mask, multiple: int) -> bool:
+    limit = math.inf if mask.film_px_per_mm is None else mask.film_px_per_mm / 2
+    return multiple * mask.frequency_per_mm <= limit * (1 + 1e-9)
+
+
+def _round(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
+    turns = np.pi * np.hypot(*cycles.T)
+    return np.asarray(np.where(turns > 0, 2 * special.j1(turns) / np.where(turns > 0, turns, 1.0), 1.0))
+
+
+def _square(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.sinc(cycles).prod(axis=1))
