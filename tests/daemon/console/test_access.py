@@ -55,6 +55,9 @@ def test_it_answers_to_its_own_names_only(rules: Access, host: str, code: int) -
         ({"content-length": "99999"}, 413),
         ({"content-length": "x"}, 411),
         ({"content-length": ""}, 411),
+        ({"content-length": "9" * 5000}, 413),
+        ({"transfer-encoding": "chunked"}, 411),
+        ({"transfer-encoding": "chunked", "content-length": "2"}, 411),
     ],
 )
 def test_only_the_page_itself_changes_anything(rules: Access, change: dict[str, str], code: int) -> None:

@@ -233,6 +233,46 @@ def test_a_frame_s_pictures(rig: Rig) -> None:
             assert client.get(f"/api/frames/4/refocus.jpg?disparity={disparity}").status_code == 422
 
 
+@pytest.mark.parametrize("digits", ["9" * 26, "9" * 5000, "٣", "1e3", "-1"])
+def test_a_frame_number_that_is_none_is_a_sentence(rig: Rig, digits: str) -> None:
+    with rig.client() as client:
+        for path in (f"/api/frames/{digits}/mean.jpg", f"/kml/{digits}.png"):
+            answer = client.get(path)
+            assert answer.status_code == 404
+            assert "a frame is named by its number" in answer.json()["error"]
+
+
+@pytest.mark.parametrize("body", ["[" * 4000, '{"sequence": ' + "9" * 4000 + "}", '{"sequence": NaN}', "\xff", "{"])
+def test_a_body_that_no_parser_likes_is_a_sentence(rig: Rig, body: str) -> None:
+    with rig.client(origin=rig.url) as client:
+        sent = {"content": body.encode("latin-1"), "headers": {"content-type": "application/json"}}
+        answer = client.post("/api/shoot", **sent)  # type: ignore[arg-type]  # httpx takes both
+    assert answer.status_code == 422
+    assert answer.json()["error"] == "a request's body must be one JSON object"
+    assert {"do": "shoot"} not in [{"do": each["do"]} for each in rig.asked]
+
+
+def test_a_body_in_chunks_is_refused_before_it_is_read(rig: Rig) -> None:
+    with rig.client(origin=rig.url) as client:
+        chunks = iter([b" " * 65536] * 100)
+        headers = {"content-type": "application/json", "content-length": "2", "transfer-encoding": "chunked"}
+        assert client.post("/api/shoot", content=chunks, headers=headers).status_code == 411
+
+
+def test_a_fault_of_the_console_is_one_line_of_log(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(rig.feed, "state", lambda: 1 / 0)
+    with rig.client() as client:
+        answer = client.get("/api/state")
+    assert answer.status_code == 500
+    assert answer.json() == {"error": "the console failed (ZeroDivisionError): see its log"}
+    assert answer.headers["content-security-policy"]
+    (line,) = [record for record in caplog.records if record.levelname in ("WARNING", "ERROR")]
+    assert line.getMessage() == "GET '/api/state' failed: unexpected ZeroDivisionError: division by zero"
+    assert line.exc_info is None
+
+
 def test_slices_that_the_daemon_can_t_give_are_a_sentence(rig: Rig) -> None:
     seen(rig, 101)
     with rig.client() as client:

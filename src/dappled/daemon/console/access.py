@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import logging
 import socket
 from collections import OrderedDict, deque
 from collections.abc import Collection, Mapping
@@ -15,11 +16,15 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from dappled.clock import Clock, SystemClock
+from dappled.errors import report
 
+log = logging.getLogger(__name__)
 COOKIE = "dappled"
 GUESSES, GUESS_WINDOW_S = 10, 60.0  # from one address
 GUESSERS = 1024  # addresses that are remembered
 BODY_BYTES = 4096
+_LENGTH_DIGITS = 10
+_PATH_CHARACTERS = 80
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' blob: data:; manifest-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -114,11 +119,11 @@ class Access:
         if request.headers.get("content-type", "").split(";")[0].strip() != "application/json":
             return Refusal(415, "a request's body must be JSON")
         length = request.headers.get("content-length", "")
-        if not length.isascii() or not length.isdigit():
-            return Refusal(411, "a request must give the length of its body")
-        return (
-            Refusal(413, f"a request's body may have at most {BODY_BYTES} bytes") if int(length) > BODY_BYTES else None
-        )
+        if not length.isascii() or not length.isdigit() or "transfer-encoding" in request.headers:
+            return Refusal(411, "a request must give the length of its body")  # in chunks it could have any length
+        if len(length) > _LENGTH_DIGITS or int(length) > BODY_BYTES:
+            return Refusal(413, f"a request's body may have at most {BODY_BYTES} bytes")
+        return None
 
     def _known(self, request: ConsoleRequest) -> Refusal | None:
         guarded = request.path.startswith(("/api/", "/kml", "/metrics")) and request.path != "/api/login"
@@ -160,8 +165,11 @@ class RequestGuard:
         refusal = self._rules.judge(ConsoleRequest(scope["method"], scope["path"], headers, query, client))
         if refusal is not None:
             await refused(refusal)(scope, receive, strictly)
-        else:
+            return
+        try:
             await self._inner(scope, receive, strictly)
+        except Exception as error:  # noqa: BLE001  # the answer is a 500 already; one request must not fill the log
+            report(log, f"{scope['method']} {scope['path'][:_PATH_CHARACTERS]!r} failed", error)
 
 
 def refused(refusal: Refusal) -> Response:

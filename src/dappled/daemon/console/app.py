@@ -17,6 +17,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
+from dappled.bounds.parsing import parse_json
 from dappled.daemon.console import access, pictures
 from dappled.daemon.console.access import Access, Refusal, RequestGuard, refused
 from dappled.daemon.console.feed import Feed, FeedError
@@ -32,6 +33,7 @@ _PICTURES = (
     "and map.png, which is north up"
 )
 _DISPARITY_PX = 8.0
+_FRAME_DIGITS = 10
 _MAP_PX, _GLOBE_BOUNDS_PX, _GLOBE_PICTURE_PX = 320, 320, 1024
 _LOG_EVERY_S = 0.7
 _STATIC = Path(str(resources.files("dappled.daemon.console") / "static"))
@@ -59,14 +61,16 @@ class ConsoleApp:
             Route("/api/shoot", self._shoot, methods=["POST"]),
             Route("/api/interval", self._interval, methods=["POST"]),
             Route("/api/interval/stop", self._stop_interval, methods=["POST"]),
-            Route("/api/frames/{frame:int}/{name}", self._frame_picture),
+            Route("/api/frames/{frame}/{name}", self._frame_picture),
             Route("/api/map", self._map),
             Route("/metrics", self._metrics),
             Route("/kml", self._kml_link),
             Route("/kml/latest.kml", self._kml_latest),
-            Route("/kml/{frame:int}.png", self._kml_picture),
+            Route("/kml/{frame}.png", self._kml_picture),
         ]
-        return RequestGuard(Starlette(routes=routes, exception_handlers={DappledError: _failure}), self._rules)
+        return RequestGuard(
+            Starlette(routes=routes, exception_handlers={DappledError: _failure, Exception: _unexpected}), self._rules
+        )
 
     async def follow_log(self) -> None:
         """Send new lines of the daemon's log to the pages, while there are pages."""
@@ -164,7 +168,7 @@ class ConsoleApp:
     # pictures
 
     async def _frame_picture(self, request: Request) -> Response:
-        frame, name = request.path_params["frame"], request.path_params["name"]
+        frame, name = _frame(request), request.path_params["name"]
         known = self._feed.frames.get(frame)
         if known is None:
             raise FeedError(f"there is no frame {frame} here")
@@ -239,7 +243,7 @@ class ConsoleApp:
 
     async def _kml_picture(self, request: Request) -> Response:
         self._hub.globe_asked()
-        return _file(await self._rectified_png(request.path_params["frame"], _GLOBE_PICTURE_PX, sharp=True), "x.png")
+        return _file(await self._rectified_png(_frame(request), _GLOBE_PICTURE_PX, sharp=True), "x.png")
 
 
 def _absolute(request: Request, path: str) -> str:
@@ -260,6 +264,14 @@ def _whole(body: Mapping[str, Any], name: str, low: int, high: int) -> int:
     return value
 
 
+def _frame(request: Request) -> int:
+    """The frame that the path names. Not Starlette's own `:int`: it fails for more digits than Python takes."""
+    digits: str = request.path_params["frame"]
+    if not digits.isascii() or not digits.isdigit() or len(digits) > _FRAME_DIGITS:
+        raise FeedError(f"there is no frame {digits[:20]!r} here: a frame is named by its number")
+    return int(digits)
+
+
 def _disparity(request: Request) -> float:
     try:
         disparity = float(request.query_params.get("disparity", "0"))
@@ -272,8 +284,8 @@ def _disparity(request: Request) -> float:
 
 async def _body(request: Request) -> dict[str, Any]:
     try:
-        body = json.loads(await request.body() or b"{}")
-    except (ValueError, RecursionError):
+        body = parse_json(await request.body() or b"{}", access.BODY_BYTES)
+    except ValueError:
         body = None
     except ClientDisconnect:
         raise StudioError("the request ended before its body was complete") from None
@@ -285,3 +297,7 @@ async def _body(request: Request) -> dict[str, Any]:
 async def _failure(_: Request, error: Exception) -> Response:
     status = 504 if isinstance(error, ConsoleRequestError) else 404 if isinstance(error, FeedError) else 422
     return JSONResponse({"error": str(error)}, status_code=status)
+
+
+async def _unexpected(_: Request, error: Exception) -> Response:
+    return JSONResponse({"error": f"the console failed ({type(error).__name__}): see its log"}, status_code=500)
