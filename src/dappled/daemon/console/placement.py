@@ -12,14 +12,16 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
+from dappled.bounds.parsing import read_bytes
+from dappled.bounds.pictures import open_picture
 from dappled.decode.geometry import camera_pose
 from dappled.decode.geometry.footprint import OrientedFrame, RectifiedFrame
-from dappled.errors import DappledError
+from dappled.errors import DappledError, first_line
 
 KML_NAMESPACE = "http://www.opengis.net/kml/2.2"
 KML_MEDIA_TYPE = "application/vnd.google-earth.kml+xml"
+_WORLD_BYTES = 4096
 _WORLD = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw"}
 
 
@@ -56,11 +58,12 @@ def load_background(file: Path) -> Background:
             f"{file} has no world file {file.with_suffix(_WORLD[file.suffix.lower()]).name} beside it"
         )
     try:
-        across, turned, turned_too, down, left, top = (float(line) for line in world.read_text().split())
-        with Image.open(file) as picture:
-            width, height = picture.size
-    except (OSError, ValueError, UnidentifiedImageError) as error:
-        raise BackgroundError(f"{file} with {world.name} can't be used as a map: {error}") from None
+        lines = read_bytes(world, _WORLD_BYTES).decode("ascii").split()
+        across, turned, turned_too, down, left, top = (float(line) for line in lines)
+        with file.open("rb") as picture:
+            width, height = open_picture(picture).size
+    except (OSError, ValueError) as error:
+        raise BackgroundError(f"{file} with {world.name} can't be used as a map: {first_line(error)}") from None
     if turned or turned_too or across <= 0 or down >= 0:
         raise BackgroundError(f"{file}: a map must be north up; warp it first (gdalwarp -t_srs EPSG:4326)")
     west, north = left - across / 2, top - down / 2

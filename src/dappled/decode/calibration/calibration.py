@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
 
+_MOST_HARMONICS = 20  # as a mask's profile
+
 
 @dataclass(frozen=True, slots=True)
 class LatticeFit:
@@ -118,7 +120,7 @@ class Calibration:
             raise DecodeError("this is not a calibration of version 1: make one with `dappled calibrate`")
         try:
             shape = _pair(values["shape"])
-            mask = Mask(**values["mask"])
+            mask = _mask_of(values["mask"])
             sensor = _sensor_of({"shape": shape, **values["sensor"]})
             fits = tuple(
                 LatticeFit(
@@ -133,13 +135,22 @@ class Calibration:
                 for entry in values["fits"]
             )
             law, pupil, verdict = values["law"], float(values.get("pupil_mm", 0.0)), str(values.get("verdict", ""))
-        except (KeyError, TypeError, ValueError) as error:
+            known_law = law in LAWS
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise DecodeError(f"the calibration is incomplete or wrong ({error}): calibrate again") from error
-        if law not in LAWS:
+        if not known_law:
             raise DecodeError(f"the calibration names the law {law!r}; known are {', '.join(LAWS)}")
         if not fits or any(len(f.transfer) != len(mask.half_orders()) for f in fits):
             raise DecodeError("the calibration's transfer doesn't fit its mask: calibrate again")
         return cls((int(shape[0]), int(shape[1])), law, mask, sensor, fits, pupil, verdict)
+
+
+def _mask_of(values: Mapping[str, Any]) -> Mask:
+    """Raises ValueError for a number of harmonics that no mask has: its carriers grow with the square."""
+    mask = Mask(**values)
+    if type(mask.p) is not int or not 1 <= mask.p <= _MOST_HARMONICS:
+        raise ValueError(f"the mask's p is {mask.p!r}, not a whole number from 1 to {_MOST_HARMONICS}")
+    return mask
 
 
 def _sensor_values(sensor: Sensor) -> dict[str, Any]:

@@ -7,10 +7,10 @@ its metadata lies beside it, or its size says which camera made it. Every error 
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
+from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,6 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.bounds.parsing import MOST_BYTES, parse_json, read_bytes
 from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, Source
 
 START = b"\x89LFP\r\n\x1a\n"
@@ -80,7 +81,7 @@ def _beside(source: Source) -> Mapping[str, Any] | None:
     for suffix in (".json", ".JSON", ".txt", ".TXT"):
         path = Path(source).with_suffix(suffix)
         if path.is_file():
-            metadata = json.loads(path.read_bytes())
+            metadata = parse_json(read_bytes(path))
             return metadata if isinstance(metadata, dict) else None
     return None
 
@@ -127,24 +128,24 @@ def _walk(view: memoryview) -> Iterator[tuple[str, memoryview]]:
 
 def _json(part: memoryview) -> Any:
     """Parse a part that is JSON; None for others."""
-    if bytes(part[:1]) != b"{" or len(part) > 50_000_000:
+    if bytes(part[:1]) != b"{" or len(part) > MOST_BYTES:
         return None
     try:
-        return json.loads(bytes(part).rstrip(b"\0"))
-    except (ValueError, RecursionError):
+        return parse_json(bytes(part).rstrip(b"\0"))
+    except ValueError:
         return None
 
 
 def _dicts(value: Any) -> Iterator[Mapping[str, Any]]:
     """Yield all objects in a JSON value, outer ones first."""
-    waiting = [value]
+    waiting = deque([value])
     while waiting:
-        one = waiting.pop(0)
+        one = waiting.popleft()
         if isinstance(one, dict):
             yield one
-            waiting += one.values()
+            waiting.extend(one.values())
         elif isinstance(one, list):
-            waiting += one
+            waiting.extend(one)
 
 
 def _imaging(metadata: Any) -> Mapping[str, Any]:

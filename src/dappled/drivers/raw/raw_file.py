@@ -17,7 +17,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
+
+from dappled.bounds.pictures import open_picture
 
 Source = Path | str | bytes | memoryview | mmap.mmap
 Values = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.float64]
@@ -26,7 +28,10 @@ _EXIF_IFD = 0x8769
 _MAKE, _MODEL, _DATETIME = 0x010F, 0x0110, 0x0132
 _EXPOSURE, _F_NUMBER, _ISO, _TAKEN, _SUBSECONDS, _FOCAL = 0x829A, 0x829D, 0x8827, 0x9003, 0x9291, 0x920A
 _RAF_JPEG = 84  # offset and length of the embedded JPEG, big-endian, in a Fujifilm RAF header
-_BAD = (OSError, ValueError, SyntaxError, KeyError, TypeError, IndexError, struct.error, EOFError, ZeroDivisionError)
+_BAD = (
+    OSError, ValueError, SyntaxError, KeyError, TypeError, IndexError, struct.error, EOFError, ArithmeticError,
+    AttributeError, MemoryError, RecursionError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,16 +117,16 @@ def read_exif(file: BinaryIO) -> ExposureSettings:
             file.seek(_RAF_JPEG)
             offset, length = struct.unpack(">II", file.read(8))
             file.seek(offset)
-            return _from(Image.open(io.BytesIO(file.read(length))).getexif())
+            return _from(open_picture(io.BytesIO(file.read(length))).getexif())
         if start[:4] in (b"II*\0", b"MM\0*"):
             exif = Image.Exif()
             exif.load_from_fp(file)
             return _from(exif)
-        image = Image.open(file)
+        image = open_picture(file)
         if image.format == "PNG" and "exif" not in image.info:
             return ExposureSettings()  # getexif would unpack all pixels to look behind them
         return _from(image.getexif())
-    except (*_BAD, UnidentifiedImageError, Image.DecompressionBombError):
+    except _BAD:
         return ExposureSettings()  # a frame without EXIF is still a frame
 
 

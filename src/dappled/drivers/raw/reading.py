@@ -21,10 +21,11 @@ import numpy as np
 import rawpy
 import tifffile
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import UnidentifiedImageError
 
 from dappled.bounds.arrays import read_npy
 from dappled.bounds.claims import ClaimError
+from dappled.bounds.pictures import FREE_PIXELS, check_pixels, check_tiff_page, open_picture
 from dappled.drivers.raw import lytro
 from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, Source, positive, read_exif
 from dappled.errors import DappledError
@@ -70,7 +71,7 @@ def read_metadata(source: Source, name: str | None = None) -> ExposureSettings:
         if start.startswith(b"\x93NUMPY"):
             return ExposureSettings()
         if start.startswith((b"\x89PNG", b"\xff\xd8\xff")):
-            Image.open(file)  # raises for a file that is not a picture
+            open_picture(file)  # raises for a file that is not a picture
             file.seek(0)
             return read_exif(file)
         if start.startswith(_TIFF_STARTS) and _is_plain_tiff(file, label):
@@ -121,8 +122,8 @@ def _sentences(label: str) -> Iterator[None]:
         ) from error
     except ClaimError as error:
         raise RawFileError(f"{label} can't be read as a frame: {error}") from error
-    except Image.DecompressionBombError as error:
-        raise RawFileError(f"{label} claims to be larger than any frame: {error}") from error
+    except MemoryError as error:
+        raise RawFileError(f"{label} needs more memory than is free: close other programs") from error
     except Exception as error:  # the readers raise anything on damaged bytes
         raise RawFileError(
             f"{label} can't be read as a frame, it may be damaged or cut short: {_words(error)}"
@@ -145,7 +146,10 @@ def _words(error: BaseException) -> str:
 
 def _read_libraw(file: BinaryIO) -> RawFile:
     """Read a raw file with a mosaic. Raises what LibRaw and EXIF raise, and ValueError for one without."""
+    stored = _length(file)
     with rawpy.imread(file) as raw:
+        if (size := (raw.sizes.raw_width, raw.sizes.raw_height))[0] * size[1] > FREE_PIXELS:
+            check_pixels(size, 2, stored)
         if raw.raw_type != rawpy.RawType.Flat:
             raise ValueError("it holds no mosaic (linear or demosaiced raws have no masked light field to decode)")
         mosaic = np.array(raw.raw_image_visible)
@@ -221,7 +225,7 @@ def _balance(gains: list[float], names: str) -> tuple[float, ...] | None:
 
 def _read_picture(file: BinaryIO) -> RawFile:
     """Read a PNG or a JPEG. Raises what Pillow raises, and ValueError for one that holds no frame."""
-    image: Image.Image = Image.open(file)
+    image = open_picture(file)
     if image.format == "PNG" and image.mode != "I;16" and _png_is_deep_colour(file):
         raise ValueError("it is a colour PNG of 16 bits, which would lose its lower 8; save it as TIFF or as grey PNG")
     if image.mode in ("P", "PA", "CMYK", "YCbCr", "LAB", "HSV"):
@@ -249,8 +253,6 @@ def _is_plain_tiff(file: BinaryIO, label: str) -> bool:
         return False
     try:
         with tifffile.TiffFile(file) as tiff:
-            if len(tiff.pages) == 0:
-                raise ValueError("it has no pages")
             return _DNG_VERSION not in tiff.pages.first.tags
     finally:
         file.seek(0)
@@ -260,6 +262,7 @@ def _read_tiff(file: BinaryIO) -> RawFile:
     """Read the first page of a TIFF. Raises what tifffile raises, and ValueError."""
     with tifffile.TiffFile(file) as tiff:
         page = tiff.pages.first
+        check_tiff_page(page, file)
         values = page.asarray()
         tag = page.tags.get(_MAX_SAMPLE)
         limit = positive(None if tag is None else tag.value)

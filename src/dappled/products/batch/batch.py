@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from dappled import __version__, confined
+from dappled.bounds.parsing import parse_json
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError, sentence
 from dappled.flight import Frame, Tag, canonical, durable
@@ -33,6 +34,7 @@ from dappled.products.maps.photographs import Station
 KINDS = {"npz": ".npz", "zarr": ".zarr", "h5": ".h5", "cog": ".tif", "kmz": ".kmz"}
 MAPS = ("cog", "kmz")
 MANIFEST = "manifest.jsonl"
+_LINE_BYTES = 1 << 20  # of a manifest
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # mallopt(3)
 
 
@@ -321,7 +323,7 @@ class Manifest:
         known: dict[str, Done] = {}
         for number, line in enumerate(text[:whole].splitlines(), 1):
             try:
-                done = _done(json.loads(line))
+                done = _done(parse_json(line, _LINE_BYTES))
             except (ValueError, TypeError, KeyError):
                 raise ManifestError(
                     f"{self.path}, line {number} is not a line of a manifest: move the file away, "
@@ -332,7 +334,11 @@ class Manifest:
 
 
 def _done(row: dict[str, Any]) -> Done:
-    return Done(**{**row, "outputs": tuple(BatchOutput(**one) for one in row["outputs"])})
+    """Raises ValueError, TypeError and KeyError."""
+    done = Done(**{**row, "outputs": tuple(BatchOutput(**one) for one in row["outputs"])})
+    if not all(isinstance(name, str) for name in (done.key, *(one.name for one in done.outputs))):
+        raise TypeError("a name is not text")
+    return done
 
 
 def _size(path: Path) -> int | None:

@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from PIL import Image
 
+from dappled.bounds.claims import ClaimError
+from dappled.bounds.parsing import read_bytes
+from dappled.bounds.pictures import check_tiff_page, open_picture
 from dappled.decode.optics.film import DensityCurve, density_curve
-from dappled.errors import DappledError
+from dappled.errors import DappledError, first_line
 from dappled.workers import spans
 
 Levels = NDArray[np.unsignedinteger]
 Tile = Callable[[slice, slice], Levels]
 _TILE = 512  # of a TIFF, in pixels a side
 _STRIP = 64  # rows of a PNG at a time
+_MASK_RATIO, _MASK_FREE_PIXELS = 1000, 100_000_000  # a periodic pattern packs as well as deflate can
 
 
 class MaskFileError(DappledError):
@@ -122,24 +127,30 @@ def read(path: Path) -> tuple[NDArray[np.float32], tuple[float, float]]:
     Raises MaskFileError for a file that is not a grey image, or has no resolution.
     """
     try:
-        if path.suffix.lower() == ".png":
-            with Image.open(path) as image:
-                values, dpi = np.asarray(image), image.info.get("dpi")
-            if dpi is None:
-                raise MaskFileError(f"{path} does not say its physical resolution: write it with `dappled mask make`")
-            density = float(dpi[1]) / 25.4, float(dpi[0]) / 25.4
-        else:
-            with tifffile.TiffFile(path) as tiff:
-                page = tiff.pages[0]
-                values = page.asarray()
-                x, y = page.get_resolution("MILLIMETER")
-            density = float(y), float(x)
-    except (OSError, ValueError, tifffile.TiffFileError) as error:
-        raise MaskFileError(f"{path} can't be read as an image: {error}") from None
+        with path.open("rb") as file:
+            values, density = _read_png(file) if path.suffix.lower() == ".png" else _read_tiff(file)
+    except Exception as error:  # the readers raise anything on damaged bytes
+        raise MaskFileError(f"{path} can't be read as an image: {first_line(error)}") from error
+    if density is None:
+        raise MaskFileError(f"{path} does not say its physical resolution: write it with `dappled mask make`")
     if values.ndim != 2 or (values.dtype.kind != "u" and values.dtype != np.int32):
         raise MaskFileError(f"{path} is not a grey image of 8 or 16 bits")
     top = 255 if values.dtype == np.uint8 else 65535
     return values.astype(np.float32) / np.float32(top), density
+
+
+def _read_png(file: BinaryIO) -> tuple[NDArray[Any], tuple[float, float] | None]:
+    image = open_picture(file, ratio=_MASK_RATIO, free_pixels=_MASK_FREE_PIXELS)
+    values, dpi = np.asarray(image), image.info.get("dpi")
+    return values, None if dpi is None else (float(dpi[1]) / 25.4, float(dpi[0]) / 25.4)
+
+
+def _read_tiff(file: BinaryIO) -> tuple[NDArray[Any], tuple[float, float]]:
+    with tifffile.TiffFile(file) as tiff:
+        page = tiff.pages.first
+        check_tiff_page(page, file, ratio=_MASK_RATIO, free_pixels=_MASK_FREE_PIXELS)
+        x, y = page.get_resolution("MILLIMETER")
+        return page.asarray(), (float(y), float(x))
 
 
 def read_density_curve(path: Path) -> DensityCurve:
@@ -161,7 +172,7 @@ def read_spots(path: Path) -> list[tuple[float, float]]:
 
 def _numbers(path: Path, wanted: tuple[str, ...]) -> list[tuple[float, ...]]:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with io.StringIO(read_bytes(path).decode("utf-8-sig"), newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             names = [name.strip().lower() for name in reader.fieldnames or []]
             missing = [name for name in wanted if name not in names]
@@ -176,8 +187,8 @@ def _numbers(path: Path, wanted: tuple[str, ...]) -> list[tuple[float, ...]]:
                 found.append(tuple(float(text) for text in texts))
     except OSError as error:
         raise MaskFileError(f"{path} can't be read: {error.strerror or error}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
+    except (ClaimError, UnicodeDecodeError, csv.Error) as error:
         raise MaskFileError(f"{path} can't be read as CSV: {error}") from None
     except ValueError as error:
-        raise MaskFileError(f"{path}, line {reader.line_num}: {error}") from None
+        raise MaskFileError(f"{path}, line {reader.line_num}: {first_line(error)}") from None
     return found

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from dappled.bounds import claims
+from dappled.bounds.claims import ClaimError
+from dappled.bounds.pictures import open_picture
 from dappled.decode.lightfield import LightField
 from dappled.decode.lightfield.light_field import CAMERAS, centred
-from dappled.errors import DappledError
+from dappled.errors import DappledError, first_line
 
 _ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 
@@ -31,6 +36,11 @@ def read(folder: Path) -> LightField:
     side = math.isqrt(len(files))
     if side == 0 or side * side != len(files):
         raise ViewFolderError(f"{folder} holds {len(files)} pictures: a light field needs n × n, one per view")
+    try:
+        # Each value is a float32 of a picture, and another of all views.
+        claims.check_size(sum(map(_values, files)) * 8, sum(path.stat().st_size for path in files), "views")
+    except ClaimError as error:
+        raise ViewFolderError(f"{folder}: {error}") from None
     pictures = [_linear(path) for path in files]
     shapes = {picture.shape for picture in pictures}
     if len(shapes) > 1:
@@ -47,12 +57,24 @@ def read(folder: Path) -> LightField:
     )
 
 
-def _linear(path: Path) -> NDArray[np.float32]:
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
     try:
-        with Image.open(path) as picture:
-            values = np.asarray(picture if picture.mode in ("L", "I;16", "I", "RGB") else picture.convert("RGB"))
-    except (OSError, ValueError) as error:
-        raise ViewFolderError(f"{path} can't be read as a picture: {error}") from None
+        with path.open("rb") as file:
+            yield open_picture(file)
+    except Exception as error:  # Pillow raises anything on damaged bytes
+        raise ViewFolderError(f"{path} can't be read as a picture: {first_line(error)}") from error
+
+
+def _values(path: Path) -> int:
+    """How many values a picture has, by its head."""
+    with _opened(path) as picture:
+        return math.prod(picture.size) * (1 if picture.mode in ("L", "I;16", "I") else 3)
+
+
+def _linear(path: Path) -> NDArray[np.float32]:
+    with _opened(path) as picture:
+        values = np.asarray(picture if picture.mode in ("L", "I;16", "I", "RGB") else picture.convert("RGB"))
     top = 255 if values.dtype == np.uint8 else 65535
     encoded = values.astype(np.float32) / np.float32(top)
     linear: NDArray[np.float32] = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

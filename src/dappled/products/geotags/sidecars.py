@@ -10,6 +10,7 @@ from dappled.decode.geometry.camera_pose import CameraPose
 from dappled.errors import DappledError
 from dappled.flight import Tag, disk_error, durable
 
+_HEAD_BYTES = 1 << 16
 _MARK = "dappled"
 _SPACES = {
     "xmp": "http://ns.adobe.com/xap/1.0/",
@@ -49,7 +50,7 @@ def write(path: Path, content: str, *, force: bool = False) -> None:
     """Write a sidecar, whole or not at all. Raises SidecarError for one that another program wrote (`force` replaces
     it), and FlightError when the disk refuses."""
     try:
-        if not force and path.exists() and f'xmp:CreatorTool="{_MARK}"' not in path.read_text("utf-8", "replace"):
+        if not force and path.exists() and not _ours(path):
             raise SidecarError(
                 f"{path} was written by another program, and may have been edited by hand: "
                 "move it away, write elsewhere with --output, or replace it with --force"
@@ -57,6 +58,12 @@ def write(path: Path, content: str, *, force: bool = False) -> None:
         durable.write_file(path, content.encode())
     except OSError as error:
         raise disk_error("write the sidecar", path, error) from error
+
+
+def _ours(path: Path) -> bool:
+    """Whether dappled wrote a sidecar; the mark stands near its beginning. Raises OSError."""
+    with path.open("rb") as file:
+        return f'xmp:CreatorTool="{_MARK}"'.encode() in file.read(_HEAD_BYTES)
 
 
 def _of_tag(tag: Tag, utc_ns: int | None) -> dict[str, str | None]:

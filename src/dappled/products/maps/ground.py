@@ -13,7 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.errors import DappledError
+from dappled.bounds import claims
+from dappled.errors import DappledError, first_line
 from dappled.products.extras import need
 from dappled.products.maps.earth import Geoid, Projection, touch
 from dappled.products.maps.eye import Eye
@@ -148,46 +149,57 @@ def load(
     Heights are taken as above sea level (DTED's are); with a `geoid` they are taken as ellipsoidal and converted.
     Raises GroundError where the file can't be read, is not georeferenced, or does not overlap.
     """
-    rasterio, warp = need("rasterio"), need("rasterio.warp")
+    rasterio = need("rasterio")
     try:
         with rasterio.open(path) as source:
-            if source.crs is None or source.transform.is_identity:
-                raise GroundError(f"the terrain {path} has no coordinates: give one with a coordinate system")
-            target = projection.crs.to_wkt()
-            step = _step(source, projection, bounds)
-            margin = 4 * step
-            west, south = bounds[0] - margin, bounds[1] - margin
-            columns = math.ceil((bounds[2] + margin - west) / step) + 1
-            rows = math.ceil((bounds[3] + margin - south) / step) + 1
-            if rows * columns > 100_000_000:
-                raise GroundError(
-                    f"the terrain {path} has {rows} × {columns} posts under the flight: give a coarser one"
-                )
-            north = south + (rows - 1) * step
-            box = warp.transform_bounds(target, source.crs, west, south, west + (columns - 1) * step, north)
-            if not touch(box, source.bounds, degrees=source.crs.is_geographic):
-                raise GroundError(
-                    f"the terrain {path} lies elsewhere: it covers {_words(source.bounds)}, the flight {_words(box)}"
-                )
-            values = np.full((rows, columns), np.nan)
-            # nodes are pixel centres: the affine's corner lies half a step out
-            affine = rasterio.Affine(step, 0, west - step / 2, 0, -step, north + step / 2)
-            warp.reproject(
-                rasterio.band(source, 1),
-                values,
-                dst_transform=affine,
-                dst_crs=target,
-                dst_nodata=np.nan,
-                resampling=warp.Resampling.bilinear,
-            )
-    except rasterio.errors.RasterioError as error:
-        raise GroundError(f"the terrain {path} can't be read: {error}") from None
+            values, west, north, step = _posts(source, path, projection, bounds)
+    except DappledError:
+        raise
+    except Exception as error:  # GDAL, PROJ and a transform of zeros raise anything
+        raise GroundError(f"the terrain {path} can't be read: {first_line(error)}") from error
     if np.isnan(values).all():
         raise GroundError(f"the terrain {path} has no heights under the flight: give one that covers it")
     if geoid is not None:
         latitude, longitude = projection.to_geodetic((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2)
         values -= geoid.undulation_m(float(latitude), float(longitude))
     return Raster(values, west, north, step, 0.05 * step if sigma_m is None else sigma_m, path.name)
+
+
+def _posts(
+    source: Any, path: Path, projection: Projection, bounds: tuple[float, float, float, float]
+) -> tuple[Floats, float, float, float]:
+    """The heights under the flight, the west and north of the first post, and the step. Raises GroundError, ClaimError
+    and what GDAL raises."""
+    rasterio, warp = need("rasterio"), need("rasterio.warp")
+    if source.crs is None or source.transform.is_identity:
+        raise GroundError(f"the terrain {path} has no coordinates: give one with a coordinate system")
+    target = projection.crs.to_wkt()
+    step = _step(source, projection, bounds)
+    margin = 4 * step
+    west, south = bounds[0] - margin, bounds[1] - margin
+    columns = math.ceil((bounds[2] + margin - west) / step) + 1
+    rows = math.ceil((bounds[3] + margin - south) / step) + 1
+    if rows * columns > 100_000_000:
+        raise GroundError(f"the terrain {path} has {rows} × {columns} posts under the flight: give a coarser one")
+    north = south + (rows - 1) * step
+    box = warp.transform_bounds(target, source.crs, west, south, west + (columns - 1) * step, north)
+    if not touch(box, source.bounds, degrees=source.crs.is_geographic):
+        raise GroundError(
+            f"the terrain {path} lies elsewhere: it covers {_words(source.bounds)}, the flight {_words(box)}"
+        )
+    claims.check_size(rows * columns * 8, rows * columns * 8, f"{rows} × {columns} posts under the flight")
+    values = np.full((rows, columns), np.nan)
+    # nodes are pixel centres: the affine's corner lies half a step out
+    affine = rasterio.Affine(step, 0, west - step / 2, 0, -step, north + step / 2)
+    warp.reproject(
+        rasterio.band(source, 1),
+        values,
+        dst_transform=affine,
+        dst_crs=target,
+        dst_nodata=np.nan,
+        resampling=warp.Resampling.bilinear,
+    )
+    return values, west, north, step
 
 
 def _step(source: Any, projection: Projection, bounds: tuple[float, float, float, float]) -> float:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,12 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.errors import DappledError
+from dappled.bounds.claims import ClaimError
+from dappled.bounds.parsing import read_bytes
+from dappled.errors import DappledError, first_line
 from dappled.products.extras import need
 from dappled.products.maps.earth import Projection, touch
 from dappled.products.maps.map_grid import MapGrid, around
 
 Floats = NDArray[np.float64]
+
+
+_MOST_MASK = 256_000_000  # cells
 
 
 class BaseMapError(DappledError):
@@ -35,13 +42,15 @@ class BaseMap:
     def check(self, points: Floats) -> None:
         """Raises BaseMapError where the map can't be read, is not georeferenced, or does not overlap the points (n, 2)
         of the flight."""
-        rasterio, warp = need("rasterio"), need("rasterio.warp")
+        warp = need("rasterio.warp")
         with self._open() as source:
             box = (*points.min(axis=0), *points.max(axis=0))
             try:
                 there = warp.transform_bounds(self.projection.crs.to_wkt(), source.crs, *box)
-            except rasterio.errors.RasterioError as error:
-                raise BaseMapError(f"the base map {self.path} and the flight have no common system: {error}") from None
+            except Exception as error:  # GDAL and PROJ raise anything
+                raise BaseMapError(
+                    f"the base map {self.path} and the flight have no common system: {first_line(error)}"
+                ) from error
             b = source.bounds
             if not touch(there, b, degrees=source.crs.is_geographic):
                 raise BaseMapError(
@@ -53,7 +62,7 @@ class BaseMap:
         """The picture float32 (rows, columns) around points (n, 2), NaN where it is empty, and its grid; None where all
         of it is empty."""
         rasterio, warp = need("rasterio"), need("rasterio.warp")
-        with self._open() as source:
+        with self._open() as source, self._sentences():
             step = max(self.gsd_m, self._step(source, points))
             corners = np.concatenate([points - margin, points + margin])
             grid = around(corners, self.projection.name, step, step)
@@ -67,10 +76,11 @@ class BaseMap:
             warp.reproject(
                 rasterio.band(source, bands), picture, dst_nodata=np.nan, resampling=warp.Resampling.cubic, **place
             )
+            mask, mask_transform = self._mask(source, grid)
             warp.reproject(
-                source.dataset_mask(),
+                mask,
                 known,
-                src_transform=source.transform,
+                src_transform=mask_transform,
                 src_crs=source.crs,
                 resampling=warp.Resampling.nearest,
                 **place,
@@ -78,16 +88,49 @@ class BaseMap:
         grey = np.where(known > 0, picture.mean(axis=0), np.nan).astype(np.float32)
         return (grey, grid) if np.isfinite(grey).any() else None
 
+    def _mask(self, source: Any, grid: MapGrid) -> tuple[NDArray[np.uint8], Any]:
+        """Read which of the map's own cells under a grid are known, and their transform. Base maps can be far larger
+        than memory, so only this part is read, and no finer than half a cell of the grid."""
+        rasterio, warp, windows = need("rasterio"), need("rasterio.warp"), need("rasterio.windows")
+        west, south, east, north = warp.transform_bounds(self.projection.crs.to_wkt(), source.crs, *grid.bounds)
+        columns = 2 * grid.shape[1]
+        if source.crs.is_geographic and not source.bounds.left <= west <= east <= source.bounds.right:
+            # Longitudes go on over the antimeridian, and some maps count them to 360: take all of these rows.
+            west, east, columns = source.bounds.left, source.bounds.right, _MOST_MASK // (2 * grid.shape[0])
+        there, back = source.transform, ~source.transform
+        x, y = np.array([west, east, west, east]), np.array([south, south, north, north])
+        across, down = back.a * x + back.b * y + back.c, back.d * x + back.e * y + back.f
+        left, right = (int(edge) for edge in np.clip([across.min() - 1, across.max() + 2], 0, source.width))
+        top, bottom = (int(edge) for edge in np.clip([down.min() - 1, down.max() + 2], 0, source.height))
+        if left == right or top == bottom:
+            return np.zeros((1, 1), dtype=np.uint8), there
+        shape = min(bottom - top, 2 * grid.shape[0]), min(right - left, columns)
+        high, wide = (bottom - top) / shape[0], (right - left) / shape[1]
+        corner = there.a * left + there.b * top + there.c, there.d * left + there.e * top + there.f
+        transform = rasterio.Affine(
+            there.a * wide, there.b * high, corner[0], there.d * wide, there.e * high, corner[1]
+        )
+        window = windows.Window(left, top, right - left, bottom - top)
+        return source.dataset_mask(window=window, out_shape=shape), transform
+
     def _open(self) -> Any:
         rasterio = need("rasterio")
-        try:
+        with self._sentences():
             source = rasterio.open(self.path)
-        except rasterio.errors.RasterioError as error:
-            raise BaseMapError(f"the base map {self.path} can't be read: {error}") from None
-        if source.crs is None or source.transform.is_identity:
+            placed = source.crs is not None and not source.transform.is_identity
+        if not placed:
             source.close()
             raise BaseMapError(f"the base map {self.path} has no coordinates: give a GeoTIFF or the like")
         return source
+
+    @contextmanager
+    def _sentences(self) -> Iterator[None]:
+        try:
+            yield
+        except DappledError:
+            raise
+        except Exception as error:  # GDAL, PROJ and a transform of zeros raise anything
+            raise BaseMapError(f"the base map {self.path} can't be read: {first_line(error)}") from error
 
     def _step(self, source: Any, points: Floats) -> float:
         """The size of the map's own cells near the points, in metres."""
@@ -119,7 +162,7 @@ def read_control_points(path: Path, projection: Projection) -> list[ControlPoint
     frame as the camera made it, degrees, metres above sea level. Raises ControlPointError naming the line."""
     wanted = ("name", "frame", "column", "row", "latitude", "longitude", "altitude")
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with io.StringIO(read_bytes(path).decode("utf-8-sig"), newline="") as file:
             rows = csv.DictReader(file, skipinitialspace=True)
             missing = [name for name in wanted if name not in (rows.fieldnames or ())]
             if missing:
@@ -143,6 +186,8 @@ def read_control_points(path: Path, projection: Projection) -> list[ControlPoint
         raise ControlPointError(f"the control points {path} can't be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise ControlPointError(f"the control points {path} are not text in UTF-8") from None
+    except (ClaimError, csv.Error) as error:
+        raise ControlPointError(f"the control points {path} can't be read: {error}") from None
     return found
 
 
