@@ -1,4 +1,4 @@
-"""Clocks: what time it is, and waiting for it. Every part is handed one; tests and replays bring their own."""
+"""Clocks: read the time, and wait. Each part is given a clock; tests and replays pass their own."""
 
 from __future__ import annotations
 

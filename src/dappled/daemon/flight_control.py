@@ -1,4 +1,4 @@
-"""Answer the questions of shutter and ground station about a flight: may a shot be taken, which camera, which disk."""
+"""Tell the shutter and the ground station about the flight: whether a shot may be taken, the camera, the disk."""
 
 from __future__ import annotations
 

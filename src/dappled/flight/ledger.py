@@ -1,4 +1,4 @@
-"""The ledger: one SQLite file that says what became of every shot. A row in it is the acknowledgement.
+"""The ledger: one SQLite file that records the outcome of every shot. A row in it is the acknowledgement.
 
 WAL with synchronous=FULL: a committed row survives a power cut. Poses, tags and results are kept as the canonical JSON
 that was hashed, so that `sha256(record)` can be checked with SQLite and sha256sum alone.

@@ -1,4 +1,4 @@
-"""The values that a flight is made of, as immutable records. What is not known is None.
+"""The records of a flight, as immutable values. An unknown value is None.
 
 One number, the image index, names a shot, the frame that it became, its file, and its CAMERA_IMAGE_CAPTURED. It goes
 on over restarts. A shot that failed keeps its index.

@@ -1,4 +1,4 @@
-"""Say where the vehicle was and how it pointed: fold the packets of the telemetry log, and interpolate poses.
+"""Compute where the vehicle was and how it pointed, by interpolation between the packets of the telemetry log.
 
 The state depends only on the packets fed (number, stamp, message), and a pose only on the packets whose number is below
 the limit that it was asked with. So a replay that passes a recorded `telemetry_packets` as `upto_packet` gets the same

@@ -1,4 +1,4 @@
-"""Decoding in a process of its own: a frame that LibRaw chokes on, or a slow decode, never touches the capture side.
+"""Decode in a separate process, so that a crash of LibRaw or a slow decode can't disturb the capture.
 
 The worker (`dappled.daemon.pipeline.decode_worker`) runs at low priority and hands its arrays back in a memfd,
 without a copy.

@@ -1,4 +1,4 @@
-"""Recognise the same message again: the rules, with their numbers. What none of them matches is new.
+"""Recognise repeated messages: the rules and their time limits. A message that no rule matches is new.
 
 1. Packet. A packet with the same sender, sequence number, message and payload within 0.5 s over the same link, or
    within 2.5 s over another link, is one packet (`PacketDedup`).

@@ -1,4 +1,4 @@
-"""Open a connection string as bytes in and out: UDP, TCP and serial, never blocking."""
+"""Open connection strings as byte channels: UDP, TCP and serial, never blocking."""
 
 from __future__ import annotations
 
