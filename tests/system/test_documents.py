@@ -42,11 +42,11 @@ def test_the_documents_commands_run(document: Path, on_stage: Stage) -> None:
 
 NUMBERS = {
     "console.md": [
-        f"At most {feed.PAGES} pages; each has a queue of {feed.WAITING} events",
-        f"One address has {connection.PER_ADDRESS} connections, all together {connection.CONNECTIONS}",
+        f"At most {feed.PAGES} pages can be open; each has a queue of {feed.WAITING} events",
+        f"One address may have {connection.PER_ADDRESS} connections, all addresses together {connection.CONNECTIONS}",
         (
-            f"no whole request within {connection.REQUEST_S:.0f} seconds is closed, and one whose reader stands still "
-            f"for {connection.UNREAD_S:.0f}"
+            f"no whole request within {connection.REQUEST_S:.0f} seconds is closed, and one whose reader stops "
+            f"reading, after {connection.UNREAD_S:.0f}"
         ),
         f"JSON, at most {access.BODY_BYTES // 1024} kB",
     ],
@@ -59,7 +59,7 @@ NUMBERS = {
             f"within {repeats.RETRY_NS / 1e9:g} s of the last such message, and within "
             f"{repeats.RETRY_LIMIT_NS / 1e9:g} s"
         ),
-        f"where the sender itself says that it repeats, {repeats.CONFIRMED_RETRY_NS / 1e9:g} s",
+        f"the sender itself marks the message as a repeat, and the limit is {repeats.CONFIRMED_RETRY_NS / 1e9:g} s",
         f"within {repeats.TRIGGER_NS / 1e9:g} s of a shot's first message",
         f"within {repeats.ECHO_NS / 1e9:g} s of the",
     ],
