@@ -71,10 +71,10 @@ TWO = ["000000.cr2", "000001.cr2"]
 def test_a_flight_is_copied_and_verified(closed: Path, tmp_path: Path) -> None:
     done = go(closed, tmp_path / "disk")
     assert done.destination == tmp_path / "disk" / closed.name
-    assert (done.copied, done.there_already, done.pruned) == (6, 0, 0)
+    assert (done.copied, done.there_already, done.pruned) == (7, 0, 0)
     assert check(done.destination).problems == check(closed).problems == ()
     again = go(closed, tmp_path / "disk")
-    assert (again.copied, again.there_already) == (0, 6)
+    assert (again.copied, again.there_already) == (0, 7)
     assert frames(closed) == TWO
 
 
@@ -82,7 +82,7 @@ def test_the_manifest_is_one_that_sha256sum_reads(closed: Path, tmp_path: Path) 
     go(closed, tmp_path / "disk")
     sums = tmp_path / "disk" / f"{closed.name}.sha256"
     subprocess.run(["/usr/bin/sha256sum", "--check", "--strict", "--quiet", sums.name], cwd=sums.parent, check=True)
-    assert len(sums.read_text().splitlines()) == 6
+    assert len(sums.read_text().splitlines()) == 7
 
 
 def test_prune_removes_the_frames_and_check_says_where_they_are(closed: Path, tmp_path: Path) -> None:
@@ -110,8 +110,8 @@ def test_the_verdict_does_not_call_a_pruned_flight_intact_as_if_nothing_had_happ
     assert main(["flight", "check", str(closed)]) == 0
     note, verdict = capsys.readouterr().out.splitlines()
     assert note.startswith("note:  2 files (frames/000000.cr2 to frames/000001.cr2) were offloaded to ")
-    assert ": intact, of what is still here: 0 files" in verdict
-    assert verdict.endswith("2 files offloaded and not read")
+    assert ": consistent, of what is still here: 0 files" in verdict
+    assert "2 files offloaded and not read; not signed" in verdict
 
 
 def test_image_indices_go_on_after_a_prune(closed: Path, tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_image_indices_go_on_after_a_prune(closed: Path, tmp_path: Path) -> None
 def test_a_second_prune_finds_nothing_to_do_and_proves_the_copy_again(closed: Path, tmp_path: Path) -> None:
     go(closed, tmp_path / "disk", prune=True)
     again = go(closed, tmp_path / "disk", prune=True)
-    assert (again.pruned, again.copied) == (0, 1)  # the ledger, which tells of the first prune
+    assert (again.pruned, again.copied) == (0, 2)  # ledger and seals, which tell of the first prune
     assert check(closed).problems == check(again.destination).problems == ()
     flip(again.destination / "frames" / "000001.cr2", 7)
     with pytest.raises(FlightError, match=r"000001.cr2 differs from what the ledger says"):
@@ -224,7 +224,7 @@ def test_what_is_there_already_is_read_back_from_the_disk_too(
     monkeypatch.setattr(read_back, "hash_on_disk", reading)
     done = go(closed, tmp_path / "disk", prune=True)
     monkeypatch.undo()
-    assert done.there_already == 6
+    assert done.there_already == 7
     copy = tmp_path / "disk" / closed.name
     for path in (copy, *copy.rglob("*"), tmp_path / "disk"):
         found = path.stat()
@@ -338,7 +338,7 @@ def test_a_user_who_may_only_read_copies_without_the_lock(
         raise FlightError("cannot make the lock") from PermissionError(13, "denied")
 
     monkeypatch.setattr(FlightsLock, "__init__", refused)
-    assert go(closed, tmp_path / "disk").copied == 6
+    assert go(closed, tmp_path / "disk").copied == 7
     with pytest.raises(FlightError, match="cannot make the lock"):
         go(closed, tmp_path / "disk", prune=True)
 
@@ -441,7 +441,7 @@ def test_the_command(closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     words = ["flight", "offload", str(tmp_path / "disk"), str(closed), "--same-device"]
     assert main([*words, "--prune"]) == 0
     said = capsys.readouterr().out
-    assert "6 files copied and verified, 0 already there; read back from ext4 by O_DIRECT" in said
+    assert "7 files copied and verified, 0 already there; read back from ext4 by O_DIRECT" in said
     assert "2 files removed here" in said
     assert layout.flights(tmp_path / "disk")[0].name == closed.name
 

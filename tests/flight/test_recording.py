@@ -66,6 +66,7 @@ def test_a_flight_from_first_to_last(flights: Path, flight: Recording) -> None:
         "flight.sqlite",
         "flight.toml",
         "frames",
+        "seals.jsonl",
         "shots.jsonl",
         "telemetry.tlog",
     ]

@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Iterable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from dappled.clock import TimeOfDayClock
 from dappled.daemon.replay import late_tags
 from dappled.decode.geometry import camera_pose
 from dappled.errors import DappledError, counted
-from dappled.flight import layout
+from dappled.flight import layout, seals
 from dappled.products.geotags import geotags
 from dappled.products.maps import earth
 from dappled.products.maps.earth import EarthError, Geoid
@@ -60,14 +61,16 @@ def run(arguments: argparse.Namespace) -> int:
     facts = layout.read_facts(layout.open_folder(arguments.flight))
     tagged_late = _tag_late(arguments.flight)
     mounting, geoid = _mounting(arguments, facts), _geoid(arguments.geoid)
-    written = geotags.write(
-        arguments.flight,
-        mounting,
-        geoid=geoid,
-        output=arguments.output,
-        replace_extension=arguments.lightroom,
-        force=arguments.force,
-    )
+    folder = layout.open_folder(arguments.flight)
+    with seals.reopened(folder, TimeOfDayClock(), "geotag") if arguments.output is None else nullcontext():
+        written = geotags.write(
+            arguments.flight,
+            mounting,
+            geoid=geoid,
+            output=arguments.output,
+            replace_extension=arguments.lightroom,
+            force=arguments.force,
+        )
     found = dict(_copies(arguments.flight, arguments.copies, mounting, geoid)) if arguments.copies else {}
     copied = [str(path) for path in found.values() if isinstance(path, Path)]
     without_copy = {name: reason for name, reason in found.items() if isinstance(reason, str)}

@@ -1,4 +1,4 @@
-"""`dappled keys` and `dappled mavlink`: key files for subscribers, the console and signed MAVLink links."""
+"""`dappled keys` and `dappled mavlink`: key files for subscribers, the console, seals and signed MAVLink links."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 from dappled.cli.arguments import Actions
 from dappled.daemon.stream import curve
 from dappled.drivers.mavlink import SigningError, make_key
+from dappled.flight import seal_key
 
 HOME = Path("~/.config/dappled/keys")
 
@@ -36,6 +37,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     show.add_argument("file", type=Path, metavar="FILE", help="NAME.key or NAME.key_secret")
     token = actions.add("token", "make a token for the console", "dappled keys token /etc/dappled/console.token")
     token.add_argument("file", type=Path, metavar="FILE", help="file to write; must not exist yet")
+    seal = actions.add("seal", "make a key that signs the seals of flights", "dappled keys seal /etc/dappled/seal.key")
+    seal.add_argument("file", type=Path, metavar="FILE", help="file to write; must not exist yet")
     for one in actions.all:
         one.add_argument("--json", action="store_true", help="print JSON")
 
@@ -68,6 +71,10 @@ def run(arguments: argparse.Namespace) -> int:
         case "show":
             key = curve.load_public(arguments.file).decode()
             facts, words = {"public_key": key}, key
+        case "seal":
+            seal_key.make(arguments.file.expanduser())
+            facts = {"seal_key_file": str(arguments.file)}
+            words = f"{arguments.file}  name it in record.seal_key, and keep a copy where flights are checked"
         case _:
             facts, words = {"token_file": str(arguments.file)}, _token(arguments.file)
     print(json.dumps(facts) if arguments.json else words)

@@ -89,6 +89,9 @@ class RecordSettings:
     min_free_mb: int = setting(
         500, "Refuse new shots when less disk space than this is free; 0: never", unit="MB", low=0, high=10_000_000
     )
+    seal_key: str = setting(
+        "", "Key file that signs the seals of flights, made by dappled keys seal; empty: seals are not signed"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +229,9 @@ def resolve(settings: Settings, beside: Path | None = None) -> Settings:
         camera=dataclasses.replace(settings.camera, profile=profile(settings.camera.profile)),
         mask=dataclasses.replace(settings.mask, profile=profile(settings.mask.profile)),
         mavlink=dataclasses.replace(settings.mavlink, keys=tuple(path(each) for each in settings.mavlink.keys)),
-        record=dataclasses.replace(settings.record, directory=path(settings.record.directory)),
+        record=dataclasses.replace(
+            settings.record, directory=path(settings.record.directory), seal_key=path(settings.record.seal_key)
+        ),
         decode=dataclasses.replace(
             settings.decode,
             calibration=path(settings.decode.calibration),

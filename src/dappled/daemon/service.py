@@ -54,7 +54,7 @@ from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot
 from dappled.errors import DappledError, report, sentence
-from dappled.flight import Recording
+from dappled.flight import Recording, seal_key
 from dappled.flight import recording as flights
 
 log = logging.getLogger(__name__)
@@ -139,8 +139,10 @@ class Service:
             "names": asdict(names),
             "decode_in_flight": recipe is not None,
         }
-        directory = Path(settings.record.directory)
-        self._recording = flights.begin(directory, clock, facts, utc_known=self._utc_known)
+        directory, key = Path(settings.record.directory), settings.record.seal_key
+        self._recording = flights.begin(
+            directory, clock, facts, utc_known=self._utc_known, seal_key=seal_key.load(Path(key)) if key else None
+        )
         stack.callback(self._remove_unused_flight)
         stack.callback(_close, self._recording)
         stack.callback(self._links.stop)  # before the recording closes: packets are logged there

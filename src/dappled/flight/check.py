@@ -12,12 +12,15 @@ from pathlib import Path
 
 from dappled.confined import OutsideError
 from dappled.errors import DappledError, counted
-from dappled.flight import check_chain, durable, layout, logs, provenance, pruning
-from dappled.flight.check_chain import ChainFindings
+from dappled.flight import durable, layout, logs, provenance, pruning
+from dappled.flight.checks import chain_check, seal_check
+from dappled.flight.checks.chain_check import ChainFindings
+from dappled.flight.checks.seal_check import LedgerBytes, SealFindings, Vouched
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.pruning import Removed
 from dappled.flight.recovery import SIDECAR
+from dappled.flight.seal_key import SealKey
 from dappled.flight.stored_rows import StoredRows
 
 _WITHOUT_CHAIN = (
@@ -28,8 +31,8 @@ _WITHOUT_CHAIN = (
 
 @dataclass(frozen=True, slots=True)
 class CheckReport:
-    """What was checked and what is wrong, in sentences. `notes` are not faults. `offloaded` counts the files that were
-    removed here after their copies were proved: they were not read."""
+    """What was checked and what is wrong, in sentences; `notes` are no faults. `offloaded` counts the files that were
+    removed here after their copies were proved: they were not read. `verdict` says what the seals vouch for."""
 
     flight: str
     files: int
@@ -37,7 +40,9 @@ class CheckReport:
     telemetry_packets: int
     problems: tuple[str, ...]
     notes: tuple[str, ...]
-    offloaded: int = 0
+    offloaded: int
+    vouched: Vouched
+    verdict: str
 
     @property
     def intact(self) -> bool:
@@ -54,21 +59,36 @@ class _Counts:
     elsewhere: Mapping[str, Removed] = field(default_factory=dict)
 
 
-def check(path: Path) -> CheckReport:
-    """Read a whole flight and compare its parts. Raises FlightError when it is not a flight."""
+def check(path: Path, key: SealKey | None = None) -> CheckReport:
+    """Read a whole flight and compare its parts; `key` verifies the signatures of its seals. Raises FlightError when it
+    is not a flight."""
     folder = layout.open_folder(path)
     problems: list[str] = []
     notes: list[str] = []
     counts = _Counts()
+    sealed = SealFindings("not sealed", "", (), ())
     with _examining("flight.toml", problems):
         layout.read_facts(folder)
     with _examining("the ledger", problems):
+        before = LedgerBytes.of(folder)
         chained = _chained(folder, problems)
         notes += [_WITHOUT_CHAIN] if chained.links is None else chained.notes
-    with _examining("the flight", problems), LedgerReader.open(folder.ledger) as ledger:
-        _compare(folder, ledger, counts, problems, notes)
+        with _examining("the flight", problems), LedgerReader.open(folder.ledger) as ledger:
+            _compare(folder, ledger, counts, problems, notes)
+            with _examining("the seals", problems):
+                sealed = seal_check.compare(folder, ledger, chained.links, before, key)
+    problems += sealed.problems
+    notes += sealed.notes
     return CheckReport(
-        folder.name, counts.files, counts.size, counts.packets, tuple(problems), tuple(notes), len(counts.elsewhere)
+        flight=folder.name,
+        files=counts.files,
+        size=counts.size,
+        telemetry_packets=counts.packets,
+        problems=tuple(problems),
+        notes=tuple(notes),
+        offloaded=len(counts.elsewhere),
+        vouched=sealed.vouched,
+        verdict=sealed.verdict,
     )
 
 
@@ -118,7 +138,7 @@ def _chained(folder: FlightFolder, problems: list[str]) -> ChainFindings:
     """What SQLite, the records' own digests, and the chain say about the ledger. Raises FlightError."""
     with StoredRows.open(folder.ledger) as stored:
         problems += [f"the ledger is damaged: {text}" for text in stored.damage()]
-        found = check_chain.compare(stored)
+        found = chain_check.compare(stored)
         problems += found.problems
         problems += _records(stored)
     return found

@@ -60,6 +60,11 @@ class FlightFolder:
         return self.path / "telemetry.tlog"
 
     @property
+    def seals(self) -> Path:
+        """seals.jsonl: the digests of every file, each time the flight was closed."""
+        return self.path / "seals.jsonl"
+
+    @property
     def frames(self) -> Path:
         return self.path / "frames"
 

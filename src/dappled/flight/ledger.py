@@ -25,7 +25,7 @@ from dappled.flight.records import Cause, Frame, LedgerEvent, Result, Shot, Shot
 from dappled.flight.tables import APPLICATION_ID, CHAIN, DEFINITIONS, KEYS, SCHEMA, SCHEMA_VERSION, TRANSITIONS
 
 LIVE = "live"
-_BUSY_S = 10.0
+BUSY_S = 10.0
 _ROW_OF = {
     table: f"SELECT * FROM {table} WHERE {' AND '.join(f'{column} = ?' for column in key)}"  # noqa: S608  constants
     for table, key in KEYS.items()
@@ -52,7 +52,7 @@ class Database(ABC):
         self.path = path
         self._lock = threading.RLock()
         try:
-            self._db = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+            self._db = sqlite3.connect(uri, uri=True, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
         except sqlite3.Error as error:
             raise self._sentence(error) from error
         try:
@@ -346,6 +346,15 @@ class Ledger(LedgerReader):
         """Store a value that holds for the whole flight; replaces an earlier one."""
         with self._transaction():
             self._fact(key, value)
+
+    def fold(self) -> None:
+        """Fold the WAL into the file, which then stays as it is until the next row. Raises FlightError where another
+        program is reading for too long."""
+        ((busy, _, _),) = self._rows("PRAGMA wal_checkpoint(TRUNCATE)")
+        if busy:
+            raise FlightError(
+                f"the ledger {self.path} could not be folded: another program holds it; close that program"
+            )
 
     def _fact(self, key: str, value: object) -> None:
         self._insert("facts", (key,), key, canonical(value).decode())

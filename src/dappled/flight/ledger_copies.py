@@ -9,15 +9,16 @@ from contextlib import closing
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.pruning import Proved
-from dappled.flight.trees import FileIdentity, Tree
+from dappled.flight.trees import FileIdentity, Tree, pieces
 
 _GROWS = ("chain", "frames", "companions", "strays", "poses", "tags", "results", "events")
 """Tables whose rows are added and never changed. Of shots the state changes, of facts the value."""
 
 
 def is_part(name: str) -> bool:
-    """Whether a file of the flight belongs to the ledger: SQLite's own files, which are not copied as they are."""
-    return name in ("flight.sqlite", "flight.sqlite-wal", "flight.sqlite-shm")
+    """Whether a file of the flight belongs to the ledger: SQLite's own files, which are not copied as they are, and the
+    seals, which go with the ledger."""
+    return name in ("flight.sqlite", "flight.sqlite-wal", "flight.sqlite-shm", "seals.jsonl")
 
 
 def bring(source: Tree, there: Tree, name: str) -> tuple[bool, Proved]:
@@ -43,6 +44,32 @@ def bring(source: Tree, there: Tree, name: str) -> tuple[bool, Proved]:
             )
     there.write(name, [image])
     return True, _proved(there, name, image)
+
+
+def bring_seals(source: Tree, there: Tree, name: str) -> tuple[bool, Proved] | None:
+    """Copy the seals, as `bring` does the ledger: lines are only added to them. None where the source has none.
+
+    Raises FlightError where each has lines that the other lacks, or a disk refuses.
+    """
+    if source.stat(name) is None:
+        return None
+    ours, theirs = _content(source, name), _content(there, name)
+    if theirs.startswith(ours):
+        return False, _proved(there, name, theirs)
+    if not ours.startswith(theirs):
+        raise FlightError(
+            f"{there.path / name} is there already and differs from {source.path / name}: move one away first"
+        )
+    there.write(name, [ours])
+    return True, _proved(there, name, ours)
+
+
+def _content(tree: Tree, name: str) -> bytes:
+    """A file's bytes; none where there is no file."""
+    if tree.stat(name) is None:
+        return b""
+    with tree.reading(name) as fd:
+        return b"".join(bytes(piece) for piece in pieces(fd, FileIdentity.of_fd(fd).size, lambda _: None))
 
 
 def _proved(there: Tree, name: str, image: bytes) -> Proved:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.clock import Clock
-from dappled.flight import check, durable, layout, ledger_copies, places, pruning, read_back
+from dappled.flight import check, durable, layout, ledger_copies, places, pruning, read_back, seals
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder, FlightsLock
 from dappled.flight.ledger import LedgerReader
@@ -98,6 +98,10 @@ class _Copying:
         ledger = self._folder.ledger.name
         written, manifest[ledger] = ledger_copies.bring(self._source, self._there, ledger)
         fresh |= {ledger} if written else set()
+        seal_file = self._folder.seals.name
+        if (brought := ledger_copies.bring_seals(self._source, self._there, seal_file)) is not None:
+            written, manifest[seal_file] = brought
+            fresh |= {seal_file} if written else set()
         self._there.sync()
         self._there.sync_above()
         ways = self._prove(manifest, fresh)
@@ -111,7 +115,8 @@ class _Copying:
             if "page cache" in ways:
                 raise FlightError(f"{doubts[0]}: nothing was removed; offload without --prune, or to another disk")
             sure = {name: manifest[name] for name in rows if name.startswith("frames/") and name in manifest}
-            pruned = pruning.remove(self._folder, self._source, self._there, sure, clock)
+            with seals.reopened(self._folder, clock, "offload --prune") if sure else nullcontext():
+                pruned = pruning.remove(self._folder, self._source, self._there, sure, clock)
         size = sum(one.identity.size for one in manifest.values())
         already = len(manifest) - len(fresh)
         return Offloaded(

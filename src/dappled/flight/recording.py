@@ -15,13 +15,14 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
 from dappled.clock import Clock
-from dappled.flight import durable, layout, provenance, recovery
+from dappled.flight import durable, layout, provenance, recovery, seals
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.index import ImageIndex, IndexEntry, open_or_rebuild
 from dappled.flight.layout import FlightFolder, FlightsLock
 from dappled.flight.ledger import Ledger
 from dappled.flight.logs import ShotJournal, TelemetryLog
 from dappled.flight.records import Frame, Stray
+from dappled.flight.seal_key import SealKey
 
 
 class FileBytes(Protocol):
@@ -139,6 +140,7 @@ class Recording:
     recovered: tuple[str, ...]
     _lock: FlightsLock
     _clock: Clock
+    _key: SealKey | None
     _ended: threading.Event = field(default_factory=threading.Event)
 
     @property
@@ -186,23 +188,32 @@ class Recording:
             report = [text for text in (self.journal.problem, self.telemetry.problem) if text is not None]
             recovery.close_ledger(self.folder, self.ledger, self._clock.utc_ns(), telemetry, report)
             report += recovery.recover_flight(self.folder, self._clock)
+            self.ledger.close()
+            seals.seal(self.folder, self._clock, "closed", self._key)
             report += self.index.take_in(self.folder, seal=True)
         return report
 
 
-def begin(root: Path, clock: Clock, facts: Mapping[str, Any] | None = None, *, utc_known: bool = True) -> Recording:
+def begin(
+    root: Path,
+    clock: Clock,
+    facts: Mapping[str, Any] | None = None,
+    *,
+    utc_known: bool = True,
+    seal_key: SealKey | None = None,
+) -> Recording:
     """Lock the flights folder, repair earlier flights, and begin a new one.
 
     `clock` stamps the events. `facts` goes to flight.toml. With `utc_known` False, its UTC counts from an arbitrary
-    time, the flight is named by boot, and `learn_utc` may give the correction later. Raises FlightError when another
-    daemon records there, or the disk refuses.
+    time, the flight is named by boot, and `learn_utc` may give the correction later. `seal_key` signs the seals of this
+    flight and of those that are repaired. Raises FlightError when another daemon records there, or the disk refuses.
     """
     with ExitStack() as stack:
         lock = FlightsLock(root)
         stack.callback(lock.close)
         index, recovered = open_or_rebuild(root)
         stack.callback(index.close)
-        recovered += recovery.recover(root, index, clock)
+        recovered += recovery.recover(root, index, clock, seal_key)
         next_index = index.next_index()
         began_utc_ns = clock.utc_ns()
         start_utc_ns = began_utc_ns if utc_known else None
@@ -223,7 +234,7 @@ def begin(root: Path, clock: Clock, facts: Mapping[str, Any] | None = None, *, u
             ledger.add_event("recovery", text)
         recorder = Recorder(folder, ledger)
         opened = Recording(
-            folder, journal, ledger, recorder, telemetry, index, next_index, tuple(recovered), lock, clock
+            folder, journal, ledger, recorder, telemetry, index, next_index, tuple(recovered), lock, clock, seal_key
         )
         stack.pop_all()
     return opened

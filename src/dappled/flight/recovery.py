@@ -13,13 +13,14 @@ from pathlib import Path
 
 from dappled.clock import Clock
 from dappled.errors import DappledError
-from dappled.flight import durable, layout, logs
+from dappled.flight import durable, layout, logs, seals
 from dappled.flight.errors import disk_error
 from dappled.flight.index import ImageIndex
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger
 from dappled.flight.logs import ShotJournal
 from dappled.flight.records import Frame, Stray
+from dappled.flight.seal_key import SealKey
 from dappled.flight.stored_rows import ledger_damage
 
 SIDECAR = ".xmp"
@@ -27,7 +28,7 @@ _JPEG = (".jpg", ".jpeg")
 LOST = "the recording ended before its file came"
 
 
-def recover(root: Path, index: ImageIndex, clock: Clock) -> list[str]:
+def recover(root: Path, index: ImageIndex, clock: Clock, key: SealKey | None) -> list[str]:
     """Repair all flights that were not closed, and index them. The caller holds the flights' lock.
 
     A flight that can't be repaired is reported and left as it is; the next flight can begin all the same. Returns
@@ -43,6 +44,8 @@ def recover(root: Path, index: ImageIndex, clock: Clock) -> list[str]:
             continue
         try:
             report += [f"flight {folder.name}: {text}" for text in recover_flight(folder, clock)]
+            if not seals.is_sealed(folder):
+                seals.seal(folder, clock, "recovered", key)
             report += index.take_in(folder, seal=True)
         except (DappledError, OSError) as error:
             report.append(f"flight {folder.name} could not be repaired: {error}")
@@ -97,6 +100,8 @@ def _move_damaged_ledger(folder: FlightFolder) -> list[str]:
     os.replace(folder.ledger, aside)
     for suffix in ("-wal", "-shm"):
         folder.ledger.with_name(folder.ledger.name + suffix).unlink(missing_ok=True)
+    if folder.seals.exists():  # they are about that ledger's chain
+        os.replace(folder.seals, folder.seals.with_name(folder.seals.name + ".damaged"))
     durable.sync_folder(folder.path)
     lost = "it was rebuilt from shots.jsonl and frames, without poses, tags and times of firing"
     return [f"the ledger was damaged ({damage}) and moved to {aside.name}; {lost}"]

@@ -11,7 +11,7 @@ import pytest
 
 from dappled.cli import main
 from dappled.clock import RecordedClock
-from dappled.flight import Recording, Result, recording
+from dappled.flight import Recording, Result, recording, seal_key
 from tests.flight.makers import deliver, flip, request, tag
 
 START_UTC_NS = 1_795_256_103_000_000_000  # 2026-11-21T10:15:03Z
@@ -91,7 +91,7 @@ def test_every_shot_is_shown_with_what_became_of_it(closed: Path, capsys: pytest
 
 
 def test_check_ends_with_the_verdict(closed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert lines(["check", str(closed)], capsys)[-1].startswith(f"{closed.name}: intact: 1 file, 2.0 MB")
+    assert lines(["check", str(closed)], capsys)[-1].startswith(f"{closed.name}: consistent: 1 file, 2.0 MB")
     flip(closed / "frames" / "000000.cr2", 1000)
     said = lines(["check", str(closed)], capsys, code=1)
     assert said[0].startswith("wrong: ")
@@ -99,6 +99,25 @@ def test_check_ends_with_the_verdict(closed: Path, capsys: pytest.CaptureFixture
     assert "NOT INTACT" in said[-1]
     assert main(["flight", "check", str(closed), "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["intact"] is False
+
+
+def test_check_insists_on_a_key(flights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    key, other = str(tmp_path / "seal.key"), str(tmp_path / "other.key")
+    assert main(["keys", "seal", key]) == main(["keys", "seal", other]) == 0
+    begun = recording.begin(flights, RecordedClock(START_UTC_NS), seal_key=seal_key.load(Path(key)))
+    begun.close()
+    flight = str(begun.folder.path)
+    name = seal_key.load(Path(key)).name
+    assert f"intact, sealed with key {name}" in lines(["check", flight, "--key", key], capsys)[-1]
+    assert (
+        f"not with the given key {seal_key.load(Path(other)).name}"
+        in lines(["check", flight, "--key", other], capsys, code=1)[-1]
+    )
+    assert "--key FILE verifies it" in lines(["check", flight], capsys)[-1]
+    (config := tmp_path / "dappled.toml").write_text('[record]\nseal_key = "seal.key"\n')
+    assert f"intact, sealed with key {name}" in lines(["check", flight, "--config", str(config)], capsys)[-1]
+    assert main(["flight", "check", flight, "--key", key, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["vouched"] == "signed"
 
 
 def test_report_adds_up(closed: Path, capsys: pytest.CaptureFixture[str]) -> None:

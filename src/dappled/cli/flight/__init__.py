@@ -17,7 +17,7 @@ from dappled.cli.flight import lines as flight_lines
 from dappled.cli.flight import pickup
 from dappled.clock import SystemClock
 from dappled.config import settings
-from dappled.flight import FlightError, check, flight_report, index, offload
+from dappled.flight import FlightError, check, flight_report, index, offload, seal_key
 
 _FLIGHT = "~/flights/20261121T101503Z-0a1b2c3d"
 
@@ -48,6 +48,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     away.add_argument("--prune", action="store_true", help="then remove the frames here, each by the proof of its copy")
     away.add_argument("--same-device", action="store_true", help="insist on a DEST that is on the same disk")
     pickup.configure(bring)
+    intact.add_argument(
+        "--key",
+        type=Path,
+        metavar="FILE",
+        help="insist that this key signed the seals (default: record.seal_key, if any)",
+    )
     for one in (show, intact, report, away, bring):
         one.add_argument("flight", nargs="?", type=Path, metavar="FLIGHT", help="flight folder (default: the newest)")
     for one in actions.all:
@@ -63,7 +69,9 @@ def run(arguments: argparse.Namespace) -> int:
         return pickup.run(flight, arguments)
     if arguments.action == "offload":
         return _offload(flight, arguments)
-    return {"show": _show, "check": _check, "report": _report}[arguments.action](flight, arguments.json)
+    if arguments.action == "check":
+        return _check(flight, arguments.config, arguments.key, arguments.json)
+    return {"show": _show, "report": _report}[arguments.action](flight, arguments.json)
 
 
 def _last_flight(flights: Path) -> Path:
@@ -90,10 +98,12 @@ def _show(flight: Path, as_json: bool) -> int:
     return _said(_plain(found), flight_lines.of_flight(found), as_json)
 
 
-def _check(flight: Path, as_json: bool) -> int:
-    found = check.check(flight)
+def _check(flight: Path, config: Path | None, key: Path | None, as_json: bool) -> int:
+    configured = settings.load(config).record.seal_key if key is None else ""
+    file = key or (Path(configured) if configured else None)
+    found = check.check(flight, seal_key.load(file) if file else None)
     _said({**_plain(found), "intact": found.intact}, flight_lines.of_check(found), as_json)
-    return 0 if found.intact else 1
+    return 0 if found.intact and (key is None or found.vouched == "signed") else 1
 
 
 def _report(flight: Path, as_json: bool) -> int:

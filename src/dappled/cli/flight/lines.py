@@ -62,13 +62,13 @@ def of_check(found: CheckReport) -> Iterator[str]:
     """The problems, the notes, and the verdict."""
     yield from (f"wrong: {text}" for text in found.problems)
     yield from (f"note:  {text}" for text in found.notes)
-    word = "intact" if found.intact else "NOT INTACT"
+    word, _, rest = (found.verdict if found.intact else "NOT INTACT").partition("; ")
     size = f"{found.size / 1e6:.1f} MB"
     packets = counted(found.telemetry_packets, "telemetry packet")
     if found.offloaded:
         word = f"{word}, of what is still here" if found.intact else word
         packets += f"; {counted(found.offloaded, 'file')} offloaded and not read"
-    yield f"{found.flight}: {word}: {counted(found.files, 'file')}, {size}, {packets}"
+    yield f"{found.flight}: {word}: {counted(found.files, 'file')}, {size}, {packets}{rest and f'; {rest}'}"
 
 
 def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:

@@ -21,7 +21,7 @@ from dappled.daemon.replay.verifier import ReplayVerifier
 from dappled.drivers.camera import Blob, Identity
 from dappled.drivers.replay import ReplayCamera
 from dappled.errors import DappledError
-from dappled.flight import FlightsLock, Frame, Ledger, LedgerReader, Tag, layout
+from dappled.flight import FlightsLock, Frame, Ledger, LedgerReader, Tag, layout, seals
 
 
 class MissingTagWriter(ReplayVerifier):
@@ -78,6 +78,7 @@ def add_missing(flight: Path, clock: Clock) -> list[int]:
     progress, time = ReplayProgress(), replay.clock(recording)
     with ExitStack() as stack:
         stack.enter_context(FlightsLock(flight.resolve().parent, "tags frames in"))
+        stack.enter_context(seals.reopened(folder, clock, "late tags"))
         ledger = stack.enter_context(Ledger(folder.ledger, clock))
         writer = MissingTagWriter(recording, ledger)
         camera = ReplayCamera(recording.files, Identity("dappled", "recording", "", str(flight)), time)

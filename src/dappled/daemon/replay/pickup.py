@@ -26,7 +26,7 @@ from dappled.drivers.raw.darkroom import camera_name
 from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching, in_order, match
 from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups
 from dappled.errors import DappledError, counted
-from dappled.flight import FlightsLock, Frame, ImageIndex, Ledger, LedgerReader, Recorder, ShotRow, layout
+from dappled.flight import FlightsLock, Frame, ImageIndex, Ledger, LedgerReader, Recorder, ShotRow, layout, seals
 from dappled.flight.index import IndexEntry
 
 
@@ -135,6 +135,7 @@ def bring(flight: Path, source: FileSource, proposal: Proposal, clock: Clock, pr
     with ExitStack() as stack:
         stack.enter_context(FlightsLock(root, "picks up files into"))
         index = stack.enter_context(ImageIndex(root))
+        stack.enter_context(seals.reopened(folder, clock, "pickup"))
         ledger = stack.enter_context(Ledger(folder.ledger, clock))
         recorder = Recorder(folder, ledger)
         for number, group in proposal.pairs:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -17,7 +18,7 @@ from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.recipes import Names
 from dappled.drivers.raw.darkroom import FILES, Recipe
 from dappled.errors import DappledError
-from dappled.flight import LIVE, Ledger, LedgerReader, Result, layout, provenance
+from dappled.flight import LIVE, Ledger, LedgerReader, Result, layout, provenance, seals
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -52,18 +53,21 @@ class RunWriter:
             raise DappledError(f"{flight} {what}, or replay it without another recipe")
         if run.name in runs or _fact(run.name) in facts:
             raise DappledError(f"{flight} has a run {run.name!r} already: give another name with --run")
-        kept = recipes.keep(run.recipe, flight, run.name)
-        self.run = replace(run, recipe=kept)
-        self._ledger = Ledger(folder.ledger, clock)
-        provenance.note(folder, self._ledger, f"{recipes.FOLDER}/{run.name}")
-        told = {"recipe": _relative(kept, flight), "names": asdict(run.names), "software": recipes.versions()}
-        self._ledger.set_fact(_fact(run.name), {**told, "utc_ns": clock.utc_ns()})
+        with ExitStack() as stack:
+            stack.enter_context(seals.reopened(folder, clock, f"run {run.name}"))
+            kept = recipes.keep(run.recipe, flight, run.name)
+            self.run = replace(run, recipe=kept)
+            self._ledger = stack.enter_context(Ledger(folder.ledger, clock))
+            provenance.note(folder, self._ledger, f"{recipes.FOLDER}/{run.name}")
+            told = {"recipe": _relative(kept, flight), "names": asdict(run.names), "software": recipes.versions()}
+            self._ledger.set_fact(_fact(run.name), {**told, "utc_ns": clock.utc_ns()})
+            self._opened = stack.pop_all()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._ledger.close()
+        self._opened.close()
 
     def decoded(self, result: Result) -> None:
         """What came out of one frame."""

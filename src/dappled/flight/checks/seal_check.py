@@ -1,0 +1,178 @@
+"""Compare the files of a flight with its newest seal, and say what the seals vouch for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from dappled.confined import OutsideError
+from dappled.errors import counted
+from dappled.flight import durable, seals
+from dappled.flight.chain import ChainLink
+from dappled.flight.layout import FlightFolder
+from dappled.flight.ledger import LedgerReader
+from dappled.flight.recovery import SIDECAR
+from dappled.flight.seal_key import SealKey
+from dappled.flight.seals import Seal
+
+Vouched = Literal["signed", "not verified", "not signed", "not sealed", "no chain"]
+_NOT_SIGNED = "not signed: someone who edits on purpose can make the seals anew"
+
+
+@dataclass(frozen=True, slots=True)
+class LedgerBytes:
+    """The ledger's file as it was before anything opened it: size, SHA-256, and the bytes of its WAL."""
+
+    size: int
+    sha256: str
+    wal_size: int
+
+    @classmethod
+    def of(cls, folder: FlightFolder) -> LedgerBytes:
+        """Read them; zeros without a file. Raises OSError."""
+        if not folder.ledger.is_file():
+            return cls(0, "", 0)
+        wal = folder.ledger.with_name(folder.ledger.name + "-wal")
+        wal_size = wal.stat().st_size if wal.exists() else 0
+        return cls(folder.ledger.stat().st_size, durable.hash_file(folder.ledger), wal_size)
+
+
+@dataclass(frozen=True, slots=True)
+class SealFindings:
+    """What the seals show. `verdict` says what they vouch for where nothing is wrong."""
+
+    vouched: Vouched
+    verdict: str
+    problems: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def compare(
+    folder: FlightFolder,
+    ledger: LedgerReader,
+    links: Mapping[int, ChainLink] | None,
+    before: LedgerBytes,
+    key: SealKey | None,
+) -> SealFindings:
+    """Compare seals, chain and files. `links` is the chain, None without one; `key` verifies signatures. Raises
+    FlightError and OSError."""
+    file, facts = seals.read(folder), ledger.facts()
+    problems = [*file.problems, *_numbers(file.seals, facts), *_heads(file.seals, links or {}, facts)]
+    problems += _signatures(file.seals, key)
+    notes = [f"seal {number} was never written: its work was interrupted" for number in seals.announced(facts)[1]]
+    last = file.last
+    if last is None:
+        vouched: Vouched = "no chain" if links is None else "not sealed"
+        verdict = "recorded without seals" if links is None else "not sealed yet"
+        return SealFindings(vouched, f"consistent; {verdict}", tuple(problems), tuple(notes))
+    unsealed = max(0, len(links or {}) - last.links)
+    if unsealed:
+        notes.append(
+            f"the flight was opened again after seal {last.seal} ({last.why}): {counted(unsealed, 'link')} "
+            "of the chain and the files written since are not sealed yet"
+        )
+    differences = [*_files(folder, last, _vouched_by_ledger(ledger, facts))]
+    (notes if unsealed else problems).extend(differences)
+    notes += _added(folder, last, ledger, problems if not unsealed else notes)
+    if not unsealed:
+        problems += _ledger_file(last, before)
+    vouched, verdict = _verdict(file.seals, last, key)
+    return SealFindings(vouched, verdict, tuple(problems), tuple(notes))
+
+
+def _numbers(found: Mapping[int, Seal], facts: Mapping[str, Any]) -> Iterator[str]:
+    """Seals that the ledger tells of and that are not there, and the other way round."""
+    count, missing = seals.announced(facts)
+    for number in sorted(set(range(1, count + 1)) - missing - found.keys()):
+        yield (
+            f"seal {number} is missing from seals.jsonl: it was cut off, or its work was interrupted; that work "
+            "(dappled run, geotag, flight pickup) seals the flight again"
+        )
+    for number in sorted(found.keys() - set(range(1, count + 1))):
+        yield f"the ledger does not tell of seal {number}"
+
+
+def _heads(found: Mapping[int, Seal], links: Mapping[int, ChainLink], facts: Mapping[str, Any]) -> Iterator[str]:
+    """Seals that contradict the chain."""
+    for number, seal in found.items():
+        if seal.flight != seals.of_flight(facts):
+            yield f"seal {number} is of another flight: {seal.flight}"
+        link = links.get(seal.links)
+        if link is None or link.link != seal.head:
+            yield f"seal {number} contradicts the chain: link {seal.links} is another one, or is missing"
+
+
+def _signatures(found: Mapping[int, Seal], key: SealKey | None) -> Iterator[str]:
+    for number, seal in found.items():
+        if (seal.key is None) != (seal.mac is None):
+            yield f"seal {number} is signed in part"
+        elif key is not None and seal.key == key.name and not key.signed(seal.signed_part(), seal.mac or ""):
+            yield f"the signature of seal {number} is wrong: key {key.name} did not make it"
+
+
+def _vouched_by_ledger(ledger: LedgerReader, facts: Mapping[str, Any]) -> dict[str, tuple[int | None, str]]:
+    """Digests of the files that are compared with the ledger elsewhere; the ledger has no size of some."""
+    known: dict[str, tuple[int | None, str]] = dict(seals.recorded_files(ledger))
+    for name, value in facts.items():
+        if name.startswith("sha256:") and isinstance(value, list) and len(value) == 1:
+            known[name.removeprefix("sha256:")] = (None, value[0])
+    return known
+
+
+def _files(folder: FlightFolder, last: Seal, known: Mapping[str, tuple[int | None, str]]) -> Iterator[str]:
+    """Files that are not those which the newest seal covers."""
+    for name, (size, sha256) in last.files.items():
+        if name == folder.ledger.name:
+            continue
+        if name in known:
+            if known[name] not in ((size, sha256), (None, sha256)):
+                yield f"seal {last.seal} and the ledger hold different digests of {name}"
+            continue
+        try:
+            path = folder.file(name)
+            now = (path.stat().st_size, durable.hash_file(path))
+        except OutsideError as error:
+            yield str(error)
+            continue
+        except FileNotFoundError:
+            yield f"{name} is missing: seal {last.seal} covers it"
+            continue
+        except OSError as error:
+            yield f"{name} can't be read: {error.strerror}"
+            continue
+        if now != (size, sha256):
+            yield f"{name} was changed since seal {last.seal}"
+
+
+def _added(folder: FlightFolder, last: Seal, ledger: LedgerReader, problems: list[str]) -> Iterator[str]:
+    """Files that no seal covers: notes, and problems where only dappled writes."""
+    rows = {row.name for row in ledger.files()}
+    for path in seals.sealed_paths(folder):
+        name = path.relative_to(folder.path).as_posix()
+        if name in last.files or name in rows:
+            continue
+        if name.startswith("inputs/"):
+            problems.append(f"{name} was added since seal {last.seal}")
+        elif not name.startswith("frames/") or name.endswith(SIDECAR):  # other frames are missed in the ledger
+            yield f"{name} was added since seal {last.seal}: no seal covers it"
+
+
+def _ledger_file(last: Seal, before: LedgerBytes) -> Iterator[str]:
+    """The ledger's bytes, free pages too; its rows are compared with the chain."""
+    if before.wal_size:
+        yield f"flight.sqlite-wal holds {counted(before.wal_size, 'byte')} that no seal covers"
+    if last.files.get("flight.sqlite") != (before.size, before.sha256):
+        yield f"flight.sqlite was changed since seal {last.seal}: its SHA-256 is not the seal's"
+
+
+def _verdict(found: Mapping[int, Seal], last: Seal, key: SealKey | None) -> tuple[Vouched, str]:
+    if last.key is None:
+        signed = [number for number, seal in found.items() if key is not None and seal.key == key.name]
+        upto = f"signed with key {key.name} up to seal {max(signed)}, then " if key is not None and signed else ""
+        return "not signed", f"consistent; {upto}{_NOT_SIGNED}"
+    if key is None:
+        return "not verified", f"consistent; sealed with key {last.key}: --key FILE verifies it"
+    if key.name != last.key:
+        return "not verified", f"consistent; sealed with key {last.key}, not with the given key {key.name}"
+    return "signed", f"intact, sealed with key {last.key}"

@@ -1,0 +1,237 @@
+"""Seal a flight when it closes: the digest of every file, and the head of the ledger's chain, in seals.jsonl.
+
+A seal stands outside the files that it covers, names the one before it, and may be signed. Work on a closed flight
+(late tags, pickups, another run, sidecars) adds rows with links of their own, and ends with a new seal.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from dappled.clock import Clock
+from dappled.flight import durable, pruning
+from dappled.flight.chain import canonical
+from dappled.flight.errors import disk_error
+from dappled.flight.layout import FlightFolder
+from dappled.flight.ledger import Ledger, LedgerReader
+from dappled.flight.seal_key import SealKey
+
+FACT = "seals"  # {"count": seals announced, "missing": those that were never written}
+_BESIDE_LEDGER = ("-wal", "-shm")
+_MAC = "mac"
+_DIGEST = "sha256"
+
+
+@dataclass(frozen=True, slots=True)
+class Seal:
+    """One seal. `files` gives size and SHA-256 by name relative to the flight; `links` and `head` are the chain's.
+
+    `previous` is the SHA-256 of the line before it; `key` the name of the key that signed it (`mac`), None without one.
+    """
+
+    seal: int
+    flight: str
+    utc_ns: int
+    why: str
+    links: int
+    head: str
+    files: Mapping[str, tuple[int, str]]
+    previous: str
+    key: str | None = None
+    mac: str | None = None
+
+    def signed_part(self) -> bytes:
+        """What `mac` covers."""
+        return canonical({name: value for name, value in asdict(self).items() if name != _MAC})
+
+    def line(self) -> bytes:
+        """As it stands in the file, with a digest of itself."""
+        values = asdict(self)
+        return canonical({**values, _DIGEST: hashlib.sha256(canonical(values)).hexdigest()})
+
+
+@dataclass(frozen=True, slots=True)
+class SealFile:
+    """The seals of a flight, by number, and what is wrong with their file, in sentences."""
+
+    seals: Mapping[int, Seal]
+    problems: tuple[str, ...]
+
+    @property
+    def last(self) -> Seal | None:
+        """The newest seal."""
+        return self.seals[max(self.seals)] if self.seals else None
+
+
+def seal(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None = None) -> None:
+    """Seal a closed flight; one that is not closed yet is left alone. The caller has closed the ledger.
+
+    The ledger says first how many seals there are, so that one cut off is missed. Frames and telemetry count with the
+    digests that the ledger took when they were written. Raises FlightError.
+    """
+    try:
+        with _alone(folder.path):
+            before, known = _content(folder), read(folder)
+            before += b"" if before.endswith(b"\n") or not before else b"\n"  # a torn line stays, by itself
+            with Ledger(folder.ledger, clock) as ledger:
+                facts = ledger.facts()
+                if "closed_utc_ns" not in facts:
+                    return
+                count = max([announced(facts)[0], *known.seals]) + 1
+                missing = sorted(set(range(1, count)) - known.seals.keys())
+                ledger.set_fact(FACT, {"count": count, "missing": missing})
+                ledger.fold()
+                head, recorded = ledger.last_link(), recorded_files(ledger)
+            assert head is not None, "a ledger that is open for writing has a chain"
+            files = {
+                str(path.relative_to(folder.path)): recorded.get(str(path.relative_to(folder.path)))
+                or (path.stat().st_size, durable.hash_file(path))
+                for path in sealed_paths(folder)
+            }
+            values = (count, of_flight(facts), clock.utc_ns(), why, head.number, head.link, files, _last_digest(before))
+            made = Seal(*values, key=None if key is None else key.name)
+            if key is not None:
+                made = Seal(*values, key=key.name, mac=key.sign(made.signed_part()))
+            durable.write_file(folder.seals, before + made.line() + b"\n")
+    except OSError as error:
+        raise disk_error("seal the flight", folder.path, error) from error
+
+
+@contextmanager
+def reopened(folder: FlightFolder, clock: Clock, why: str) -> Iterator[None]:
+    """Work on a closed flight: the ledger says so first, and the flight is sealed again after the work, also where that
+    raised. Should the work be killed, `flight check` says what is not sealed. A flight that is still open is left to
+    the daemon. Raises FlightError."""
+    with LedgerReader.open(folder.ledger) as reader:
+        closed = "closed_utc_ns" in reader.facts()
+    if not closed:
+        yield
+        return
+    with Ledger(folder.ledger, clock) as ledger:
+        ledger.add_event("opened again", why)
+    try:
+        yield
+    finally:
+        seal(folder, clock, why)
+
+
+def is_sealed(folder: FlightFolder) -> bool:
+    """Whether the newest seal covers all of the chain. Raises FlightError."""
+    last = read(folder).last
+    with LedgerReader.open(folder.ledger) as ledger:
+        if "chain" not in ledger.facts():
+            return False
+        head = ledger.last_link()
+    return last is not None and head is not None and last.head == head.link
+
+
+def read(folder: FlightFolder) -> SealFile:
+    """The seals of a flight; none where there is no file. A line that is no seal, or does not follow from the line
+    before it, is reported. Raises FlightError when the file can't be read."""
+    try:
+        lines = _content(folder).split(b"\n")
+    except OSError as error:
+        raise disk_error("read the seals", folder.seals, error) from error
+    tail = lines.pop()
+    seals: dict[int, Seal] = {}
+    problems: list[str] = []
+    previous = ""
+    for number, line in enumerate(lines, 1):
+        found = _parse(line)
+        if found is None:
+            problems.append(f"line {number} of {folder.seals.name} was changed: it is no seal")
+        elif found.previous != previous:
+            problems.append(f"line {number} of {folder.seals.name} does not follow from the line before it")
+        elif found.seal in seals:
+            problems.append(f"line {number} of {folder.seals.name} is seal {found.seal} again")
+        if found is not None:
+            seals.setdefault(found.seal, found)
+        previous = hashlib.sha256(line).hexdigest()
+    if tail:
+        problems.append(f"the last line of {folder.seals.name} is torn ({len(tail)} bytes)")
+    return SealFile(seals, tuple(problems))
+
+
+def recorded_files(ledger: LedgerReader) -> dict[str, tuple[int, str]]:
+    """Size and SHA-256 of frames, companions, strays and telemetry as the ledger holds them. Raises FlightError."""
+    files = {row.name: (row.size, row.sha256) for row in ledger.files()}
+    facts = ledger.facts()
+    if "telemetry_sha256" in facts:
+        files["telemetry.tlog"] = (facts["telemetry_bytes"], facts["telemetry_sha256"])
+    return files
+
+
+def sealed_paths(folder: FlightFolder) -> Iterator[Path]:
+    """Every file of a flight that a seal covers, in order: all but seals.jsonl, the record of what was removed (the
+    ledger has its digest, and a copy lacks it), and SQLite's files beside the ledger. Links are not followed.
+
+    Raises OSError."""
+    ledger = folder.ledger
+    beside = {ledger.with_name(ledger.name + suffix) for suffix in _BESIDE_LEDGER}
+    beside |= {folder.seals, folder.path / pruning.RECORD}
+    for root, folders, names in os.walk(folder.path, onerror=_raise):
+        folders.sort()
+        for name in sorted(names):
+            path = Path(root, name)
+            if path not in beside and path.is_file() and not path.is_symlink():
+                yield path
+
+
+def of_flight(facts: Mapping[str, object]) -> str:
+    """The name that a flight was recorded under, from the ledger's facts; the folder may be called otherwise by now."""
+    value = facts.get("chain")
+    return str(value.get("flight", "")) if isinstance(value, dict) else ""
+
+
+def announced(facts: Mapping[str, object]) -> tuple[int, frozenset[int]]:
+    """From the ledger's facts: how many seals there are, and which of them were never written."""
+    value = facts.get(FACT)
+    if not isinstance(value, dict):
+        return 0, frozenset()
+    return int(value.get("count", 0)), frozenset(value.get("missing", ()))
+
+
+def _parse(line: bytes) -> Seal | None:
+    """A seal, where the line is exactly one, with the digest of itself."""
+    try:
+        values = json.loads(line)
+        del values[_DIGEST]
+        found = Seal(**{**values, "files": {name: (size, sha256) for name, (size, sha256) in values["files"].items()}})
+        whole = type(found.seal) is int and type(found.links) is int and found.line() == line
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return None
+    return found if whole else None
+
+
+def _content(folder: FlightFolder) -> bytes:
+    try:
+        return folder.seals.read_bytes()
+    except FileNotFoundError:
+        return b""
+
+
+def _last_digest(content: bytes) -> str:
+    """SHA-256 of the last line; "" before the first one."""
+    return hashlib.sha256(content.split(b"\n")[-2]).hexdigest() if content else ""
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Keep other processes from sealing the same flight meanwhile. Raises OSError."""
+    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(fd)
+
+
+def _raise(error: OSError) -> None:
+    raise error

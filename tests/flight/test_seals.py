@@ -1,0 +1,337 @@
+"""Seals: what they cover, who signed them, and what a crash or an attacker leaves of them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from dappled.clock import RecordedClock
+from dappled.flight import (
+    FlightError,
+    FlightFolder,
+    Ledger,
+    LedgerReader,
+    Recording,
+    durable,
+    recording,
+    seal_key,
+    seals,
+)
+from dappled.flight.check import check
+from tests.flight.checks.test_chain_check import attacked, fly, without_chain
+from tests.flight.conftest import START_UTC_NS
+from tests.flight.makers import flip
+
+SEED = 20261122
+LATER = RecordedClock(START_UTC_NS + 10**12)
+
+
+@pytest.fixture
+def sealed(flight: Recording) -> FlightFolder:
+    """A closed flight with rows in every table, a journal, telemetry, inputs and sidecars; seals 1 and 2."""
+    (inputs := flight.folder.path / "inputs").mkdir()
+    (inputs / "white.npy").write_bytes(b"what frames were decoded with" * 10)
+    flight.note_inputs("inputs")
+    folder = fly(flight)
+    with seals.reopened(folder, LATER, "geotag"):
+        (folder.frames / "000000.cr2.xmp").write_bytes(b"<x:xmpmeta/>" * 20)
+        (folder.path / "geotags").mkdir()
+        (folder.path / "geotags/geo.txt").write_bytes(b"EPSG:4326\n")
+    return folder
+
+
+def key_file(folder: Path, name: str = "seal.key") -> Path:
+    seal_key.make(folder / name)
+    return folder / name
+
+
+def reseal(folder: FlightFolder, **changes: object) -> None:
+    """What an attacker without the key does: change the newest seal and compute its digests anew."""
+    *before, last = folder.seals.read_bytes().splitlines(keepends=True)
+    values = {name: value for name, value in json.loads(last).items() if name != "sha256"} | changes
+    folder.seals.write_bytes(b"".join(before) + seals.Seal(**values).line() + b"\n")
+
+
+def files(folder: FlightFolder) -> list[Path]:
+    return sorted(path for path in folder.path.rglob("*") if path.is_file())
+
+
+def test_a_sealed_flight_is_consistent_and_not_signed(sealed: FlightFolder) -> None:
+    bytes_before = {path: path.read_bytes() for path in files(sealed)}
+    report = check(sealed.path)
+    assert (report.problems, report.notes) == ((), ())
+    assert report.vouched == "not signed"
+    assert report.verdict == "consistent; not signed: someone who edits on purpose can make the seals anew"
+    assert {path: path.read_bytes() for path in files(sealed)} == bytes_before
+
+
+def test_a_seal_covers_every_file_but_itself(sealed: FlightFolder) -> None:
+    last = seals.read(sealed).last
+    assert last is not None
+    names = {path.relative_to(sealed.path).as_posix() for path in files(sealed)}
+    assert last.files.keys() == names - {"seals.jsonl"}
+    for name, (size, sha256) in last.files.items():
+        path = sealed.path / name
+        assert (path.stat().st_size, durable.hash_file(path)) == (size, sha256)
+    assert (last.seal, last.why, last.flight) == (2, "geotag", sealed.name)
+
+
+def flips(folder: FlightFolder, count: int, seed: int) -> list[str]:
+    """Single bits flipped at random, over every file in turn; those that nothing named, and unexpected errors."""
+    chosen, unnamed = random.Random(seed), []  # noqa: S311  chances, not secrets
+    paths = files(folder)
+    for number in range(count):
+        path = paths[number % len(paths)]
+        before = path.read_bytes()
+        at, bit = chosen.randrange(len(before)), chosen.randrange(8)
+        path.write_bytes(before[:at] + bytes([before[at] ^ 1 << bit]) + before[at + 1 :])
+        where = f"{path.name}: bit {bit} of byte {at}"
+        try:
+            if not check(folder.path).problems:
+                unnamed.append(where)
+        except Exception as error:  # noqa: BLE001  any error but a finding is what is looked for
+            unnamed.append(f"{where}: {error!r}")
+        for leftover in folder.path.glob("flight.sqlite-*"):
+            leftover.unlink()
+        path.write_bytes(before)
+    assert check(folder.path).problems == ()
+    return unnamed
+
+
+def test_each_flipped_bit_of_any_file_is_named(sealed: FlightFolder) -> None:
+    assert flips(sealed, 200, SEED) == []
+
+
+def test_each_flipped_bit_of_the_ledger_is_named(sealed: FlightFolder) -> None:
+    chosen = random.Random(SEED)  # noqa: S311  chances, not secrets
+    before, unnamed = sealed.ledger.read_bytes(), []
+    places = [*range(100), *(chosen.randrange(len(before)) for _ in range(60))]
+    for at in places:
+        sealed.ledger.write_bytes(before[:at] + bytes([before[at] ^ 1 << chosen.randrange(8)]) + before[at + 1 :])
+        unnamed += [] if check(sealed.path).problems else [at]
+        for leftover in sealed.path.glob("flight.sqlite-*"):
+            leftover.unlink()
+    assert unnamed == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+def test_each_of_many_flipped_bits_is_named(sealed: FlightFolder, seed: int) -> None:
+    assert flips(sealed, 400, seed) == []
+
+
+@dataclass(frozen=True)
+class Attack:
+    name: str
+    do: Callable[[FlightFolder], object]
+    words: str
+
+
+def cut(path: Path, size: int) -> None:
+    os.truncate(path, size)
+
+
+def vacuum(folder: FlightFolder) -> None:
+    with attacked(folder) as db:
+        db.execute("VACUUM")
+
+
+def cut_seal(folder: FlightFolder) -> None:
+    folder.seals.write_bytes(folder.seals.read_bytes().splitlines(keepends=True)[0])
+
+
+def unseal(folder: FlightFolder) -> None:
+    with attacked(folder) as db:
+        db.execute("DELETE FROM facts WHERE key = 'seals'")
+
+
+ATTACKS = [
+    Attack("no seals", lambda f: f.seals.unlink(), "seal 1 is missing"),
+    Attack("the last seal cut off", cut_seal, "seal 2 is missing"),
+    Attack("half a seal", lambda f: cut(f.seals, f.seals.stat().st_size - 20), "is torn"),
+    Attack("garbage for seals", lambda f: f.seals.write_bytes(b"\xff\n\xfe{}[\n"), "line 1 of seals.jsonl was changed"),
+    Attack("deep nesting", lambda f: f.seals.write_bytes(b"[" * 10**5 + b"\n"), "line 1 of seals.jsonl was changed"),
+    Attack("seals that the ledger doesn't tell of", unseal, "the ledger does not tell of seal 2"),
+    Attack("free pages", vacuum, "flight.sqlite was changed since seal 2"),
+    Attack("a sidecar", lambda f: flip(f.frames / "000000.cr2.xmp", 3), "000000.cr2.xmp was changed since seal 2"),
+    Attack("no list", lambda f: (f.path / "geotags/geo.txt").unlink(), "geotags/geo.txt is missing: seal 2 covers it"),
+    Attack("another input", lambda f: (f.path / "inputs/dark.npy").write_bytes(b"x"), "inputs/dark.npy was added"),
+    Attack("a shorter ledger", lambda f: cut(f.ledger, f.ledger.stat().st_size // 2), "damaged"),
+    Attack("an empty ledger", lambda f: cut(f.ledger, 0), "not a dappled ledger"),
+    Attack("a WAL", lambda f: f.ledger.with_name("flight.sqlite-wal").write_bytes(b"x" * 99), "holds 99 bytes"),
+    Attack("another head", lambda f: reseal(f, head="0" * 64), "seal 2 contradicts the chain"),
+    Attack("fewer links", lambda f: reseal(f, links=3), "seal 2 contradicts the chain"),
+    Attack("a frame's digest", lambda f: reseal(f, files={}), "flight.sqlite was changed"),
+    Attack("half a signature", lambda f: reseal(f, key="00000000"), "signed in part"),
+    Attack("another flight's seal", lambda f: reseal(f, flight="20260101T000000Z-00000000"), "is of another flight"),
+]
+
+
+@pytest.mark.parametrize("attack", ATTACKS, ids=lambda attack: attack.name)
+def test_an_attack_is_named(sealed: FlightFolder, attack: Attack) -> None:
+    attack.do(sealed)
+    problems = check(sealed.path).problems
+    assert any(attack.words in problem for problem in problems), problems
+
+
+def test_a_file_of_ones_own_is_named_and_no_fault(sealed: FlightFolder) -> None:
+    (sealed.path / "notes.txt").write_bytes(b"windy")
+    report = check(sealed.path)
+    assert report.problems == ()
+    assert report.notes == ("notes.txt was added since seal 2: no seal covers it",)
+
+
+def test_work_that_was_killed_leaves_rows_that_the_chain_vouches_for(sealed: FlightFolder) -> None:
+    with Ledger(sealed.ledger, LATER) as writer:
+        writer.add_event("opened again", "late tags")
+    (sealed.frames / "000001.cr2.xmp").write_bytes(b"<x:xmpmeta/>")
+    report = check(sealed.path)
+    assert report.problems == ()
+    assert any("opened again after seal 2 (geotag): 1 link of the chain" in note for note in report.notes)
+    with seals.reopened(sealed, LATER, "late tags"):
+        pass
+    assert (check(sealed.path).problems, check(sealed.path).notes) == ((), ())
+    with attacked(sealed) as db:
+        db.execute("UPDATE events SET text = 'else' WHERE number = 1")
+    assert "the row of events 1 was changed since dappled wrote it" in check(sealed.path).problems
+
+
+def test_a_crash_between_announcement_and_seal_is_told_and_sealed_again(
+    sealed: FlightFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def crash(path: Path, data: bytes) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as dying:
+        dying.setattr(durable, "write_file", crash)
+        with pytest.raises(KeyboardInterrupt):
+            seals.seal(sealed, LATER, "late tags")
+    assert any("seal 3 is missing" in problem for problem in check(sealed.path).problems)
+    seals.seal(sealed, LATER, "late tags")
+    report = check(sealed.path)
+    assert report.problems == ()
+    assert report.notes == ("seal 3 was never written: its work was interrupted",)
+
+
+def test_the_next_flight_seals_one_that_was_closed_and_not_sealed(
+    flight: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as dying:
+        dying.setattr(seals, "seal", lambda *_: None)
+        dying.setattr(flight.index, "take_in", lambda *_, **__: [])
+        folder = fly(flight)
+    assert check(folder.path).vouched == "not sealed"
+    recording.begin(folder.path.parent, LATER).close()
+    report = check(folder.path)
+    assert (report.problems, report.vouched) == ((), "not signed")
+    last = seals.read(folder).last
+    assert last is not None
+    assert last.why == "recovered"
+
+
+def test_an_open_flight_is_not_sealed(flight: Recording) -> None:
+    with seals.reopened(flight.folder, LATER, "geotag"):
+        pass
+    seals.seal(flight.folder, LATER, "geotag")
+    assert not flight.folder.seals.exists()
+    assert check(flight.folder.path).vouched == "not sealed"
+
+
+def test_a_flight_without_a_chain_is_sealed_by_later_work(sealed: FlightFolder) -> None:
+    sealed.seals.unlink()
+    without_chain(sealed)
+    assert check(sealed.path).vouched == "no chain"
+    with seals.reopened(sealed, LATER, "geotag"):
+        pass
+    report = check(sealed.path)
+    assert report.problems == ()
+    assert report.vouched == "not signed"
+    with LedgerReader.open(sealed.ledger) as reader:
+        assert seals.announced(reader.facts()) == (1, frozenset())
+
+
+def test_a_key_tells_a_genuine_seal_from_one_made_anew(flights: Path, tmp_path: Path) -> None:
+    key, other = (seal_key.load(key_file(tmp_path, name)) for name in ("seal.key", "other.key"))
+    folder = fly(recording.begin(flights, RecordedClock(START_UTC_NS), seal_key=key))
+    genuine = folder.seals.read_bytes()
+    report = check(folder.path, key)
+    assert (report.problems, report.vouched) == ((), "signed")
+    assert report.verdict == f"intact, sealed with key {key.name}"
+    assert check(folder.path).vouched == check(folder.path, other).vouched == "not verified"
+
+    reseal(folder, why="forged")  # its digests fit; its signature doesn't
+    assert check(folder.path).problems == ()
+    assert check(folder.path, key).problems == (f"the signature of seal 1 is wrong: key {key.name} did not make it",)
+    reseal(folder, key=None, mac=None)
+    assert check(folder.path, key).vouched == "not signed"
+
+    folder.seals.write_bytes(genuine)
+    with seals.reopened(folder, LATER, "geotag"):
+        pass
+    report = check(folder.path, key)
+    assert report.problems == ()
+    assert report.verdict.startswith(f"consistent; signed with key {key.name} up to seal 1, then not signed: ")
+
+
+def test_a_key_is_derived_for_seals_alone(tmp_path: Path) -> None:
+    """RFC 5869 by its own words."""
+    path = key_file(tmp_path)
+    secret = bytes.fromhex(path.read_text().strip())
+    key = seal_key.load(path)
+    extracted = hashlib.sha256()  # HMAC spelled out: H(salt ^ opad, H(salt ^ ipad, key))
+    block = b"dappled".ljust(64, b"\0")
+    inner = hashlib.sha256(bytes(b ^ 0x36 for b in block) + secret).digest()
+    extracted.update(bytes(b ^ 0x5C for b in block) + inner)
+    assert secret not in (key.secret, extracted.digest())
+    block = extracted.digest().ljust(64, b"\0")
+    inner = hashlib.sha256(bytes(b ^ 0x36 for b in block) + b"dappled flight seal 1\x01").digest()
+    assert key.secret == hashlib.sha256(bytes(b ^ 0x5C for b in block) + inner).digest()
+    assert secret.hex() not in repr(key)
+
+
+def test_a_key_that_others_can_read_is_refused(tmp_path: Path) -> None:
+    path = key_file(tmp_path)
+    assert path.stat().st_mode & 0o777 == 0o600
+    with pytest.raises(FlightError, match="exists already"):
+        seal_key.make(path)
+    path.chmod(0o640)
+    with pytest.raises(FlightError, match="chmod 600"):
+        seal_key.load(path)
+    path.chmod(0o600)
+    path.write_text("short")
+    with pytest.raises(FlightError, match="64 hexadecimal digits"):
+        seal_key.load(path)
+    with pytest.raises(FlightError, match="dappled keys seal"):
+        seal_key.load(tmp_path / "missing")
+
+
+def test_a_flight_is_sealed_beside_a_reader_and_under_another_name(sealed: FlightFolder) -> None:
+    copy = FlightFolder(sealed.path.with_name("renamed"))
+    shutil.copytree(sealed.path, copy.path)
+    with LedgerReader.open(copy.ledger) as reader:
+        assert reader.shots()
+        with seals.reopened(copy, LATER, "geotag"):
+            pass
+        assert check(copy.path).problems == ()
+    assert (check(copy.path).problems, check(copy.path).notes) == ((), ())
+
+
+def test_a_ledger_that_can_not_be_folded_is_not_sealed(sealed: FlightFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A seal of a file that SQLite has still to change would be wrong later."""
+    monkeypatch.setattr("dappled.flight.ledger.BUSY_S", 0.05)
+    with attacked(sealed) as reader, Ledger(sealed.ledger, LATER) as writer:
+        writer.add_event("camera", "another row, in the WAL")
+        reader.execute("BEGIN")
+        reader.execute("SELECT count(*) FROM events").fetchone()
+        with pytest.raises(FlightError, match="another program holds it"):
+            seals.seal(sealed, LATER, "late tags")
+    seals.seal(sealed, LATER, "late tags")
+    assert check(sealed.path).problems == ()
