@@ -19,7 +19,7 @@ from starlette.types import ASGIApp
 from dappled.daemon.console import placement
 from dappled.daemon.console.access import Access
 from dappled.daemon.console.app import ConsoleApp
-from dappled.daemon.console.connection import CONNECTIONS, Connection
+from dappled.daemon.console.connection import BACKLOG, CONNECTIONS, Connection
 from dappled.daemon.console.feed import Feed, Hub
 from dappled.daemon.console.process import DaemonChannel
 from dappled.daemon.console.studio import Studio
@@ -77,6 +77,7 @@ def configuration(served: ASGIApp) -> uvicorn.Config:
         http=Connection,
         loop="asyncio",
         server_header=False,
+        backlog=BACKLOG,
         timeout_keep_alive=10,
         timeout_graceful_shutdown=1,
         limit_concurrency=2 * CONNECTIONS,  # twice, because the tasks of closed ones end a moment later

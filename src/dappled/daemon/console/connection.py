@@ -10,6 +10,7 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 CONNECTIONS = 64  # with more, an idle one is closed
+BACKLOG = 32  # asyncio accepts so many at once, before the limits below see any of them
 PER_ADDRESS = 24  # a browser opens at most six; some machines have a few pages open, and a virtual globe
 REQUEST_S = 10.0  # from the connection, or the last answer, to a whole request
 UNREAD_S = 30.0  # for a page that does not read

@@ -121,10 +121,11 @@ class Publisher:
         """
         self._flight, self._answer = flight, answer
         self._loop.start()
+        self._sockets.start()
 
     def dead_threads(self) -> list[str]:
-        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
-        return self._loop.dead_threads()
+        """The threads that have ended without having been stopped: never, unless there is a bug."""
+        return [*self._loop.dead_threads(), *self._sockets.dead_threads()]
 
     def publish(self, topic: str, facts: Mapping[str, Any], body: Any = None) -> None:
         """Queue a message; `seq`, `dropped` and the rest of the envelope are added when it is sent. Never waits.

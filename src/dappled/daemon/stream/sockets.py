@@ -19,7 +19,9 @@ from zmq.utils.monitor import recv_monitor_message
 
 from dappled.daemon.stream import curve
 from dappled.daemon.stream.curve import ServerKeys
+from dappled.daemon.stream.relay import TcpRelay
 from dappled.daemon.stream.wire import WireError
+from dappled.refusals import RefusalLog
 from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
@@ -31,17 +33,20 @@ ROOM_BYTES = (
 _HEARTBEAT_MS, _DEAF_MS = 5_000, 30_000  # a peer that reads nothing for so long is disconnected; it may come again
 _PATH_BYTES = 107  # of sockaddr_un
 _BEGIN_S = 10.0
+_OWN_MODE = 0o600
 
 
 class Sockets:
     """Opens sockets of one context and closes them all. `keys` turn CURVE on for tcp, `mode` is the file mode of ipc
-    sockets. One thread calls it."""
+    sockets. A process of its own listens on tcp, see `TcpRelay`. One thread calls it."""
 
     def __init__(self, keys: ServerKeys | None, mode: int) -> None:
         self._keys, self._mode = keys, mode
         self._context = niced_context()
         self._bound: list[str] = []
         self._sockets: list[zmq.Socket[Any]] = []
+        self._refusals = RefusalLog(log)
+        self._relay = TcpRelay(self._refusals)
         self.wrong_keys = 0
         self._monitors: list[zmq.Socket[Any]] = []
         self._judge: zmq.Socket[Any] | None = None
@@ -71,12 +76,29 @@ class Sockets:
         try:
             for endpoint in filter(None, wanted):
                 prepare(endpoint, keyed=self._keys is not None)
-                bind(one, endpoint, keys=self._keys, mode=self._mode)
-                self._bound.append(endpoint)
+                if endpoint.startswith("ipc://"):
+                    bind(one, endpoint, mode=self._mode)
+                    self._bound.append(endpoint)
+                else:
+                    self._bind_relayed(one, endpoint)
         except WireError:
             self.close(0.0)
             raise
         return one
+
+    def _bind_relayed(self, one: zmq.Socket[Any], endpoint: str) -> None:
+        inner = self._relay.listen(endpoint)
+        prepare(inner)
+        bind(one, inner, keys=self._keys, mode=_OWN_MODE)
+        self._bound.append(inner)
+
+    def start(self) -> None:
+        """Let viewers in over tcp."""
+        self._relay.start()
+
+    def dead_threads(self) -> list[str]:
+        """See `Loop.dead_threads`."""
+        return self._relay.dead_threads()
 
     def let_in(self) -> None:
         """Answer ZeroMQ about the keys of new peers, and give new readers more kernel memory."""
@@ -94,8 +116,7 @@ class Sockets:
                 log.info("%s connected with its key", name)
                 continue
             self.wrong_keys += 1
-            if self.wrong_keys == 1 or self.wrong_keys % 100 == 0:  # such a peer keeps trying
-                log.warning("a peer whose key is not in publish.clients was refused (%d times)", self.wrong_keys)
+            self._refusals.refused("a viewer", "its key is not in publish.clients")
 
     def close(self, linger_s: float) -> None:
         """Close all; messages already sent have this long to go out."""
@@ -110,6 +131,7 @@ class Sockets:
         if self._judge is not None:
             self._judge.close(linger=0)
         self._context.term()
+        self._relay.stop()
 
 
 def prepare(endpoint: str, *, keyed: bool = False) -> None:
@@ -144,26 +166,21 @@ def is_loopback(host: str) -> bool:
 
 
 def bind(one: zmq.Socket[Any], endpoint: str, *, keys: ServerKeys | None = None, mode: int = 0o660) -> None:
-    """Bind a socket to an endpoint that `prepare` has checked; `keys` hold for tcp, `mode` for an ipc socket's file.
+    """Bind a socket to an ipc endpoint that `prepare` has checked. `keys` turn CURVE on, `mode` is its file's.
 
     Raises WireError where it is in use or can't be bound.
     """
-    ipc = endpoint.startswith("ipc://")
-    if ipc and _answers(endpoint.removeprefix("ipc://")):
+    path = endpoint.removeprefix("ipc://")
+    if _answers(path):
         raise WireError(f"{endpoint} is in use by another program; stop it, or choose another endpoint")
-    one.curve_server = keys is not None and not ipc
-    if keys is not None and not ipc:
+    one.curve_server = keys is not None
+    if keys is not None:
         one.curve_secretkey, one.curve_publickey = keys.own.secret, keys.own.public
-    if not ipc and "[" in endpoint:
-        one.setsockopt(zmq.IPV6, 1)
     try:
         one.bind(endpoint)
     except zmq.ZMQError as error:
-        if error.errno == zmq.EADDRINUSE:
-            raise WireError(f"{endpoint} is in use by another program; stop it, or choose another endpoint") from None
         raise WireError(f"{endpoint} can't be bound ({error.strerror}); choose another endpoint") from None
-    if ipc:  # it was 0755 until now: no other user could connect
-        Path(endpoint.removeprefix("ipc://")).chmod(mode)
+    Path(path).chmod(mode)  # it was 0755 until now: no other user could connect
 
 
 def niced_context() -> zmq.Context[Any]:
