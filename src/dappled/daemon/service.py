@@ -24,6 +24,7 @@ from dappled.config.schema import ConfigError
 from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol.camera_status import ReportedCamera
 from dappled.daemon.camera_protocol.component import Component
+from dappled.daemon.camera_protocol.earlier_outcomes import IndexedOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters
 from dappled.daemon.console import process as console_process
@@ -184,6 +185,7 @@ class Service:
             clock,
             self._parameters(camera, names, decodes=recipe is not None),
             model=self._control,
+            earlier=IndexedOutcomes(recording.index),
             feedback_is_shot=settings.mavlink.feedback_is_shot,
         )
         self._decoder = None if recipe is None else DecodeProcess(recipe, clock=clock)

@@ -50,7 +50,8 @@ class ShotEvents(Observer):
     def tagged(self, pending: PendingShot) -> None:
         """See Observer."""
         captured = captured_shot(pending, self._utc.utc_ns)
-        self._component.announce(captured)
+        if self._component.announce(captured):
+            self._note_reported(captured.index)
         if not captured.ok:
             self._component.say(f"image {pending.shot.index} failed: {pending.problem}", mavlink.MAV_SEVERITY_ERROR)
         zoomed = None if pending.tag is None else self._camera.zoomed(pending.tag.focal_length_mm)
@@ -84,6 +85,13 @@ class ShotEvents(Observer):
         self.doubt = battery_doubt(change.settings)
         self._component.settings_changed(change.refused)
         self._outside.settings_changed(change)
+
+    def _note_reported(self, index: int) -> None:
+        """Remember over a restart that the ground station was sent this outcome."""
+        try:
+            self._recording.index.note_reported(index)
+        except DappledError as error:
+            report(log, "index", error)
 
     def _record_camera(self, camera: Identity) -> None:
         """Write down which camera it is: the first one, or another."""

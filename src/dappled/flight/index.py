@@ -1,7 +1,8 @@
 """The index over all flights: the flight and the frame of each image index.
 
 The camera's image index goes on over restarts. The index is made from the flights' own ledgers and can be rebuilt from
-them at any time.
+them at any time. It alone remembers which shots' outcomes were reported to the ground station: an index that is rebuilt
+has nothing to report.
 """
 
 from __future__ import annotations
@@ -37,6 +38,15 @@ CREATE TABLE images (
 ) STRICT;
 COMMIT;
 """
+# Tables that an index of this version may lack. The shots whose outcomes were reported stand in the first until their
+# flight is sealed; the others stand in the second from then on. What is in an index without the tables was reported.
+_REPORTS = """
+BEGIN IMMEDIATE;
+CREATE TABLE reported (idx INTEGER PRIMARY KEY) STRICT;
+CREATE TABLE unreported (idx INTEGER PRIMARY KEY, counted INTEGER NOT NULL DEFAULT 0) STRICT;
+INSERT INTO reported SELECT idx FROM images WHERE flight IN (SELECT name FROM flights WHERE NOT sealed);
+COMMIT;
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +78,8 @@ class ImageIndex(Database):
         self._db.execute("PRAGMA synchronous=NORMAL")  # the ledgers are the truth: a lost row is found again there
         if empty:
             self._db.executescript(_SCHEMA)
+        if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'reported'").fetchone():
+            self._db.executescript(_REPORTS)
 
     def _sentence(self, error: sqlite3.Error | UnicodeDecodeError) -> FlightError:
         if getattr(error, "sqlite_errorname", "") == "SQLITE_CANTOPEN":
@@ -124,8 +136,11 @@ class ImageIndex(Database):
         return {row[0] for row in self._rows("SELECT name FROM flights WHERE sealed")}
 
     def take_in(self, folder: FlightFolder, *, seal: bool) -> list[str]:
-        """Index all shots of a flight from its ledger. `seal`: no more shots will come. Returns sentences."""
+        """Index all shots of a flight from its ledger. `seal`: no more shots will come. Returns sentences.
+
+        A sealed flight that this index saw begin, and that had a MAVLink link, leaves its unreported shots behind."""
         problems: list[str] = []
+        reports = folder.name in self.flights() and folder.telemetry.exists() and folder.telemetry.stat().st_size > 0
         with LedgerReader.open(folder.ledger) as ledger:
             correction_ns, began_utc_ns = ledger.utc_correction_ns(), ledger.facts().get("began_utc_ns")
             start_utc_ns = None if correction_ns is None or began_utc_ns is None else began_utc_ns + correction_ns
@@ -138,9 +153,42 @@ class ImageIndex(Database):
                 except FlightError as error:
                     problems.append(str(error))
         if seal:
-            highest = highest_in(folder)
-            self._rows("UPDATE flights SET sealed = 1, highest = ? WHERE name = ?", highest, folder.name)
+            self._seal(folder, reports=reports)
         return problems
+
+    def _seal(self, folder: FlightFolder, *, reports: bool) -> None:
+        """Mark a flight as sealed, and in the same transaction its shots that were not reported."""
+        highest = highest_in(folder)
+        with self._lock, self._speaking(), self._db:
+            self._db.execute("BEGIN IMMEDIATE")
+            if reports:
+                self._db.execute(
+                    "INSERT OR IGNORE INTO unreported (idx) SELECT idx FROM images WHERE flight = ? "
+                    "AND idx NOT IN (SELECT idx FROM reported)",
+                    (folder.name,),
+                )
+            self._db.execute(
+                "DELETE FROM reported WHERE idx IN (SELECT idx FROM images WHERE flight = ?)", (folder.name,)
+            )
+            self._db.execute("UPDATE flights SET sealed = 1, highest = ? WHERE name = ?", (highest, folder.name))
+
+    def note_reported(self, index: int) -> None:
+        """The outcome of a shot was sent to the ground station. Survives the death of the process, not always a power
+        cut: then it is sent once more."""
+        self._rows("INSERT OR IGNORE INTO reported VALUES (?)", index)
+
+    def unreported(self) -> dict[int, bool]:
+        """The shots of sealed flights whose outcomes were not reported, in their order, and whether a text to the pilot
+        has counted each."""
+        return {index: bool(said) for index, said in self._rows("SELECT idx, counted FROM unreported ORDER BY idx")}
+
+    def note_counted(self) -> None:
+        """A text to the pilot has counted all unreported shots."""
+        self._rows("UPDATE unreported SET counted = 1")
+
+    def note_late_report(self, index: int) -> None:
+        """The outcome of a shot of a sealed flight was sent to the ground station."""
+        self._rows("DELETE FROM unreported WHERE idx = ?", index)
 
     def next_index(self) -> int:
         """The image index of the next shot, from 0: above everything in the index, and above what the ledger, journal

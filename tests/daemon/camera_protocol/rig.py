@@ -24,6 +24,19 @@ from dappled.flight.layout import DiskSpace
 from tests.daemon.fakes import eventually
 
 
+class NothingEarlier:
+    """No outcome of an earlier flight is left to report."""
+
+    def summary(self) -> None:
+        """Nothing was lost."""
+
+    def due(self, now_ns: int) -> tuple[()]:
+        return ()
+
+    def sent(self, index: int) -> None:
+        """Never: nothing is due."""
+
+
 class Camera:
     """A camera that has each frame `exposure_s` after the wish. `fails` are indices that fail; `hung`: none ever comes.
     `settled`: it belongs to system 1 without having listened for autopilots.
@@ -61,7 +74,15 @@ class Camera:
         self.shutter = Shutter(self, self.clock, next_index=first, capacity=capacity)
         autopilot = OwnAutopilot(self.links.sender, self.clock)
         autopilot.identity.settled = settled
-        self.component = Component(self.links.sender, autopilot, self.shutter, self.clock, Parameters(self), model=self)
+        self.component = Component(
+            self.links.sender,
+            autopilot,
+            self.shutter,
+            self.clock,
+            Parameters(self),
+            model=self,
+            earlier=NothingEarlier(),
+        )
         self._worker = threading.Thread(target=self._work)
 
     def __enter__(self) -> Camera:

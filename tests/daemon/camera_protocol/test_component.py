@@ -13,12 +13,14 @@ from dappled.clock import RecordedClock
 from dappled.config.settings import PoseSettings
 from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured
 from dappled.daemon.camera_protocol.component import Component
+from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters, code
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Setting, SettingName, check_change
 from dappled.drivers.mavlink import Message, Packet, mavlink, pack
 from dappled.flight.layout import DiskSpace
+from tests.daemon.camera_protocol.rig import NothingEarlier
 from tests.daemon.fakes import FakeSink
 
 NAN = math.nan
@@ -47,7 +49,9 @@ class Body:
 class Rig:
     """A component whose links are a list."""
 
-    def __init__(self, *, feedback_is_shot: bool = False, capacity: int = 8) -> None:
+    def __init__(
+        self, *, feedback_is_shot: bool = False, capacity: int = 8, earlier: EarlierOutcomes | None = None
+    ) -> None:
         self.body = Body()
         self.decode = "on"
         own = OwnParameter("LF_DECODE", "Decode in flight", lambda: self.decode, ("on", "off"), self._decode)
@@ -63,7 +67,14 @@ class Rig:
         knobs = Parameters(self.body, (own,))
         self.autopilot = OwnAutopilot(self, self.clock)
         self.component = Component(
-            self, self.autopilot, self.shutter, self.clock, knobs, model=self, feedback_is_shot=feedback_is_shot
+            self,
+            self.autopilot,
+            self.shutter,
+            self.clock,
+            knobs,
+            model=self,
+            earlier=earlier or NothingEarlier(),
+            feedback_is_shot=feedback_is_shot,
         )
 
     @property

@@ -32,7 +32,7 @@ def test_a_ground_station_process_gets_every_photograph_or_hears_that_it_failed(
 
 
 def test_the_client_reads_what_the_camera_is_and_asks_again_for_a_lost_report(camera: Camera) -> None:
-    camera.component.announce = lambda captured: None  # type: ignore[method-assign]  # every report is lost
+    camera.component.announce = lambda captured: False  # type: ignore[method-assign]  # every report is lost
     with GroundClient(camera.url) as client:
         assert client.find_camera() == (1, 100)
         information = client.request(259)

@@ -20,6 +20,7 @@ from dappled.daemon.camera_protocol.commands import (
     CommandAnswer,
     MessageIntervals,
 )
+from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
 from dappled.daemon.camera_protocol.ftp_server import FtpServer
 from dappled.daemon.camera_protocol.own_autopilot import Links, OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import ParameterReply, Parameters, ParameterServer
@@ -48,11 +49,12 @@ class Component:
         parameters: Parameters,
         *,
         model: CameraModel,
+        earlier: EarlierOutcomes,
         feedback_is_shot: bool = False,
     ) -> None:
         self._links, self._autopilot, self._identity = links, autopilot, autopilot.identity
         self._shutter, self._clock = shutter, clock
-        self._model, self._feedback_is_shot = model, feedback_is_shot
+        self._model, self._earlier, self._feedback_is_shot = model, earlier, feedback_is_shot
         self._status = CameraStatus(model, shutter, parameters, clock, component_id=links.component_id)
         self._intervals = MessageIntervals()
         self._commands = CameraCommands(shutter, clock, self._status, parameters, self._intervals)
@@ -186,10 +188,11 @@ class Component:
 
     # what goes out
 
-    def announce(self, captured: Captured) -> None:
-        """Report a shot that ended, its frame safe or lost, on all links, once."""
-        self._links.send(image_captured(captured, self._status.boot_ms()))
+    def announce(self, captured: Captured) -> bool:
+        """Report a shot that ended, its frame safe or lost, on all links, once. False where no link took it."""
+        taken = self._links.send(image_captured(captured, self._status.boot_ms()))
         self.state_changed()
+        return taken
 
     def state_changed(self) -> None:
         """CAMERA_CAPTURE_STATUS may have changed: send it with the next tick."""
@@ -212,8 +215,8 @@ class Component:
         return self._stations.new_one(self._clock.monotonic_ns())
 
     def tick(self, *, healthy: bool = True) -> None:
-        """Send what is due by now: time requests, stream requests, status, periodic messages, old images; and, while
-        the daemon is `healthy`, the heartbeat."""
+        """Send what is due by now: time requests, stream requests, status, periodic messages, old images, outcomes of
+        earlier flights; and, while the daemon is `healthy`, the heartbeat."""
         now_ns = self._clock.monotonic_ns()
         if not self._identity.decide(now_ns):
             return
@@ -240,6 +243,8 @@ class Component:
         for link, reply in self._parameters.settled(now_ns):
             self._send_reply(reply, link)
         self._send_old_images()
+        if self._stations.listening(now_ns):
+            self._send_earlier_outcomes(now_ns)
 
     def _send_reply(self, reply: ParameterReply, link: int) -> None:
         for message in reply.messages:
@@ -260,6 +265,13 @@ class Component:
                 self.say(f"image {index} is in none of the flights here, or has not ended yet")
             else:
                 self._links.send(image_captured(captured, self._status.boot_ms()), link)
+
+    def _send_earlier_outcomes(self, now_ns: int) -> None:
+        if lost := self._earlier.summary():
+            self.say(lost, mavlink.MAV_SEVERITY_ERROR)
+        for captured in self._earlier.due(now_ns):
+            if self.announce(captured):
+                self._earlier.sent(captured.index)
 
 
 _HANDLERS: dict[str, Callable[[Component, Packet], None]] = {

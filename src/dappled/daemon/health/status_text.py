@@ -14,6 +14,7 @@ PIECE_BYTES = 50
 LONGEST_BYTES = 4 * PIECE_BYTES
 AGAIN_NS = 10 * 10**9
 AWAY_NS = 60 * 10**9
+LISTENS_NS = 5 * 10**9
 _REMEMBERED = 32
 
 
@@ -75,6 +76,11 @@ class GroundStations:
                 del self._heard_ns[next(iter(self._heard_ns))]
         if before_ns is None or now_ns - before_ns > AWAY_NS:
             self._due_ns = now_ns + AGAIN_NS  # `PilotMessages` would leave out what was sent a moment ago
+
+    def listening(self, now_ns: int) -> bool:
+        """Whether a ground station was heard in the last five seconds."""
+        with self._lock:
+            return any(now_ns - heard_ns <= LISTENS_NS for heard_ns in self._heard_ns.values())
 
     def new_one(self, now_ns: int) -> bool:
         """Whether a new one listens since a while; True once for each."""
