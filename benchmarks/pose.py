@@ -28,7 +28,7 @@ from dappled.daemon.navigation.samples import AttitudeSample, PositionSample, at
 from dappled.daemon.navigation.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
 from dappled.decode.geometry import Pose, metres_per_radian, turn_rad
 from dappled.drivers.mavlink import Message, PacketParser, mavlink
-from dappled.flight import logs
+from dappled.flight import log_reading
 from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
 from dappled.mocks.autopilot.path import FlightPath
 
@@ -144,7 +144,7 @@ def _samples(log: File) -> tuple[list[PositionSample], list[AttitudeSample]]:
     decode = PacketParser()
     positions: list[PositionSample] = []
     attitudes: list[AttitudeSample] = []
-    for number, stamp_us, raw in logs.read_telemetry(log):
+    for number, stamp_us, raw in log_reading.read_telemetry(log):
         message = decode(raw)
         if message is None or message.get_srcComponent() != 1:
             continue

@@ -26,7 +26,6 @@ UNUSED = {
 # What may make a thread besides `workers.Loop`, and why.
 THREADS = {
     "workers.py": "`Loop` is one, and `share` joins its helpers without a limit of time",
-    "flight/logs.py": "closing a log waits for its last fdatasync without a limit of time, which `Loop.stop` has",
 }
 
 

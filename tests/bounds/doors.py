@@ -40,7 +40,7 @@ from dappled.decode.geometry import camera_pose
 from dappled.drivers.child_process import ProcessChannel
 from dappled.drivers.raw import calibration_files, reading
 from dappled.errors import DappledError
-from dappled.flight import FlightError, layout, logs
+from dappled.flight import FlightError, layout, log_reading
 from dappled.products import opened
 from dappled.products.batch.batch import Manifest
 from dappled.products.exports import mask_files, view_folders
@@ -107,7 +107,7 @@ def _doors(stack: contextlib.ExitStack) -> dict[str, Callable[[Path], object]]:
         "calibration": calibration_files.load,
         "calibration-npz": calibration_files.load,
         "facts": lambda path: layout.read_facts(layout.FlightFolder(path)),
-        "journal": logs.read_journal,
+        "journal": log_reading.read_journal,
         "telemetry": lambda path: list(replay._packets(path)),
         "dng": _frame,
         "lfp": _frame,

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.flight import Cause, FlightError, Shot, logs
+from dappled.flight import Cause, FlightError, Shot, log_reading, logs
 from dappled.flight.logs import Flusher
 from tests.flight.makers import shot
 
@@ -34,12 +34,12 @@ def test_shots_come_back_and_a_torn_end_is_reported(
     for each in shots:
         journal.note(each)
     journal.close()
-    assert logs.read_journal(path) == logs.JournalContents(tuple(shots), ())
+    assert log_reading.read_journal(path) == log_reading.JournalContents(tuple(shots), ())
 
     torn = torn.replace(b"\n", b"")
     with path.open("ab") as file:
         file.write(torn)
-    found = logs.read_journal(path)
+    found = log_reading.read_journal(path)
     assert found.shots == tuple(shots)
     assert len(found.problems) == (1 if torn else 0)
 
@@ -47,14 +47,14 @@ def test_shots_come_back_and_a_torn_end_is_reported(
     new = shot(2**31 + 1)
     again.note(new)
     again.close()
-    assert logs.read_journal(path).shots == (*shots, new)
+    assert log_reading.read_journal(path).shots == (*shots, new)
 
 
 @given(st.binary(max_size=300))
 def test_any_bytes_are_read_without_a_crash(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
     path = tmp_path_factory.mktemp("journal") / "shots.jsonl"
     path.write_bytes(data)
-    found = logs.read_journal(path)
+    found = log_reading.read_journal(path)
     lines = data.split(b"\n")
     assert len(found.shots) + len(found.problems) == len(lines) - (lines[-1] == b"")
 
@@ -73,7 +73,7 @@ def test_any_bytes_are_read_without_a_crash(tmp_path_factory: pytest.TempPathFac
 def test_a_line_that_is_not_a_shot_is_reported(tmp_path: Path, line: bytes) -> None:
     path = tmp_path / "shots.jsonl"
     path.write_bytes(line + b"\n")
-    assert logs.read_journal(path) == logs.JournalContents((), (f"line 1 of {path} is not a shot",))
+    assert log_reading.read_journal(path) == log_reading.JournalContents((), (f"line 1 of {path} is not a shot",))
 
 
 @pytest.mark.parametrize("index", ["9" * 26, "9" * 5000, "[" * 100_000])
@@ -81,7 +81,7 @@ def test_a_number_beyond_64_bits_is_no_shot(tmp_path: Path, index: str) -> None:
     path = tmp_path / "shots.jsonl"
     line = '{"cause":{"kind":"k","sequence":null,"source":"s"},"index":%s,"wished_monotonic_ns":1,"wished_utc_ns":1}\n'
     path.write_text(line % "7" + line % index)
-    found = logs.read_journal(path)
+    found = log_reading.read_journal(path)
     assert [shot.index for shot in found.shots] == [7]
     assert found.problems == (f"line 2 of {path} is not a shot",)
 
@@ -92,13 +92,15 @@ def test_a_shot_noted_twice_is_told(tmp_path: Path) -> None:
     journal.note(shot(1))
     journal.note(shot(1))
     journal.close()
-    assert logs.read_journal(path) == logs.JournalContents((shot(1),), (f"line 2 of {path} notes shot 1 again",))
+    assert log_reading.read_journal(path) == log_reading.JournalContents(
+        (shot(1),), (f"line 2 of {path} notes shot 1 again",)
+    )
 
 
 def test_no_journal_is_an_empty_one(tmp_path: Path) -> None:
-    assert logs.read_journal(tmp_path / "missing") == logs.JournalContents((), ())
+    assert log_reading.read_journal(tmp_path / "missing") == log_reading.JournalContents((), ())
     with pytest.raises(FlightError, match="is a folder"):
-        logs.read_journal(tmp_path)
+        log_reading.read_journal(tmp_path)
 
 
 def test_a_note_is_one_write_and_reaches_the_disk_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,7 +143,7 @@ def test_a_note_that_the_disk_refuses_raises(tmp_path: Path, monkeypatch: pytest
     monkeypatch.undo()
     journal.note(shot(4))
     journal.close()
-    assert logs.read_journal(tmp_path / "shots.jsonl").shots == (shot(4),)
+    assert log_reading.read_journal(tmp_path / "shots.jsonl").shots == (shot(4),)
 
 
 def test_what_is_noted_after_the_end_gets_into_no_other_file(tmp_path: Path) -> None:
@@ -175,7 +177,7 @@ def test_a_note_survives_the_process(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=False, timeout=60)
     assert done.returncode == -9
-    assert logs.read_journal(path).shots == (shot(5),)
+    assert log_reading.read_journal(path).shots == (shot(5),)
 
 
 def test_bytes_written_while_the_disk_was_busy_are_synced_at_the_end(
@@ -200,7 +202,7 @@ def test_bytes_written_while_the_disk_was_busy_are_synced_at_the_end(
         flusher.poke()
         end = threading.Thread(target=flusher.close)
         end.start()
-        assert flusher._closing.wait(DEADLINE_S)  # from here on `close` only waits
+        assert flusher._loop.stopping.wait(DEADLINE_S)  # from here on `close` only waits
         go_on.set()
         end.join(DEADLINE_S)
         assert not end.is_alive()

@@ -4,14 +4,16 @@ import errno
 import hashlib
 import os
 import threading
+import time
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.flight import FlightError, logs
-from dappled.flight.logs import TelemetryLog, packet_length, split
+from dappled.flight import FlightError, log_reading
+from dappled.flight.log_reading import split
+from dappled.flight.logs import BLOCK_BYTES, TelemetryLog, packet_length
 from tests.flight.makers import logged, mavlink_1, mavlink_2
 
 PACKETS = st.builds(mavlink_1, st.binary(max_size=255), st.integers(0, 255)) | st.builds(
@@ -27,9 +29,9 @@ def test_what_is_logged_is_read(tmp_path_factory: pytest.TempPathFactory, record
     assert [log.append(*record) for record in records] == list(range(len(records)))
     summary = log.close()
     problems: list[str] = []
-    assert list(logs.read_telemetry(path, problems.append)) == [(n, *record) for n, record in enumerate(records)]
+    assert list(log_reading.read_telemetry(path, problems.append)) == [(n, *record) for n, record in enumerate(records)]
     assert problems == []
-    assert summary == logs.summarise(path)
+    assert summary == log_reading.summarise(path)
     assert summary.sha256 == hashlib.sha256(b"".join(logged(*record) for record in records)).hexdigest()
 
 
@@ -100,7 +102,7 @@ def test_threads_share_the_log(tmp_path: Path) -> None:
         thread.join()
     assert sorted(numbers) == list(range(600))
     summary = log.close()
-    assert logs.summarise(log.path) == summary
+    assert log_reading.summarise(log.path) == summary
 
 
 @pytest.mark.parametrize("fault", ["ENOSPC", "short"])
@@ -121,9 +123,9 @@ def test_a_full_disk_uses_up_no_number(tmp_path: Path, monkeypatch: pytest.Monke
     assert log.append(3, mavlink_1(b"c")) == 1
     summary = log.close()
     problems: list[str] = []
-    assert [stamp for _, stamp, _ in logs.read_telemetry(log.path, problems.append)] == [1, 3]
+    assert [stamp for _, stamp, _ in log_reading.read_telemetry(log.path, problems.append)] == [1, 3]
     assert problems == []
-    assert logs.summarise(log.path) == summary
+    assert log_reading.summarise(log.path) == summary
 
 
 def test_a_torn_record_that_can_not_be_cut_at_once_is_cut_before_the_next(
@@ -147,8 +149,8 @@ def test_a_torn_record_that_can_not_be_cut_at_once_is_cut_before_the_next(
     monkeypatch.undo()
     assert log.append(3, mavlink_1(b"c")) == 1
     summary = log.close()
-    assert [stamp for _, stamp, _ in logs.read_telemetry(log.path)] == [1, 3]
-    assert logs.summarise(log.path) == summary
+    assert [stamp for _, stamp, _ in log_reading.read_telemetry(log.path)] == [1, 3]
+    assert log_reading.summarise(log.path) == summary
 
 
 def test_what_is_logged_after_the_end_gets_into_no_other_file(tmp_path: Path) -> None:
@@ -159,25 +161,68 @@ def test_what_is_logged_after_the_end_gets_into_no_other_file(tmp_path: Path) ->
     with (tmp_path / "other").open("wb"), pytest.raises(FlightError, match=told):  # it is given the log's descriptor
         log.append(2, mavlink_1(b"b"))
     assert (tmp_path / "other").read_bytes() == b""
-    assert log.close() == logs.summarise(log.path) == summary
+    assert log.close() == log_reading.summarise(log.path) == summary
 
 
 def test_faults_of_the_file_are_told(tmp_path: Path) -> None:
     log = TelemetryLog(tmp_path / "telemetry.tlog")
     log.close()
-    assert list(logs.read_telemetry(log.path)) == []
+    assert list(log_reading.read_telemetry(log.path)) == []
     with pytest.raises(FlightError, match="in the way"):
         TelemetryLog(log.path)
     with pytest.raises(FlightError, match="does not exist"):
-        list(logs.read_telemetry(tmp_path / "missing"))
+        list(log_reading.read_telemetry(tmp_path / "missing"))
     with pytest.raises(FlightError, match="is a folder"):
-        list(logs.read_telemetry(tmp_path))
+        list(log_reading.read_telemetry(tmp_path))
 
 
 def test_a_real_flight_reads_but_for_its_torn_end(shared_data: Path) -> None:
     problems: list[str] = []
     path = shared_data / "telemetry" / "dronekit-flight.tlog"
-    stamps = [stamp for _, stamp, _ in logs.read_telemetry(path, problems.append)]
+    stamps = [stamp for _, stamp, _ in log_reading.read_telemetry(path, problems.append)]
     assert problems == [f"{path}: 19 bytes at the end are not telemetry and were skipped"]
     assert len(stamps) > 10_000
     assert round((stamps[-1] - stamps[0]) / 1e6) == 1377
+
+
+def test_a_block_counts_once_it_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A link to bytes that a power cut may take would look like damage."""
+    may, synced, fdatasync = threading.Event(), threading.Event(), os.fdatasync
+
+    def slow(fd: int) -> None:
+        assert may.wait(30)
+        fdatasync(fd)
+        synced.set()
+
+    monkeypatch.setattr(os, "fdatasync", slow)
+    log = TelemetryLog(tmp_path / "telemetry.tlog", flush_interval_s=0.01)
+    packet = mavlink_2(b"x" * 200)
+    while log.append(1, packet) * (len(packet) + 8) < 3 * BLOCK_BYTES:
+        pass
+    assert log.blocks(0) == []
+    may.set()
+    assert synced.wait(30)
+    deadline = time.monotonic() + 30
+    while len(found := log.blocks(0)) < 3 and time.monotonic() < deadline:
+        pass
+    assert [block.start for block in found] == [0, found[0].end, found[1].end]
+    data = log.path.read_bytes()
+    for block in found:
+        assert block.end - block.start >= BLOCK_BYTES
+        assert hashlib.sha256(data[block.start : block.end]).hexdigest() == block.sha256
+    assert log.blocks(2) == found[2:]
+    log.close()
+
+
+def test_a_log_that_could_not_be_flushed_has_no_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(fd: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(os, "fdatasync", broken)
+    log = TelemetryLog(tmp_path / "telemetry.tlog", flush_interval_s=0.01)
+    packet = mavlink_2(b"x" * 200)
+    while log.append(1, packet) * (len(packet) + 8) < 2 * BLOCK_BYTES:
+        pass
+    log.close()
+    assert log.problem is not None
+    assert log.blocks(0) == []

@@ -21,6 +21,7 @@ from dappled.flight import (
     Stray,
     flight_report,
     layout,
+    log_reading,
     logs,
     recording,
     recovery,
@@ -142,7 +143,7 @@ def test_a_shot_that_only_the_ledger_kept_is_noted_again(flights: Path, flight: 
     crash(flight)
     flight.folder.journal.write_bytes(b'{"torn')  # a power cut took what was not flushed
     begin_later(flights).close()
-    assert logs.read_journal(flight.folder.journal).shots == (shot(0),)
+    assert log_reading.read_journal(flight.folder.journal).shots == (shot(0),)
     assert check(flight.folder.path).problems == ()
 
 

@@ -48,7 +48,7 @@ def digest(record: Pose | Tag | Mapping[str, Any]) -> str:
 
 def json_array(values: Sequence[Column]) -> str:
     """Values of a row, or its primary key, as SQLite's json_array() gives them."""
-    return json.dumps(list(values), separators=(",", ":"), ensure_ascii=False, default=_hex)
+    return _ENCODER.encode(values)
 
 
 def row_digest(row: Sequence[Column]) -> str:
@@ -68,3 +68,6 @@ def _hex(value: object) -> str:
     if isinstance(value, bytes):
         return value.hex()
     raise TypeError(f"{type(value).__name__} is not a column of the ledger")
+
+
+_ENCODER = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, default=_hex)

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from dappled.confined import OutsideError
 from dappled.errors import DappledError, counted
-from dappled.flight import durable, layout, logs, provenance, pruning
-from dappled.flight.checks import chain_check, seal_check
+from dappled.flight import durable, layout, log_reading, provenance, pruning
+from dappled.flight.checks import chain_check, seal_check, telemetry_check
 from dappled.flight.checks.chain_check import ChainFindings
 from dappled.flight.checks.seal_check import LedgerBytes, SealFindings, Vouched
 from dappled.flight.layout import FlightFolder
@@ -75,6 +75,8 @@ def check(path: Path, key: SealKey | None = None) -> CheckReport:
         notes += [_WITHOUT_CHAIN] if chained.links is None else chained.notes
         with _examining("the flight", problems), LedgerReader.open(folder.ledger) as ledger:
             _compare(folder, ledger, counts, problems, notes)
+            with _examining("the telemetry", problems):
+                problems += telemetry_check.compare(folder.telemetry, chained.links)
             with _examining("the seals", problems):
                 sealed = seal_check.compare(folder, ledger, chained.links, before, key)
     problems += sealed.problems
@@ -210,7 +212,7 @@ def _names(folder: FlightFolder, ledger: LedgerReader, closed: bool) -> Iterator
 
 
 def _shots(folder: FlightFolder, ledger: LedgerReader, notes: list[str]) -> Iterator[str]:
-    journal = logs.read_journal(folder.journal)
+    journal = log_reading.read_journal(folder.journal)
     notes.extend(journal.problems)  # a torn line; where it hid a shot, that is a problem below
     rows = {row.shot.index: row for row in ledger.shots()}
     noted = {shot.index: shot for shot in journal.shots}
@@ -259,7 +261,7 @@ def _telemetry(folder: FlightFolder, ledger: LedgerReader, problems: list[str], 
             notes.append("the flight has no telemetry")
         return 0
     gaps: list[str] = []
-    found = logs.summarise(folder.telemetry, gaps.append)
+    found = log_reading.summarise(folder.telemetry, gaps.append)
     noted = facts.get("telemetry_sha256")
     if noted is not None and noted != found.sha256:
         problems.append("telemetry.tlog was changed: its SHA-256 is not the ledger's")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import cast
 
 from dappled import confined
-from dappled.flight import layout, logs
+from dappled.flight import layout, log_reading
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Database, LedgerReader
@@ -236,7 +236,7 @@ def in_order(root: Path) -> list[FlightFolder]:
 
 def highest_in(folder: FlightFolder) -> int | None:
     """The highest image index that a flight's journal, ledger or frames mention; a damaged ledger is skipped."""
-    found = [shot.index for shot in logs.read_journal(folder.journal).shots]
+    found = [shot.index for shot in log_reading.read_journal(folder.journal).shots]
     try:
         with LedgerReader.open(folder.ledger) as ledger:
             found += [row.shot.index for row in ledger.shots()]

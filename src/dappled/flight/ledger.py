@@ -12,7 +12,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, astuple
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
@@ -21,8 +21,18 @@ from dappled.decode.geometry import Gnss, Pose
 from dappled.flight import chain
 from dappled.flight.chain import ChainLink, Column, canonical, digest
 from dappled.flight.errors import FlightError, ledger_error
+from dappled.flight.logs import TelemetryLog
 from dappled.flight.records import Cause, Frame, LedgerEvent, Result, Shot, ShotRow, ShotState, Stray, Tag
-from dappled.flight.tables import APPLICATION_ID, CHAIN, DEFINITIONS, KEYS, SCHEMA, SCHEMA_VERSION, TRANSITIONS
+from dappled.flight.tables import (
+    APPLICATION_ID,
+    CHAIN,
+    DEFINITIONS,
+    KEYS,
+    SCHEMA,
+    SCHEMA_VERSION,
+    TELEMETRY,
+    TRANSITIONS,
+)
 
 LIVE = "live"
 BUSY_S = 10.0
@@ -250,9 +260,10 @@ class LedgerReader(Database):
 class Ledger(LedgerReader):
     """Write a ledger. Every method is one short transaction, durable when it returns, and may raise FlightError."""
 
-    def __init__(self, path: Path, clock: Clock) -> None:
-        """Open a flight's ledger, or make it. `clock` stamps the events."""
-        self._clock = clock
+    def __init__(self, path: Path, clock: Clock, telemetry: TelemetryLog | None = None) -> None:
+        """Open a flight's ledger, or make it. `clock` stamps events; the chain covers the blocks of `telemetry` too."""
+        self._clock, self._telemetry = clock, telemetry
+        self._blocks = 0  # of the telemetry that have a link
         self._written: dict[tuple[str, tuple[Column, ...]], None] = {}  # (table, key) of rows that need a link
         super().__init__(path, uri=f"{path.absolute().as_uri()}?mode=rwc", create=True)
         try:
@@ -387,8 +398,9 @@ class Ledger(LedgerReader):
             self._db.execute("BEGIN IMMEDIATE")
             try:
                 yield
-                self._chain()
+                blocks = self._chain()
                 self._db.execute("COMMIT")
+                self._blocks += blocks
             except BaseException:
                 if self._db.in_transaction:
                     self._db.execute("ROLLBACK")
@@ -396,15 +408,22 @@ class Ledger(LedgerReader):
             finally:
                 self._written.clear()
 
-    def _chain(self) -> None:
-        """Add a link for each row that this transaction has written, as the row is now."""
+    def _chain(self) -> int:
+        """Add a link for each row that this transaction has written, as the row is now, and for each block of telemetry
+        that has come since the last one; returns the number of blocks."""
         head = self.last_link()
         for table, key in self._written:
-            head = self._link(head, table, key, self._db.execute(_ROW_OF[table], key).fetchone())
+            row = self._db.execute(_ROW_OF[table], key).fetchone()
+            head = self._link(head, table, key, chain.row_digest(row))
+        blocks = self._telemetry.blocks(self._blocks) if self._telemetry is not None and self._written else []
+        for block in blocks:
+            head = self._link(head, TELEMETRY, (block.start, block.end), block.sha256)
+        return len(blocks)
 
-    def _link(self, last: ChainLink | None, subject: str, key: Sequence[Column], row: Sequence[Column]) -> ChainLink:
-        link = chain.follow(last, subject, chain.json_array(key), chain.row_digest(row))
-        self._db.execute("INSERT INTO chain VALUES (?, ?, ?, ?, ?)", astuple(link))
+    def _link(self, last: ChainLink | None, subject: str, key: Sequence[Column], sha256: str) -> ChainLink:
+        link = chain.follow(last, subject, chain.json_array(key), sha256)
+        values = (link.number, link.subject, link.key, link.sha256, link.link)
+        self._db.execute("INSERT INTO chain VALUES (?, ?, ?, ?, ?)", values)
         return link
 
     def _set_up(self) -> None:
@@ -421,12 +440,12 @@ class Ledger(LedgerReader):
                 self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
             last = None
             for row in self._db.execute("SELECT name, type, tbl_name, sql FROM sqlite_master ORDER BY name").fetchall():
-                last = self._link(last, DEFINITIONS, row[:1], row)
+                last = self._link(last, DEFINITIONS, row[:1], chain.row_digest(row))
             rows_before = 0
             for table in KEYS if found else ():
                 if table in found:
                     for key, row in self.keyed_rows(table):
-                        last = self._link(last, table, key, row)
+                        last = self._link(last, table, key, chain.row_digest(row))
                         rows_before += 1
             self._fact("chain", {"flight": self.path.absolute().parent.name, "rows_before": rows_before})
 

@@ -1,4 +1,4 @@
-"""Write and read the two files of a flight that are only appended to: shots.jsonl and telemetry.tlog.
+"""Write the two files of a flight that are only appended to: shots.jsonl and telemetry.tlog.
 
 Each entry is one write(2), which survives the death of the process at once. A thread brings it to the disk within a
 second; after that it survives a power cut. Neither firing nor receiving waits for a frame's fsync or for a database.
@@ -16,14 +16,12 @@ import json
 import mmap
 import os
 import threading
-from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
-from dappled.bounds.parsing import parse_json
 from dappled.flight.errors import FlightError, disk_error
-from dappled.flight.records import Cause, Shot
+from dappled.flight.records import Shot
+from dappled.workers import Loop
 
 
 class AppendedFile:
@@ -74,6 +72,11 @@ class AppendedFile:
         error = self._flusher.error
         return None if error is None else str(disk_error(f"flush {self._what}", self.path, error))
 
+    @property
+    def synced(self) -> int:
+        """How many of the file's first bytes survive a power cut; 0 once anything could not be flushed."""
+        return 0 if self._flusher.error else self._flusher.synced
+
     def shut(self) -> bool:
         """Refuse writes from now on. False when they were refused already."""
         was, self._closed = self._closed, True
@@ -92,18 +95,18 @@ class AppendedFile:
 class Flusher:
     """fdatasync one descriptor, at most `interval_s` after the first `poke`.
 
-    Owns a thread, not the descriptor. A failed fdatasync stays in `error`: what was written before it may not survive
-    a power cut.
+    Owns a thread, not the descriptor. What was written before a sync that succeeded is on the disk: the first `synced`
+    bytes. A failed one stays in `error`: what was written before it may not survive a power cut.
     """
 
     def __init__(self, fd: int, interval_s: float = 0.5) -> None:
         self._fd = fd
         self._interval_s = interval_s
         self._dirty = threading.Event()
-        self._closing = threading.Event()
         self.error: OSError | None = None
-        self._thread = threading.Thread(target=self._run, name="dappled-flusher", daemon=True)
-        self._thread.start()
+        self.synced = 0
+        self._loop = Loop("flusher", self._run)
+        self._loop.start()
 
     def poke(self) -> None:
         """Say that something was written."""
@@ -112,14 +115,15 @@ class Flusher:
 
     def close(self) -> None:
         """Flush what is left and end the thread; the descriptor may be closed afterwards."""
-        self._closing.set()
+        self._loop.stopping.set()
         self._dirty.set()
-        self._thread.join()
+        while not self._loop.stop(60.0):
+            pass  # a disk that stalls in fdatasync: the descriptor must stay open
 
     def _run(self) -> None:
-        while not self._closing.is_set():
+        while not self._loop.stopping.is_set():
             self._dirty.wait()
-            self._closing.wait(self._interval_s)
+            self._loop.stopping.wait(self._interval_s)
             self._sync()
         if self._dirty.is_set():
             self._sync()  # written, then closed, while the last one ran
@@ -127,9 +131,12 @@ class Flusher:
     def _sync(self) -> None:
         self._dirty.clear()  # before the sync: a write during the sync needs another one
         try:
+            written = os.fstat(self._fd).st_size
             os.fdatasync(self._fd)
         except OSError as error:
             self.error = error
+        else:
+            self.synced = written
 
 
 class ShotJournal:
@@ -169,60 +176,10 @@ class ShotJournal:
             self._file.close()
 
 
-@dataclass(frozen=True, slots=True)
-class JournalContents:
-    """The shots of a journal in the order of its lines, and a sentence for each line that is not a shot."""
-
-    shots: tuple[Shot, ...]
-    problems: tuple[str, ...]
-
-
-def read_journal(path: Path) -> JournalContents:
-    """Read a journal; a missing file counts as empty. A torn or damaged line is reported, the others are kept.
-
-    Raises FlightError when the file can't be read.
-    """
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        return JournalContents((), ())
-    except OSError as error:
-        raise disk_error("read the shot journal", path, error) from error
-    lines = data.split(b"\n")
-    tail = lines.pop()
-    shots: dict[int, Shot] = {}
-    problems: list[str] = []
-    for number, line in enumerate(lines, 1):
-        shot = _parse(line)
-        if shot is None:
-            problems.append(f"line {number} of {path} is not a shot")
-        elif shot.index in shots:
-            problems.append(f"line {number} of {path} notes shot {shot.index} again")
-        else:
-            shots[shot.index] = shot
-    if tail:
-        problems.append(f"the last line of {path} is torn ({len(tail)} bytes)")
-    return JournalContents(tuple(shots.values()), tuple(problems))
-
-
-def _parse(line: bytes) -> Shot | None:
-    try:
-        value: Any = parse_json(line, _LINE_BYTES)
-        shot = Shot(**{**value, "cause": Cause(**value["cause"])})
-    except (ValueError, TypeError, KeyError):
-        return None
-    numbers = (shot.index, shot.wished_utc_ns, shot.wished_monotonic_ns)
-    words = (shot.cause.source, shot.cause.kind)
-    sequence = shot.cause.sequence
-    whole = all(type(number) is int for number in numbers) and all(type(word) is str for word in words)
-    return shot if whole and shot.index >= 0 and (sequence is None or type(sequence) is int) else None
-
-
-_LINE_BYTES = 1 << 16  # of the journal; a shot takes some 200
-_MAVLINK_1, _MAVLINK_2 = 0xFE, 0xFD
+MAVLINK_1, MAVLINK_2 = 0xFE, 0xFD
 _SIGNED = 0x01
 _LOGGING = "log telemetry in"
-_LATEST_US = 1 << 53  # stamps beyond (year 2255) are damage
+BLOCK_BYTES = 1 << 16  # a block is complete with the record that reaches this
 _Bytes = bytes | mmap.mmap | memoryview
 
 
@@ -235,12 +192,21 @@ class TelemetrySummary:
     sha256: str
 
 
+@dataclass(frozen=True, slots=True)
+class TelemetryBlock:
+    """Whole records of a telemetry log: from byte `start` up to `end`, and their SHA-256 (hex)."""
+
+    start: int
+    end: int
+    sha256: str
+
+
 def packet_length(data: _Bytes, at: int = 0) -> int | None:
     """Length of the MAVLink packet that begins at `at`; None where none begins or the packet is cut off."""
     left = len(data) - at
-    if left >= 8 and data[at] == _MAVLINK_1:
+    if left >= 8 and data[at] == MAVLINK_1:
         length = data[at + 1] + 8
-    elif left >= 12 and data[at] == _MAVLINK_2:
+    elif left >= 12 and data[at] == MAVLINK_2:
         length = data[at + 1] + 12 + (13 if data[at + 2] & _SIGNED else 0)
     else:
         return None
@@ -254,8 +220,9 @@ class TelemetryLog:
         """Make the log. Raises FlightError, also when the file exists."""
         self.path = path
         self._lock = threading.Lock()
-        self._sha = hashlib.sha256()
-        self._packets = self._size = 0
+        self._sha, self._block_sha = hashlib.sha256(), hashlib.sha256()
+        self._blocks: list[TelemetryBlock] = []
+        self._packets = self._size = self._block_start = 0
         self._torn = False  # the last write ended within a record
         self._file = AppendedFile(path, "the telemetry log", flush_interval_s, new=True)
 
@@ -277,10 +244,19 @@ class TelemetryLog:
                 self._cut()
                 raise FlightError(f"cannot {_LOGGING} {self.path}: the disk is full; free some space")
             self._sha.update(record)
+            self._block_sha.update(record)
             self._size += written
+            if self._size - self._block_start >= BLOCK_BYTES:
+                self._blocks.append(TelemetryBlock(self._block_start, self._size, self._block_sha.hexdigest()))
+                self._block_start, self._block_sha = self._size, hashlib.sha256()
             number = self._packets
             self._packets += 1
         return number
+
+    def blocks(self, after: int) -> list[TelemetryBlock]:
+        """The blocks that are full and on the disk, without the first `after`."""
+        with self._lock:
+            return [block for block in self._blocks[after:] if block.end <= self._file.synced]
 
     @property
     def problem(self) -> str | None:
@@ -299,68 +275,3 @@ class TelemetryLog:
         """Remove a record that was written in part; tried again before the next record."""
         self._file.cut(self._size, _LOGGING)
         self._torn = False
-
-
-def read_telemetry(path: Path, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, int, bytes]]:
-    """(running number, stamp in µs UTC, packet) of a .tlog, in the file's order.
-
-    Bytes that are not a packet are skipped up to the next place where two records follow each other, or one ends the
-    file. `report` gets a sentence for each such gap. Raises FlightError when the file can't be read.
-    """
-    try:
-        with path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            data = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) if size else None
-    except OSError as error:
-        raise disk_error("read the telemetry", path, error) from error
-    if data is not None:
-        with data:
-            for number, (stamp_us, raw) in enumerate(split(data, lambda text: report(f"{path}: {text}"))):
-                yield number, stamp_us, raw
-
-
-def split(data: bytes | mmap.mmap, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, bytes]]:
-    """(stamp in µs UTC, packet) of each record in a log's bytes; see `read`."""
-    at, size = 0, len(data)
-    while at < size:
-        end = _record_end(data, at)
-        if end is None:
-            found = _resynchronise(data, at + 1)
-            skipped = (size if found is None else found) - at
-            where = "at the end" if found is None else f"before byte {found}"
-            report(f"{skipped} bytes {where} are not telemetry and were skipped")
-            if found is None:
-                return
-            at = found
-            continue
-        yield int.from_bytes(data[at : at + 8], "big"), bytes(data[at + 8 : end])
-        at = end
-
-
-def summarise(path: Path, report: Callable[[str], object] = lambda _: None) -> TelemetrySummary:
-    """Read a whole log and summarise it. Raises FlightError."""
-    packets = sum(1 for _ in read_telemetry(path, report))
-    try:
-        with path.open("rb") as file:
-            return TelemetrySummary(
-                packets, os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest()
-            )
-    except OSError as error:
-        raise disk_error("read the telemetry", path, error) from error
-
-
-def _record_end(data: bytes | mmap.mmap, at: int) -> int | None:
-    length = packet_length(data, at + 8)
-    if length is None or int.from_bytes(data[at : at + 8], "big") >= _LATEST_US:
-        return None
-    return at + 8 + length
-
-
-def _resynchronise(data: bytes | mmap.mmap, start: int) -> int | None:
-    """The first offset at which two complete records follow each other, or one ends the file."""
-    for at in range(start, len(data) - 15):
-        if data[at + 8] in (_MAVLINK_1, _MAVLINK_2):
-            end = _record_end(data, at)
-            if end is not None and (end == len(data) or _record_end(data, end) is not None):
-                return at
-    return None

@@ -219,7 +219,9 @@ def begin(
         start_utc_ns = began_utc_ns if utc_known else None
         folder = layout.create(root, start_utc_ns, facts)
         stack.callback(shutil.rmtree, folder.path, ignore_errors=True)  # a flight that could not begin
-        ledger = Ledger(folder.ledger, clock)
+        telemetry = TelemetryLog(folder.telemetry)
+        stack.callback(telemetry.close)
+        ledger = Ledger(folder.ledger, clock, telemetry)
         stack.callback(ledger.close)
         ledger.set_fact("began_utc_ns", began_utc_ns)
         ledger.set_fact("utc_known", utc_known)
@@ -227,8 +229,6 @@ def begin(
         index.add_flight(folder.name, start_utc_ns)
         journal = ShotJournal(folder.journal)
         stack.callback(journal.close)
-        telemetry = TelemetryLog(folder.telemetry)
-        stack.callback(telemetry.close)
         _sync_names(folder)
         for text in recovered:
             ledger.add_event("recovery", text)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from dappled.clock import Clock
 from dappled.errors import DappledError
-from dappled.flight import durable, layout, logs, seals
+from dappled.flight import durable, layout, log_reading, logs, seals
 from dappled.flight.errors import disk_error
 from dappled.flight.index import ImageIndex
 from dappled.flight.layout import FlightFolder
@@ -83,7 +83,7 @@ def close_ledger(
 ) -> None:
     """Store in the ledger the telemetry's summary (read from the file when not given) and the flight's end."""
     if telemetry is None and folder.telemetry.exists():
-        telemetry = logs.summarise(folder.telemetry, report.append)
+        telemetry = log_reading.summarise(folder.telemetry, report.append)
     if telemetry is not None:
         ledger.set_fact("telemetry_packets", telemetry.packets)
         ledger.set_fact("telemetry_bytes", telemetry.size)
@@ -120,7 +120,7 @@ def _remove_parts(folder: FlightFolder) -> list[str]:
 
 
 def _add_noted_shots(folder: FlightFolder, ledger: Ledger) -> list[str]:
-    journal = logs.read_journal(folder.journal)
+    journal = log_reading.read_journal(folder.journal)
     report = [*journal.problems]
     for shot in journal.shots:
         if ledger.shot(shot.index) is None:

@@ -61,6 +61,7 @@ KEYS: dict[str, tuple[str, ...]] = {  # the primary key of each table that the c
     "events": ("number",),
     "facts": ("key",),
 }
+TELEMETRY = "telemetry.tlog"  # the subject of its blocks
 DEFINITIONS = "sqlite_master"  # the subject of the tables' own definitions
 # The life of a shot: wished → fired → safe | failed. A file is proof of an exposure: it makes a shot safe even when the
 # trigger call was not seen to return, and even when the shot had been given up. What is safe stays safe.

@@ -21,7 +21,19 @@ from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import Message, PacketParser
 from dappled.drivers.replay import RecordedShot
 from dappled.errors import DappledError
-from dappled.flight import LIVE, Cause, FlightFolder, Frame, LedgerReader, Result, Shot, ShotRow, durable, layout, logs
+from dappled.flight import (
+    LIVE,
+    Cause,
+    FlightFolder,
+    Frame,
+    LedgerReader,
+    Result,
+    Shot,
+    ShotRow,
+    durable,
+    layout,
+    log_reading,
+)
 
 FRAME_SUFFIXES = (".raf", ".cr2", ".dng", ".tif", ".tiff", ".png", ".npy", ".nef", ".arw", ".jpg", ".jpeg")
 
@@ -249,7 +261,7 @@ def _recorded(digests: dict[int, tuple[str, str]], index: int) -> str | None:
 
 def _packets(path: Path) -> Iterator[tuple[int, int, Message]]:
     decoder = PacketParser()
-    for number, stamp_us, raw in logs.read_telemetry(path):
+    for number, stamp_us, raw in log_reading.read_telemetry(path):
         message = decoder(raw)
         if message is not None:  # a packet with a wrong checksum was never acted on either
             yield number, stamp_us, message

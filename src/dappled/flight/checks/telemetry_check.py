@@ -1,0 +1,42 @@
+"""Compare the telemetry log with the blocks of it that the chain covers."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from dappled.flight.chain import ChainLink
+from dappled.flight.errors import disk_error
+from dappled.flight.tables import TELEMETRY
+
+
+def compare(path: Path, links: Mapping[int, ChainLink] | None) -> Iterator[str]:
+    """A sentence for each block of the log that differs from its link. Raises FlightError when it can't be read."""
+    blocks = [link for link in (links or {}).values() if link.subject == TELEMETRY]
+    if not blocks:
+        return
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            for link in blocks:
+                start, end = _range(link.key)
+                file.seek(min(start, size))
+                if hashlib.sha256(file.read(min(end, size) - min(start, size))).hexdigest() != link.sha256:
+                    yield f"{path.name} was changed between bytes {start} and {end}: its SHA-256 is not the chain's"
+    except FileNotFoundError:
+        yield f"{path.name} is missing, and the chain covers {len(blocks)} blocks of it"
+    except OSError as error:
+        raise disk_error("read the telemetry", path, error) from error
+
+
+def _range(key: str) -> tuple[int, int]:
+    """First byte and end of a block; an empty one where the link was damaged, which its chain tells."""
+    try:
+        start, end = json.loads(key)
+    except (ValueError, TypeError, RecursionError):
+        return 0, 0
+    whole = type(start) is int and type(end) is int and 0 <= start <= end
+    return (start, end) if whole else (0, 0)

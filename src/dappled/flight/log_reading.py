@@ -1,0 +1,133 @@
+"""Read the two files of a flight that are only appended to, shots.jsonl and telemetry.tlog, past damage."""
+
+from __future__ import annotations
+
+import hashlib
+import mmap
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dappled.bounds.parsing import parse_json
+from dappled.flight.errors import disk_error
+from dappled.flight.logs import MAVLINK_1, MAVLINK_2, TelemetrySummary, packet_length
+from dappled.flight.records import Cause, Shot
+
+_LINE_BYTES = 1 << 16  # of the journal; a shot takes some 200
+_LATEST_US = 1 << 53  # stamps beyond (year 2255) are damage
+
+
+@dataclass(frozen=True, slots=True)
+class JournalContents:
+    """The shots of a journal in the order of its lines, and a sentence for each line that is not a shot."""
+
+    shots: tuple[Shot, ...]
+    problems: tuple[str, ...]
+
+
+def read_journal(path: Path) -> JournalContents:
+    """Read a journal; a missing file counts as empty. A torn or damaged line is reported, the others are kept.
+
+    Raises FlightError when the file can't be read.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return JournalContents((), ())
+    except OSError as error:
+        raise disk_error("read the shot journal", path, error) from error
+    lines = data.split(b"\n")
+    tail = lines.pop()
+    shots: dict[int, Shot] = {}
+    problems: list[str] = []
+    for number, line in enumerate(lines, 1):
+        shot = _parse(line)
+        if shot is None:
+            problems.append(f"line {number} of {path} is not a shot")
+        elif shot.index in shots:
+            problems.append(f"line {number} of {path} notes shot {shot.index} again")
+        else:
+            shots[shot.index] = shot
+    if tail:
+        problems.append(f"the last line of {path} is torn ({len(tail)} bytes)")
+    return JournalContents(tuple(shots.values()), tuple(problems))
+
+
+def _parse(line: bytes) -> Shot | None:
+    try:
+        value: Any = parse_json(line, _LINE_BYTES)
+        shot = Shot(**{**value, "cause": Cause(**value["cause"])})
+    except (ValueError, TypeError, KeyError):
+        return None
+    numbers = (shot.index, shot.wished_utc_ns, shot.wished_monotonic_ns)
+    words = (shot.cause.source, shot.cause.kind)
+    sequence = shot.cause.sequence
+    whole = all(type(number) is int for number in numbers) and all(type(word) is str for word in words)
+    return shot if whole and shot.index >= 0 and (sequence is None or type(sequence) is int) else None
+
+
+def read_telemetry(path: Path, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, int, bytes]]:
+    """(running number, stamp in µs UTC, packet) of a .tlog, in the file's order.
+
+    Bytes that are not a packet are skipped up to the next place where two records follow each other, or one ends the
+    file. `report` gets a sentence for each such gap. Raises FlightError when the file can't be read.
+    """
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            data = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) if size else None
+    except OSError as error:
+        raise disk_error("read the telemetry", path, error) from error
+    if data is not None:
+        with data:
+            for number, (stamp_us, raw) in enumerate(split(data, lambda text: report(f"{path}: {text}"))):
+                yield number, stamp_us, raw
+
+
+def split(data: bytes | mmap.mmap, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, bytes]]:
+    """(stamp in µs UTC, packet) of each record in a log's bytes; see `read`."""
+    at, size = 0, len(data)
+    while at < size:
+        end = _record_end(data, at)
+        if end is None:
+            found = _resynchronise(data, at + 1)
+            skipped = (size if found is None else found) - at
+            where = "at the end" if found is None else f"before byte {found}"
+            report(f"{skipped} bytes {where} are not telemetry and were skipped")
+            if found is None:
+                return
+            at = found
+            continue
+        yield int.from_bytes(data[at : at + 8], "big"), bytes(data[at + 8 : end])
+        at = end
+
+
+def summarise(path: Path, report: Callable[[str], object] = lambda _: None) -> TelemetrySummary:
+    """Read a whole log and summarise it. Raises FlightError."""
+    packets = sum(1 for _ in read_telemetry(path, report))
+    try:
+        with path.open("rb") as file:
+            return TelemetrySummary(
+                packets, os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest()
+            )
+    except OSError as error:
+        raise disk_error("read the telemetry", path, error) from error
+
+
+def _record_end(data: bytes | mmap.mmap, at: int) -> int | None:
+    length = packet_length(data, at + 8)
+    if length is None or int.from_bytes(data[at : at + 8], "big") >= _LATEST_US:
+        return None
+    return at + 8 + length
+
+
+def _resynchronise(data: bytes | mmap.mmap, start: int) -> int | None:
+    """The first offset at which two complete records follow each other, or one ends the file."""
+    for at in range(start, len(data) - 15):
+        if data[at + 8] in (MAVLINK_1, MAVLINK_2):
+            end = _record_end(data, at)
+            if end is not None and (end == len(data) or _record_end(data, end) is not None):
+                return at
+    return None
