@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,10 +50,25 @@ def test_a_wrong_mask_and_a_frame_that_shows_no_carriers_are_told(
 ) -> None:
     wrong = tmp_path / "wrong.toml"
     wrong.write_text("frequency_per_mm = 9.3\np = 2\n")
-    for frame, mask in ((stopped, str(wrong)), (stopped.with_name("open.dng"), MASK)):
-        code, out, _ = _told(capsys, stopped.parent, str(frame), "-o", str(tmp_path / f"{frame.stem}.npz"), mask=mask)
-        assert code == 0
-        assert "no carriers in this frame, cut at the law's prediction" in out
+    words = [str(stopped), "-o", str(tmp_path / "wrong.npz")]
+    code, _, err = _told(capsys, stopped.parent, *words, mask=str(wrong))
+    assert code == 1
+    assert "should stand out at f/59.2 and no lattice of this mask does" in err
+    assert _told(capsys, stopped.parent, *words, "--anyway", mask=str(wrong))[0] == 0
+
+
+def test_a_frame_near_the_ideal_aperture_still_shows_where_its_lattice_is(
+    stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(stopped.with_name("open.dng")), "-o", str(tmp_path / "open.npz")]
+    code, out, _ = _told(capsys, stopped.parent, *words)
+    assert code == 0
+    assert re.search(
+        r"carriers seen, measured, by the law geometric \(odds against chance: geometric 10\^\d\d : 1", out
+    )
+    rows = light_files.load(tmp_path / "open.npz").carriers
+    off = rows[:, :2] @ reference_camera(6, scale=0.25).lattice.matrix() - rows[:, 2:]
+    assert np.abs(off * (694, 922)).max() < 0.1
 
 
 def test_a_wrong_focal_length_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -65,11 +81,11 @@ def test_a_wrong_focal_length_is_told(tmp_path: Path, capsys: pytest.CaptureFixt
         'law = "fd"\nmask_distance_mm = 1.01\n[[raw]]\nname = "a quarter"\nshape = [694, 922]\n'
         f"row_mm = [{pitch}, 0.0]\ncolumn_mm = [0.0, {pitch}]\n"
     )
-    for length, words in (("13", "measured"), ("20", "focal length are not the right ones")):
+    for length, expected, words in (("13", 0, "measured"), ("20", 1, "check mask, camera, focal length and f-number")):
         wanted = [str(path), "--focal-length", length, "-o", str(tmp_path / f"{length}.npz")]
-        code, out, _ = _told(capsys, tmp_path, *wanted, mask="mask-2-full")
-        assert code == 0
-        assert words in out
+        code, out, err = _told(capsys, tmp_path, *wanted, mask="mask-2-full")
+        assert code == expected
+        assert words in out + err
 
 
 def test_carriers_are_found_and_cut_as_far_off_as_exif_rounds_the_focal_length(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from PIL import Image
 from dappled.cli import decode_arguments
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
+from dappled.decode.calibration.law_search import LawSearch
 from dappled.decode.decoder import CarriersFrom, doubt
 from dappled.decode.optics import Carrier, Lattice, Mask, Order
 from dappled.decode.optics.carrier_tables import crossed_orders, lattice_rotation
@@ -23,7 +25,7 @@ from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
 from dappled.decode.spectrum.peaks import Measured, measure
 from dappled.decode.spectrum.pictures import LOOKS, Look, around, spectrum_boxes
 from dappled.decode.spectrum.transform import padded_shape, transform
-from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, known_to
+from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, at_found, known_to, search_frame
 from dappled.errors import counted
 
 
@@ -65,6 +67,12 @@ class Table:
     carriers_from: CarriersFrom | None = None
     own: Lattice | None = None
     rotation_rad: float | None = None
+    search: LawSearch | None = None
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether carriers must be visible in this frame, and none is."""
+        return self.search is not None and self.search.found is None and self.search.expected
 
     @property
     def used(self) -> Lattice:
@@ -88,7 +96,9 @@ def run(arguments: argparse.Namespace) -> int:
             raise DarkroomError("--picture draws a frame's spectrum: name the frame")
         Image.fromarray(_picture(plane, table, arguments)).save(arguments.picture)
     print(json.dumps(_as_json(table), indent=2) if arguments.json else _as_text(table))
-    return 0
+    if table.contradicted:
+        print(f"dappled carriers: {table.search.reason if table.search else ''}", file=sys.stderr)
+    return 1 if table.contradicted else 0
 
 
 def picture(plane: Plane, table: Table, look: Look = "magnitude") -> Any:
@@ -155,6 +165,14 @@ def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
         spectrum = transform(plane, workers=2)
         predicted = decoder.predict(length)
         used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
+        stop = arguments.f_number or raw.f_number
+        search = None
+        if carriers_from == "predicted" and stop is not None and not arguments.law:
+            search = search_frame(decoder, plane, length, stop)
+            if search.found is not None:
+                decoder = at_found(decoder, search)
+                predicted = decoder.predict(length)
+                used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
         known = {(c.ky, c.kx): m for c, m in zip(predicted, seen, strict=True)}
         lattice = decoder.lattice_at(length)
         mask = decoder.mask
@@ -176,6 +194,7 @@ def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
             carriers_from=carriers_from,
             own=used,
             rotation_rad=turned,
+            search=search,
         )
 
 
@@ -232,6 +251,10 @@ def _as_json(table: Table) -> dict[str, Any]:
     if table.carriers_from is not None:
         whole["carriers_from"] = table.carriers_from
         whole["rotation_rad"] = table.rotation_rad
+    if table.search is not None:
+        whole["observable"] = table.search.found is not None or table.search.expected
+        whole["reason"] = table.search.reason or None
+        whole["laws"] = [{"law": one.law, "odds_nats": one.nats} for one in table.search.odds]
     if table.found:
         whole["pitch_px"] = list(table.found.spacing_px)
     return whole
@@ -273,9 +296,13 @@ def _summary(table: Table) -> str:
         turned = math.degrees(table.rotation_rad)
         sentence = f"{start}; {table.seen} of {there} carriers seen, on a lattice turned by {turned:.3f}°"
         orders = [(c.ky, c.kx) for c, _ in table.rows]
+        if table.search is not None:
+            sentence += f"; {table.search.sentence}"
         strange = doubt(table.used.carriers(orders), [c for c, _ in table.rows])
         return f"{sentence}; {strange}" if strange else sentence
     whose = "calibration's" if table.carriers_from == "calibrated" else "law's"
+    if table.search is not None and table.search.found is None:
+        return f"{start}; {table.search.reason}; a decode uses the {whose} prediction"
     if table.seen == 0:
         return (
             f"{start}; no carriers in this frame: it was taken without this mask, or near the mask's ideal "

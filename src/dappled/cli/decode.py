@@ -27,6 +27,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--colour", action="store_true", help="views in red, green and blue (default: grey)")
     parser.add_argument("--taper", type=float, default=0.0, metavar="SHARE",
                         help="share of each band with a soft edge, 0 to 1: less ringing, less detail")  # fmt: skip
+    parser.add_argument("--anyway", action="store_true",
+                        help="write the light field although carriers that must be visible are not")  # fmt: skip
     parser.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
 
 
@@ -42,6 +44,8 @@ def run(arguments: argparse.Namespace) -> int:
         target = arguments.output if single else arguments.output / f"{frame.stem}.zarr"
         try:
             made = darkroom.decode(frame, focal_length_mm=arguments.focal_length, f_number=arguments.f_number)
+            if not arguments.anyway:
+                _refuse_contradicted(frame, made)
             light_files.save(target, made.light_field, overwrite=arguments.overwrite)
             print(f"{target}: {summary(made)}")
         except DappledError as error:
@@ -65,6 +69,12 @@ def _refuse_same_names(frames: Sequence[Path], folder: Path) -> None:
             )
 
 
+def _refuse_contradicted(frame: Path, made: DecodeResult) -> None:
+    """Carriers that must be visible and are not: slices cut at the prediction would hold nothing."""
+    if made.contradiction:
+        raise DappledError(f"{frame}: {made.contradiction}; --anyway decodes it at the prediction")
+
+
 def summary(made: DecodeResult) -> str:
     """Slices, views, and where both came from."""
     field = made.light_field
@@ -73,12 +83,18 @@ def summary(made: DecodeResult) -> str:
     size = " × ".join(str(n) for n in field.slices.shape)
     found = f"{made.carriers_found} of {made.carriers_predicted} carriers seen"
     whole = f"slices {size}, {views}; {found}, {made.report.carriers_from}"
-    if made.carriers_found == 0:
-        whose = "calibration's" if made.report.carriers_from == "calibrated" else "law's"
+    whose = "calibration's" if made.report.carriers_from == "calibrated" else "law's"
+    if made.contradiction:
+        whole += f": {made.contradiction}; cut at the {whose} prediction"
+    elif not made.observable:
+        whole += f", not observable at this aperture: no carriers in this frame, cut at the {whose} prediction"
+    elif made.carriers_found == 0:
         whole += (
             f": no carriers in this frame, cut at the {whose} prediction; unless it was taken near the mask's ideal "
             "aperture, mask, camera or focal length are not the right ones"
         )
+    if made.search is not None and made.search.found is not None:
+        whole += f", by the law {field.attributes['law']} ({made.search.sentence})"
     if made.report.doubt:
         whole += f": {made.report.doubt}"
     return whole

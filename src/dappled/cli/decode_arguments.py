@@ -61,6 +61,7 @@ def recipe(arguments: argparse.Namespace) -> Recipe:
         white_level=arguments.white_level,
         colour=getattr(arguments, "colour", False),
         taper=getattr(arguments, "taper", 0.0),
+        try_laws=not arguments.law,
     )
 
 

@@ -30,6 +30,7 @@ from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.views import Views, from_slices
 from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Order, Sensor
 from dappled.decode.spectrum.peaks import (
+    ALONE_NATS,
     STRONG,
     STRONGER,
     Measured,
@@ -139,7 +140,8 @@ class MaskDecoder:
     (half of the EXIF rounding), which widens the search. `size` of the slices in bins of the padded transform;
     None: as large as the spacing allows. Views need a calibration, or a frame that shows its carriers; else only the
     slices are there, and `views` has the shape (0, 0, h, w). `colours` says that the planes are colour mosaics.
-    `taper` apodises the bands, see `slices.extract`. `buffers` are reused from frame to frame.
+    `taper` apodises the bands, see `slices.extract`. `at` is this frame's own lattice where a search has found it.
+    `buffers` are reused from frame to frame.
     """
 
     sensor: Sensor
@@ -153,6 +155,7 @@ class MaskDecoder:
     workers: int = 1
     colours: bool = False
     taper: float = 0.0
+    at: Lattice | None = None
     buffers: SpectrumBuffers = field(default_factory=SpectrumBuffers, repr=False)
 
     def __post_init__(self) -> None:
@@ -251,6 +254,9 @@ class MaskDecoder:
         self, spectrum: Spectrum, focal_length_mm: float, predicted: Sequence[Carrier]
     ) -> tuple[Lattice, list[Measured | None], CarriersFrom]:
         """The lattice to use, what was measured near each predicted carrier, and where the lattice came from."""
+        if self.at is not None:
+            there = self.at.carriers([(c.ky, c.kx) for c in predicted])
+            return self.at, measure(spectrum, there, 1.0, prominence_nats=ALONE_NATS), "measured"
         lattice = self.lattice_at(focal_length_mm)
         measured = measure(spectrum, predicted, self._radii(predicted, focal_length_mm))
         least = STRONGER if self.calibration is not None else STRONG

@@ -2,37 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.calibration.law_search import LawOdds, search_laws
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.aperture import relative_transfer
-from dappled.decode.optics import LAWS, Carrier, Lattice, Mask, Order, Sensor
-from dappled.decode.optics.visibility import OrderStrength, order_strengths
+from dappled.decode.optics import Carrier, Lattice, Mask, Order, Sensor
 from dappled.decode.spectrum import Spectrum
-from dappled.decode.spectrum.lattice import find_lattice
-from dappled.decode.spectrum.mask_lattice import MaskLattice, PeakList, find_mask_lattice, should_stand
+from dappled.decode.spectrum.mask_lattice import MaskLattice
 from dappled.decode.spectrum.peaks import Measured, fit, measure, residual_bins
 from dappled.decode.spectrum.slices import extract
 from dappled.decode.spectrum.transform import transform
 
 _ALIKE_BINS = 0.5  # rms from their lattice: peaks farther off belong to the scene
 _ENOUGH = 0.6  # of a mask's carriers: a prediction with so many peaks near it is the right one
-
-
-@dataclass(frozen=True, slots=True)
-class LawOdds:
-    """What a frame says about one law: the log odds (nats) that the mask's carriers stand where the law allows.
-
-    None where no two of the mask's carriers agree near the law's prediction.
-    """
-
-    law: str
-    nats: float | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +54,7 @@ def frame_lattice(
     if plane.shape != sensor.shape:
         raise DecodeError(f"the calibration frame is {plane.shape}, the camera's are {sensor.shape}")
     spectrum = transform(plane, workers=workers)
-    located, odds = _located(
+    search = search_laws(
         spectrum,
         sensor=sensor,
         mask=mask,
@@ -75,8 +62,11 @@ def frame_lattice(
         mask_distance_mm=mask_distance_mm,
         focal_length_mm=focal_length_mm,
         f_number=f_number,
+        anywhere=True,
     )
-    lattice, found = _fitted(spectrum, located, mask)
+    if search.found is None:
+        raise DecodeError(search.reason)
+    lattice, found = _fitted(spectrum, search.found, mask)
     lattice = refine(spectrum, lattice, [(0, 0), *((c.ky, c.kx) for c, _ in found)], workers)
     residual = residual_bins(lattice.carriers([(c.ky, c.kx) for c, _ in found]), [m for _, m in found], spectrum)
     carriers = [c for c in lattice.carriers(mask.half_orders()) if c.on_sensor]
@@ -89,93 +79,8 @@ def frame_lattice(
         tuple(found),
         tuple((c.ky, c.kx) for c in carriers),
         relative_transfer(values),
-        odds,
+        search.odds,
     )
-
-
-def _located(
-    spectrum: Spectrum,
-    *,
-    sensor: Sensor,
-    mask: Mask,
-    law: str,
-    mask_distance_mm: float,
-    focal_length_mm: float,
-    f_number: float,
-) -> tuple[MaskLattice, tuple[LawOdds, ...]]:
-    """The lattice that the mask's carriers stand on, near the prediction of whichever law, and each law's odds."""
-    peaks = PeakList.of(spectrum)
-    odds: list[LawOdds] = []
-    asked: list[list[OrderStrength]] = []
-    best: MaskLattice | None = None
-    for name in (law, *(other for other in LAWS if other != law)):
-        predicted = LAWS[name](mask, sensor, mask_distance_mm, focal_length_mm)
-        expected = order_strengths(mask, sensor, predicted, mask_distance_mm=mask_distance_mm, f_number=f_number)
-        found = find_mask_lattice(peaks, predicted, expected)
-        asked.append(expected)
-        odds.append(LawOdds(name, None if found is None else found.odds_nats))
-        if found is not None and found.sure and (best is None or found.odds_nats > best.odds_nats):
-            best = found
-    if best is None and mask.pattern == "full":
-        best = _anywhere(spectrum, mask)
-    if best is None:
-        raise DecodeError(unseen(spectrum, asked, mask, mask_distance_mm, f_number))
-    return best, tuple(odds)
-
-
-def unseen(
-    spectrum: Spectrum,
-    predictions: Sequence[Sequence[OrderStrength]],
-    mask: Mask,
-    mask_distance_mm: float,
-    f_number: float,
-) -> str:
-    """Why a frame shows no lattice of its mask, in a sentence: which orders can't be seen, and which should be.
-
-    `predictions` are one or more laws'; the sentence is about the one under which most should be seen.
-    """
-    expected, above = max(
-        ((list(one), should_stand(spectrum, one)) for one in predictions), key=lambda pair: len(pair[1])
-    )
-    named = ", ".join(f"({ky}, {kx})" for ky, kx in (one.order for one in above[:4]))
-    causes: dict[str, list[str]] = {}
-    for one in expected:
-        if one not in above:
-            causes.setdefault(one.cause or "below the frame's own detail and noise", []).append(
-                f"({one.order[0]}, {one.order[1]})"
-            )
-    lost = "; ".join(f"{_some(orders)} {cause}" for cause, orders in causes.items())
-    if len(above) >= 2 and np.linalg.matrix_rank([one.order for one in above]) == 2:
-        more = f" (not expected: {lost})" if lost else ""
-        return (
-            f"no carriers: {named} should stand out at f/{f_number:g} and no lattice of this mask does{more}: check "
-            "mask, camera, focal length and f-number"
-        )
-    ideal = mask.frequency_per_mm * mask_distance_mm
-    return (
-        f"no carriers can be seen in this frame at f/{f_number:g}: {lost}. Calibrate on a white frame at a small "
-        f"aperture (f/{3 * ideal:.0f} or smaller for this mask; its ideal is f/{ideal:.1f})"
-    )
-
-
-def _some(orders: Sequence[str]) -> str:
-    return ", ".join(orders[:4]) + (f" and {len(orders) - 4} more" if len(orders) > 4 else "")
-
-
-def _anywhere(spectrum: Spectrum, mask: Mask) -> MaskLattice | None:
-    """The lattice of a full mask without a prediction, if the frame shows nearly all of its carriers."""
-    try:
-        lattice = find_lattice(spectrum).lattice
-    except DecodeError:
-        return None
-    looked = [c for c in lattice.carriers(mask.half_orders()) if c.on_sensor and (c.ky, c.kx) != (0, 0)]
-    found = [(c, m) for c, m in zip(looked, measure(spectrum, looked, 2.0), strict=True) if m is not None]
-    if (
-        len(found) <= _ENOUGH * len(looked)
-        or residual_bins([c for c, _ in found], [m for _, m in found], spectrum) > _ALIKE_BINS
-    ):
-        return None
-    return MaskLattice(lattice, tuple(found), 0.0, math.nan, math.nan)
 
 
 def _fitted(spectrum: Spectrum, at: MaskLattice, mask: Mask) -> tuple[Lattice, list[tuple[Carrier, Measured]]]:

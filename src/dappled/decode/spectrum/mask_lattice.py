@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from dappled.decode.optics import Carrier, Lattice, Order
 from dappled.decode.optics.visibility import OrderStrength
 from dappled.decode.spectrum.lattice import Candidate, candidates
-from dappled.decode.spectrum.peaks import Measured, is_suspect, lattice_from, measure, residual_bins
+from dappled.decode.spectrum.peaks import ALONE_NATS, Measured, is_suspect, lattice_from, measure, residual_bins
 from dappled.decode.spectrum.transform import Spectrum, hann
 
 SCALES = 0.35  # relative: a print's scale and the mask's distance, together
@@ -210,7 +210,7 @@ def _judged(
     lattice = lattice_from(matrix / bins)
     looked = lattice.carriers([asked[i].order for i in chosen])
     pairs = [
-        (c, m) for c, m in zip(looked, measure(spectrum, looked, 1.5, prominence_nats=_PEAK_NATS), strict=True) if m
+        (c, m) for c, m in zip(looked, measure(spectrum, looked, 1.5, prominence_nats=ALONE_NATS), strict=True) if m
     ]
     if len(pairs) < 2 or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in pairs]) < 2:
         return None

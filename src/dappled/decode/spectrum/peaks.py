@@ -13,6 +13,7 @@ from dappled.decode.optics import Carrier, Lattice
 from dappled.decode.spectrum.transform import Complex, Spectrum, hann
 
 PROMINENCE_NATS = 2.5  # of log magnitude above the median around; the highest of 400 bins of noise reaches 1.1
+ALONE_NATS = 1.6  # for a peak that is expected within a bin: the highest of 10 bins of noise reaches 0.6
 _FEWEST_WITHOUT_OUTLIERS = 6  # peaks that a fit needs once outliers are left out
 _ENOUGH = 4  # peaks of a half plane, in both directions, before a frame's own lattice is believed
 STRONG = 0.02  # of the mean; at the ideal aperture parallax alone leaves up to a thousandth

@@ -19,6 +19,7 @@ from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode import DecodeError
 from dappled.decode.calibration import Calibration
+from dappled.decode.calibration.law_search import LawSearch, missing, search_laws
 from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
 from dappled.decode.depth import RANGING
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
@@ -27,7 +28,7 @@ from dappled.decode.spectrum import LinearRows, Plane
 from dappled.decode.spectrum import plane as planes
 from dappled.decode.spectrum.lineariser import check_shape, lineariser
 from dappled.decode.spectrum.plane import Places, coloured, find_defects, local_colours, mended, spread
-from dappled.decode.spectrum.transform import Source
+from dappled.decode.spectrum.transform import Source, transform
 from dappled.drivers.raw import calibration_files, reading
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
@@ -50,6 +51,7 @@ class Recipe:
     `law` "" takes the camera's; a file is "" where there is none.
     `cfa` (as "BGGR", row by row), `black` and `white_level` are for files that don't contain them. `colour` makes
     views in red, green and blue; `taper`, 0 to 1, makes the bands of a printed mask's slices fall off softly.
+    With `try_laws` a frame without carriers at the prediction is searched near those of all laws.
     """
 
     camera: str
@@ -64,6 +66,7 @@ class Recipe:
     white_level: float | None = None
     colour: bool = False
     taper: float = 0.0
+    try_laws: bool = False
 
 
 def read(path: Path | str, recipe: Recipe) -> RawFile:
@@ -155,17 +158,37 @@ def naming(path: Path | str) -> Iterator[None]:
         raise DarkroomError(f"{path}: {error}") from error
 
 
-__all__ = ["Darkroom", "DarkroomError", "DecodeResult", "Recipe", "camera_name", "known_to"]
+__all__ = [
+    "Darkroom",
+    "DarkroomError",
+    "DecodeResult",
+    "Recipe",
+    "at_found",
+    "camera_name",
+    "known_to",
+    "search_frame",
+]
 
 
 @dataclass(frozen=True, slots=True)
 class DecodeResult:
-    """A decoded frame, its report and raw file, and how many milliseconds each step took."""
+    """A decoded frame, its report and raw file, and how many milliseconds each step took.
+
+    `search` is what the frame shows under all laws, where they were tried. `contradiction` says in a sentence that
+    carriers should be visible and are not; None where there is no such reason for doubt.
+    """
 
     light_field: LightField
     report: DecodeReport
     raw: RawFile
     ms: dict[str, float] = field(default_factory=dict)
+    search: LawSearch | None = None
+    contradiction: str | None = None
+
+    @property
+    def observable(self) -> bool:
+        """False where no carrier is seen, and none needs to be at this aperture and in this scene."""
+        return self.report.found > 1 or self.contradiction is not None or self.search is None
 
     @property
     def carriers_found(self) -> int:
@@ -228,10 +251,22 @@ class Darkroom:
                 decoder = known_to(decoder, None if focal_length_mm else raw.focal_sigma_mm)
             focal_length_mm = focal_length_mm or raw.focal_length_mm
             f_number = f_number or raw.f_number
+            search, doubt = None, None
             with _timed(ms, "slices and views" if views else "slices"):
                 light_field, report = decoder.decode_reported(
                     plane, focal_length_mm=focal_length_mm, f_number=f_number, views=views
                 )
+                if self.recipe.try_laws and isinstance(decoder, MaskDecoder) and focal_length_mm and f_number:
+                    if report.carriers_from == "predicted":
+                        search = search_frame(decoder, plane, focal_length_mm, f_number)
+                        if search.found is not None:
+                            decoder = at_found(decoder, search)
+                            light_field, report = decoder.decode_reported(
+                                plane, focal_length_mm=focal_length_mm, f_number=f_number, views=views
+                            )
+                        doubt = search.reason if search.expected and search.found is None else None
+                    elif report.carriers_from == "calibrated" and report.found <= 1:
+                        doubt = missing_at(decoder, plane, focal_length_mm, f_number)
                 if chroma is not None:
                     light_field = replace(
                         light_field, views=coloured(light_field.views, light_field.grid, chroma, plane.shape)
@@ -243,7 +278,12 @@ class Darkroom:
             "decoded_from": "grey" if raw.cfa is None else "mosaic",
             **(self._ranging if views else {}),
         }
-        return DecodeResult(replace(light_field, attributes=attributes), report, raw, ms)
+        made = DecodeResult(light_field, report, raw, ms, search, doubt)
+        if self.recipe.try_laws:
+            attributes["doubts"] = [words for words in (doubt, report.doubt) if words]
+            if not made.observable:
+                attributes["carriers_found"] = None
+        return replace(made, light_field=replace(light_field, attributes=attributes))
 
     def plane(self, raw: RawFile) -> Plane:
         """Return a frame's linear plane: black, white and dark frame; for masks also even colours and white frame."""
@@ -309,6 +349,37 @@ class Darkroom:
 
     def _calibration(self) -> Calibration:
         return calibration_files.load(Path(self.recipe.calibration))
+
+
+def search_frame(decoder: MaskDecoder, plane: Source, focal_length_mm: float, f_number: float) -> LawSearch:
+    """Search a frame for its mask's carriers near the prediction of every law."""
+    return search_laws(
+        transform(plane, workers=decoder.workers),
+        sensor=decoder.sensor,
+        mask=decoder.mask,
+        law=decoder.law,
+        mask_distance_mm=decoder.mask_distance_mm,
+        focal_length_mm=focal_length_mm,
+        f_number=f_number,
+    )
+
+
+def at_found(decoder: MaskDecoder, search: LawSearch) -> MaskDecoder:
+    """Return the decoder for the frame that a search found the lattice of, by the law that it obeys."""
+    assert search.found is not None
+    return replace(decoder, law=search.law or decoder.law, at=search.found.lattice)
+
+
+def missing_at(decoder: MaskDecoder, plane: Source, focal_length_mm: float, f_number: float) -> str | None:
+    """Why a calibration can't be this frame's, in a sentence; None where it may be."""
+    return missing(
+        transform(plane, workers=decoder.workers),
+        decoder.lattice_at(focal_length_mm),
+        sensor=decoder.sensor,
+        mask=decoder.mask,
+        mask_distance_mm=decoder.mask_distance_mm,
+        f_number=f_number,
+    )
 
 
 def known_to(decoder: MaskDecoder, focal_sigma_mm: float | None) -> MaskDecoder:

@@ -1,0 +1,164 @@
+"""Try every law on one frame: which of them the frame's carriers obey, with the odds, or why none can be seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dappled.decode.errors import DecodeError
+from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
+from dappled.decode.optics.visibility import OrderStrength, order_strengths
+from dappled.decode.spectrum import Spectrum
+from dappled.decode.spectrum.lattice import find_lattice
+from dappled.decode.spectrum.mask_lattice import MaskLattice, PeakList, find_mask_lattice, should_stand
+from dappled.decode.spectrum.peaks import measure, residual_bins
+
+_ALIKE_BINS = 0.5  # rms from their lattice: peaks farther off belong to the scene
+_ENOUGH = 0.6  # of a mask's carriers: a lattice found without a prediction needs so many
+
+
+@dataclass(frozen=True, slots=True)
+class LawOdds:
+    """What a frame says about one law: the log odds (nats) that the mask's carriers stand where the law allows.
+
+    None where no two of the mask's carriers agree near the law's prediction.
+    """
+
+    law: str
+    nats: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class LawSearch:
+    """What a frame shows under all laws.
+
+    `found` is the lattice that chance is ruled out for, `law` the law near whose prediction it is; both None where
+    there is none, and `reason` says why. `expected` is whether carriers must be visible in this frame, whatever shape
+    the stop has: then the absence of a lattice means that something is wrong.
+    """
+
+    odds: tuple[LawOdds, ...]
+    found: MaskLattice | None
+    law: str | None
+    expected: bool
+    reason: str
+
+    @property
+    def sentence(self) -> str:
+        """The odds of each law in words."""
+        shown = "; ".join(
+            f"{one.law} " + ("shows nothing" if one.nats is None else f"10^{one.nats / math.log(10):.0f} : 1")
+            for one in self.odds
+        )
+        return f"odds against chance: {shown}"
+
+
+def search_laws(
+    spectrum: Spectrum,
+    *,
+    sensor: Sensor,
+    mask: Mask,
+    law: str,
+    mask_distance_mm: float,
+    focal_length_mm: float,
+    f_number: float,
+    anywhere: bool = False,
+) -> LawSearch:
+    """Look for a mask's lattice in a whole spectrum near the prediction of each law; `law` wins a tie.
+
+    With `anywhere` a full mask that shows nearly all of its carriers is found away from every prediction, too.
+    """
+    peaks = PeakList.of(spectrum)
+    odds: list[LawOdds] = []
+    asked: list[list[OrderStrength]] = []
+    best: MaskLattice | None = None
+    chosen: str | None = None
+    for name in (law, *(other for other in LAWS if other != law)):
+        predicted = LAWS[name](mask, sensor, mask_distance_mm, focal_length_mm)
+        expected = order_strengths(mask, sensor, predicted, mask_distance_mm=mask_distance_mm, f_number=f_number)
+        found = find_mask_lattice(peaks, predicted, expected)
+        asked.append(expected)
+        odds.append(LawOdds(name, None if found is None else found.odds_nats))
+        if found is not None and found.sure and (best is None or found.odds_nats > best.odds_nats):
+            best, chosen = found, name
+    if anywhere and best is None and mask.pattern == "full":
+        best = _anywhere(spectrum, mask)
+    expects, reason = unseen(
+        spectrum, asked, ideal_f_number=mask.frequency_per_mm * mask_distance_mm, f_number=f_number
+    )
+    return LawSearch(tuple(odds), best, chosen, expects, "" if best is not None else reason)
+
+
+def missing(
+    spectrum: Spectrum, lattice: Lattice, *, sensor: Sensor, mask: Mask, mask_distance_mm: float, f_number: float
+) -> str | None:
+    """Why a calibration's lattice can't be this frame's, in a sentence: carriers should be seen on it and none is."""
+    expected = order_strengths(mask, sensor, lattice, mask_distance_mm=mask_distance_mm, f_number=f_number)
+    there = should_stand(spectrum, expected)
+    if not _spans(there):
+        return None
+    seen = measure(spectrum, lattice.carriers([one.order for one in there]), 3.0)
+    if any(one is not None for one in seen):
+        return None
+    return (
+        f"no carriers: {_some([_name(one) for one in there])} should stand out at f/{f_number:g} where the calibration "
+        "has them, and none does: check mask, camera, focal length, f-number and calibration"
+    )
+
+
+def unseen(
+    spectrum: Spectrum, predictions: Sequence[Sequence[OrderStrength]], *, ideal_f_number: float, f_number: float
+) -> tuple[bool, str]:
+    """(whether carriers must be visible, why no lattice is, in a sentence that names the orders).
+
+    `predictions` are one or more laws'; the sentence is about the one under which most should be seen.
+    """
+    expected, above = max(
+        ((list(one), should_stand(spectrum, one)) for one in predictions), key=lambda pair: len(pair[1])
+    )
+    causes: dict[str, list[str]] = {}
+    for one in expected:
+        if one not in above:
+            causes.setdefault(one.cause or "below the frame's own detail and noise", []).append(_name(one))
+    lost = "; ".join(f"{_some(orders)} {cause}" for cause, orders in causes.items())
+    if _spans(above):
+        more = f" (not expected: {lost})" if lost else ""
+        return True, (
+            f"no carriers: {_some([_name(one) for one in above])} should stand out at f/{f_number:g} and no lattice of "
+            f"this mask does{more}: check mask, camera, focal length and f-number"
+        )
+    return False, (
+        f"no carriers can be seen in this frame at f/{f_number:g}: {lost}. Calibrate on a white frame at a small "
+        f"aperture (f/{3 * ideal_f_number:.0f} or smaller for this mask; its ideal is f/{ideal_f_number:.1f})"
+    )
+
+
+def _spans(orders: Sequence[OrderStrength]) -> bool:
+    return len(orders) > 1 and bool(np.linalg.matrix_rank([one.order for one in orders]) == 2)
+
+
+def _name(one: OrderStrength) -> str:
+    return f"({one.order[0]}, {one.order[1]})"
+
+
+def _some(orders: Sequence[str]) -> str:
+    return ", ".join(orders[:4]) + (f" and {len(orders) - 4} more" if len(orders) > 4 else "")
+
+
+def _anywhere(spectrum: Spectrum, mask: Mask) -> MaskLattice | None:
+    """The lattice of a full mask without a prediction, if the frame shows nearly all of its carriers."""
+    try:
+        lattice = find_lattice(spectrum).lattice
+    except DecodeError:
+        return None
+    looked = [c for c in lattice.carriers(mask.half_orders()) if c.on_sensor and (c.ky, c.kx) != (0, 0)]
+    found = [(c, m) for c, m in zip(looked, measure(spectrum, looked, 2.0), strict=True) if m is not None]
+    if (
+        len(found) <= _ENOUGH * len(looked)
+        or residual_bins([c for c, _ in found], [m for _, m in found], spectrum) > _ALIKE_BINS
+    ):
+        return None
+    return MaskLattice(lattice, tuple(found), 0.0, math.nan, math.nan)

@@ -1,0 +1,113 @@
+"""The thesis' camera at the command line: a 450D behind Mask 2, by rays, as a stranger's files would be."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dappled.cli import main
+from dappled.drivers.raw import calibration_files
+from dappled.mocks.scene import dng
+from dappled.products.exports import light_files
+from tests.decode.ray_frames import MASKS, Body, Shot
+
+FULL = Body((2856, 4290), (0.0051948051948, 0.0051948051948), "450D, whole")
+QUARTER = replace(FULL, shape=(714, 1072), scale="450D, a quarter of its sides")
+PROFILE = (
+    'law = "fd"\nmask_distance_mm = 1.01\n[[raw]]\nname = "a quarter"\nshape = [714, 1072]\n'
+    "row_mm = [0.0051948051948, 0.0]\ncolumn_mm = [0.0, 0.0051948051948]\n"
+)
+
+
+def _file(path: Path, shot: Shot, plane: np.ndarray, *, colours: bool = False) -> Path:
+    """A DNG of a plane; `colours` with an RGGB pattern of a warm light."""
+    black, white = 1024, 15000
+    light = plane.astype(np.float64) * 0.8
+    if colours:
+        light[::2, ::2] *= 0.6
+        light[1::2, 1::2] *= 0.45
+    raw = np.clip(black + light * (white - black), 0, white).astype(np.uint16)
+    exif = dng.Exif("Canon", "Canon EOS 450D", "1", shot.focal_length_mm, shot.f_number, 1e-2, 100, 0)
+    path.write_bytes(dng.encode(raw, black=black, white=white, exif=exif, mono=not colours))
+    return path
+
+
+def _quarter(folder: Path) -> list[str]:
+    (folder / "quarter.toml").write_text(PROFILE)
+    return ["--camera", str(folder / "quarter.toml"), "--mask", "mask-2"]
+
+
+@pytest.mark.slow
+def test_the_readme_s_calibrate_command_works_on_a_450d_behind_mask_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (line,) = re.findall(
+        r"^dappled (calibrate white-f22\.cr2 --mask .*?)\s*(?:#.*)?$", Path("README.md").read_text(), re.M
+    )
+    shot = Shot(MASKS["mask-2"], FULL, 50.0, 22.0, turn_deg=0.7, finer=1)
+    _file(tmp_path / "white-f22.dng", shot, shot.frame(), colours=True)
+    words = line.replace("white-f22.cr2", str(tmp_path / "white-f22.dng")).split()
+    words[words.index("-o") + 1] = str(tmp_path / "calibration.toml")
+    assert main(words) == 0, capsys.readouterr().err
+    found = calibration_files.load(tmp_path / "calibration.toml")
+    orders = np.array([(1, 1), (1, -1), (2, 2), (2, -2)])
+    off = orders @ (found.fits[0].lattice.matrix() - shot.lattice) * FULL.shape
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.1
+    assert found.law == "geometric"
+    assert "only geometric would do" in found.verdict
+
+
+def test_the_law_that_the_frame_obeys_is_used_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shot = Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, turn_deg=1.0, scene="texture", seed=2)
+    frame = str(_file(tmp_path / "f.dng", shot, shot.frame()))
+    words = [frame, *_quarter(tmp_path)]
+    assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 0
+    assert "by the law geometric (odds against chance: fd shows nothing; geometric 10^" in capsys.readouterr().out
+    made = light_files.load(tmp_path / "f.npz")
+    assert made.attributes["law"] == "geometric"
+    assert made.attributes["carriers_from"] == "measured"
+    assert made.attributes["doubts"] == []
+    at = {(int(ky), int(kx)): (fy, fx) for ky, kx, fy, fx in made.carriers}
+    assert np.abs((np.array(at[1, 1]) - (1, 1) @ shot.lattice) * QUARTER.shape).max() < 0.1
+    assert main(["carriers", *words, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["law"] == "geometric"
+    assert {one["law"]: one["odds_nats"] is not None for one in told["laws"]} == {"fd": False, "geometric": True}
+
+
+def test_a_frame_that_must_show_carriers_and_does_not_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shot = Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, scene="white")
+    words = [str(_file(tmp_path / "bare.dng", shot, shot.without_film())), *_quarter(tmp_path)]
+    assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 1
+    told = capsys.readouterr().err
+    assert "should stand out at f/22" in told
+    assert "--anyway" in told
+    assert "\n" not in told.strip()
+    assert not (tmp_path / "f.npz").exists()
+    assert main(["carriers", *words]) == 1
+    assert main(["calibrate", *words, "-o", str(tmp_path / "c.toml")]) == 1
+    assert not (tmp_path / "c.toml").exists()
+    capsys.readouterr()
+    assert main(["decode", *words, "--anyway", "-o", str(tmp_path / "f.npz")]) == 0
+    assert "should stand out at f/22" in capsys.readouterr().out
+    (doubt,) = light_files.load(tmp_path / "f.npz").attributes["doubts"]
+    assert "no lattice of this mask does" in doubt
+
+
+def test_where_no_carrier_can_be_seen_that_is_no_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shot = Shot(MASKS["mask-2"], QUARTER, 85.0, 1.8, scene="texture", exponent=1.1, snr=30.0)
+    words = [str(_file(tmp_path / "open.dng", shot, shot.frame())), *_quarter(tmp_path)]
+    assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 0
+    assert "not observable at this aperture" in capsys.readouterr().out
+    assert light_files.load(tmp_path / "f.npz").attributes["carriers_found"] is None
+    assert main(["carriers", *words, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["observable"] is False
+    assert "averaged out over the stop" in told["reason"]
