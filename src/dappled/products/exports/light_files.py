@@ -25,7 +25,7 @@ from dappled.bounds.parsing import parse_json
 from dappled.decode.lightfield import LightField
 from dappled.errors import DappledError, first_line
 from dappled.flight import durable
-from dappled.products.exports import packed_arrays
+from dappled.products.exports import h5_reader, packed_arrays
 
 _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "slices": (np.complex64, 3),
@@ -189,9 +189,9 @@ def _save_h5(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
 
 
 def _load_h5(path: Path) -> tuple[_Arrays, dict[str, Any]]:
-    with _h5py(path).File(path, "r") as file:
-        packed_arrays.check_h5(file, list(_ARRAYS), _ATTRIBUTES)
-        return {name: np.asarray(file[name]) for name in _ARRAYS}, parse_json(file.attrs[_ATTRIBUTES])
+    _h5py(path)
+    arrays, attributes = h5_reader.read(path, list(_ARRAYS), _ATTRIBUTES)
+    return arrays, parse_json(attributes)
 
 
 def _zarr(path: Path) -> Any:
