@@ -18,6 +18,7 @@ from dappled.bounds.claims import ClaimError, in_words
 MOST_BYTES = 4 << 20
 """Of one text. Python's objects take up to forty times as much."""
 MOST_DEPTH = 64
+_MOST_BRACKETS = 100_000
 _LEAST, _MOST = -(1 << 63), (1 << 63) - 1  # what TOML, SQLite and the wire's readers hold
 _MOST_DIGITS = 20
 _NAME_CHARACTERS = 1000  # of a TOML key
@@ -51,7 +52,7 @@ def parse_json(data: bytes | memoryview | str, most: int = MOST_BYTES) -> Any:
     if not isinstance(data, str):
         data = bytes(data)
         data = data.decode(json.detect_encoding(data))
-    if data.count("[") + data.count("{") > MOST_DEPTH:
+    if _brackets(data) > MOST_DEPTH:
         _check_json_depth(data)
     return json.loads(data, parse_int=_integer, parse_float=_real, parse_constant=_constant)
 
@@ -59,6 +60,7 @@ def parse_json(data: bytes | memoryview | str, most: int = MOST_BYTES) -> Any:
 def parse_toml(text: str, most: int = MOST_BYTES) -> dict[str, Any]:
     """Parse TOML whose whole numbers have 64 bits. Raises ValueError; ClaimError where a limit is passed."""
     _check_length(text, most)
+    _brackets(text)
     _check_toml_depth(text)
     try:
         tables = tomllib.loads(text)
@@ -75,6 +77,14 @@ def parse_toml(text: str, most: int = MOST_BYTES) -> dict[str, Any]:
 def _check_length(data: Sized, most: int) -> None:
     if len(data) > most:
         raise ClaimError(f"it is longer than {in_words(most)}, the most that is read: check what it holds")
+
+
+def _brackets(text: str) -> int:
+    """Count opening brackets. Raises ClaimError where there are too many: each is an object of Python's."""
+    count = text.count("[") + text.count("{")
+    if count > _MOST_BRACKETS:
+        raise ClaimError(f"it has more than {_MOST_BRACKETS} brackets, the most that is read: check what it holds")
+    return count
 
 
 def _check_json_depth(text: str) -> None:

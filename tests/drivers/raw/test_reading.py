@@ -280,3 +280,29 @@ def test_real_photographs_say_their_focal_length(shared_data: Path) -> None:
 def test_a_lenslet_photograph(shared_data: Path) -> None:
     frame = reading.read(shared_data / "lenslet" / "ulf_letters" / "letters_ULF_M1.png")
     assert frame.mosaic.shape == (960, 1280)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["tif", "png"])
+def test_a_frame_of_200_megapixels_is_read(tmp_path: Path, kind: str) -> None:
+    """Pillow's own limit is 179."""
+    values = np.random.default_rng(1).integers(0, 255, (12_000, 17_000), dtype=np.uint8)
+    path = tmp_path / f"a.{kind}"
+    if kind == "tif":
+        tifffile.imwrite(path, values)
+    else:
+        Image.fromarray(values).save(path, compress_level=0)
+    np.testing.assert_array_equal(read(path).mosaic, values)
+    read_metadata(path)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_pixels_that_are_not_stored_are_not_unpacked(name: str) -> None:
+    values = np.zeros((9000, 9000), np.uint8)
+    file = io.BytesIO()
+    if name == "a.png":
+        Image.fromarray(values).save(file, "PNG", compress_level=1)
+    else:
+        tifffile.imwrite(file, values, compression="zlib")
+    with pytest.raises(RawFileError, match=r"its 9000 × 9000 pixels would take 81 MB of memory, and the .* stored"):
+        read(file.getvalue(), name)
