@@ -36,6 +36,8 @@ def open_picture(file: BinaryIO, *, ratio: int = claims.RATIO, free_pixels: int 
     kind = next((kind for mark, kind in _MARKS if start.startswith(mark)), None)
     if kind is None:
         raise UnidentifiedImageError("it is neither PNG, nor JPEG, nor TIFF")
+    if start == b"\x89PNG":
+        _check_png_chunks(file)
     try:
         # Not Image.open: its limit of pixels is a global of Pillow, below the size of today's survey cameras.
         picture: Image.Image = kind(file)
@@ -78,6 +80,10 @@ def check_tiff_page(page: Any, file: BinaryIO, *, ratio: int = claims.RATIO, fre
     check_pixels(size, sample_bytes, stored, ratio=ratio, free_pixels=free_pixels)
     if page.shape and claims.count(page.shape, "picture") > page.imagewidth * page.imagelength * page.samplesperpixel:
         raise ClaimError("it is a volume, not a picture: save one layer of it")
+    if max(page.databytecounts, default=0) > stored:
+        raise ClaimError(
+            "one of its strips or tiles ends after the file does: it is damaged or cut short; make it anew"
+        )
     part = math.prod(page.chunks) * page.dtype.itemsize
     claims.check_size(part, stored, "strips or tiles", ratio=ratio)
     if page.compression in _DEFLATED:
@@ -85,6 +91,17 @@ def check_tiff_page(page: Any, file: BinaryIO, *, ratio: int = claims.RATIO, fre
             file.seek(at)
             claims.check_inflated(file.read(min(length, stored)), part, "strip or tile")
         file.seek(0)
+
+
+def _check_png_chunks(file: BinaryIO) -> None:
+    """Check that each chunk ends inside the file: Pillow takes memory for what its length claims. Raises ClaimError."""
+    size, at = _length(file), 8
+    while at + 8 <= size:
+        file.seek(at)
+        at += 12 + int.from_bytes(file.read(4), "big")
+        if at > size:
+            raise ClaimError("one of its chunks ends after the file does: it is damaged or cut short; make it anew")
+    file.seek(0)
 
 
 def _length(file: BinaryIO) -> int:
