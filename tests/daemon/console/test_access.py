@@ -160,3 +160,15 @@ def test_nothing_strange_gets_in(method: str, path: str, headers: dict[str, str]
     rules = Access(TOKEN)
     refusal = rules.judge(ConsoleRequest(method, "/api/" + path, headers, query))
     assert refusal is not None or path == "login"
+
+
+def test_a_flood_of_wrong_tokens_is_a_few_lines_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    rules = Access("t" * 20, clock=RecordedClock(10**18))
+    for number in range(500):
+        assert rules.try_token(f"guess {number}", "10.0.0.5") is not None
+        assert rules.judge(ConsoleRequest("GET", "/", {"host": f"evil{number}.example"}, "", "10.0.0.5")) is not None
+    assert sorted(caplog.messages) == [
+        "10.0.0.5: refused: a wrong token",
+        "10.0.0.5: refused: it asked for a host name that is not in console.hosts",
+        "10.0.0.5: refused: too many wrong tokens",
+    ]

@@ -296,3 +296,12 @@ def test_every_refusal_is_told() -> None:
     assert len(sink.refusals) == shutter.statistics().refused == 2
     assert "an interval must be" in sink.refusals[0]
     assert "waiting for the camera" in sink.refusals[1]
+
+
+def test_a_flood_of_refused_requests_is_one_line_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    rig = Rig()
+    rig.sink.problem = "no camera on the bus"
+    for sequence in range(516):
+        assert not rig.shutter.request(CaptureRequest(PILOT, "x", sequence)).accepted
+    assert len(caplog.messages) == 1
+    assert "no camera on the bus" in caplog.messages[0]

@@ -54,12 +54,13 @@ async def _serve(channel: ProcessChannel, listener: socket.socket, setup: Mappin
     studio = Studio(None if recipe is None else Recipe(**recipe), setup["mount"])
     feed = Feed(setup["endpoint"], setup["ask"], Hub(), studio)
     daemon = DaemonChannel(channel)
-    app = ConsoleApp(feed, studio, daemon, Access(setup["token"], setup["hosts"]), _background(setup["map"]))
+    rules = Access(setup["token"], setup["hosts"])
+    app = ConsoleApp(feed, studio, daemon, rules, _background(setup["map"]))
     server = uvicorn.Server(configuration(app.asgi()))
     tasks = [asyncio.create_task(feed.run()), asyncio.create_task(app.follow_log())]
     for task in tasks:
         task.add_done_callback(lambda done: _end(done, server))
-    watcher = asyncio.create_task(_until_gone(daemon, server))
+    watcher = asyncio.create_task(_until_gone(daemon, rules, server))
     await server.serve(sockets=[listener])
     for task in (*tasks, watcher):
         task.cancel()
@@ -93,11 +94,12 @@ def _end(task: asyncio.Task[None], server: uvicorn.Server) -> None:
         server.should_exit = True
 
 
-async def _until_gone(daemon: DaemonChannel, server: uvicorn.Server) -> None:
-    """End the server when the daemon has ended: ask every second, because nothing else would show it."""
+async def _until_gone(daemon: DaemonChannel, rules: Access, server: uvicorn.Server) -> None:
+    """End the server when the daemon has ended: ask every second, because nothing else would show it. Log refusals."""
     loop = asyncio.get_running_loop()
     while not daemon.gone.is_set():
         await asyncio.sleep(1.0)
+        rules.settle()
         try:
             await loop.run_in_executor(None, daemon.ask, {"do": "nothing"})
         except DappledError as error:

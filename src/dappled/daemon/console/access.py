@@ -16,7 +16,9 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from dappled.clock import Clock, SystemClock
+from dappled.daemon.stream.admission import network_of
 from dappled.errors import report
+from dappled.refusals import RefusalLog
 
 log = logging.getLogger(__name__)
 COOKIE = "dappled"
@@ -25,6 +27,7 @@ GUESSERS = 1024  # addresses that are remembered
 BODY_BYTES = 4096
 _LENGTH_DIGITS = 10
 _PATH_CHARACTERS = 80
+_OTHER_HOST = "it asked for a host name that is not in console.hosts"
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' blob: data:; manifest-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -69,6 +72,7 @@ class Access:
         self._names = {name.lower() for name in (*names, "localhost", own, f"{own}.local")}
         self._clock = clock or SystemClock()
         self._guesses: OrderedDict[str, deque[float]] = OrderedDict()
+        self._refusals = RefusalLog(log, self._clock)
         self.refused = 0
 
     @property
@@ -78,17 +82,26 @@ class Access:
 
     def judge(self, request: ConsoleRequest) -> Refusal | None:
         """None for a request that is allowed."""
-        refusal = self._host(request) or self._state_change(request) or self._known(request)
+        refusal = self._host(request) or self._state_change(request)
+        if refusal is not None:  # a page without its token yet is no such case
+            self._refusals.refused(request.client, _OTHER_HOST if refusal.status == 421 else refusal.text)
+        else:
+            refusal = self._known(request)
         if refusal is not None:
             self.refused += 1
         return refusal
 
+    def settle(self) -> None:
+        """See `RefusalLog.settle`."""
+        self._refusals.settle()
+
     def try_token(self, token: str, client: str) -> Refusal | None:
         """None for the right token. Wrong ones are limited for each address; other addresses are not affected."""
-        now, client = self._clock.monotonic_ns() / 1e9, _network(client)
+        now, client = self._clock.monotonic_ns() / 1e9, network_of(client)
         guesses = self._guesses.get(client, deque())
         if len(guesses) == GUESSES and now - guesses[0] < GUESS_WINDOW_S:
             self.refused += 1
+            self._refusals.refused(client, "too many wrong tokens")
             return Refusal(429, "too many wrong tokens: wait a minute")
         if not self._token or self._right(token):
             return None
@@ -97,6 +110,7 @@ class Access:
         if len(self._guesses) > GUESSERS:
             self._guesses.popitem(last=False)
         self.refused += 1
+        self._refusals.refused(client, "a wrong token")
         return Refusal(403, "this is not the token")
 
     def _host(self, request: ConsoleRequest) -> Refusal | None:
@@ -183,14 +197,3 @@ def _cookie(header: str) -> str:
     except CookieError:
         return ""
     return found.value if found is not None else ""
-
-
-def _network(client: str) -> str:
-    """The address; for IPv6 the /64 network, because one machine can have many addresses there."""
-    try:
-        address = ipaddress.ip_address(client)
-    except ValueError:
-        return client
-    if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is None:
-        return str(ipaddress.ip_network((int(address) >> 64 << 64, 64)))
-    return client

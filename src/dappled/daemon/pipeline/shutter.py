@@ -12,12 +12,13 @@ from dappled.clock import Clock
 from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
 from dappled.errors import counted, report
 from dappled.flight import Cause, FlightError, Shot
+from dappled.refusals import RefusalLog
 from dappled.workers import Loop
 
 __all__ = ["CaptureRequest", "ShotDecision", "Shutter", "ShutterStatistics"]
 
 log = logging.getLogger(__name__)
-_IDLE_S = 3600.0
+_IDLE_S = 60.0
 _SHORTEST_S = 0.05
 _AGAIN_S = 1.0
 
@@ -93,6 +94,7 @@ class Shutter:
         self._capacity = capacity
         self._lock = threading.Lock()
         self._recent = RecentRequests()
+        self._refusals = RefusalLog(log, clock)
         self._pending: set[int] = set()
         self._interval: _Interval | None = None
         self._requests = self._shots = self._duplicates = self._refused = self._succeeded = self._failed = 0
@@ -241,7 +243,7 @@ class Shutter:
     def _refuse(self, request: CaptureRequest, reason: str) -> ShotDecision:
         self._refused += 1
         self._sink.refused(request, reason)
-        log.warning("A shot was refused (%s, %s): %s", request.source, request.kind, reason)
+        self._refusals.refused(f"{request.kind} from {request.source}", reason)
         return ShotDecision("refused", reason=reason)
 
     def _why_not(self) -> str | None:
@@ -254,6 +256,7 @@ class Shutter:
     def _run(self) -> None:
         while not self._stopped:
             self._wake.clear()
+            self._refusals.settle()
             try:
                 wait_s = self.serve()
             except Exception as error:  # noqa: BLE001  # noting or firing failed: the interval goes on
