@@ -274,10 +274,6 @@ class MaskDecoder:
         at_own = measure(spectrum, own.carriers([(c.ky, c.kx) for c in predicted]), 2.0)
         return own, at_own, "measured"
 
-    def cut(self, spectrum: Spectrum, lattice: Lattice, carriers: Sequence[Carrier]) -> Slices:
-        """The slices at these carriers, cut at Nyquist."""
-        return extract(spectrum, carriers, self.slice_size(lattice), taper=self.taper, workers=self.workers)
-
     def _radii(self, carriers: Sequence[Carrier], focal_length_mm: float) -> list[float]:
         """How far from each prediction a carrier may lie, in bins: rotation, rounding of the focal length, 1.5 bins."""
         high, wide = padded_shape(self.sensor.shape)

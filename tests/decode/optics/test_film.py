@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics.carriers import Harmonics, Mask, Pattern
-from dappled.decode.optics.film import FILMS, MaskImage, density_curve, film_of, period_on, wedge
+from dappled.decode.optics.film import FILMS, DensityCurve, MaskImage, density_curve, film_of, period_on, wedge
+
+
+def develop(curve: DensityCurve, levels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The transmittance that printed levels (0 to 1) get on a film of this curve."""
+    return np.interp(levels, curve.levels, curve.transmittance)
 
 
 def test_a_mask_wider_than_the_film_is_refused_with_both_sizes() -> None:
@@ -28,7 +34,7 @@ def test_a_curve_is_inverted(gamma: float, top: float, falling: bool, wanted: fl
     share = (levels / 255) ** gamma
     curve = density_curve(list(levels), list(top * (share if falling else 1 - share)))
     low, high = curve.range
-    made = curve.develop(curve.level(np.array([wanted])))
+    made = develop(curve, curve.level(np.array([wanted])))
     assert (made[0] - low) / (high - low) == pytest.approx(wanted, abs=1e-9)
 
 
@@ -154,9 +160,9 @@ def test_a_curve_makes_the_film_s_transmittance_the_pattern() -> None:
     image = _image(20, 2, "full", "linear")
     printed = replace(image, curve=curve, bits=16).levels(ALL, ALL) / 65535
     low, high = curve.range
-    developed = (curve.develop(printed) - low) / (high - low)
+    developed = (develop(curve, printed) - low) / (high - low)
     np.testing.assert_allclose(developed, image.transmittance(ALL, ALL), atol=1e-3)
-    plain = (curve.develop(image.transmittance(ALL, ALL)) - low) / (high - low)
+    plain = (develop(curve, image.transmittance(ALL, ALL)) - low) / (high - low)
     assert np.abs(plain - image.transmittance(ALL, ALL)).max() > 0.2  # what it corrects
 
 

@@ -100,11 +100,6 @@ class DensityCurve:
         result: NDArray[np.float64] = np.interp(low + np.asarray(wanted) * (high - low), t, levels[first])
         return result
 
-    def develop(self, levels: NDArray[np.floating]) -> NDArray[np.float64]:
-        """The transmittance of printed levels (0 to 1)."""
-        result: NDArray[np.float64] = np.interp(levels, self.levels, self.transmittance)
-        return result
-
 
 def density_curve(levels: Sequence[float], densities: Sequence[float], *, top_level: float = 255) -> DensityCurve:
     """The curve of a step wedge: printed levels (0 to `top_level`) and the optical densities measured on the film.
