@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from dappled.drivers.mavlink import Message, PacketParser, mavlink, pack
-from dappled.flight import layout, logs
+from dappled.flight import layout, log_reading
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import free_port
 from dappled.workers import Loop
@@ -135,7 +135,7 @@ def test_every_accepted_request_has_one_outcome_at_the_ground_station_over_nine_
                 noted = [
                     shot.index
                     for flight in layout.flights(tmp_path / "flights")
-                    for shot in logs.read_journal(flight.journal).shots
+                    for shot in log_reading.read_journal(flight.journal).shots
                 ]
                 eventually(lambda: {index for index, _ in ground.outcomes} >= set(noted), "an outcome of each", START_S)
                 heard = list(ground.outcomes)

@@ -110,8 +110,8 @@ class Service:
         with ExitStack() as stack:
             names, recipe = recipes.recipe(settings)
             camera = open_camera(settings.camera)
-            door = console_process.open_listener(settings, stack)
-            self._publisher = _open_publisher(settings, door.private if door else "")
+            listener = console_process.open_listener(settings, stack)
+            self._publisher = _open_publisher(settings, listener.private if listener else "")
             stack.callback(self._publisher.stop)
             self._links = _configured_links(settings, self._clock)
             self._links.open()
@@ -119,11 +119,11 @@ class Service:
             recipe = self._begin_recording(names, recipe, stack)
             self._build(camera, names, recipe)
             self._start_parts(names, stack)
-            if door:
-                self.console_url = door.url
+            if listener:
+                self.console_url = listener.url
                 act = partial(console_process.answer, shutter=self._shutter, logbook=self._logbook)
                 self._console = console_process.start(
-                    door, settings, stack, recipe=recipe, act=act, logbook=self._logbook
+                    listener, settings, stack, recipe=recipe, act=act, logbook=self._logbook
                 )
             self._started = True
             self._stack = stack.pop_all()

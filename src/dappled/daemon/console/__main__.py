@@ -60,11 +60,11 @@ async def _serve(channel: ProcessChannel, listener: socket.socket, setup: Mappin
     tasks = [asyncio.create_task(feed.run()), asyncio.create_task(app.follow_log())]
     for task in tasks:
         task.add_done_callback(lambda done: _end(done, server))
-    watcher = asyncio.create_task(_until_gone(daemon, rules, server))
+    waiting = asyncio.create_task(_until_gone(daemon, rules, server))
     await server.serve(sockets=[listener])
-    for task in (*tasks, watcher):
+    for task in (*tasks, waiting):
         task.cancel()
-    await asyncio.gather(*tasks, watcher, return_exceptions=True)
+    await asyncio.gather(*tasks, waiting, return_exceptions=True)
 
 
 def configuration(served: ASGIApp) -> uvicorn.Config:

@@ -382,19 +382,19 @@ def _attitude(at: Around, sigma_s: float, own_rad: float) -> tuple[Quaternion | 
     if not samples:
         return None, None, None
     found, doubt = attitude_at(samples, at.boot_ns)
-    told = max((sample.sigma_rad for sample in samples if sample.sigma_rad is not None), default=own_rad)
+    reported_rad = max((sample.sigma_rad for sample in samples if sample.sigma_rad is not None), default=own_rad)
     rates = max((s.rates_rad_s for s in samples if s.rates_rad_s is not None), key=norm, default=None)
     if len(samples) == 1:
         sigma_s = math.hypot(sigma_s, abs(samples[0].boot_ns - at.boot_ns) / 1e9)
     if rates is not None:
-        each = (doubt**2 + told**2) / 3  # of each axis
+        each = (doubt**2 + reported_rad**2) / 3  # of each axis
         covariance = _symmetric(rates, sigma_s, (each, each, each))
-        return found, math.hypot(norm(rates) * sigma_s, doubt, told), covariance
+        return found, math.hypot(norm(rates) * sigma_s, doubt, reported_rad), covariance
     if len(samples) == 1:
         return found, None, None
     span_s = (samples[1].boot_ns - samples[0].boot_ns) / 1e9
     rate = turn_rad(samples[0].attitude, samples[1].attitude) / span_s
-    return found, math.hypot(rate * sigma_s, doubt, told), None
+    return found, math.hypot(rate * sigma_s, doubt, reported_rad), None
 
 
 def _symmetric(way: Vector3, sigma_s: float, own: Vector3) -> Symmetric:

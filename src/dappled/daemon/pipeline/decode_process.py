@@ -125,7 +125,7 @@ class DecodeProcess:
             self._ask({"do": "warm up"})
 
     def begin_warm_up(self) -> None:
-        """The same in a thread of its own; what goes wrong is told in the log."""
+        """The same in a thread of its own; a failure is logged."""
         Loop("decoder warm-up", self._warm_up).start()
 
     def _warm_up(self) -> None:
@@ -151,10 +151,10 @@ class DecodeProcess:
             body = _mapped(body_fd)
         finally:
             os.close(body_fd)
-        told = answer.body
-        nearest = told["nearest_m"]
+        depth = answer.body
+        nearest = depth["nearest_m"]
         pair = None if nearest is None else (float(nearest[0]), float(nearest[1]))
-        return FrameDepth(body, told["arrays"], told["range_px"], told["grid"], told["law"], pair)
+        return FrameDepth(body, depth["arrays"], depth["range_px"], depth["grid"], depth["law"], pair)
 
     def close(self) -> None:
         """End the worker, also in the middle of a frame, which then is not decoded."""

@@ -116,7 +116,7 @@ def propose(flight: Path, source: FileSource, choice: Choice) -> Proposal:
 
 
 def bring(flight: Path, source: FileSource, proposal: Proposal, clock: Clock, progress: Callable[[int], Any]) -> Picked:
-    """Record, tag and index what was proposed. `progress` is told the bytes of each file. What was brought when an
+    """Record, tag and index what was proposed. `progress` gets the bytes of each file. What was brought when an
     error comes stays; doing it again brings the rest. Raises FlightError, CameraError."""
     folder = layout.open_folder(flight)
     facts = layout.read_facts(folder)

@@ -68,9 +68,9 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
         results = ledger.results(run)
         events = [event for event in ledger.events() if event.index is not None]
         turns = recorded_vehicles(ledger)
-    told: dict[int | None, dict[str, str]] = defaultdict(dict)
+    texts: dict[int | None, dict[str, str]] = defaultdict(dict)
     for event in events:
-        told[event.index][event.kind] = event.text
+        texts[event.index][event.kind] = event.text
     expected, files = [], []
     for row in rows:
         index = row.shot.index
@@ -83,10 +83,10 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
                 _recorded(digests["poses"], index),
                 _recorded(digests["tags"], index),
                 None if result is None else result.slices_sha256,
-                frozenset(told[index]),
+                frozenset(texts[index]),
             )
         )
-        files.append(_file(flight, row, frame, told[index].get("doubt")))
+        files.append(_file(flight, row, frame, texts[index].get("doubt")))
     if not frames:
         raise ReplayError(f"{folder} holds no frames: there is nothing to replay")
     telemetry = flight.telemetry if flight.telemetry.is_file() else None

@@ -59,8 +59,8 @@ class RunWriter:
             self.run = replace(run, recipe=kept)
             self._ledger = stack.enter_context(Ledger(folder.ledger, clock))
             provenance.note(folder, self._ledger, f"{recipes.FOLDER}/{run.name}")
-            told = {"recipe": _relative(kept, flight), "names": asdict(run.names), "software": recipes.versions()}
-            self._ledger.set_fact(_fact(run.name), {**told, "utc_ns": clock.utc_ns()})
+            kept_as = {"recipe": _relative(kept, flight), "names": asdict(run.names), "software": recipes.versions()}
+            self._ledger.set_fact(_fact(run.name), {**kept_as, "utc_ns": clock.utc_ns()})
             self._opened = stack.pop_all()
 
     def __enter__(self) -> Self:
@@ -78,11 +78,11 @@ def of_flight(flight: Path, name: str) -> Run:
     """A run that was made. Raises DappledError where there is none of this name."""
     with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
         facts = ledger.facts()
-    told = facts.get(_fact(name))
-    if told is None:
+    fact = facts.get(_fact(name))
+    if fact is None:
         runs = sorted(key.removeprefix("run:") for key in facts if key.startswith("run:"))
         raise DappledError(f"{flight} has no run {name!r}; it has {', '.join(runs) or 'only the flight itself'}")
-    return Run(name, Recipe(**{**told["recipe"], **_absolute(told["recipe"], flight)}), Names(**told["names"]))
+    return Run(name, Recipe(**{**fact["recipe"], **_absolute(fact["recipe"], flight)}), Names(**fact["names"]))
 
 
 def _fact(name: str) -> str:

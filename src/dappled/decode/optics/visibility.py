@@ -19,7 +19,7 @@ from scipy import special
 
 from dappled.decode.optics.carriers import Lattice, Mask, Order, Sensor
 
-_ROUNDING = 0.12  # relative: an f-number told in third stops, and nulls where only their neighbourhood counts
+_ROUNDING = 0.12  # relative: an f-number given in third stops, and nulls where only their neighbourhood counts
 _WAVELENGTHS_MM = np.array([450e-6, 500e-6, 550e-6, 600e-6, 650e-6])
 _LOST = 0.15  # a factor below this is named as the cause why a carrier is not seen
 

@@ -75,8 +75,8 @@ class Troubles:
         self._simulation.body.fault("clear")
         if self._full:
             self._disk()
-        for watcher in self._subscribers:
-            _end(watcher)
+        for subscriber in self._subscribers:
+            _end(subscriber)
         self._subscribers.clear()
         for page in self._pages:
             page.close()
@@ -120,13 +120,13 @@ class Troubles:
         if len(self._subscribers) >= 4:
             _end(self._subscribers.pop(0))
         command = [sys.executable, "-m", "dappled", "watch", self._stream, "--timeout", "600"]
-        watcher = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-        self._subscribers.append(watcher)
-        assert watcher.stdout is not None
-        select.select([watcher.stdout], [], [], HEAR_S)
-        watcher.send_signal(then)
+        subscriber = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        self._subscribers.append(subscriber)
+        assert subscriber.stdout is not None
+        select.select([subscriber.stdout], [], [], HEAR_S)
+        subscriber.send_signal(then)
 
 
-def _end(watcher: subprocess.Popen[bytes]) -> None:
-    watcher.kill()
-    watcher.communicate(timeout=5)
+def _end(subscriber: subprocess.Popen[bytes]) -> None:
+    subscriber.kill()
+    subscriber.communicate(timeout=5)

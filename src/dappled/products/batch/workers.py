@@ -38,7 +38,7 @@ class ClusterError(DappledError):
 @dataclass(slots=True)
 class _Worker:
     process: BaseProcess
-    door: Connection
+    channel: Connection
     job: Job | None = None
     until_s: float = 0.0  # when its job is overdue
 
@@ -62,8 +62,8 @@ def in_processes(
                     worker.job, worker.until_s = waiting.popleft(), now_s() + job_s
                     _hand(worker, worker.job)
             busy = [w for w in crew if w.job is not None]
-            ready = wait([w.door for w in busy], max(0.0, min(w.until_s for w in busy) - now_s()))
-            for worker in [w for w in busy if w.door in ready or now_s() >= w.until_s]:
+            ready = wait([w.channel for w in busy], max(0.0, min(w.until_s for w in busy) - now_s()))
+            for worker in [w for w in busy if w.channel in ready or now_s() >= w.until_s]:
                 job = worker.job
                 assert job is not None
                 try:
@@ -132,21 +132,21 @@ def _hired(make: Make) -> _Worker:
 
 def _hand(worker: _Worker, job: Job) -> None:
     try:
-        worker.door.send(job)
+        worker.channel.send(job)
     except OSError:
         return  # it died at once: reading from it will raise
 
 
 def _answer(worker: _Worker) -> Done:
     """Read a worker's answer. Raises EOFError or OSError where it will never answer."""
-    if not worker.door.poll():
+    if not worker.channel.poll():
         raise TimeoutError("overdue")
-    answer: Done = worker.door.recv()
+    answer: Done = worker.channel.recv()
     return answer
 
 
 def _dismiss(worker: _Worker) -> None:
-    worker.door.close()
+    worker.channel.close()
     worker.process.terminate()
     worker.process.join(5.0)
     if worker.process.is_alive():
@@ -154,16 +154,16 @@ def _dismiss(worker: _Worker) -> None:
         worker.process.join()
 
 
-def _work(door: Connection, make: Make) -> None:
+def _work(channel: Connection, make: Make) -> None:
     """Run in a worker: read a job, send its result, until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that hands out the jobs
     single_threaded()
     while True:
         try:
-            job: Job = door.recv()
+            job: Job = channel.recv()
         except (EOFError, OSError):
             return
-        door.send(make(job))
+        channel.send(make(job))
 
 
 def single_threaded() -> None:
