@@ -125,7 +125,8 @@ def candidates(spectrum: Spectrum, *, prominence_nats: float = 2.0, spacing_bins
         if math.hypot(signed, column) < spacing_bins / 2 or (column == 0 and signed < 0):
             continue
         dy = _parabola(log[row - 1, column], log[row, column], log[(row + 1) % half.shape[0], column])
-        dx = _parabola(log[row, abs(column - 1)], log[row, column], log[row, column + 1])
+        left = log[row, column - 1] if column else log[-row, 1]  # column −1 is the conjugate of column 1
+        dx = _parabola(left, log[row, column], log[row, column + 1])
         found.append(Candidate(signed + dy, column + dx, float(prominence[row, column])))
     return sorted(found, key=lambda c: -c.prominence)
 

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from dappled.decode.optics import Carrier, Lattice, Order
 from dappled.decode.optics.visibility import OrderStrength
 from dappled.decode.spectrum.lattice import Candidate, candidates
-from dappled.decode.spectrum.peaks import ALONE_NATS, Measured, is_suspect, lattice_from, measure, residual_bins
+from dappled.decode.spectrum.peaks import ALONE_NATS, Measured, fit, is_suspect, lattice_from, measure, residual_bins
 from dappled.decode.spectrum.transform import Spectrum, hann
 
 SCALES = 0.35  # relative: a print's scale and the mask's distance, together
@@ -209,13 +209,13 @@ def _judged(
         return None
     lattice = lattice_from(matrix / bins)
     looked = lattice.carriers([asked[i].order for i in chosen])
-    pairs = [
-        (c, m) for c, m in zip(looked, measure(spectrum, looked, 1.5, prominence_nats=ALONE_NATS), strict=True) if m
-    ]
-    if len(pairs) < 2 or np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in pairs]) < 2:
+    near = measure(spectrum, looked, 1.5, prominence_nats=ALONE_NATS)
+    lattice, pairs = _on_lattice(spectrum, [(c, m) for c, m in zip(looked, near, strict=True) if m is not None])
+    if lattice is None:
         return None
-    if residual_bins([c for c, _ in pairs], [m for _, m in pairs], spectrum) > _ALIKE_BINS:
-        return None
+    kept = {(c.ky, c.kx) for c, _ in pairs}
+    picked = [(i, n) for i, n in picked if asked[i].order in kept]
+    chosen = [i for i, _ in picked]
     density = peaks.rank_density()[[n for _, n in picked]]
     radius = 1.5 + 0.5 * _SKEW * np.hypot(*(orders[chosen] @ matrix).T)
     information = -np.log(np.minimum(density * math.pi * radius**2, 1.0))
@@ -224,6 +224,21 @@ def _judged(
     odds -= 0.5 * (math.log(scale) / _SCALE_SIGMA) ** 2 + 0.5 * (turn / _TURN_SIGMA) ** 2
     odds -= _MISSED_NATS * _missed(spectrum, lattice, asked, {asked[i].order: n for i, n in picked}, pairs)
     return MaskLattice(lattice, tuple(pairs), odds + _alike(pairs), scale, turn)
+
+
+def _on_lattice(
+    spectrum: Spectrum, pairs: Sequence[tuple[Carrier, Measured]]
+) -> tuple[Lattice | None, list[tuple[Carrier, Measured]]]:
+    """The lattice of measured peaks, and those on it: the farthest is left out as long as they don't agree."""
+    left = list(pairs)
+    while len(left) >= 2 and np.linalg.matrix_rank([(c.ky, c.kx) for c, _ in left]) == 2:
+        lattice = fit(left)
+        there = lattice.carriers([(c.ky, c.kx) for c, _ in left])
+        off = [residual_bins([c], [m], spectrum) for c, (_, m) in zip(there, left, strict=True)]
+        if math.sqrt(sum(one * one for one in off) / len(off)) <= _ALIKE_BINS:
+            return lattice, [(c, m) for c, (_, m) in zip(there, left, strict=True)]
+        del left[int(np.argmax(off))]
+    return None, []
 
 
 def _alike(pairs: Sequence[tuple[Carrier, Measured]]) -> float:
