@@ -15,6 +15,7 @@ from dappled.decode.calibration.calibration import Calibration
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
+from dappled.products.exports import light_files
 
 MASK = "reference-5x5"
 LENGTHS = (35.0, 50.0, 80.0)
@@ -139,10 +140,17 @@ def test_a_wrong_mask_is_told_in_a_sentence(
     wrong = tmp_path / "wrong.toml"
     wrong.write_text("frequency_per_mm = 9.3\np = 2\n")
     words = [*frames("geometric")[:1], "--camera", str(profile), "--mask", str(wrong), "-o", str(tmp_path / "c.toml")]
-    main(["calibrate", *words])
+    assert main(["calibrate", *words]) == 1
     told = capsys.readouterr().err.strip()
     assert "mask" in told
     assert "\n" not in told
+    assert not (tmp_path / "c.toml").exists()
+    assert main(["calibrate", *words, "--anyway"]) == 0
+    assert calibration_files.load(tmp_path / "c.toml").verdict.startswith("neither law explains")
+    frame = [*words[:-2], "--calibration", str(tmp_path / "c.toml"), "-o", str(tmp_path / "f.npz")]
+    assert main(["decode", *frame]) == 0
+    (doubt,) = light_files.load(tmp_path / "f.npz").attributes["doubts"]
+    assert doubt.startswith("calibration: neither law explains")
 
 
 def test_a_dark_frame_is_taken_off_and_one_of_another_size_is_refused(

@@ -34,6 +34,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="calibration to write: FILE.toml and FILE.npz"
     )
+    parser.add_argument("--anyway", action="store_true", help="write a calibration that no law explains, too")
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
 
 
@@ -66,17 +67,17 @@ def run(arguments: argparse.Namespace) -> int:
         raise DarkroomError("no frame is left to calibrate with: each was refused, for the reason above")
     camera = darkroom.camera(seen[0].model)
     found = fit_views(darkroom, seen, choose_law=not arguments.law)
+    if not arguments.anyway and not any(law.explains for law in report.law_fits(found, camera.mask_distance_mm)):
+        raise DarkroomError(
+            f"{found.verdict}: check that mask, camera and focal length are the right ones; --anyway writes the "
+            "calibration with this doubt in it"
+        )
     written = calibration_files.save(arguments.output, found)
     if arguments.json:
         print(json.dumps(report.as_values(found, camera.mask_distance_mm), indent=2))
     else:
         print(report.as_text(found, camera.mask_distance_mm))
         print(f"written to {written[0]} and {written[1]}")
-    if not any(law.explains for law in report.law_fits(found, camera.mask_distance_mm)):
-        print(
-            f"dappled calibrate: {found.verdict}: check that mask, camera and focal length are the right ones",
-            file=sys.stderr,
-        )
     if bad:
         print(f"{bad} of {counted(len(arguments.frames), 'frame')} could not be used", file=sys.stderr)
     return 1 if bad else 0

@@ -280,7 +280,7 @@ class Darkroom:
         }
         made = DecodeResult(light_field, report, raw, ms, search, doubt)
         if self.recipe.try_laws:
-            attributes["doubts"] = [words for words in (doubt, report.doubt) if words]
+            attributes["doubts"] = [words for words in (doubt, report.doubt, doubt_of(decoder)) if words]
             if not made.observable:
                 attributes["carriers_found"] = None
         return replace(made, light_field=replace(light_field, attributes=attributes))
@@ -380,6 +380,12 @@ def missing_at(decoder: MaskDecoder, plane: Source, focal_length_mm: float, f_nu
         mask_distance_mm=decoder.mask_distance_mm,
         f_number=f_number,
     )
+
+
+def doubt_of(decoder: Decoder) -> str | None:
+    """What a decoder's calibration was in doubt about, in a sentence: no law explains it. None for others."""
+    known = decoder.calibration if isinstance(decoder, MaskDecoder) else None
+    return None if known is None or not known.verdict.startswith("neither") else f"calibration: {known.verdict}"
 
 
 def known_to(decoder: MaskDecoder, focal_sigma_mm: float | None) -> MaskDecoder:
