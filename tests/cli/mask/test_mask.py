@@ -121,3 +121,15 @@ def test_a_wrong_wish_is_one_sentence(
     assert said in err
     assert len(err.strip().splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_table_says_how_strong_each_order_is_and_what_takes_the_rest(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["mask", "table", "--mask", "mask-3", "--camera", "canon-eos-450d", "--law", "geometric", "--visibility"]
+    assert main([*words, "--focal-length", "50", "--f-number", "8", "92", "--json"]) == 0
+    told = {(one["f_number"], *one["order"]): one for one in json.loads(capsys.readouterr().out)["orders"]}
+    assert told[92.0, 1, 1]["least"] > 0.08
+    assert told[8.0, 1, 1]["most"] < 0.15 * told[92.0, 1, 1]["most"]
+    assert told[8.0, 1, 1]["cause"] == "averaged out over the stop"
+    assert told[92.0, 8, 8]["cause"] == "at 91 cycles/mm, which the film cannot draw"
+    assert main([*words, "--focal-length", "50"]) == 0
+    assert "averaged out over the stop" in capsys.readouterr().out

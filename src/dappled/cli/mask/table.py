@@ -11,6 +11,8 @@ from dataclasses import asdict
 from dappled.cli.mask import arguments as mask_arguments
 from dappled.cli.mask.arguments import Installed
 from dappled.decode.optics import carrier_tables
+from dappled.decode.optics.lenses import within
+from dappled.decode.optics.visibility import order_strengths
 
 HELP = "print where the carriers are over focal lengths (Tables 11 and 14)"
 EXAMPLE = "dappled mask table --mask mask-2 --camera fujifilm-s5200"
@@ -34,6 +36,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--carriers", action="store_true", help="list every carrier with its row and column, including crossed ones"
     )
+    parser.add_argument(
+        "--visibility", action="store_true", help="predicted strength of each order on the sensor, and what takes it"
+    )
+    parser.add_argument(
+        "--f-number", type=float, nargs="+", default=[8.0, 11.0, 16.0, 22.0, 32.0], metavar="N",
+        help="stops for --visibility (default: 8 11 16 22 32)",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -42,6 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
     only = mask_arguments.only_length(one.camera)
     lengths = arguments.focal_length or (THESIS_FOCAL_LENGTHS_MM if only is None else (only,))
     rows = carrier_tables.table(one.mask, one.sensor, one.distance_mm, lengths, law=one.law)
+    if arguments.visibility:
+        return _visibility(one, lengths, arguments.f_number, as_json=arguments.json)
     if arguments.carriers or arguments.rotation:
         return _carriers(one, lengths, math.radians(arguments.rotation), as_json=arguments.json)
     if arguments.json:
@@ -88,4 +99,27 @@ def _carriers(one: Installed, lengths: Sequence[float], rotation_rad: float, *, 
     for c in listed:
         words = f"{'' if c['main'] else '  crossed'}{'' if c['on_sensor'] else '  off the sensor'}"
         print(f"{c['focal_length_mm']:6g} {c['ky']:4d} {c['kx']:4d} {c['row']:9.1f} {c['col']:9.1f}{words}")
+    return 0
+
+
+def _visibility(one: Installed, lengths: Sequence[float], stops: Sequence[float], *, as_json: bool) -> int:
+    """The strength of each order, as a share of the mean, at least and at most over the shapes that a stop may have."""
+    listed = []
+    for length in lengths:
+        lattice = carrier_tables.lattice_of(one.law, one.mask, one.sensor, one.distance_mm, length)
+        for stop in stops:
+            within("f-number", stop, "", 0.5, 256)
+            for order in order_strengths(
+                one.mask, one.sensor, lattice, mask_distance_mm=one.distance_mm, f_number=stop
+            ):
+                listed.append({"focal_length_mm": length, "f_number": stop, **asdict(order), "cause": order.cause})
+    if as_json:
+        print(json.dumps({"shape": list(one.sensor.shape), "law": one.law, "orders": listed}, indent=2))
+        return 0
+    print(f"law {one.law}, mask {one.distance_mm:g} mm before the sensor; strengths as shares of the mean")
+    print(f"{'f/mm':>6} {'f/':>5} {'ky':>4} {'kx':>4} {'least':>9} {'most':>9}")
+    for row in listed:
+        ky, kx = row["order"]
+        start = f"{row['focal_length_mm']:6g} {row['f_number']:5g} {ky:4d} {kx:4d}"
+        print(f"{start} {row['least']:9.5f} {row['most']:9.5f}  {row['cause'] or ''}".rstrip())
     return 0
