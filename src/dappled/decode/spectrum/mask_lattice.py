@@ -210,9 +210,10 @@ def _judged(
     lattice = lattice_from(matrix / bins)
     looked = lattice.carriers([asked[i].order for i in chosen])
     near = measure(spectrum, looked, 1.5, prominence_nats=ALONE_NATS)
-    lattice, pairs = _on_lattice(spectrum, [(c, m) for c, m in zip(looked, near, strict=True) if m is not None])
-    if lattice is None:
+    fitted, pairs = _on_lattice(spectrum, [(c, m) for c, m in zip(looked, near, strict=True) if m is not None])
+    if fitted is None:
         return None
+    lattice = fitted
     kept = {(c.ky, c.kx) for c, _ in pairs}
     picked = [(i, n) for i, n in picked if asked[i].order in kept]
     chosen = [i for i, _ in picked]
