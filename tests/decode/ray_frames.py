@@ -300,8 +300,8 @@ def floors(plane: Grid, places: Grid, bins: int = 5) -> Grid:
     return np.array(found)
 
 
-def orders_above_noise(shot: Shot, times: float = 15.0) -> int:
-    """How many orders of the whole plane are that many times stronger than the same frame without the film there."""
+def orders_above_noise(shot: Shot, times: float = 15.0) -> list[Order]:
+    """The orders of half of the plane that are that many times stronger than the same frame without the film there."""
     seen = shot.seen()
     orders = [order for order in seen if order > (0, 0)]
     level = (
@@ -309,4 +309,4 @@ def orders_above_noise(shot: Shot, times: float = 15.0) -> int:
         if orders
         else np.zeros(0)
     )
-    return 2 * sum(seen[order] > times * float(at) for order, at in zip(orders, level, strict=True))
+    return [order for order, at in zip(orders, level, strict=True) if seen[order] > times * float(at)]
