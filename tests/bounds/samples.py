@@ -158,7 +158,7 @@ def _flat_bombs(raster: bytes) -> Iterator[tuple[str, str, bytes | str]]:
         "chunks": _request("POST", "/api/shoot", "5\r\n{}   \r\n0\r\n\r\n", chunked=True),
     }.items():  # fmt: skip
         yield "console", name, request
-    huge = _png_head(2**31 - 1, 2**31 - 1), _png_head(60_000, 60_000), _png_zeros(15_000, 15_000)
+    huge = _png_head(2**31 - 1, 2**31 - 1), _png_head(60_000, 60_000), _png_zeros(9000, 9000)
     for door in ("png", "mask-png"):
         for name, data in zip(("claim", "large", "zeros"), huge, strict=True):
             yield door, name, data
@@ -170,7 +170,7 @@ def _flat_bombs(raster: bytes) -> Iterator[tuple[str, str, bytes | str]]:
     }.items():
         for name, tags in {
             "claim": {256: 2**31 - 1, 257: 2**31 - 1}, "large": {256: 60_000, 257: 60_000, 278: 60_000},
-            "rows": {278: 2**32 - 1}, "samples": {277: 60_000},
+            "rows": {278: 2**32 - 1}, "samples": {277: 20_000},
         }.items():  # fmt: skip
             yield door, name, _with_tags(small, tags)
         yield door, "strip", _tiff_bomb(small)
@@ -365,8 +365,8 @@ def _with_tags(data: bytes, tags: Mapping[int, int]) -> bytes:
 
 
 def _tiff_bomb(small: bytes) -> bytes:
-    """A strip of a few pixels that unpacks to 300 MB."""
-    packed = zlib.compress(bytes(300_000_000), 1)
+    """A strip of a few pixels that unpacks to 60 MB."""
+    packed = zlib.compress(bytes(60_000_000), 1)
     return _with_tags(small, {259: 8, 273: len(small), 279: len(packed), 278: 2**16}) + packed
 
 
