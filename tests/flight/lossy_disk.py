@@ -18,8 +18,8 @@ from typing import Literal
 
 Left = Literal["all", "none", "data", "names", "some"]  # of what isn't sure: all, none, only data, only names, some
 CALLS = (
-    "openat,write,pwrite64,pwritev,sendfile,ftruncate,fsync,fdatasync,rename,renameat2,unlink,unlinkat,mkdir,rmdir,"
-    "copy_file_range,fallocate,link,linkat,symlink"
+    "openat,write,pwrite64,pwritev,sendfile,ftruncate,fsync,fdatasync,rename,renameat,renameat2,unlink,unlinkat,mkdir,"
+    "mkdirat,rmdir,copy_file_range,fallocate,link,linkat,symlink"
 )
 _SECTOR = 512
 _CALL = re.compile(r"^(\d+)\s+(\w+)\((.*)\)\s+= (-?\d+|\?)")
@@ -55,13 +55,18 @@ class Call:
         """A path argument."""
         return self.data(place).decode()
 
+    def name_in(self, place: int) -> str:
+        """A path argument that is relative to the folder of the descriptor before it."""
+        name = self.name_at(place)
+        return name if name.startswith("/") else f"{self.path(place - 1)}/{name}"
+
 
 def record(code: str, *arguments: str, log: Path) -> list[Call]:
     """Run Python code under strace and return the calls that succeeded, in the order of their ends."""
     command = ["strace", "-f", "-y", "-xx", "-s", "10000000", "-e", f"trace={CALLS}", "-e", "signal=none", "-o"]
     subprocess.run(
         [*command, str(log), sys.executable, "-c", code, *arguments],
-        cwd=Path(__file__).parents[2], check=True, timeout=100, stdout=subprocess.DEVNULL,
+        cwd=Path(__file__).parents[2], check=True, timeout=300, stdout=subprocess.DEVNULL,
     )  # fmt: skip
     calls: list[Call] = []
     open_calls: dict[str, tuple[str, int]] = {}
@@ -111,6 +116,10 @@ class LossyDisk:
         self._top = _Folder()
         self._number = 0
 
+    def hold(self, *, sure: bool) -> None:
+        """Take over what stands in `root` now; `sure`: durable, and not only in memory."""
+        self._top = _held(Path(self._root), 0 if sure else -1)
+
     def apply(self, call: Call) -> bool:
         """Do what the call did; says whether it touched this disk."""
         self._number += 1
@@ -157,7 +166,7 @@ class LossyDisk:
         return None
 
     def _openat(self, call: Call) -> bool | None:
-        path = call.name_at(1)
+        path = call.name_in(1)
         if "O_CREAT" in call.arguments[2] and self._find(path) is None:
             return self._put({path: _File()})
         found = self._find(path)
@@ -211,14 +220,25 @@ class LossyDisk:
     _fdatasync = _fsync
 
     def _rename(self, call: Call) -> bool | None:
-        old, new = call.name_at(0), call.name_at(1)
+        return self._move(call.name_at(0), call.name_at(1))
+
+    def _renameat(self, call: Call) -> bool | None:
+        return self._move(call.name_in(1), call.name_in(3))
+
+    def _move(self, old: str, new: str) -> bool | None:
         return self._put({old: None, new: self._find(old)})
 
     def _unlink(self, call: Call) -> bool | None:
         return self._put({call.name_at(0): None})
 
+    def _unlinkat(self, call: Call) -> bool | None:
+        return self._put({call.name_in(1): None})
+
     def _mkdir(self, call: Call) -> bool | None:
         return self._put({call.name_at(0): _Folder()})
+
+    def _mkdirat(self, call: Call) -> bool | None:
+        return self._put({call.name_in(1): _Folder()})
 
     # what is left
 
@@ -234,6 +254,14 @@ class LossyDisk:
                 self._lay(now, target / name, left, chosen)
             elif now is not None:
                 (target / name).write_bytes(_content(_survived(now, left, chosen)))
+
+
+def _held(path: Path, sure: int) -> _Folder:
+    """What stands in a real folder, as written before the first call."""
+    names: dict[str, _File | _Folder | None] = {}
+    for inner in sorted(path.iterdir()):
+        names[inner.name] = _held(inner, sure) if inner.is_dir() else _File([(0, 0, inner.read_bytes())], sure)
+    return _Folder([(0, names)], sure)
 
 
 def _names(folder: _Folder, count: int) -> dict[str, _File | _Folder | None]:

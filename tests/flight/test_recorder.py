@@ -162,6 +162,16 @@ def test_a_file_without_its_bytes_fails_the_shot(flight: Recording, data: bytes,
     assert row.state == "failed"
 
 
+def test_a_file_that_lost_its_row_is_the_frame_when_it_comes_again(flight: Recording) -> None:
+    """A power cut between the rename and the row; the camera still has the file."""
+    request(flight, 0)
+    (flight.folder.frames / "000000.cr2").write_bytes(b"raw")
+    with held(b"raw") as blob:
+        frame = flight.recorder.record(0, "A.CR2", blob, arrived_utc_ns=5)
+    assert (frame.name, frame.camera_name) == ("frames/000000.cr2", "A.CR2")
+    assert flight.ledger.frame(0) == frame
+
+
 def test_nothing_is_written_over(flight: Recording) -> None:
     request(flight, 0)
     (flight.folder.frames / "000000.cr2").write_bytes(b"older")

@@ -31,8 +31,13 @@ def bring(source: Tree, there: Tree, name: str) -> tuple[bool, Proved]:
         image = ledger.image()
     goal = there.path / name
     if there.stat(name) is not None:
-        with LedgerReader.open(goal) as held:
-            theirs = held.image()
+        try:
+            with LedgerReader.open(goal) as held:
+                theirs = held.image()
+        except FlightError as error:
+            raise FlightError(
+                f"{goal} is there already and is no copy of the ledger ({error}): move it away first"
+            ) from error
         if theirs == image:
             return False, _proved(there, name, image)
         if _within(image, theirs):

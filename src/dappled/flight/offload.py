@@ -66,7 +66,7 @@ def offload(
         stack.enter_context(_lock(folder.path.parent, needed=prune))
         _refuse_unready(folder)
         source = stack.enter_context(Tree(folder.path))
-        names = [name for name in source.walk() if not ledger_copies.is_part(name) and name != pruning.RECORD]
+        names = [name for name in source.walk() if _is_copied(name)]
         there = stack.enter_context(_open_copy(source, destination, same_device=same_device))
         system = places.file_system(there.folders[""])
         if prune:
@@ -114,7 +114,11 @@ class _Copying:
         if prune:
             if "page cache" in ways:
                 raise FlightError(f"{doubts[0]}: nothing was removed; offload without --prune, or to another disk")
-            sure = {name: manifest[name] for name in rows if name.startswith("frames/") and name in manifest}
+            sure = {
+                name: manifest[name]
+                for name, row in rows.items()
+                if name.startswith("frames/") and name in manifest and manifest[name].sha256 == row.sha256
+            }
             with seals.reopened(self._folder, clock, "offload --prune") if sure else nullcontext():
                 pruned = pruning.remove(self._folder, self._source, self._there, sure, clock)
         size = sum(one.identity.size for one in manifest.values())
@@ -206,6 +210,12 @@ class _Copying:
                 f"the copy {self._there.path} is not intact ({found.problems[0]}): nothing was removed; "
                 f"run `dappled flight check {self._folder.path}`"
             )
+
+
+def _is_copied(name: str) -> bool:
+    """Whether a file is copied as it is: not the ledger's, the record of what was removed, or half-written."""
+    half = durable.is_temporary(name.rpartition("/")[2])
+    return not (ledger_copies.is_part(name) or name == pruning.RECORD or half)
 
 
 def _lock(root: Path, *, needed: bool) -> AbstractContextManager[object]:

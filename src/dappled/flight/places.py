@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import secrets
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,6 +25,7 @@ KEEPS_FSYNC = frozenset(
 """File systems on a disk of this machine, in the kernel: a file that was fsynced is on the disk."""
 NETWORK = frozenset(("nfs", "nfs4", "cifs", "smb3", "ceph", "afs"))
 """File systems that hand an fsync to another machine, which is believed."""
+_NONCE = re.compile(r"\.dappled-[0-9a-f]{32}\.part")
 _MOUNTS = Path("/proc/self/mountinfo")
 _DEVICES = Path("/sys/dev/block")
 
@@ -83,6 +85,8 @@ def refuse_reexport(source: Tree, there: Tree) -> None:
     for name, fd in there.folders.items():
         made = there.path / name / nonce
         try:
+            for old in filter(_NONCE.fullmatch, os.listdir(fd)):
+                os.unlink(old, dir_fd=fd)  # of an attempt that was cut short
             os.close(os.open(nonce, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600, dir_fd=fd))
             try:
                 seen = [held for held, own in source.folders.items() if _stands(nonce, own)]

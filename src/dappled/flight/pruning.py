@@ -73,6 +73,7 @@ def remove(folder: FlightFolder, source: Tree, there: Tree, sure: Mapping[str, P
     Raises FlightError where one isn't, a copy has vanished, or a disk refuses; the other files then stay.
     """
     if not sure:
+        source.remove_part(RECORD)  # of an attempt that was cut short
         return 0
     _note(folder, there.path, sure, clock)
     copies = {name: _copy_of(there, name) for name in sure}

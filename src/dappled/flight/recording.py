@@ -107,14 +107,25 @@ class Recorder:
         path = self._folder.path / name
         if blob.size <= 0:
             raise FlightError(f"the camera's file {camera_name} is empty: nothing was recorded")
-        if path.exists():
-            raise FlightError(f"{path} already exists without a ledger row; start a new flight to have it adopted")
         try:
+            if path.exists():
+                return self._left_over(path, blob)
             return durable.copy_in(blob.fd, blob.size, path)
         except OSError as error:
             raise disk_error(f"record {camera_name} as", path, error) from error
         except EOFError as error:
             raise FlightError(f"the camera's file {camera_name} ended early ({error}): it was not recorded") from error
+
+    def _left_over(self, path: Path, blob: FileBytes) -> str:
+        """The hash of a file without a row, left by an attempt that was cut short: whole, since it has its final name.
+
+        Raises FlightError where it holds other bytes than the camera's file.
+        """
+        sha256 = durable.hash_descriptor(blob.fd, blob.size)
+        if path.stat().st_size != blob.size or durable.hash_file(path) != sha256:
+            raise FlightError(f"{path} already exists without a ledger row; start a new flight to have it adopted")
+        durable.sync_file(path)
+        return sha256
 
     def _note_failure(self, index: int, error: FlightError) -> None:
         try:

@@ -116,6 +116,8 @@ def _remove_parts(folder: FlightFolder) -> list[str]:
             if durable.is_temporary(name):
                 (place / name).unlink()
                 report.append(f"the half-written file {name} was removed")
+        if report:
+            durable.sync_folder(place)  # or it might stand there again, in a flight that is closed by then
     return report
 
 

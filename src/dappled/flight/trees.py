@@ -132,9 +132,8 @@ class Tree:
         """Put a file under a name, whole or not at all; `sync` makes the name durable. Raises FlightError."""
         parent, last = self._at(name)
         part = durable.temporary(Path(last)).name
+        self.remove_part(name)
         with self._saying("write", name):
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(part, dir_fd=parent)  # of an attempt that was cut short
             try:
                 fd = os.open(part, _WRITE, 0o644, dir_fd=parent)
                 try:
@@ -150,6 +149,12 @@ class Tree:
                 with contextlib.suppress(OSError):
                     os.unlink(part, dir_fd=parent)
                 raise
+
+    def remove_part(self, name: str) -> None:
+        """Remove what an attempt to write a file left half-written, if there is something. Raises FlightError."""
+        parent, last = self._at(name)
+        with self._saying("remove the half-written", name), contextlib.suppress(FileNotFoundError):
+            os.unlink(durable.temporary(Path(last)).name, dir_fd=parent)
 
     def unlink(self, name: str) -> None:
         """Remove a file. Raises FlightError."""
@@ -179,9 +184,12 @@ class Tree:
             while True:
                 here = os.fstat(fd)
                 try:
-                    upper = os.open("..", _FOLDER, dir_fd=fd)
-                except PermissionError:
-                    return
+                    with self._saying("open a folder above", ""):
+                        upper = os.open("..", _FOLDER, dir_fd=fd)
+                except FlightError as error:
+                    if isinstance(error.__cause__, PermissionError):
+                        return
+                    raise
                 os.close(fd)
                 fd = upper
                 if os.path.samestat(here, os.fstat(fd)):
