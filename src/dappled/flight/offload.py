@@ -25,6 +25,7 @@ from dappled.flight.read_back import ReadBack
 from dappled.flight.records import Frame, Stray
 from dappled.flight.trees import FileIdentity, Tree, pieces
 
+PRUNES = "offload --prune"
 FACT = "offloaded"  # of flights that a version before 1.0 pruned
 
 
@@ -65,6 +66,8 @@ def offload(
     with ExitStack() as stack:
         stack.enter_context(_lock(folder.path.parent, needed=prune))
         _refuse_unready(folder)
+        if prune:
+            _finish_seal(folder, clock)
         source = stack.enter_context(Tree(folder.path))
         names = [name for name in source.walk() if _is_copied(name)]
         there = stack.enter_context(_open_copy(source, destination, same_device=same_device))
@@ -119,7 +122,7 @@ class _Copying:
                 for name, row in rows.items()
                 if name.startswith("frames/") and name in manifest and manifest[name].sha256 == row.sha256
             }
-            with seals.reopened(self._folder, clock, "offload --prune") if sure else nullcontext():
+            with seals.reopened(self._folder, clock, PRUNES) if sure else nullcontext():
                 pruned = pruning.remove(self._folder, self._source, self._there, sure, clock)
         size = sum(one.identity.size for one in manifest.values())
         already = len(manifest) - len(fresh)
@@ -245,6 +248,17 @@ def _refuse_unready(folder: FlightFolder) -> None:
         )
     if FACT in facts:
         raise FlightError(f"{folder.path} was offloaded to {facts[FACT]['destination']} and pruned already")
+
+
+def _finish_seal(folder: FlightFolder, clock: Clock) -> None:
+    """Seal a flight again where a prune was cut short between announcing a seal and writing it. Raises FlightError."""
+    with LedgerReader.open(folder.ledger) as ledger:
+        count, missing = seals.announced(ledger.facts())
+        reasons = [event.text for event in ledger.events() if event.kind == "opened again"]
+    last = seals.read(folder).last
+    written = 0 if last is None else last.seal
+    if reasons[-1:] == [PRUNES] and count > written and count not in missing:
+        seals.seal(folder, clock, PRUNES)
 
 
 def _open_copy(source: Tree, destination: Path, *, same_device: bool) -> Tree:

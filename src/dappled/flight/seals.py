@@ -170,7 +170,8 @@ def recorded_files(ledger: LedgerReader) -> dict[str, tuple[int, str]]:
 
 def sealed_paths(folder: FlightFolder) -> Iterator[Path]:
     """Every file of a flight that a seal covers, in order: all but seals.jsonl, the record of what was removed (the
-    ledger has its digest, and a copy lacks it), and SQLite's files beside the ledger. Links are not followed.
+    ledger has its digest, and a copy lacks it), SQLite's files beside the ledger, and half-written ones. Links are not
+    followed.
 
     Raises OSError."""
     ledger = folder.ledger
@@ -180,7 +181,9 @@ def sealed_paths(folder: FlightFolder) -> Iterator[Path]:
         folders.sort()
         for name in sorted(names):
             path = Path(root, name)
-            if path not in beside and path.is_file() and not path.is_symlink():
+            if path in beside or durable.is_temporary(name):
+                continue
+            if path.is_file() and not path.is_symlink():
                 yield path
 
 
