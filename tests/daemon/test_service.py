@@ -14,8 +14,10 @@ import pytest
 
 from dappled.config import settings as configuration
 from dappled.config.settings import MaskSettings, PoseSettings, PublishSettings, RecordSettings, Settings
+from dappled.daemon import flight_control
 from dappled.daemon import service as module
 from dappled.daemon.flight_handover import FlightHandover
+from dappled.daemon.health import resources
 from dappled.daemon.navigation import UtcCorrection
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
@@ -105,6 +107,37 @@ def test_a_disk_that_can_t_be_asked_refuses_in_words(
     assert (decision.outcome, decision.reason) == ("refused", "cannot ask for the free space of the disk")
     service.stop()
     assert not camera.fired
+
+
+@pytest.mark.parametrize("free", [layout.DiskSpace(10**12, 0, 10**12, 3), layout.DiskSpace(10**12, 0, 9000)])
+def test_a_disk_without_inodes_or_room_for_the_journal_refuses_in_words(
+    camera: FakeCamera, settings: Settings, monkeypatch: pytest.MonkeyPatch, free: layout.DiskSpace
+) -> None:
+    service = started(settings, [])
+    with monkeypatch.context() as full:
+        full.setattr(layout, "disk_space", lambda _: free)
+        decision = service.request(CaptureRequest("test", "console", 1))
+        said = "\n".join(service.health()["problems"])
+    assert (decision.outcome, decision.reason) == ("refused", free.shortage(0))
+    assert ("only 3 more files" in said) == (free.files == 3)
+    service.stop()
+    assert not camera.fired
+
+
+def test_too_little_memory_refuses_in_words_as_long_as_that_is_fresh(
+    camera: FakeCamera, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = started(settings, [])
+    with monkeypatch.context() as small:
+        small.setattr(resources, "look", lambda: resources.Resources(500, 10**7))
+        service._control.look()
+    decision = service.request(CaptureRequest("test", "console", 1))
+    said = "too little memory is left for a photograph: 10 MB; end other programs"
+    assert (decision.outcome, decision.reason) == ("refused", said)
+    assert said in service.health()["problems"]
+    monkeypatch.setattr(flight_control, "LOOK_VALID_NS", 0)
+    assert service.request(CaptureRequest("test", "console", 2)).accepted
+    service.stop()
 
 
 def test_a_flight_that_closes_badly_is_kept(

@@ -3,7 +3,9 @@ from __future__ import annotations
 import errno
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -115,3 +117,18 @@ def test_unreadable_facts_are_told(flights: Path) -> None:
     folder.settings.unlink()
     with pytest.raises(FlightError, match="does not exist"):
         layout.read_facts(folder)
+
+
+def test_a_disk_without_inodes_or_room_for_the_journal_is_too_small() -> None:
+    room = layout.DiskSpace(10**12, 0, 10**9, files=16)
+    assert room.shortage(500) is None
+    assert replace(room, files=None).shortage(500) is None  # btrfs: no number is not none left
+    assert "only 15 more files" in (replace(room, files=15).shortage(500) or "")
+    assert "asks for 1001 MB" in (room.shortage(1001) or "")
+    assert "999 kB left, the shot journal" in (replace(room, available=999_999).shortage(0) or "")
+
+
+def test_a_file_system_without_inodes_reports_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    btrfs = SimpleNamespace(f_frsize=4096, f_blocks=9, f_bfree=5, f_bavail=4, f_files=0, f_favail=0)
+    monkeypatch.setattr(os, "statvfs", lambda _: btrfs)
+    assert layout.disk_space(tmp_path) == layout.DiskSpace(9 * 4096, 4 * 4096, 4 * 4096, None)

@@ -6,6 +6,7 @@ from dappled.clock import Clock
 from dappled.daemon.camera_protocol import camera_status
 from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, ReportedCamera
 from dappled.daemon.flight_handover import FlightHandover
+from dappled.daemon.health import resources
 from dappled.daemon.health.status_text import Alarms
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import Navigation
@@ -16,6 +17,8 @@ from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import PacketSender
 from dappled.flight import FlightError, Recording, Shot, layout
 from dappled.flight.layout import DiskSpace
+
+LOOK_VALID_NS = 5 * 10**9
 
 
 class FlightControl:
@@ -41,6 +44,7 @@ class FlightControl:
         self._settings, self._clock, self._recording, self._shots = settings, clock, recording, shots
         self._writer, self._navigation, self._camera = writer, navigation, camera
         self._sender, self._alarms, self._handover = sender, alarms, handover
+        self._looked: tuple[str | None, int] = (None, 0)
 
     # ShotSink
 
@@ -51,13 +55,20 @@ class FlightControl:
         if self._shots.state not in ("ready", "busy"):
             return self._shots.camera_sentence()
         try:
-            free = layout.disk_space(self._recording.folder.path).available
+            space = layout.disk_space(self._recording.folder.path)
         except FlightError as error:
             return str(error)
-        wanted_mb = self._settings.now.record.min_free_mb
-        if free < wanted_mb * 1_000_000:
-            return f"the disk is nearly full: {free // 1_000_000} MB left, record.min_free_mb asks for {wanted_mb} MB"
-        return None
+        return space.shortage(self._settings.now.record.min_free_mb) or self.shortage
+
+    @property
+    def shortage(self) -> str | None:
+        """Why descriptors or memory don't suffice, as `look` found it; None where it is older than five seconds."""
+        found, at_ns = self._looked
+        return found if self._clock.monotonic_ns() - at_ns <= LOOK_VALID_NS else None
+
+    def look(self) -> None:
+        """See what this machine has left. The working loop calls this, so that no command waits for it."""
+        self._looked = resources.shortage(resources.look()), self._clock.monotonic_ns()
 
     def note(self, shot: Shot) -> None:
         """See ShotSink."""

@@ -289,6 +289,7 @@ class Service:
         """The tasks of the working loop, in order, and what each does. Without the loop there is no heartbeat."""
         tasks: dict[PeriodicTask, Callable[[], object]] = {
             PeriodicTask("events"): self._writer.write_later,
+            PeriodicTask("resources", every_ns=HEALTH_NS): self._control.look,
             PeriodicTask("health", every_ns=HEALTH_NS): self._publish_health,
         }
         if not self._settings.now.mavlink.url:
@@ -339,7 +340,7 @@ class Service:
             self._answers,
             *(part for part in (self._depth, self._console) if part is not None),
         ]
-        doubts = (self._component.doubt(), navigation.utc.doubt(), self._events.doubt)
+        doubts = (self._component.doubt(), navigation.utc.doubt(), self._events.doubt, self._control.shortage)
         return health.record(
             self._settings.now,
             utc_ns=self._clock.utc_ns(),

@@ -27,6 +27,8 @@ from dappled.flight.errors import FlightError, disk_error
 _FLIGHT_NAME = re.compile(r"(\d{8}T\d{6}Z|boot[0-9a-f]{8})-[0-9a-f]{8}")
 _FRAME_NAME = re.compile(r"(\d{6,})\.([a-z0-9]{1,8})")
 _LOCK = ".lock"
+FEWEST_FILES = 16  # a frame, its companion, temporary files, for each of the shots that may be under way
+JOURNAL_BYTES = 1_000_000  # journal, ledger and telemetry of some seconds
 RECORDS = "records into"  # what the daemon does in a flights folder
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
@@ -171,20 +173,40 @@ def _folders(root: Path) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class DiskSpace:
-    """The space of a disk in bytes: `available` to this user."""
+    """The space of a disk in bytes: `available` to this user.
+
+    `files` is how many more files it takes (inodes); None where the file system sets no number (btrfs, vfat).
+    """
 
     total: int
     used: int
     available: int
+    files: int | None = None
+
+    def shortage(self, least_mb: int) -> str | None:
+        """Why a photograph should not be taken, in a sentence; None where there is room. `least_mb` is the setting
+        record.min_free_mb."""
+        if self.files is not None and self.files < FEWEST_FILES:
+            return f"the disk takes only {self.files} more files (its inodes are used up): remove small files"
+        if self.available < least_mb * 1_000_000:
+            return (
+                f"the disk is nearly full: {self.available // 1_000_000} MB left, "
+                f"record.min_free_mb asks for {least_mb} MB"
+            )
+        if self.available < JOURNAL_BYTES:
+            return f"the disk is full: {self.available // 1000} kB left, the shot journal needs more"
+        return None
 
 
 def disk_space(path: Path) -> DiskSpace:
     """The space of the disk of `path`. Raises FlightError."""
     try:
-        usage = shutil.disk_usage(path)
+        disk = os.statvfs(path)
     except OSError as error:
         raise disk_error("ask for the free space of", path, error) from error
-    return DiskSpace(usage.total, usage.used, usage.free)
+    block = disk.f_frsize
+    total, free, available = (count * block for count in (disk.f_blocks, disk.f_bfree, disk.f_bavail))
+    return DiskSpace(total, total - free, available, disk.f_favail if disk.f_files else None)
 
 
 def write_facts(folder: FlightFolder, facts: Mapping[str, Any]) -> None:

@@ -583,3 +583,27 @@ def test_the_autopilot_is_given_orders_and_its_refusal_is_told() -> None:
         rig.hear(mavlink.MAVLink_command_ack_message(command, result, 0, 0, 1, 100), sender=(1, 1))
         assert len(rig.of("STATUSTEXT")) >= words
         assert bool(rig.of("STATUSTEXT")) == bool(words)
+
+
+def test_a_trigger_replayed_long_after_is_the_same_photograph_and_one_of_another_instant_is_not() -> None:
+    rig = Rig()
+    rig.tick(4)
+    rig.hear(mavlink.MAVLink_camera_trigger_message(123456, 9), AUTOPILOT)
+    rig.clock.advance(13)
+    rig.hear(mavlink.MAVLink_camera_trigger_message(123456, 9), AUTOPILOT)
+    assert rig.fired == [5]
+    rig.clock.advance(13)
+    rig.hear(mavlink.MAVLink_camera_trigger_message(123457, 9), AUTOPILOT)  # rebooted: its numbers start again
+    assert rig.fired == [5, 6]
+    for _ in range(2):  # no time: no rule
+        rig.clock.advance(13)
+        rig.hear(mavlink.MAVLink_camera_trigger_message(0, 9), AUTOPILOT)
+    assert rig.fired == [5, 6, 7, 8]
+
+
+def test_a_command_with_a_known_number_long_after_is_a_new_photograph() -> None:
+    rig = Rig()
+    for turn in range(2):  # a ground station that was restarted, and numbers from 1 again
+        rig.clock.advance(13)
+        assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, 1) == mavlink.MAV_RESULT_ACCEPTED
+        assert rig.fired == [5, 6][: turn + 1]

@@ -148,7 +148,10 @@ class Component:
             return
         source = f"mavlink:{message.get_srcSystem()}/{message.get_srcComponent()}"
         sequence = message.seq if name == "CAMERA_TRIGGER" else message.img_idx
-        decision = self._shutter.request(CaptureRequest(source, name, sequence, 0, packet.link, acknowledged=False))
+        request = CaptureRequest(
+            source, name, sequence, 0, packet.link, acknowledged=False, time_us=int(message.time_usec)
+        )
+        decision = self._shutter.request(request)
         if not decision.accepted:
             self.say(f"no photo: {decision.reason}")
             self.state_changed()

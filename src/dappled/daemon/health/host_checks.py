@@ -13,6 +13,7 @@ from importlib import metadata
 from pathlib import Path
 
 from dappled.config.settings import Settings
+from dappled.daemon.health import resources
 from dappled.daemon.health.go_no_go import Check
 from dappled.daemon.navigation.clocks import kernel_synchronised
 from dappled.drivers import usb_bus
@@ -157,12 +158,21 @@ def disk(settings: Settings, machine: Machine) -> list[Check]:
     place = next(one for one in (folder, *folder.parents) if os.path.exists(one))  # False without permission to look
     if not os.access(place, os.W_OK):
         return [Check("disk", "no-go", f"{place} can't be written to", f"make {folder} yours, or set record.directory")]
-    free = layout.disk_space(place).available
+    space = layout.disk_space(place)
+    free = space.available
+    if space.files is not None and space.files < layout.FEWEST_FILES:
+        return [Check("disk", "no-go", f"{place} takes only {space.files} more files", "remove small files there")]
     text = f"{free / 1e9:.1f} GB free at {folder}, room for about {counted(int(free / _FRAME_BYTES), 'frame')}"
     if free < settings.record.min_free_mb * 1e6:
         mend = "`dappled flight offload DEST --prune` makes room"
         return [Check("disk", "no-go", f"{text}: below record.min_free_mb", mend)]
     return [Check("disk", "go", text)]
+
+
+def memory(settings: Settings, machine: Machine) -> list[Check]:
+    """Memory for a file on its way, and descriptors; nothing where there is enough."""
+    short = resources.shortage(resources.look(machine.proc))
+    return [] if short is None else [Check("memory", "no-go", short, "then `dappled doctor` again")]
 
 
 def clock(settings: Settings, machine: Machine) -> list[Check]:
@@ -196,7 +206,7 @@ def mask(settings: Settings, machine: Machine) -> list[Check]:
     return [Check("mask", "caution", "no mask is configured: frames are kept, not decoded", "set mask.profile")]
 
 
-CHECKS: tuple[HostCheck, ...] = (libraries, bodies, grabbers, camera, disk, clock, link, mask)
+CHECKS: tuple[HostCheck, ...] = (libraries, bodies, grabbers, camera, disk, memory, clock, link, mask)
 
 
 def _wants_usb(settings: Settings) -> bool:

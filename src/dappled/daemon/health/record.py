@@ -65,7 +65,10 @@ def record(
         problems.append(
             "UTC is not known yet: all time stamps will be corrected when the autopilot gets it from its satellites"
         )
-    free = _free(folder)
+    space = _space(folder)
+    free = None if space is None else space.available
+    if space is not None and space.files is not None and space.files < layout.FEWEST_FILES:
+        problems.append(f"the disk takes only {space.files} more files, new shots are refused: remove small files")
     if free is not None and free < settings.record.min_free_mb * 1_000_000:
         problems.append(f"disk nearly full: {free // 1_000_000} MB left, new shots are refused")
     elif free is not None and free < settings.record.warn_free_mb * 1_000_000:
@@ -88,7 +91,7 @@ def record(
             "positions": telemetry.positions,
             "each": [_counters(link) for link in links],
         },
-        "disk": {"free_bytes": free, "folder": str(folder)},
+        "disk": {"free_bytes": free, "free_files": space.files if space else None, "folder": str(folder)},
         "shots": {
             "wished": shutter.shots,
             "safe": shutter.succeeded,
@@ -173,8 +176,8 @@ def line(health: Mapping[str, Any]) -> str:
     return f"{counts}; {'; '.join(problems)}" if problems else f"{counts}; all is well"
 
 
-def _free(folder: Path) -> int | None:
+def _space(folder: Path) -> layout.DiskSpace | None:
     try:
-        return layout.disk_space(folder).available
+        return layout.disk_space(folder)
     except DappledError:
         return None

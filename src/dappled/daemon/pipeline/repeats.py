@@ -14,6 +14,11 @@
    CAMERA_TRIGGER, CAMERA_FEEDBACK, or the command for cameras. One message of each kind on each link within 2 s of our
    command is its echo and not a request, else every shot would ask for the next (`AutopilotCommands`).
 
+5. Same instant. CAMERA_TRIGGER and CAMERA_FEEDBACK carry the autopilot's time in microseconds. One of the same source
+   with the same time (not 0) and number as one of the last 256 is that trigger, however late it comes: delayed on a
+   link, or replayed by somebody (`RecentRequests`). Commands carry no time, and their numbers start again with their
+   sender, so a command that comes again after the windows above can't be told from a new one.
+
 A series (an interval, a step of the zoom) is a different request than a single shot and than a series with other
 numbers: only a retry with the same numbers is the same, and nothing else belongs to its first shot.
 
@@ -58,6 +63,7 @@ class CaptureRequest:
     link: int | None = None
     acknowledged: bool = True
     series: tuple[float, ...] | None = None
+    time_us: int = 0  # the sender's own time of it; 0: the kind has none
 
 
 @dataclass(slots=True)
@@ -80,13 +86,17 @@ class RecentRequests:
 
     def __init__(self) -> None:
         self._requests: list[_Remembered] = []
+        self._instants: dict[tuple[str, str, int | None, int], int] = {}  # of triggers with a time; the oldest first
 
     def same(self, request: CaptureRequest, now_ns: int) -> int | None:
         """The image index of the shot that this request already has; None for a new one. Times are monotonic."""
+        if (index := self._instants.get(_instant(request))) is not None:
+            return index
         self._requests = [one for one in self._requests if now_ns - one.last_ns <= CONFIRMED_RETRY_NS][-_REQUESTS_KEPT:]
         found = self._retry(request, now_ns) or self._part(request, now_ns)
         if found is None:
             return None
+        self._note_instant(request, found.index)
         found.parts[request.kind, request.link] = request.sequence
         if (request.kind, request.sequence) == (found.kind, found.sequence):
             found.last_ns = max(found.last_ns, now_ns)
@@ -100,6 +110,7 @@ class RecentRequests:
 
     def add(self, request: CaptureRequest, now_ns: int, index: int) -> None:
         """A new request became shot `index`."""
+        self._note_instant(request, index)
         parts = {(request.kind, request.link): request.sequence}
         self._requests.append(
             _Remembered(index, request.source, request.kind, request.sequence, request.series, now_ns, now_ns, parts)
@@ -108,6 +119,12 @@ class RecentRequests:
     def forget(self, request: CaptureRequest) -> None:
         """The next message like this is a new request."""
         self._requests = [known for known in self._requests if known.key() != _request_key(request)]
+
+    def _note_instant(self, request: CaptureRequest, index: int) -> None:
+        if request.time_us:
+            self._instants[_instant(request)] = index
+            if len(self._instants) > _REQUESTS_KEPT:
+                del self._instants[next(iter(self._instants))]
 
     def _retry(self, request: CaptureRequest, now_ns: int) -> _Remembered | None:
         if not request.acknowledged and request.sequence is None:
@@ -193,6 +210,10 @@ def _packet_key(packet: Packet) -> _PacketKey:
     start = 10 if raw[0] == mavlink.PROTOCOL_MARKER_V2 else 6
     payload = raw[start : start + raw[1]].rstrip(b"\0")  # version 2 leaves trailing zeros out
     return message.get_srcSystem(), message.get_srcComponent(), message.get_seq(), message.get_msgId(), payload
+
+
+def _instant(request: CaptureRequest) -> tuple[str, str, int | None, int]:
+    return request.source, request.kind, request.sequence, request.time_us
 
 
 def _request_key(request: CaptureRequest) -> _RequestKey:
