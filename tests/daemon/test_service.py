@@ -129,7 +129,7 @@ def test_too_little_memory_refuses_in_words_as_long_as_that_is_fresh(
 ) -> None:
     service = started(settings, [])
     with monkeypatch.context() as small:
-        small.setattr(resources, "look", lambda: resources.Resources(500, 10**7))
+        small.setattr(resources, "look", lambda: resources.ResourcesLeft(500, 10**7))
         service._control.look()
     decision = service.request(CaptureRequest("test", "console", 1))
     said = "too little memory is left for a photograph: 10 MB; end other programs"

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from dappled.daemon.health.resources import Resources, look, shortage
+from dappled.daemon.health.resources import ResourcesLeft, look, shortage
 
 
 def test_this_machine_has_enough() -> None:
     left = look()
     assert left.memory_bytes is not None
     assert left.memory_bytes > 0
-    assert shortage(Resources(1000, 10**9)) is None
+    assert shortage(ResourcesLeft(1000, 10**9)) is None
 
 
 def test_descriptors_are_counted() -> None:
@@ -30,15 +30,15 @@ def test_descriptors_are_counted() -> None:
 
 @pytest.mark.parametrize(
     ("left", "words"),
-    [(Resources(15, 10**9), "too few file descriptors"), (Resources(None, 47_999_999), "too little memory")],
+    [(ResourcesLeft(15, 10**9), "too few file descriptors"), (ResourcesLeft(None, 47_999_999), "too little memory")],
 )
-def test_a_shortage_is_a_sentence(left: Resources, words: str) -> None:
+def test_a_shortage_is_a_sentence(left: ResourcesLeft, words: str) -> None:
     assert words in (shortage(left) or "")
 
 
 def test_unknown_is_not_zero(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert look(tmp_path) == Resources(None, None)
-    assert shortage(Resources(None, None)) is None
+    assert look(tmp_path) == ResourcesLeft(None, None)
+    assert shortage(ResourcesLeft(None, None)) is None
     (tmp_path / "meminfo").write_text("MemAvailable: many kB\n")
     monkeypatch.setattr(resource, "getrlimit", lambda _: (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     assert look().descriptors is None

@@ -12,14 +12,14 @@ LEAST_MEMORY_BYTES = 48_000_000  # a raw file in the camera's process and in its
 
 
 @dataclass(frozen=True, slots=True)
-class Resources:
+class ResourcesLeft:
     """Descriptors that this process may still open, and memory in bytes. None: unknown."""
 
     descriptors: int | None
     memory_bytes: int | None
 
 
-def look(proc: Path = Path("/proc")) -> Resources:
+def look(proc: Path = Path("/proc")) -> ResourcesLeft:
     """What is left now. Reads /proc, so not for the path of a command."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     try:
@@ -27,10 +27,10 @@ def look(proc: Path = Path("/proc")) -> Resources:
     except OSError:
         used = None
     unknown = used is None or soft == resource.RLIM_INFINITY
-    return Resources(None if unknown or used is None else max(0, soft - used), _memory_bytes(proc))
+    return ResourcesLeft(None if unknown or used is None else max(0, soft - used), _memory_bytes(proc))
 
 
-def shortage(left: Resources) -> str | None:
+def shortage(left: ResourcesLeft) -> str | None:
     """Why no photograph could be kept, in a sentence; None where one can, as far as is known."""
     if left.descriptors is not None and left.descriptors < FEWEST_DESCRIPTORS:
         return f"too few file descriptors are left for a photograph ({left.descriptors}): raise LimitNOFILE"
