@@ -335,3 +335,23 @@ def test_a_ledger_that_can_not_be_folded_is_not_sealed(sealed: FlightFolder, mon
             seals.seal(sealed, LATER, "late tags")
     seals.seal(sealed, LATER, "late tags")
     assert check(sealed.path).problems == ()
+
+
+def test_a_record_that_was_rewritten_with_links_and_a_seal_of_its_own_is_named(flights: Path, tmp_path: Path) -> None:
+    """Whoever edits without the key can only go on from the signed seal; what was recorded can't be changed so."""
+    key = seal_key.load(key_file(tmp_path))
+    folder = fly(recording.begin(flights, RecordedClock(START_UTC_NS), seal_key=key))
+    flip(folder.frames / "000001.cr2", 5)
+    flip(folder.telemetry, 30)
+    with Ledger(folder.ledger, LATER) as writer:
+        writer.set_fact("telemetry_sha256", durable.hash_file(folder.telemetry))
+        with writer._transaction():
+            writer._db.execute(
+                "UPDATE frames SET sha256 = ? WHERE idx = 1", (durable.hash_file(folder.frames / "000001.cr2"),)
+            )
+            writer._written["frames", (1,)] = None
+    seals.seal(folder, LATER, "late tags")
+    problems = check(folder.path, key).problems
+    assert "the row of frames 1 was written again, which dappled never does" in problems
+    for name in ("frames/000001.cr2", "telemetry.tlog"):
+        assert f"seal 2 holds another digest of {name} than seal 1: it was changed in between" in problems

@@ -61,6 +61,7 @@ KEYS: dict[str, tuple[str, ...]] = {  # the primary key of each table that the c
     "events": ("number",),
     "facts": ("key",),
 }
+CHANGED_LATER = frozenset({"shots", "facts"})  # tables whose rows are updated; rows of the others stay as they are
 TELEMETRY = "telemetry.tlog"  # the subject of its blocks
 DEFINITIONS = "sqlite_master"  # the subject of the tables' own definitions
 # The life of a shot: wished → fired → safe | failed. A file is proof of an exposure: it makes a shot safe even when the

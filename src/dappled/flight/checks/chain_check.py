@@ -11,7 +11,7 @@ from dappled.flight import chain
 from dappled.flight.chain import ChainLink, Column
 from dappled.flight.errors import FlightError
 from dappled.flight.stored_rows import Row, StoredRows
-from dappled.flight.tables import DEFINITIONS, KEYS
+from dappled.flight.tables import CHANGED_LATER, DEFINITIONS, KEYS
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,10 @@ def compare(stored: StoredRows) -> ChainFindings:
     problems = [*_broken(links)]
     latest: dict[str, dict[str, str]] = {}
     for link in links:
-        latest.setdefault(link.subject, {})[link.key] = link.sha256
+        keys = latest.setdefault(link.subject, {})
+        if link.key in keys and link.subject in KEYS and link.subject not in CHANGED_LATER:
+            problems.append(f"the row of {link.subject} {_shown(link.key)} was written again, which dappled never does")
+        keys[link.key] = link.sha256
     problems += _differences("definition", latest.get(DEFINITIONS, {}), ((row[:1], row) for row in definitions))
     for table in KEYS:
         try:

@@ -59,7 +59,7 @@ def compare(
     FlightError and OSError."""
     file, facts = seals.read(folder), ledger.facts()
     problems = [*file.problems, *_numbers(file.seals, facts), *_heads(file.seals, links or {}, facts)]
-    problems += _signatures(file.seals, key)
+    problems += [*_signatures(file.seals, key), *_rewritten(file.seals)]
     notes = [f"seal {number} was never written: its work was interrupted" for number in seals.announced(facts)[1]]
     last = file.last
     if last is None:
@@ -109,6 +109,19 @@ def _signatures(found: Mapping[int, Seal], key: SealKey | None) -> Iterator[str]
             yield f"seal {number} is signed in part"
         elif key is not None and seal.key == key.name and not key.signed(seal.signed_part(), seal.mac or ""):
             yield f"the signature of seal {number} is wrong: key {key.name} did not make it"
+
+
+def _rewritten(found: Mapping[int, Seal]) -> Iterator[str]:
+    """What was recorded never changes from one seal to the next, whoever made that one."""
+    first: dict[str, tuple[int, tuple[int, str]]] = {}
+    for number, seal in sorted(found.items()):
+        for name, digest in seal.files.items():
+            recorded = name in ("telemetry.tlog", "shots.jsonl") or name.startswith(("frames/", "inputs/"))
+            if not recorded or name.endswith(SIDECAR):
+                continue
+            before, was = first.setdefault(name, (number, digest))
+            if was != digest:
+                yield f"seal {number} holds another digest of {name} than seal {before}: it was changed in between"
 
 
 def _vouched_by_ledger(ledger: LedgerReader, facts: Mapping[str, Any]) -> dict[str, tuple[int | None, str]]:
