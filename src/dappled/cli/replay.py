@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,20 +16,13 @@ from dappled.clock import TimeOfDayClock
 from dappled.config import settings as configuration
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline import recipes
-from dappled.daemon.pipeline.capture import PendingShot, PendingShots
-from dappled.daemon.pipeline.decode_process import DecodeProcess
-from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.recipes import Names
-from dappled.daemon.replay import replay, runs
-from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayProgress
+from dappled.daemon.replay import playback, replay, runs
+from dappled.daemon.replay.playback import FlownWith
+from dappled.daemon.replay.replay import ReplayError, ReplayProgress
 from dappled.daemon.replay.runs import Run, RunWriter
-from dappled.daemon.replay.verifier import ReplayVerifier
-from dappled.daemon.stream import curve, wire
-from dappled.daemon.stream.answers import Answers
-from dappled.daemon.stream.publisher import Publisher
-from dappled.drivers.camera import Identity
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.drivers.replay import ReplayCamera
 from dappled.errors import counted
 from dappled.flight import LIVE, check, layout
 
@@ -98,30 +91,27 @@ def run(arguments: argparse.Namespace) -> int:
     facts = layout.read_facts(layout.open_folder(arguments.flight)) if is_flight else {}
     recipe = _recipe(arguments, facts, settings)
     recording = _recording(arguments, is_flight)
-    names, latency, recorded = _as_recorded(arguments, facts, recipe)
+    flown = _as_recorded(arguments, facts, recipe)
+    progress = PrintedProgress(as_json=arguments.json)
     with ExitStack() as stack:
         keep = None
         if is_flight and recipe and (arguments.run_name or _changed(arguments)) and not arguments.verify:
             name = arguments.run_name or datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-            results = stack.enter_context(RunWriter(arguments.flight, Run(name, recipe, names), TimeOfDayClock()))
+            results = stack.enter_context(RunWriter(arguments.flight, Run(name, recipe, flown.names), TimeOfDayClock()))
             recipe, keep = results.run.recipe, results.decoded
             print(f"storing the results beside the old ones, as run {name}", file=sys.stderr)
         writer = replay.verifier(recording, keep)
-        decoder = DecodeProcess(recipe) if recipe else None
-        if decoder:
-            stack.callback(decoder.close)
-            decoder.warm_up()
-        bad = _play(
-            arguments,
-            settings,
+        playback.run(
             recording,
-            writer=writer,
-            decoder=decoder,
-            flown=(names, latency, recorded),
-            stack=stack,
+            writer,
+            progress,
+            flown,
+            recipe=recipe,
+            publish=settings.publish if arguments.publish else None,
+            pace=_pace(arguments),
         )
     if not arguments.verify:
-        return 1 if bad else 0
+        return 1 if progress.bad else 0
     problems += writer.verdict(decoded=recipe is not None)
     for text in problems:
         print(f"different: {text}", file=sys.stderr)
@@ -139,58 +129,14 @@ def run(arguments: argparse.Namespace) -> int:
 class PrintedProgress(ReplayProgress):
     """Prints a line for each shot that has ended."""
 
-    def __init__(self, line: Callable[[PendingShot], str]) -> None:
+    def __init__(self, *, as_json: bool) -> None:
         super().__init__()
-        self._line = line
+        self._as_json = as_json
 
     def finished(self, pending: PendingShot) -> None:
         """See Observer."""
-        print(self._line(pending), flush=True)
+        print(frame_json(pending) if self._as_json else frame_line(pending), flush=True)
         super().finished(pending)
-
-
-def _play(
-    arguments: argparse.Namespace,
-    settings: configuration.Settings,
-    recording: replay.RecordedFlight,
-    *,
-    writer: ReplayVerifier,
-    decoder: DecodeProcess | None,
-    flown: tuple[Names, BodyLatency, configuration.Settings],
-    stack: ExitStack,
-) -> int:
-    """Play the recording through the pipeline. Returns how many frames failed."""
-    names, latency, recorded = flown
-    clock, progress = replay.clock(recording), PrintedProgress(frame_json if arguments.json else frame_line)
-    telemetry = RecordedTelemetry.flown(recorded, recording.telemetry, recording.horizons, recording.vehicles)
-
-    publisher = _publisher(settings, writer, decoder, stack) if arguments.publish else None
-    if publisher:
-        header = wire.start_header(settings.publish, clock.utc_ns(), camera=names.camera, mask=names.mask)
-        publisher.publish("start", header)
-    identity = Identity("dappled", "recording", "", str(arguments.flight))
-    camera = ReplayCamera(recording.files, identity, clock)
-    shots = PendingShots(camera)
-    pipeline = Pipeline(
-        camera,
-        shots,
-        writer,
-        telemetry,
-        decoder=decoder,
-        publisher=publisher,
-        latency=latency,
-        names=names,
-        observer=progress,
-        decode_queue=1000,
-    )
-    pipeline.start()
-    stack.callback(pipeline.stop, 5.0)
-    replay.play(recording, shots, progress, time=clock, pace=_pace(arguments))
-    if publisher:
-        counts = {"wished": len(recording.shots), "safe": progress.frames}
-        publisher.publish("end", {"utc_ns": clock.utc_ns(), "shots": counts})
-        publisher.stop()  # answer the last questions while the decoder still runs
-    return progress.bad
 
 
 def _changed(arguments: argparse.Namespace) -> bool:
@@ -226,36 +172,17 @@ def _recording(arguments: argparse.Namespace, is_flight: bool) -> replay.Recorde
     )
 
 
-def _as_recorded(
-    arguments: argparse.Namespace, facts: Mapping[str, Any], recipe: Recipe | None
-) -> tuple[Names, BodyLatency, configuration.Settings]:
+def _as_recorded(arguments: argparse.Namespace, facts: Mapping[str, Any], recipe: Recipe | None) -> FlownWith:
     """Names, body latency and settings of the flight. The frames of a folder begin to expose at their times."""
     if not facts:
-        return recipes.names(recipe), BodyLatency(0.0, 0.0, "given by --start and --interval"), configuration.Settings()
+        latency = BodyLatency(0.0, 0.0, "given by --start and --interval")
+        return FlownWith(recipes.names(recipe), latency, configuration.Settings())
     if "settings" not in facts or "names" not in facts:
         raise ReplayError(f"{arguments.flight}/flight.toml lacks its settings; replay its folder frames/ with --mask")
     recorded = configuration.of_tables(facts["settings"], "flight.toml")
-    latency = BodyLatency.of(recorded.camera)
     changed = any(getattr(arguments, name) for name in ("camera", "mask"))
-    return recipes.names(recipe) if changed else Names(**facts["names"]), latency, recorded
-
-
-def _publisher(
-    settings: configuration.Settings, writer: ReplayVerifier, decoder: DecodeProcess | None, stack: ExitStack
-) -> Publisher:
-    answers = Answers(writer, decoder)
-    publisher = Publisher(
-        settings.publish.slices,
-        settings.publish.ask,
-        high_water_mark=settings.publish.high_water_mark,
-        keys=curve.server(settings.publish.keys, settings.publish.clients),
-        mode=int(settings.publish.socket_mode, 8),
-    )
-    answers.start()
-    stack.callback(answers.stop)
-    publisher.start(writer.root.absolute().name, answers.answer)
-    stack.callback(publisher.stop)
-    return publisher
+    names = recipes.names(recipe) if changed else Names(**facts["names"])
+    return FlownWith(names, BodyLatency.of(recorded.camera), recorded)
 
 
 def _pace(arguments: argparse.Namespace) -> replay.Pace | None:

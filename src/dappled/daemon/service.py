@@ -46,7 +46,7 @@ from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
 from dappled.daemon.shot_events import ShotEvents
-from dappled.daemon.stream import curve, wire
+from dappled.daemon.stream import wire
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import Camera
@@ -111,7 +111,7 @@ class Service:
             names, recipe = recipes.recipe(settings)
             camera = open_camera(settings.camera)
             listener = console_process.open_listener(settings, stack)
-            self._publisher = _open_publisher(settings, listener.private if listener else "")
+            self._publisher = Publisher.of(settings.publish, private=listener.private if listener else "")
             stack.callback(self._publisher.stop)
             self._links = _configured_links(settings, self._clock)
             self._links.open()
@@ -411,18 +411,6 @@ class PeriodicTask:
             self.problem = ""
             self._due_ns = now_ns + self._every_ns
             self._new.among([])
-
-
-def _open_publisher(settings: Settings, private: str) -> Publisher:
-    publish = settings.publish
-    return Publisher(
-        publish.slices,
-        publish.ask,
-        high_water_mark=publish.high_water_mark,
-        keys=curve.server(publish.keys, publish.clients),
-        mode=int(publish.socket_mode, 8),
-        private=private,
-    )
 
 
 def _configured_links(settings: Settings, clock: Clock) -> MavlinkLinks:

@@ -12,14 +12,12 @@ from pathlib import Path
 from dappled.clock import Clock
 from dappled.config import settings as configuration
 from dappled.daemon.navigation import BodyLatency
-from dappled.daemon.pipeline.capture import PendingShots
-from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
-from dappled.daemon.replay import replay
-from dappled.daemon.replay.replay import RecordedFlight, RecordedTelemetry, ReplayProgress
+from dappled.daemon.replay import playback, replay
+from dappled.daemon.replay.playback import FlownWith
+from dappled.daemon.replay.replay import RecordedFlight, ReplayProgress
 from dappled.daemon.replay.verifier import ReplayVerifier
-from dappled.drivers.camera import Blob, Identity
-from dappled.drivers.replay import ReplayCamera
+from dappled.drivers.camera import Blob
 from dappled.errors import DappledError
 from dappled.flight import FlightsLock, Frame, Ledger, LedgerReader, Tag, layout, seals
 
@@ -75,29 +73,13 @@ def add_missing(flight: Path, clock: Clock) -> list[int]:
     settings = configuration.of_tables(facts["settings"], str(folder.settings))
     recording = replay.of_flight(flight)
     recording = replace(recording, shots=[shot for shot in recording.shots if shot.index <= max(missing)])
-    progress, time = ReplayProgress(), replay.clock(recording)
+    flown = FlownWith(Names(**facts["names"]), BodyLatency.of(settings.camera), settings)
     with ExitStack() as stack:
         stack.enter_context(FlightsLock(flight.resolve().parent, "tags frames in"))
         stack.enter_context(seals.reopened(folder, clock, "late tags"))
         ledger = stack.enter_context(Ledger(folder.ledger, clock))
         writer = MissingTagWriter(recording, ledger)
-        camera = ReplayCamera(recording.files, Identity("dappled", "recording", "", str(flight)), time)
-        shots = PendingShots(camera)
-        pipeline = Pipeline(
-            camera,
-            shots,
-            writer,
-            RecordedTelemetry.flown(settings, recording.telemetry, recording.horizons, recording.vehicles),
-            decoder=None,
-            publisher=None,
-            latency=BodyLatency.of(settings.camera),
-            names=Names(**facts["names"]),
-            observer=progress,
-            decode_queue=1,
-        )
-        pipeline.start()
-        stack.callback(pipeline.stop, 5.0)
-        replay.play(recording, shots, progress, time=time, pace=None)
+        playback.run(recording, writer, ReplayProgress(), flown)
         for index in writer.added:
             ledger.add_event("tagged late", "the recording ended before it was tagged; it is tagged now", index)
     return writer.added

@@ -17,11 +17,12 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import zmq
 
-from dappled.daemon.stream import wire
+from dappled.config.settings import PublishSettings
+from dappled.daemon.stream import curve, wire
 from dappled.daemon.stream.curve import ServerKeys
 from dappled.daemon.stream.sockets import Sockets
 from dappled.daemon.stream.wire import Message, WireError
@@ -113,6 +114,18 @@ class Publisher:
             os.close(self._wake)
             raise
         self._loop = Loop("publisher", self._run)
+
+    @classmethod
+    def of(cls, settings: PublishSettings, *, private: str = "") -> Self:
+        """A publisher at the endpoints of these settings. Raises WireError, KeyFileError."""
+        return cls(
+            settings.slices,
+            settings.ask,
+            high_water_mark=settings.high_water_mark,
+            keys=curve.server(settings.keys, settings.clients),
+            mode=int(settings.socket_mode, 8),
+            private=private,
+        )
 
     def start(self, flight: str, answer: Answer) -> None:
         """Start to send and to listen. `flight` is the name in the headers.
