@@ -8,7 +8,7 @@ from dappled.flight.chain import Column
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
 
-Row = tuple[Column, ...]
+StoredRow = tuple[Column, ...]
 
 
 class StoredRows(LedgerReader):
@@ -31,11 +31,11 @@ class StoredRows(LedgerReader):
         except FlightError as error:
             return [str(error)]
 
-    def definitions(self) -> list[Row]:
+    def definitions(self) -> list[StoredRow]:
         """(name, type, table, SQL) of each table and index."""
         return self._rows("SELECT name, type, tbl_name, sql FROM sqlite_master ORDER BY name")
 
-    def links(self) -> list[Row]:
+    def links(self) -> list[StoredRow]:
         """The chain: (number, subject, key, sha256, link)."""
         return self._rows("SELECT number, subject, key, sha256, link FROM chain ORDER BY number")
 

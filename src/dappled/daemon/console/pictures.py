@@ -15,7 +15,6 @@ from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
 
 Grey = NDArray[np.uint8]
-Colour = NDArray[np.uint8]
 MOSAIC_PX = 2560  # of the mosaic of views; every WebGL2 supports 2048, phones of the last ten years 4096
 _DEPTH_STOPS = np.array(  # dark violet to yellow, even in lightness: after viridis
     [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=np.float64
@@ -120,7 +119,7 @@ def refocused(mosaic: Mosaic, disparity: float) -> Grey:
     return encoded(np.nan_to_num(shift_and_add(stack, disparity / mosaic.scale)))
 
 
-def depth_colours(disparity: NDArray[np.float32], sigma: NDArray[np.float32] | None) -> Colour:
+def depth_colours(disparity: NDArray[np.float32], sigma: NDArray[np.float32] | None) -> NDArray[np.uint8]:
     """uint8 (h, w, 3): near to far from yellow to violet; grey where unknown (NaN, or σ above a quarter of
     the range)."""
     known = np.isfinite(disparity)
@@ -140,7 +139,7 @@ def depth_colours(disparity: NDArray[np.float32], sigma: NDArray[np.float32] | N
     colours = np.stack(
         [np.interp(place, range(len(_DEPTH_STOPS)), _DEPTH_STOPS[:, channel]) for channel in range(3)], axis=-1
     )
-    picture: Colour = np.where(known[..., None], np.rint(colours), _UNKNOWN).astype(np.uint8)
+    picture: NDArray[np.uint8] = np.where(known[..., None], np.rint(colours), _UNKNOWN).astype(np.uint8)
     return picture
 
 

@@ -27,7 +27,7 @@ from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import sentence
 
 DEPTH_NICENESS = 14
-Reply = tuple[Mapping[str, Any], tuple[int, ...]]
+WorkerReply = tuple[Mapping[str, Any], tuple[int, ...]]
 
 
 class DecodeWorker:
@@ -37,7 +37,7 @@ class DecodeWorker:
         self._darkroom: Darkroom | None = None
         self._preview_px = 1024
 
-    def __call__(self, question: ChannelMessage) -> Reply:
+    def __call__(self, question: ChannelMessage) -> WorkerReply:
         body = question.body
         if body["do"] == "set up":
             self._darkroom = Darkroom(Recipe(**body["recipe"]))
@@ -54,7 +54,9 @@ class DecodeWorker:
         except Exception as error:  # noqa: BLE001  # no frame may end the worker: the next one may be good
             return {"error": _naming(body.get("path"), error)}, ()
 
-    def _decode(self, darkroom: Darkroom, path: str, focal_length_mm: float | None, f_number: float | None) -> Reply:
+    def _decode(
+        self, darkroom: Darkroom, path: str, focal_length_mm: float | None, f_number: float | None
+    ) -> WorkerReply:
         done = darkroom.decode(path, focal_length_mm=focal_length_mm, f_number=f_number, views=False)
         field = done.light_field
         ms = dict(done.ms)
@@ -91,7 +93,7 @@ class DecodeWorker:
         return file.getvalue(), (mosaic.shape[1], mosaic.shape[0])
 
 
-def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> Reply:
+def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
     """Disparity and its sigma of one frame, float32 (h, w) each, at a lower priority than decoding."""
     if os.nice(0) < DEPTH_NICENESS:
         os.nice(DEPTH_NICENESS - os.nice(0))

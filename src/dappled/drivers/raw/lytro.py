@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.bounds.parsing import MOST_BYTES, parse_json, read_bytes
-from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, Source
+from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, RawSource
 
 START = b"\x89LFP\r\n\x1a\n"
 _PART = re.compile(rb"\x89LF[A-Z]\r\n\x1a\n")
@@ -63,7 +63,7 @@ def read_container(data: bytes, *, pixels: bool = True) -> RawFile:
     return _frame(metadata, packed if pixels else None)
 
 
-def find_bare(source: Source, file: BinaryIO, *, pixels: bool = True) -> RawFile | None:
+def find_bare(source: RawSource, file: BinaryIO, *, pixels: bool = True) -> RawFile | None:
     """The frame of a bare .raw file; None where neither metadata beside it nor its size names a Lytro camera.
 
     Raises ValueError as `read_container`.
@@ -74,7 +74,7 @@ def find_bare(source: Source, file: BinaryIO, *, pixels: bool = True) -> RawFile
     return None if metadata is None else _frame(_imaging(metadata), file.read() if pixels else None)
 
 
-def _beside(source: Source) -> Mapping[str, Any] | None:
+def _beside(source: RawSource) -> Mapping[str, Any] | None:
     """Return the JSON file beside a bare .raw file, of the same name with .json or .txt; None without."""
     if not isinstance(source, Path | str):
         return None

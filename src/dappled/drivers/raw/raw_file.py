@@ -21,7 +21,7 @@ from PIL import Image
 
 from dappled.bounds.pictures import open_picture
 
-Source = Path | str | bytes | memoryview | mmap.mmap
+RawSource = Path | str | bytes | memoryview | mmap.mmap
 Values = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.float64]
 
 _EXIF_IFD = 0x8769

@@ -27,10 +27,10 @@ from dappled.bounds.arrays import read_npy
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.pictures import FREE_PIXELS, check_pixels, check_tiff_page, open_picture
 from dappled.drivers.raw import lytro
-from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, Source, positive, read_exif
+from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, RawSource, positive, read_exif
 from dappled.errors import DappledError
 
-__all__ = ["ExposureSettings", "RawFile", "RawFileError", "Source", "read", "read_metadata"]
+__all__ = ["ExposureSettings", "RawFile", "RawFileError", "RawSource", "read", "read_metadata"]
 
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _DNG_VERSION, _MAX_SAMPLE = 50706, 281  # TIFF tags
@@ -40,7 +40,7 @@ class RawFileError(DappledError):
     """A file can't be read as a frame; one sentence with its name."""
 
 
-def read(source: Source, name: str | None = None) -> RawFile:
+def read(source: RawSource, name: str | None = None) -> RawFile:
     """Read a frame from a path, or from bytes (`name` stands for the file in error sentences).
 
     Raises RawFileError when it is missing, empty, truncated, damaged or of a kind that holds no frame.
@@ -59,7 +59,7 @@ def read(source: Source, name: str | None = None) -> RawFile:
         return _read_libraw(file) if frame is None else frame
 
 
-def read_metadata(source: Source, name: str | None = None) -> ExposureSettings:
+def read_metadata(source: RawSource, name: str | None = None) -> ExposureSettings:
     """Read camera and exposure alone, without unpacking the pixels (milliseconds).
 
     A kind of file without metadata gives None throughout. Raises RawFileError as `read` does.
@@ -84,19 +84,19 @@ def read_metadata(source: Source, name: str | None = None) -> ExposureSettings:
         return _read_libraw_settings(file)
 
 
-def _find_lytro(source: Source, label: str, file: BinaryIO, start: bytes, *, pixels: bool = True) -> RawFile | None:
+def _find_lytro(source: RawSource, label: str, file: BinaryIO, start: bytes, *, pixels: bool = True) -> RawFile | None:
     """Read a Lytro container, or a bare file that is named .raw; None for other files."""
     if start.startswith(lytro.START):
         return lytro.read_container(file.read(), pixels=pixels)
     return lytro.find_bare(source, file, pixels=pixels) if label.lower().endswith(".raw") else None
 
 
-def _label(source: Source, name: str | None) -> str:
+def _label(source: RawSource, name: str | None) -> str:
     return name or (str(source) if isinstance(source, Path | str) else "the frame")
 
 
 @contextmanager
-def _open(source: Source, label: str) -> Iterator[BinaryIO]:
+def _open(source: RawSource, label: str) -> Iterator[BinaryIO]:
     try:
         if isinstance(source, Path | str):
             file: BinaryIO = open(source, "rb")  # noqa: SIM115  closed by the with below

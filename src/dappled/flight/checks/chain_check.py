@@ -10,7 +10,7 @@ from dappled.errors import counted
 from dappled.flight import chain
 from dappled.flight.chain import ChainLink, Column
 from dappled.flight.errors import FlightError
-from dappled.flight.stored_rows import Row, StoredRows
+from dappled.flight.stored_rows import StoredRow, StoredRows
 from dappled.flight.tables import CHANGED_LATER, DEFINITIONS, KEYS
 
 
@@ -75,7 +75,9 @@ def _broken(links: Sequence[ChainLink]) -> Iterator[str]:
         yield "the chain is empty"
 
 
-def _differences(what: str, latest: dict[str, str], rows: Iterable[tuple[Sequence[Column], Row]]) -> Iterator[str]:
+def _differences(
+    what: str, latest: dict[str, str], rows: Iterable[tuple[Sequence[Column], StoredRow]]
+) -> Iterator[str]:
     """Sentences for the rows that were changed or added since they were written, and for those that are missing."""
     left, changed, added = dict(latest), [], []
     for key, row in rows:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 Floats = NDArray[np.float32]
-Colour = tuple[float, float, float]
+Reflectance = tuple[float, float, float]
 
 EXTENT_M = 80.0
 TEXEL_M = 0.05
@@ -23,15 +23,20 @@ DETAIL_TEXEL_M = 0.0125
 HEADROOM = 2.3  # brightest surface over the mean
 SUN = (0.45, -0.5, 0.74)  # towards the sun: north, east, up
 
-GRASS: Colour = (0.115, 0.140, 0.080)
-MEADOW: Colour = (0.150, 0.150, 0.095)
-SOIL: Colour = (0.165, 0.135, 0.105)
-ASPHALT: Colour = (0.105, 0.105, 0.110)
-GRAVEL: Colour = (0.200, 0.190, 0.170)
-PAINT: Colour = (0.330, 0.330, 0.325)
-TREE: Colour = (0.062, 0.085, 0.045)
-ROOFS: tuple[Colour, ...] = ((0.235, 0.155, 0.120), (0.135, 0.140, 0.150), (0.185, 0.160, 0.135))
-CARS: tuple[Colour, ...] = ((0.300, 0.300, 0.300), (0.190, 0.095, 0.085), (0.085, 0.110, 0.170), (0.050, 0.050, 0.055))
+GRASS: Reflectance = (0.115, 0.140, 0.080)
+MEADOW: Reflectance = (0.150, 0.150, 0.095)
+SOIL: Reflectance = (0.165, 0.135, 0.105)
+ASPHALT: Reflectance = (0.105, 0.105, 0.110)
+GRAVEL: Reflectance = (0.200, 0.190, 0.170)
+PAINT: Reflectance = (0.330, 0.330, 0.325)
+TREE: Reflectance = (0.062, 0.085, 0.045)
+ROOFS: tuple[Reflectance, ...] = ((0.235, 0.155, 0.120), (0.135, 0.140, 0.150), (0.185, 0.160, 0.135))
+CARS: tuple[Reflectance, ...] = (
+    (0.300, 0.300, 0.300),
+    (0.190, 0.095, 0.085),
+    (0.085, 0.110, 0.170),
+    (0.050, 0.050, 0.055),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,12 +121,12 @@ class _Canvas:
     albedo: Floats
     rough: Floats
 
-    def paint(self, cover: Floats, colour: Colour, rough: float, shade: Floats | float = 1.0) -> None:
+    def paint(self, cover: Floats, colour: Reflectance, rough: float, shade: Floats | float = 1.0) -> None:
         """Cover the whole map, as far as `cover` (0 to 1) says."""
         self.stamp((slice(None), slice(None)), cover, colour, rough, shade)
 
     def stamp(
-        self, where: tuple[slice, slice], cover: Floats, colour: Colour, rough: float, shade: Floats | float = 1.0
+        self, where: tuple[slice, slice], cover: Floats, colour: Reflectance, rough: float, shade: Floats | float = 1.0
     ) -> None:
         """Cover a part of the map."""
         for plane, value in zip(self.albedo, colour, strict=True):
@@ -281,5 +286,5 @@ def _step(distance: Floats | NDArray[np.float64], half_width: float) -> Floats:
     return np.asarray(t * t * (3 - 2 * t), dtype=np.float32)
 
 
-def _mix(a: Colour, b: Colour, share: Floats) -> Floats:
+def _mix(a: Reflectance, b: Reflectance, share: Floats) -> Floats:
     return np.stack([x + share * (y - x) for x, y in zip(a, b, strict=True)]).astype(np.float32)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,7 +22,7 @@ from dappled.flight import durable
 from dappled.products.extras import need
 from dappled.products.maps import cog, hyperstereo, map_grid
 from dappled.products.maps.earth import Projection
-from dappled.products.maps.georeference import Survey
+from dappled.products.maps.georeference import Progress, Survey
 from dappled.products.maps.ground import Flat, Ground
 from dappled.products.maps.hyperstereo import Surface
 from dappled.products.maps.map_grid import MapGrid
@@ -40,8 +39,6 @@ _REACH = (1, 2, 4, 8, 16)  # cells: holes are filled from the nearest heights fi
 _LEAST_KNOWN = 0.05  # share of a hole's surroundings that must be known
 _FADE = 8.0  # cells over which found heights fade into the given ground
 _SEARCH_M = (3.0, 12.0)  # below the lowest and above the highest of the given ground
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
