@@ -224,7 +224,7 @@ class Service:
             decode_queue=settings.decode.queue,
             preview_interval_s=settings.publish.preview_interval_s,
         )
-        self._answers = Answers(writer, self._decoder, shots.wait_decoded)
+        self._answers = Answers(writer, self._decoder, shots)
         driver = (camera,) if isinstance(camera, HasThreads) else ()
         self._vital: tuple[HasThreads, ...] = (self._pipeline, self._links, self._shutter, *driver)
         self._tasks = self._periodic_tasks()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 from dappled.daemon.stream.publisher import Reply
@@ -42,14 +42,21 @@ class SlicesDecoder(Protocol):
         """Decode the raw file at `path`. Raises DappledError."""
 
 
+class FlightDecoding(Protocol):
+    """The decoding of a flight, which goes before answers."""
+
+    def wait_decoded(self) -> bool:
+        """Wait, up to a limit, while the flight itself has frames to decode. Whether none is left."""
+
+
 class Answers:
     """Answers questions one by one, behind a bounded queue; a question that finds it full is refused."""
 
     def __init__(
-        self, record: FrameRecord, decoder: SlicesDecoder | None, give_way: Callable[[], object] = lambda: None
+        self, record: FrameRecord, decoder: SlicesDecoder | None, flight: FlightDecoding | None = None
     ) -> None:
-        """`give_way` waits, up to a limit, while the flight itself has frames to decode."""
-        self._record, self._decoder, self._give_way = record, decoder, give_way
+        """`flight`, where given, decodes its own frames before a frame is decoded for an answer."""
+        self._record, self._decoder, self._flight = record, decoder, flight
         self._worker: Worker[tuple[Mapping[str, Any], Reply]] = Worker(
             "answers", self._work, capacity=WAITING, on_failure=self._failed
         )
@@ -85,7 +92,8 @@ class Answers:
             return Message("frame", frame_header(tag, frame, None))
         if self._decoder is None:
             raise WireError("this flight is not decoded: no mask is configured")
-        self._give_way()
+        if self._flight is not None:
+            self._flight.wait_decoded()
         decoded = self._decoder.decode(self._record.path(frame), tag.focal_length_mm, tag.f_number)
         return Message("slices", slices_header(tag, decoded), decoded.body)
 
