@@ -59,7 +59,7 @@ def test_reset_resets_the_one_at_the_port() -> None:
     one, other = replace(EOS_450D), replace(FINEPIX_DISK)
     reset("usb:001,005", UsbDevices([one, other]))
     assert (one.resets, other.resets) == (1, 0)
-    with pytest.raises(UsbError, match="no device is at usb:001,007"):
+    with pytest.raises(UsbError, match="there is no device at usb:001,007 any more"):
         reset("usb:001,007", UsbDevices([one]))
     with pytest.raises(UsbError, match="can't be reset"):
         reset("usb:001,005", UsbDevices([replace(EOS_450D, allowed=False)]))

@@ -164,7 +164,7 @@ def test_two_file_systems_on_one_disk_are_one_place(
         go(closed, memory, prune=False)
     assert os.listdir(memory) == []
     monkeypatch.undo()
-    assert go(closed, memory, prune=False).copied == 8
+    assert go(closed, memory, prune=False).copied == 9
 
 
 def test_a_copy_in_memory_is_made_and_doubted_and_nothing_is_removed_for_it(closed: Path, memory: Path) -> None:

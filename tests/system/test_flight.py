@@ -107,7 +107,7 @@ def test_a_changed_slices_hash_is_found(copied: Path) -> None:
     ledger.close()
     done = dappled("replay", str(copied), "--verify")
     assert done.returncode == 1
-    assert "frame 0: its slices came out different" in done.stderr
+    assert "frame 0: the slices came out different" in done.stderr
 
 
 def test_verify_needs_a_flight(tmp_path: Path) -> None:

@@ -119,7 +119,7 @@ def test_a_missing_file_leaves_doubt_that_a_person_settles(
 @pytest.mark.parametrize(
     "case",
     [(["--pair", "99=DSCF0001.RAF"], "shot 99"), (["--pair", "0=nothing.RAF"], "nothing.RAF"),
-     (["--by-order"], "1 shots wait for 0 files"), (["--from", "/no/such"], "/no/such")],
+     (["--by-order"], "needs as many files as shots: 1 shot, 0 files"), (["--from", "/no/such"], "/no/such")],
 )  # fmt: skip
 def test_a_wrong_wish_is_one_sentence(
     here: Path, body: FinePix, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], case: Wrong

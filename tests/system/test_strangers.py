@@ -123,7 +123,7 @@ def test_silent_strangers_cost_no_photograph_and_no_viewer(
             assert [each.reason for each in outcomes if not each.ok] == []
             acks = sorted(math.inf if each.ack_ms is None else each.ack_ms for each in outcomes)
             assert acks[-1 - requests // 20] <= ACK_MS  # one in 20 may wait for other programs of this machine
-            until = time.monotonic() + 10
+            until = time.monotonic() + 60
             while (message := viewer.receive(1)) is None or message.topic != "frame":
                 assert time.monotonic() < until
             viewer.ask({"get": "frame", "frame": 0})

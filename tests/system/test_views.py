@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -91,10 +92,16 @@ def test_views_of_a_scene_with_hardly_any_parallax_are_no_worse_than_their_mean(
 
 
 def test_the_mask_s_installation_is_found(tmp_path: Path) -> None:
-    """Rotation and distance from one stopped-down frame; the simulator drew them from its seed."""
+    """Rotation and distance from one stopped-down frame; the simulator drew them from its seed.
+
+    One focal length shows the product of the print's scale and 1 − d/f. The distance stays as the profile states it,
+    and the scale takes the difference.
+    """
     for seed in (11, 12):
         camera = reference_camera(seed, scale=0.5, scene="white")
         (tmp_path / "bench.dng").write_bytes(camera.bench_frame().file)
         (fit,) = from_frame(Darkroom(Recipe(CAMERA, MASK)), tmp_path / "bench.dng").fits
         assert fit.rotation_rad == pytest.approx(camera.installed.rotation_rad, abs=2e-5)
-        assert fit.mask_distance_mm == pytest.approx(camera.installed.distance_mm, rel=2e-3)
+        assert (fit.mask_distance_mm, fit.distance_fitted) == (0.48, False)
+        shadow_per_px = 15.5 * (1 - camera.installed.distance_mm / 50) * 0.01  # 15.5/mm, 50 mm, pixels of 0.01 mm
+        assert math.hypot(*fit.lattice.ky) == pytest.approx(shadow_per_px, rel=2e-5)

@@ -9,6 +9,9 @@ ROOT = Path(__file__).parents[2]
 ELSEWHERE = {
     "cargo",  # Rust comes from rustup, not from Debian
     "unshare",  # util-linux: part of every Debian
+    "mount",  # as above, but not in the smallest root
+    "umount",
+    "cc",  # comes with g++
     "g++",  # looked for by a header of the libraries that it comes with
 }
 

@@ -132,6 +132,11 @@ class LedgerReader(Database):
                 raise
             reader = cls(path, uri=f"{path.absolute().as_uri()}?mode=ro&immutable=1")
         reader._rows("PRAGMA query_only=ON")
+        made = reader._rows("SELECT type, name FROM sqlite_master WHERE type NOT IN ('table', 'index')")
+        if made:  # a view or a trigger can compute without end, or more than memory holds
+            reader.close()
+            kind, name = made[0]
+            raise FlightError(f"{path} holds the {kind} {name!r}, which dappled didn't make: use another copy of it")
         return reader
 
     def shots(self) -> list[ShotRow]:

@@ -73,7 +73,7 @@ def offload(
         there = stack.enter_context(_open_copy(source, destination, same_device=same_device))
         system = places.file_system(there.folders[""])
         if prune:
-            _refuse_unprovable(there.path, system)
+            _refuse_unprovable(there, system, same_device=same_device)
         return _Copying(folder, source, there, system).run(names, prune=prune, clock=clock, progress=progress)
 
 
@@ -107,7 +107,7 @@ class _Copying:
             fresh |= {seal_file} if written else set()
         self._there.sync()
         self._there.sync_above()
-        ways = self._prove(manifest, fresh)
+        ways, copies = self._prove(manifest, fresh)
         rows = self._acknowledged()
         elsewhere = self._prove_removed(rows, manifest)
         self._check()
@@ -123,7 +123,7 @@ class _Copying:
                 if name.startswith("frames/") and name in manifest and manifest[name].sha256 == row.sha256
             }
             with seals.reopened(self._folder, clock, PRUNES) if sure else nullcontext():
-                pruned = pruning.remove(self._folder, self._source, self._there, sure, clock)
+                pruned = pruning.remove(self._folder, self._source, self._there, sure, copies, clock)
         size = sum(one.identity.size for one in manifest.values())
         already = len(manifest) - len(fresh)
         return Offloaded(
@@ -163,10 +163,15 @@ class _Copying:
         if before != after:
             raise FlightError(f"{self._source.path / name} changed while it was copied; try again")
 
-    def _prove(self, manifest: Mapping[str, Proved], fresh: set[str]) -> tuple[ReadBack, ...]:
-        """Read every file of the copy back and compare it with the manifest; in which ways they were read."""
+    def _prove(
+        self, manifest: Mapping[str, Proved], fresh: set[str]
+    ) -> tuple[tuple[ReadBack, ...], dict[str, FileIdentity | None]]:
+        """Read every file of the copy back and compare it with the manifest. Returns in which ways they were read, and
+        which files they were before that."""
         ways: set[ReadBack] = set()
+        copies: dict[str, FileIdentity | None] = {}
         for name, one in manifest.items():
+            copies[name] = pruning.copy_of(self._there, name)
             found, how = self._read_back(name)
             ways.add(how)
             if found == one.sha256:
@@ -175,7 +180,7 @@ class _Copying:
             if name in fresh:
                 raise FlightError(f"{goal} reads back different from {origin}: check that disk; nothing was removed")
             raise FlightError(f"{goal} is there already and differs from {origin}: move it away first")
-        return tuple(sorted(ways))
+        return tuple(sorted(ways)), copies
 
     def _read_back(self, name: str) -> tuple[str, ReadBack]:
         folder, _, last = name.rpartition("/")
@@ -291,12 +296,24 @@ def _open_copy(source: Tree, destination: Path, *, same_device: bool) -> Tree:
     return there
 
 
-def _refuse_unprovable(there: Path, system: str) -> None:
-    """Raise FlightError where a file system is not known to keep what was fsynced."""
+def _refuse_unprovable(copy: Tree, system: str, *, same_device: bool) -> None:
+    """Raise FlightError where a file system is not known to keep what was fsynced, or its disk is not known or forgets
+    what it holds."""
+    there = copy.path
     if system not in places.KEEPS_FSYNC | places.NETWORK:
         raise FlightError(
             f"--prune can't be sure of {there}: its file system is {system}, of which dappled doesn't know that an "
             "fsync reaches a disk; nothing was copied; offload to ext4, xfs, btrfs, exfat or NFS, or without --prune"
+        )
+    volatile = places.volatile(copy.folders[""])
+    if volatile:
+        raise FlightError(
+            f"--prune refuses {there}: {volatile}; nothing was copied; offload to another disk, or without --prune"
+        )
+    if not same_device and system not in places.NETWORK and not places.disks(copy.folders[""]):
+        raise FlightError(
+            f"--prune can't tell which disk {there} is on; nothing was copied; offload to a disk of this machine, or "
+            "without --prune, or insist with --same-device"
         )
 
 

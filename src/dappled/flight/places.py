@@ -45,6 +45,15 @@ def disks(fd: int) -> frozenset[str]:
     return _disks_of(device)
 
 
+def volatile(fd: int) -> str:
+    """Why the disk behind a descriptor may forget what was fsynced to it; "" where nothing says so."""
+    _, _, options = _mount(fd)
+    if options & {"nobarrier", "barrier=0"}:
+        return "it is mounted without write barriers"
+    memory = sorted(name for name in disks(fd) if name.startswith(("zram", "ram")))
+    return f"{memory[0]} is a disk in memory" if memory else ""
+
+
 def refuse_same_place(source: Tree, there: Tree, *, same_device: bool) -> None:
     """Compare every open folder of the copy with every one of the source, by device, inode and disk.
 
@@ -113,20 +122,21 @@ def _identity(fd: int) -> tuple[int, int]:
     return found.st_dev, found.st_ino
 
 
-def _mount(fd: int) -> tuple[str, str]:
-    """(kind, source) of the mount behind a descriptor, from proc(5); ("unknown", "") where it is not listed."""
+def _mount(fd: int) -> tuple[str, str, frozenset[str]]:
+    """Kind, source and options of the mount behind a descriptor, from proc(5); ("unknown", "", none) where it is not
+    listed."""
     with contextlib.suppress(OSError, ValueError):
         notes = dict(line.split(":\t", 1) for line in Path(f"/proc/self/fdinfo/{fd}").read_text().splitlines())
         return _mounts()[notes["mnt_id"].strip()]
-    return "unknown", ""
+    return "unknown", "", frozenset()
 
 
-def _mounts() -> Mapping[str, tuple[str, str]]:
-    found: dict[str, tuple[str, str]] = {}
+def _mounts() -> Mapping[str, tuple[str, str, frozenset[str]]]:
+    found: dict[str, tuple[str, str, frozenset[str]]] = {}
     for line in _MOUNTS.read_text(errors="surrogateescape").splitlines():
         before, _, after = line.partition(" - ")
-        kind, source, *_ = after.split(" ")
-        found[before.split(" ", 1)[0]] = (kind, source)
+        kind, source, *options = after.split(" ")
+        found[before.split(" ", 1)[0]] = (kind, source, frozenset(",".join(options).split(",")))
     return found
 
 
@@ -142,7 +152,11 @@ def _disks_of(device: int) -> frozenset[str]:
             return frozenset[str]().union(*(_disks_of(_number(path.read_text())) for path in below))
         image = here / "loop" / "backing_file"
         if image.exists():
-            return _disks_of(os.stat(image.read_text().strip()).st_dev)
+            backing = os.open(image.read_text().strip(), os.O_RDONLY | os.O_CLOEXEC)
+            try:
+                return disks(backing)
+            finally:
+                os.close(backing)
         return frozenset({here.name})
     return frozenset()
 

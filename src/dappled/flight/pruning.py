@@ -67,8 +67,16 @@ def removed(folder: FlightFolder) -> dict[str, Removed]:
     return {row.name: row for row in rows}
 
 
-def remove(folder: FlightFolder, source: Tree, there: Tree, sure: Mapping[str, Proved], clock: Clock) -> int:
-    """Remove files whose copies were read back from `there`; how many. Each must still be the file that was copied.
+def remove(  # noqa: PLR0917  # the two trees, and what was proved of each
+    folder: FlightFolder,
+    source: Tree,
+    there: Tree,
+    sure: Mapping[str, Proved],
+    copies: Mapping[str, FileIdentity | None],
+    clock: Clock,
+) -> int:
+    """Remove files whose copies were read back from `there`; how many. Each must still be the file that was copied, and
+    its copy the one of `copies`, which was read back.
 
     Raises FlightError where one isn't, a copy has vanished, or a disk refuses; the other files then stay.
     """
@@ -76,14 +84,13 @@ def remove(folder: FlightFolder, source: Tree, there: Tree, sure: Mapping[str, P
         source.remove_part(RECORD)  # of an attempt that was cut short
         return 0
     _note(folder, there.path, sure, clock)
-    copies = {name: _copy_of(there, name) for name in sure}
     for name, one in sure.items():
         with source.reading(name) as fd:
             _refuse_other(source, name, fd, one)
-            if _copy_of(there, name) != copies[name]:
+            if copy_of(there, name) != copies[name]:
                 raise FlightError(f"{there.path / name} is not the file any more that was read back: {name} stays here")
             source.unlink(name)
-            if _copy_of(there, name) != copies[name]:  # one file under two names that nothing told apart
+            if copy_of(there, name) != copies[name]:  # one file under two names that nothing told apart
                 source.write(name, pieces(fd, one.identity.size, lambda _: None))
                 source.sync()
                 raise FlightError(
@@ -131,6 +138,7 @@ def _refuse_other(source: Tree, name: str, fd: int, one: Proved) -> None:
         )
 
 
-def _copy_of(there: Tree, name: str) -> FileIdentity | None:
+def copy_of(there: Tree, name: str) -> FileIdentity | None:
+    """Which file a copy is now; None where there is none."""
     found = there.stat(name)
     return None if found is None else FileIdentity.of(found)

@@ -18,13 +18,14 @@ from pathlib import Path
 from dappled.clock import Clock
 from dappled.flight import durable, pruning
 from dappled.flight.chain import canonical
-from dappled.flight.errors import disk_error
+from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.seal_key import SealKey
 
 FACT = "seals"  # {"count": seals announced, "missing": those that were never written}
 _BESIDE_LEDGER = ("-wal", "-shm")
+_MOST_SEALS = 1_000_000
 _MAC = "mac"
 _DIGEST = "sha256"
 
@@ -198,7 +199,10 @@ def announced(facts: Mapping[str, object]) -> tuple[int, frozenset[int]]:
     value = facts.get(FACT)
     if not isinstance(value, dict):
         return 0, frozenset()
-    return int(value.get("count", 0)), frozenset(value.get("missing", ()))
+    count, missing = int(value.get("count", 0)), frozenset(value.get("missing", ()))
+    if not 0 <= count <= _MOST_SEALS:
+        raise FlightError(f"the ledger tells of {count} seals: it was changed; use another copy of the flight")
+    return count, missing
 
 
 def _parse(line: bytes) -> Seal | None:

