@@ -14,6 +14,7 @@ from dappled import cli
 from dappled.errors import DappledError
 
 INTERNAL = {  # caught where they arise, and told as another error or as an event
+    "dappled.bounds.claims.ClaimError",
     "dappled.drivers.child_process.ChannelError",
     "dappled.drivers.gphoto2.protocol.SessionError",
     "dappled.mocks.body.ptp.MalformedPacketError",

@@ -12,8 +12,6 @@ import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from dappled.errors import DappledError
-
 FREE_BYTES = 256 << 20
 RATIO = 200
 _MOST_DIMENSIONS = 8
@@ -22,7 +20,7 @@ _GROUP, _GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 _INFLATE_STEP = 1 << 20
 
 
-class ClaimError(DappledError, ValueError):
+class ClaimError(ValueError):
     """A file or message claims more than is read. The text goes on after the file's name: "its … ; what to do"."""
 
 
