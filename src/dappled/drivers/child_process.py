@@ -43,7 +43,7 @@ _REAL_TIME_US = 1_000_000
 _RR_PRIORITY = 1
 NICENESS = -10
 DECODER_GOES, CONSOLE_GOES = 500, 800  # of 1000: looking before decoding, decoding before recording
-_DEAD_S = 0.5
+_DEAD_S = 2.0
 
 
 # --- messages
@@ -238,7 +238,7 @@ def start_child(module: str, *arguments: str, quiet: bool = False) -> tuple[subp
 def end_child(process: subprocess.Popen[bytes], patience_s: float = 0.2) -> None:
     """Wait `patience_s` for a process to end by itself, then kill it.
 
-    A process that the kernel holds in a USB call dies later; this waits half a second for it, not longer.
+    A process that the kernel holds in a USB call dies later; this waits two seconds for it, not longer.
     """
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(patience_s)
