@@ -52,6 +52,7 @@ SUBSTITUTES = {
     "127.0.0.1:8042": "127.0.0.1:0",
     "/etc/dappled/dappled.toml": "dappled.toml",
     "COPY/FLIGHT": "FLIGHT",
+    "offload COPY": "offload COPY --same-device",  # the test has one disk
 }
 """What a real camera, card or day would have made, and what stands for it here."""
 
