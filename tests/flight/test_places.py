@@ -207,11 +207,24 @@ def test_a_partition_a_volume_and_an_image_are_on_their_disk(tmp_path: Path, mon
 def test_the_kind_of_file_system_is_that_of_the_descriptor(tmp_path: Path) -> None:
     with Tree(tmp_path) as tree:
         found = places.file_system(tree.folders[""])
-    kinds = {line.split(" - ")[1].split(" ")[0] for line in Path("/proc/self/mountinfo").read_text().splitlines()}
-    assert found in kinds
+    listed = [path.read_text() for path in places._MOUNTS if os.access(path, os.R_OK)]
+    assert found in {line.split(" - ")[1].split(" ")[0] for text in listed for line in text.splitlines()}
     with Tree(Path("/proc")) as tree:
         assert places.file_system(tree.folders[""]) == "proc"
     assert places.file_system(10**6) == "unknown"
+
+
+def test_in_a_chroot_the_mounts_of_the_whole_machine_are_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Inside one, a process' own list leaves out the file system that it stands on."""
+    with Tree(tmp_path) as tree:
+        found = places.file_system(tree.folders[""])
+        inside = tmp_path / "inside"
+        inside.write_text("61 60 0:5 / /proc rw - proc proc rw\n")
+        whole_machine = places._MOUNTS
+        monkeypatch.setattr(places, "_MOUNTS", (inside, *whole_machine))
+        assert places.file_system(tree.folders[""]) == found != "unknown"
+        monkeypatch.setattr(places, "_MOUNTS", (inside,))
+        assert places.file_system(tree.folders[""]) == "unknown"
 
 
 @pytest.mark.parametrize("system", ["fuse", "fuse.sshfs", "fuseblk", "overlay", "unknown", "zfs"])

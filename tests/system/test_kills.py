@@ -106,7 +106,7 @@ def test_every_accepted_request_has_one_outcome_at_the_ground_station_over_nine_
     dice = random.Random(17)  # noqa: S311  # kills anywhere between request and report, the same in each run
     port = free_port()
     ground = Ground(port)
-    with SimulatedBody.start(BodyOptions(picture="pattern:20000000:CR2")) as body:
+    with SimulatedBody.start(BodyOptions(picture="pattern:20000000:CR2", card_bytes=8 << 30)) as body:
         (tmp_path / "dappled.toml").write_text(
             f'[camera]\nport = "{body.port}"\n[record]\ndirectory = "flights"\nmin_free_mb = 0\n'
             f'[publish]\nslices = "ipc://{tmp_path}/s"\n[mavlink]\nurl = "udpin:127.0.0.1:{port}"\n',

@@ -26,7 +26,8 @@ KEEPS_FSYNC = frozenset(
 NETWORK = frozenset(("nfs", "nfs4", "cifs", "smb3", "ceph", "afs"))
 """File systems that hand an fsync to another machine, which is believed."""
 _NONCE = re.compile(r"\.dappled-[0-9a-f]{32}\.part")
-_MOUNTS = Path("/proc/self/mountinfo")
+_MOUNTS = (Path("/proc/self/mountinfo"), Path("/proc/1/mountinfo"))
+"""The second lists what lies outside a chroot, which the first leaves out; mount ids are the same in both."""
 _DEVICES = Path("/sys/dev/block")
 
 
@@ -125,15 +126,19 @@ def _identity(fd: int) -> tuple[int, int]:
 def _mount(fd: int) -> tuple[str, str, frozenset[str]]:
     """Kind, source and options of the mount behind a descriptor, from proc(5); ("unknown", "", none) where it is not
     listed."""
-    with contextlib.suppress(OSError, ValueError):
+    with contextlib.suppress(OSError, ValueError, KeyError):
         notes = dict(line.split(":\t", 1) for line in Path(f"/proc/self/fdinfo/{fd}").read_text().splitlines())
-        return _mounts()[notes["mnt_id"].strip()]
+        number = notes["mnt_id"].strip()
+        for listed in _MOUNTS:
+            mounts = _mounts(listed)
+            if number in mounts:
+                return mounts[number]
     return "unknown", "", frozenset()
 
 
-def _mounts() -> Mapping[str, tuple[str, str, frozenset[str]]]:
+def _mounts(listed: Path) -> Mapping[str, tuple[str, str, frozenset[str]]]:
     found: dict[str, tuple[str, str, frozenset[str]]] = {}
-    for line in _MOUNTS.read_text(errors="surrogateescape").splitlines():
+    for line in listed.read_text(errors="surrogateescape").splitlines():
         before, _, after = line.partition(" - ")
         kind, source, *options = after.split(" ")
         found[before.split(" ", 1)[0]] = (kind, source, frozenset(",".join(options).split(",")))
