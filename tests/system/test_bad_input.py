@@ -396,7 +396,7 @@ def test_a_disk_that_is_nearly_full_refuses_new_shots(body: SimulatedBody, here:
         decision = daemon.request()
         assert decision.outcome == "refused"
         assert "the disk is nearly full" in str(decision.reason)
-        assert "disk nearly full" in daemon.problems
+        assert "the disk is nearly full" in daemon.problems
     assert not daemon.shots
     balance = flight_report.balance(daemon.service.folder)
     assert (balance.wishes, balance.refused) == (0, 1)  # a wish that was refused stands in the flight as well

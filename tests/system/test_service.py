@@ -150,7 +150,7 @@ def test_what_is_amiss_is_told_in_every_place(manager: socket.socket, tmp_path: 
         assert any(one.get_type() == "HEARTBEAT" for one in heard)  # the link is up: what comes now is heard
         settings.write_text(RECORD.replace("= 1", "= 9000000") + rest, encoding="utf-8")
         daemon.send_signal(signal.SIGHUP)
-        text = "disk nearly full"
+        text = "the disk is nearly full"
         assert any(one.get_type() == "STATUSTEXT" and text in one.text for one in heard)
         critical = mavutil.mavlink.MAV_STATE_CRITICAL
         assert any(one.get_type() == "HEARTBEAT" and one.system_status == critical for one in heard)

@@ -184,18 +184,22 @@ class DiskSpace:
     files: int | None = None
 
     def shortage(self, least_mb: int) -> str | None:
-        """Why a photograph should not be taken, in a sentence; None where there is room. `least_mb` is the setting
-        record.min_free_mb."""
-        if self.files is not None and self.files < FEWEST_FILES:
-            return f"the disk takes only {self.files} more files (its inodes are used up): remove small files"
-        if self.available < least_mb * 1_000_000:
-            return (
-                f"the disk is nearly full: {self.available // 1_000_000} MB left, "
-                f"record.min_free_mb asks for {least_mb} MB"
-            )
-        if self.available < JOURNAL_BYTES:
-            return f"the disk is full: {self.available // 1000} kB left, the shot journal needs more"
-        return None
+        """See `disk_shortage`."""
+        return disk_shortage(self.available, self.files, least_mb)
+
+
+def disk_shortage(available: int, files: int | None, least_mb: int) -> str | None:
+    """Why no photograph should be taken with so many bytes and files left, in a sentence; None where there is room.
+
+    `least_mb` is the setting record.min_free_mb. Shutter, health record, go/no-go and doctor all ask here.
+    """
+    if files is not None and files < FEWEST_FILES:
+        return f"the disk takes only {files} more files (its inodes are used up): remove small files"
+    if available < least_mb * 1_000_000:
+        return f"the disk is nearly full: {available // 1_000_000} MB left, record.min_free_mb asks for {least_mb} MB"
+    if available < JOURNAL_BYTES:
+        return f"the disk is full: {available // 1000} kB left, the shot journal needs more"
+    return None
 
 
 def disk_space(path: Path) -> DiskSpace:

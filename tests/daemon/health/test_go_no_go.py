@@ -50,6 +50,7 @@ def test_all_is_well() -> None:
         ("Camera", "no-go", "faulted", {"camera": {"state": "faulted", "reason": ""}}),
         ("Disk", "no-go", "can't be read", {"disk": {"free_bytes": None}}),
         ("Disk", "no-go", "shots are refused", {"disk": {"free_bytes": 4 * 10**8}}),
+        ("Disk", "no-go", "only 3 more files", {"disk": {"free_bytes": 50 * 10**9, "free_files": 3}}),
         ("Disk", "caution", "room for about 25 frames", {"disk": {"free_bytes": 10**9}}),
         ("Autopilot", "caution", "no link is configured", {"link": {"urls": 0, "packets": 0}}),
         ("Autopilot", "go", "1 of 2 links silent", {"link": LINK | {"silent": 1}}),

@@ -77,7 +77,7 @@ def test_well(tmp_path: Path) -> None:
         ),
         ({"settings": replace(WELL, mavlink=MavlinkSettings())}, "no MAVLink link is configured"),
         ({"settings": replace(WELL, mask=MaskSettings())}, "no mask is configured"),
-        ({"settings": replace(WELL, record=RecordSettings(min_free_mb=10_000_000))}, "disk nearly full"),
+        ({"settings": replace(WELL, record=RecordSettings(min_free_mb=10_000_000))}, "the disk is nearly full"),
         ({"doubts": ["autopilot 7 is heard"]}, "autopilot 7 is heard"),
         ({"utc_known": False}, "UTC is not known yet"),
         ({"settings": replace(WELL, record=RecordSettings(warn_free_mb=10_000_000))}, "the disk is filling up"),
@@ -97,4 +97,7 @@ def test_a_start_is_no_problem(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_gone_is_unknown_not_zero(tmp_path: Path) -> None:
-    assert record(tmp_path / "gone")["disk"]["free_bytes"] is None
+    found = record(tmp_path / "gone")
+    assert found["disk"]["free_bytes"] is None
+    (problem,) = found["problems"]
+    assert "new shots are refused" in problem

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from dappled.flight.layout import disk_shortage
+
 State = Literal["go", "caution", "no-go"]
 _SURE_M, _SLOW_CLOCK_MS, _FRESH_MS = 5.0, 50.0, 3000.0
 _FRAME_BYTES = 20e6  # until a flight has shown its own
@@ -69,8 +71,9 @@ def _disk(health: Mapping[str, Any], frame_bytes: float, *, known: bool) -> Chec
     text = (
         f"{free / 1e9:.1f} GB free, room for {'' if known else 'about '}{count} {'frame' if frames == 1 else 'frames'}"
     )
-    if free < least:
-        return Check("Disk", "no-go", f"nearly full: {free / 1e6:.0f} MB left, shots are refused")
+    short = disk_shortage(free, health["disk"].get("free_files"), least // 1_000_000)
+    if short is not None:
+        return Check("Disk", "no-go", f"{short}; shots are refused")
     return Check("Disk", "go" if frames >= 100 else "caution", text)
 
 

@@ -160,12 +160,10 @@ def disk(settings: Settings, machine: Machine) -> list[Check]:
         return [Check("disk", "no-go", f"{place} can't be written to", f"make {folder} yours, or set record.directory")]
     space = layout.disk_space(place)
     free = space.available
-    if space.files is not None and space.files < layout.FEWEST_FILES:
-        return [Check("disk", "no-go", f"{place} takes only {space.files} more files", "remove small files there")]
     text = f"{free / 1e9:.1f} GB free at {folder}, room for about {counted(int(free / _FRAME_BYTES), 'frame')}"
-    if free < settings.record.min_free_mb * 1e6:
-        mend = "`dappled flight offload DEST --prune` makes room"
-        return [Check("disk", "no-go", f"{text}: below record.min_free_mb", mend)]
+    short = space.shortage(settings.record.min_free_mb)
+    if short is not None:
+        return [Check("disk", "no-go", f"{text}: {short}", "`dappled flight offload DEST --prune` makes room")]
     return [Check("disk", "go", text)]
 
 

@@ -16,8 +16,8 @@ from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import LinkStatistics
-from dappled.errors import DappledError, counted
-from dappled.flight import layout
+from dappled.errors import counted
+from dappled.flight import FlightError, layout
 from dappled.workers import Statistics
 
 SILENT_NS = 5 * 10**9
@@ -65,12 +65,15 @@ def record(
         problems.append(
             "UTC is not known yet: all time stamps will be corrected when the autopilot gets it from its satellites"
         )
-    space = _space(folder)
+    space: layout.DiskSpace | None = None
+    try:
+        space = layout.disk_space(folder)
+        short = space.shortage(settings.record.min_free_mb)
+    except FlightError as error:
+        short = str(error)
     free = None if space is None else space.available
-    if space is not None and space.files is not None and space.files < layout.FEWEST_FILES:
-        problems.append(f"the disk takes only {space.files} more files, new shots are refused: remove small files")
-    if free is not None and free < settings.record.min_free_mb * 1_000_000:
-        problems.append(f"disk nearly full: {free // 1_000_000} MB left, new shots are refused")
+    if short is not None:
+        problems.append(f"{short}; new shots are refused")
     elif free is not None and free < settings.record.warn_free_mb * 1_000_000:
         problems.append(
             f"the disk is filling up: {free // 10**6} MB left; shots are refused below {settings.record.min_free_mb} MB"
@@ -174,10 +177,3 @@ def line(health: Mapping[str, Any]) -> str:
     shots, problems = health["shots"], health["problems"]
     counts = f"camera {health['camera']['state']}, {shots['safe']} of {shots['wished']} frames safe"
     return f"{counts}; {'; '.join(problems)}" if problems else f"{counts}; all is well"
-
-
-def _space(folder: Path) -> layout.DiskSpace | None:
-    try:
-        return layout.disk_space(folder)
-    except DappledError:
-        return None
