@@ -27,10 +27,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from dappled import durable
 from dappled.clock import SystemClock
 from dappled.drivers.camera import Arrival, Fired, ShotFailed, StateChanged
 from dappled.drivers.gphoto2.client import GPhoto2Camera, open_camera
-from dappled.flight import Cause, Shot, durable, recording
+from dappled.flight import Cause, Shot, recording
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 
 SIZE = 17_582_091  # of a real EOS 450D's CR2

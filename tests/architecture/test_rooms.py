@@ -28,7 +28,7 @@ THREADS = {
     "workers.py": "`Loop` is one, and `share` joins its helpers without a limit of time",
     "daemon/console/__main__.py": "a timer ends the console's own process, whatever its other threads do",
     "daemon/console/app.py": "asyncio waits for the answers of two pools, in the console's own process",
-    "flight/durable.py": "hashes one file beside its writing; the call waits for it",
+    "durable.py": "hashes one file beside its writing; the call waits for it",
     "mocks/scene/bench.py": "the views of one picture are rendered side by side; the call waits for them",
     "mocks/scene/flyover.py": "the views of one picture are rendered side by side; the call waits for them",
 }

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from dappled.flight import FlightError, FlightFolder, LedgerReader, Recording, Result, durable, flight_report
+from dappled import durable
+from dappled.flight import FlightError, FlightFolder, LedgerReader, Recording, Result, flight_report
 from dappled.flight.check import check
 from tests.flight.makers import deliver, flip, mavlink_2, request, shot, tag
 

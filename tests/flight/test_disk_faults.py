@@ -16,8 +16,9 @@ from typing import Any
 
 import pytest
 
+from dappled import durable
 from dappled.clock import RecordedClock
-from dappled.flight import FlightError, Frame, Recording, durable, layout, recording
+from dappled.flight import FlightError, Frame, Recording, layout, recording
 from dappled.flight.check import check
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, flip, request, shot, tag

@@ -15,8 +15,9 @@ from pathlib import Path
 
 import pytest
 
+from dappled import durable
 from dappled.clock import RecordedClock
-from dappled.flight import durable, layout, recording
+from dappled.flight import layout, recording
 from dappled.flight.check import check
 from tests.flight.lossy_disk import Call, Left, LossyDisk, listing, record
 
@@ -160,7 +161,7 @@ def test_a_recorder_that_forgets_to_make_sure_is_found_out(folder: Path, forgott
     if shutil.which("strace") is None:
         pytest.skip("strace is not installed: no system call can be recorded")
     flights = folder / f"forgetful-{len(forgotten)}"
-    code = f"import os\nfrom dappled.flight import durable\n{forgotten}\n{FLIGHT}"
+    code = f"import os\nfrom dappled import durable\n{forgotten}\n{FLIGHT}"
     calls = record(code, str(flights), log=folder / "trace-forgetful")
     with pytest.raises(AssertionError, match="is lost"):
         cut_everywhere(calls, flights, folder / "left", [("none", 0)])

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from dappled import durable
 from dappled.clock import RecordedClock
-from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Recording, Stray, durable
+from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Recording, Stray
 from dappled.flight.check import check
 from dappled.flight.recording import StrayFileError
 from tests.flight.makers import deliver, held, request

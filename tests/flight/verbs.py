@@ -12,12 +12,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled import durable
 from dappled.clock import RecordedClock
 from dappled.daemon.replay import pickup
 from dappled.daemon.replay.pickup import Choice
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
-from dappled.flight import LedgerReader, durable, layout, offload, places, recording
+from dappled.flight import LedgerReader, layout, offload, places, recording
 from dappled.flight.check import check
 from dappled.products.geotags import geotags
 from dappled.products.mounting import Mounting

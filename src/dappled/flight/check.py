@@ -10,9 +10,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from dappled import durable
 from dappled.confined import OutsideError
 from dappled.errors import DappledError, counted
-from dappled.flight import durable, layout, log_reading, provenance, pruning
+from dappled.flight import layout, log_reading, provenance, pruning
 from dappled.flight.checks import chain_check, seal_check, telemetry_check
 from dappled.flight.checks.chain_check import ChainFindings
 from dappled.flight.checks.seal_check import LedgerBytes, SealFindings, Vouched

@@ -19,9 +19,8 @@ from typing import Any, Self
 
 import tomli_w
 
-from dappled import confined
+from dappled import confined, durable
 from dappled.bounds.parsing import parse_toml, read_bytes
-from dappled.flight import durable
 from dappled.flight.errors import FlightError, disk_error
 
 _FLIGHT_NAME = re.compile(r"(\d{8}T\d{6}Z|boot[0-9a-f]{8})-[0-9a-f]{8}")

@@ -15,8 +15,9 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled import durable
 from dappled.clock import Clock
-from dappled.flight import check, durable, layout, ledger_copies, places, pruning, read_back, seals
+from dappled.flight import check, layout, ledger_copies, places, pruning, read_back, seals
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder, FlightsLock
 from dappled.flight.ledger import LedgerReader

@@ -14,7 +14,7 @@ import secrets
 from collections.abc import Mapping
 from pathlib import Path
 
-from dappled.flight import durable
+from dappled import durable
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.trees import Tree
 

@@ -7,8 +7,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from dappled import durable
 from dappled.confined import OutsideError
-from dappled.flight import durable, layout
+from dappled.flight import layout
 from dappled.flight.errors import disk_error
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader

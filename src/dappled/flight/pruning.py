@@ -13,9 +13,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled import durable
 from dappled.clock import Clock
 from dappled.errors import counted
-from dappled.flight import durable
 from dappled.flight.chain import canonical
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder

@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
+from dappled import durable
 from dappled.clock import Clock
-from dappled.flight import durable, layout, provenance, recovery, seals
+from dappled.flight import layout, provenance, recovery, seals
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.index import ImageIndex, IndexEntry, open_or_rebuild
 from dappled.flight.layout import FlightFolder, FlightsLock

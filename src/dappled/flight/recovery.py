@@ -11,9 +11,10 @@ import os
 import shutil
 from pathlib import Path
 
+from dappled import durable
 from dappled.clock import Clock
 from dappled.errors import DappledError
-from dappled.flight import durable, layout, log_reading, logs, seals
+from dappled.flight import layout, log_reading, logs, seals
 from dappled.flight.errors import disk_error
 from dappled.flight.index import ImageIndex
 from dappled.flight.layout import FlightFolder

@@ -10,7 +10,7 @@ import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dappled.flight import durable
+from dappled import durable
 from dappled.flight.errors import FlightError, disk_error
 
 _BYTES = 32

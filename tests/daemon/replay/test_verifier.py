@@ -24,7 +24,7 @@ def tag(frame: Frame) -> Tag:
 def replay(tmp_path: Path, **digests: Any) -> tuple[ReplayVerifier, Frame]:
     """The verifier of a replay of one frame, which stands on disk."""
     blob = Blob.of(DATA)
-    from dappled.flight import durable  # noqa: PLC0415  # used here only
+    from dappled import durable  # noqa: PLC0415  # used here only
 
     frame = Frame(0, "000000.dng", "IMG.DNG", len(DATA), durable.hash_descriptor(blob.fd, blob.size), 5)
     blob.close()

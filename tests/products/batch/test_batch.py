@@ -15,10 +15,11 @@ from pathlib import Path
 
 import pytest
 
+from dappled import durable
 from dappled.cli import main
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
-from dappled.flight import Frame, durable
+from dappled.flight import Frame
 from dappled.products.batch import batch, workers
 from dappled.products.batch.batch import Done, Job, Manifest, ManifestError
 from dappled.products.exports import light_files

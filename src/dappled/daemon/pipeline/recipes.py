@@ -12,11 +12,11 @@ from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
+from dappled import durable
 from dappled.config import profiles
 from dappled.config.settings import Settings
 from dappled.drivers.raw.darkroom import FILES, FOLDER, Darkroom, Recipe, camera_name, of_flight
 from dappled.errors import DappledError
-from dappled.flight import durable
 
 __all__ = ["FOLDER", "Names", "called", "keep", "names", "of_flight", "recipe", "versions"]
 _LIBRARIES = ("numpy", "scipy", "rawpy", "pyzmq", "pymavlink", "gphoto2", "pillow", "tifffile")

@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled import durable
 from dappled.drivers.camera import Blob, Fired
 from dappled.errors import DappledError
-from dappled.flight import Frame, Result, Shot, ShotRow, Tag, digest, durable
+from dappled.flight import Frame, Result, Shot, ShotRow, Tag, digest
 
 
 @dataclass(frozen=True, slots=True)

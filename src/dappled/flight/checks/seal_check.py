@@ -6,9 +6,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from dappled import durable
 from dappled.confined import OutsideError
 from dappled.errors import counted
-from dappled.flight import durable, seals
+from dappled.flight import seals
 from dappled.flight.chain import ChainLink
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader

@@ -20,11 +20,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
-from dappled import __version__, confined
+from dappled import __version__, confined, durable
 from dappled.bounds.parsing import parse_json
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError, sentence
-from dappled.flight import Frame, Tag, canonical, durable
+from dappled.flight import Frame, Tag, canonical
 from dappled.products.exports import light_files
 from dappled.products.maps import cog, georeference, map_files, photographs
 from dappled.products.maps.earth import Projection, utm

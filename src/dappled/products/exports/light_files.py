@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled import confined
+from dappled import confined, durable
 from dappled.bounds.arrays import read_npz
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import parse_json
 from dappled.decode.lightfield import LightField
 from dappled.errors import DappledError, first_line
-from dappled.flight import durable
 from dappled.products.exports import h5_reader, packed_arrays
 
 _ARRAYS: dict[str, tuple[type[np.generic], int]] = {

@@ -11,9 +11,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from dappled import durable
 from dappled.decode.geometry import Pose
 from dappled.decode.geometry.camera_pose import CameraPose
-from dappled.flight import FlightError, Frame, LedgerReader, Tag, disk_error, durable, layout
+from dappled.flight import FlightError, Frame, LedgerReader, Tag, disk_error, layout
 from dappled.products.geotags import exif_gps, sidecars
 from dappled.products.geotags.exif_gps import ExifError
 from dappled.products.maps.earth import Geoid

@@ -6,9 +6,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
+from dappled import durable
 from dappled.decode.geometry.camera_pose import CameraPose
 from dappled.errors import DappledError
-from dappled.flight import Tag, disk_error, durable
+from dappled.flight import Tag, disk_error
 
 _HEAD_BYTES = 1 << 16
 _MARK = "dappled"

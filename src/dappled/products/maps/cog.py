@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.flight import durable
+from dappled import durable
 from dappled.products.extras import need
 from dappled.products.maps.eye import Image
 from dappled.products.maps.map_grid import MapError, MapGrid

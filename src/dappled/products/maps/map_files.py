@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.flight import durable
+from dappled import durable
 from dappled.products.maps import cog, kmz, map_grid
 from dappled.products.maps.earth import GEODETIC, Projection
 from dappled.products.maps.georeference import Survey

@@ -18,7 +18,7 @@ import pyproj
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from dappled.flight import durable
+from dappled import durable
 from dappled.products.extras import need
 from dappled.products.maps import cog, hyperstereo, map_grid
 from dappled.products.maps.earth import Projection

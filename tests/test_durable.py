@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from dappled.flight import durable
+from dappled import durable
 from tests.flight.makers import held
 
 
