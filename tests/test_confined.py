@@ -13,7 +13,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from dappled import confined
+from dappled import confined, durable
 from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.confined import OutsideError
@@ -30,7 +30,6 @@ from dappled.flight import (
     Ledger,
     LedgerReader,
     check,
-    durable,
     layout,
     recording,
     recovery,

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled import durable
 from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.confined import OutsideError
@@ -26,7 +27,6 @@ from dappled.flight import (
     LedgerReader,
     Recording,
     Stray,
-    durable,
     layout,
     offload,
     places,

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled import durable
 from dappled.clock import RecordedClock
 from dappled.flight import (
     FlightError,
@@ -20,7 +21,6 @@ from dappled.flight import (
     Ledger,
     LedgerReader,
     Recording,
-    durable,
     recording,
     seal_key,
     seals,

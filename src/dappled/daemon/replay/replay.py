@@ -11,7 +11,7 @@ from pathlib import Path
 from time import sleep
 from typing import Self
 
-from dappled import confined
+from dappled import confined, durable
 from dappled.clock import RecordedClock
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_vehicles
@@ -30,7 +30,6 @@ from dappled.flight import (
     Result,
     Shot,
     ShotRow,
-    durable,
     layout,
     log_reading,
 )
