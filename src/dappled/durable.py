@@ -57,7 +57,7 @@ def make_folder(path: Path) -> None:
     sync_folder(path.parent)
 
 
-def write_file(path: Path, data: bytes) -> None:
+def write_file(path: Path, data: bytes, mode: int = 0o644) -> None:
     """Put `data` under `path`, replacing what was there, whole or not at all. Raises OSError."""
 
     def fill(fd: int) -> None:
@@ -65,7 +65,7 @@ def write_file(path: Path, data: bytes) -> None:
         while view:
             view = view[os.write(fd, view) :]
 
-    _put(path, fill)
+    _put(path, fill, mode)
 
 
 def copy_in(source_fd: int, size: int, path: Path) -> str:
@@ -110,10 +110,10 @@ def hash_descriptor(fd: int, size: int) -> str:
     return sha256.hexdigest()
 
 
-def _put(path: Path, fill: Callable[[int], None]) -> None:
+def _put(path: Path, fill: Callable[[int], None], mode: int = 0o644) -> None:
     part = temporary(path)
     try:
-        fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+        fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
         try:
             fill(fd)
             os.fsync(fd)

@@ -9,6 +9,7 @@ import secrets
 import sys
 from pathlib import Path
 
+from dappled import key_files
 from dappled.cli.arguments import Actions
 from dappled.daemon.stream import curve
 from dappled.drivers.mavlink import SigningError, make_key
@@ -83,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _token(path: Path) -> str:
     try:
-        curve.write_new(path.expanduser(), secrets.token_urlsafe(24) + "\n", 0o600)
+        key_files.write_new(path.expanduser(), secrets.token_urlsafe(24) + "\n")
     except FileExistsError:
         raise curve.KeyFileError(f"{path} is there already: choose another name, or move it away") from None
     except OSError as error:

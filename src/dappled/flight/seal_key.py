@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import os
 import secrets
-import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dappled import durable
+from dappled import key_files
 from dappled.flight.errors import FlightError, disk_error
 
-_BYTES = 32
 _SALT = b"dappled"
 _PURPOSE, _NAME = b"dappled flight seal 1", b"dappled flight seal name 1"
 
@@ -37,12 +34,7 @@ class SealKey:
 def make(path: Path) -> None:
     """Write a new key file: 64 hexadecimal digits, for this user alone. Raises FlightError, also where it exists."""
     try:
-        fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        with os.fdopen(fd, "w", encoding="ascii") as file:
-            file.write(secrets.token_hex(_BYTES) + "\n")
-            file.flush()
-            os.fsync(fd)
-        durable.sync_folder(path.absolute().parent)
+        key_files.write_new(path, secrets.token_hex(key_files.KEY_BYTES) + "\n")
     except FileExistsError:
         raise FlightError(f"{path} exists already; keys are not overwritten: name another file") from None
     except OSError as error:
@@ -53,21 +45,15 @@ def load(path: Path) -> SealKey:
     """Read a key file that only this user can read, and derive the key for seals (HKDF-SHA256, RFC 5869): a file that
     holds another program's key too gives nothing away of it. Raises FlightError."""
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe must not block
-        with os.fdopen(fd, "rb") as file:
-            facts = os.fstat(fd)
-            text = file.read(1024)
+        file = key_files.read(path)
     except OSError as error:
         raise FlightError(
             f"cannot read the key for seals {path}: {error.strerror}; make one with dappled keys seal"
         ) from error
-    if not stat.S_ISREG(facts.st_mode) or facts.st_mode & 0o077 or facts.st_uid not in (0, os.geteuid()):
+    if not file.own or not file.private:
         raise FlightError(f"the key for seals {path} can be used by others; run: chown $USER {path}; chmod 600 {path}")
-    try:
-        key = bytes.fromhex(text.decode("ascii").strip())
-    except ValueError:
-        key = b""
-    if len(key) != _BYTES:
+    key = key_files.key_in(file.data)
+    if key is None:
         raise FlightError(f"{path} holds no key for seals (64 hexadecimal digits); make one with dappled keys seal")
     return SealKey(_derived(key, _NAME).hex()[:8], _derived(key, _PURPOSE))
 

@@ -150,23 +150,23 @@ def test_a_key_file_is_made_once_for_its_owner_alone(tmp_path: Path) -> None:
 
 
 class Disk:
-    """Record the calls to the disk in order: fsync of a file with its size, fsync of a folder, replace."""
+    """Record the calls to the disk in order: fsync of a file with its size, fsync of a folder, rename."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.calls: list[str | int] = []
-        fsync, replace = os.fsync, os.replace
+        fsync, rename = os.fsync, os.rename
 
         def watched_fsync(fd: int) -> None:
             facts = os.fstat(fd)
             self.calls.append("folder" if stat.S_ISDIR(facts.st_mode) else facts.st_size)
             fsync(fd)
 
-        def watched_replace(old: Path, new: Path) -> None:
-            self.calls.append("replace")
-            replace(old, new)
+        def watched_rename(old: Path, new: Path) -> None:
+            self.calls.append("rename")
+            rename(old, new)
 
         monkeypatch.setattr(os, "fsync", watched_fsync)
-        monkeypatch.setattr(os, "replace", watched_replace)
+        monkeypatch.setattr(os, "rename", watched_rename)
 
 
 def test_a_key_is_on_the_disk_when_it_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -189,7 +189,7 @@ def test_a_key_that_could_not_be_written_leaves_no_file(tmp_path: Path, monkeypa
 def test_a_power_cut_brings_no_older_times_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(monkeypatch)
     SigningTime(tmp_path / "time", Clock())
-    assert disk.calls == [(tmp_path / "time").stat().st_size, "replace", "folder"]
+    assert disk.calls == [(tmp_path / "time").stat().st_size, "rename", "folder"]
 
 
 def test_a_key_that_others_can_read_or_that_is_malformed_is_refused(tmp_path: Path) -> None:

@@ -6,9 +6,7 @@ be given away, NAME.key_secret both and stays here. Keys are 40 characters of Z8
 
 from __future__ import annotations
 
-import os
 import re
-import stat
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +15,7 @@ from pathlib import Path
 import zmq
 import zmq.utils.z85
 
+from dappled import key_files
 from dappled.errors import DappledError
 
 ZAP_ENDPOINT = "inproc://zeromq.zap.01"  # ZeroMQ's RFC 27
@@ -62,45 +61,38 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
             f"{name!r} can't be the name of a key: use letters, digits, dot, dash and underscore, 64 at most"
         )
     public, secret = zmq.curve_keypair()
-    paths = folder / f"{name}.key", folder / f"{name}.key_secret"
+    public_file, secret_file = folder / f"{name}.key", folder / f"{name}.key_secret"
     head = "# A ZeroMQ CURVE key made by dappled; {}\nmetadata\ncurve\n"
     line = '    {}-key = "{}"\n'
-    texts = (
-        head.format("public: give it to the other side") + line.format("public", public.decode()),
-        head.format("SECRET: leave it where it is")
-        + line.format("public", public.decode())
-        + line.format("secret", secret.decode()),
-    )
+    public_line = line.format("public", public.decode())
+    public_text = head.format("public: give it to the other side") + public_line
+    secret_text = head.format("SECRET: leave it where it is") + public_line + line.format("secret", secret.decode())
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        for path, text, mode in zip(reversed(paths), reversed(texts), (0o600, 0o644), strict=True):
-            write_new(path, text, mode)
+        key_files.write_new(secret_file, secret_text)
+        try:
+            key_files.write_new(public_file, public_text, 0o644)
+        except OSError:
+            secret_file.unlink()  # half a pair would stop the next attempt
+            raise
     except FileExistsError as error:
         raise KeyFileError(f"{error.filename} exists already: choose another name, or move it away") from None
     except OSError as error:
         raise KeyFileError(f"{error.filename or folder} can't be written: {error.strerror}") from None
-    return paths
-
-
-def write_new(path: Path, text: str, mode: int) -> None:
-    """Write a file that must not exist yet, with this mode from its first moment. Raises OSError."""
-    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
-    with os.fdopen(fd, "w", encoding="ascii") as file:
-        os.fchmod(fd, mode)
-        file.write(text)
+    return public_file, secret_file
 
 
 def read_private(path: Path, what: str) -> str:
     """The text of a secret file that only its owner can read. Raises KeyFileError with what to do."""
     try:
-        facts = path.stat()
-        text = path.read_text(encoding="ascii")
+        file = key_files.read(path)
+        text = file.data.decode("ascii")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not text"
         raise KeyFileError(f"{path} can't be read as {what}: {why}") from None
-    if stat.S_IMODE(facts.st_mode) & 0o077:
+    if not file.private:
         raise KeyFileError(f"{path} can be read by others than its owner: chmod 600 {path}")
-    if facts.st_uid not in (0, os.getuid()):
+    if not file.own:
         raise KeyFileError(f"{path} belongs to another user: {what} must be your own")
     return text
 

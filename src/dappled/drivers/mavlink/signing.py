@@ -11,9 +11,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import logging
-import os
 import secrets
-import stat
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,6 +20,7 @@ from typing import Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from dappled import durable, key_files
 from dappled.clock import Clock
 from dappled.errors import DappledError
 
@@ -32,7 +31,6 @@ EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01
 UNITS_PER_S = 100_000
 NEW_STREAM_UNITS = 60 * UNITS_PER_S
 AHEAD_UNITS = 10 * UNITS_PER_S
-KEY_BYTES = 32
 _BLOCK = 13
 _SIGNED_FLAG = 0x01
 _STREAMS = 256
@@ -47,47 +45,32 @@ class SigningError(DappledError):
 def make_key(path: Path, passphrase: str | None = None) -> None:
     """Write a new key file (64 hexadecimal digits, mode 0600): random, or SHA-256 of a passphrase as QGroundControl,
     Mission Planner and MAVProxy make it. Raises SigningError, also where the file exists already."""
-    key = secrets.token_bytes(KEY_BYTES) if passphrase is None else hashlib.sha256(passphrase.encode()).digest()
+    key = (
+        secrets.token_bytes(key_files.KEY_BYTES) if passphrase is None else hashlib.sha256(passphrase.encode()).digest()
+    )
     try:
-        fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        key_files.write_new(path, key.hex() + "\n")
     except FileExistsError:
         raise SigningError(f"{path} exists already; keys are not overwritten: name another file") from None
     except OSError as error:
-        raise SigningError(f"cannot write the key {path}: {error.strerror or error}; check its folder") from error
-    try:
-        with os.fdopen(fd, "w", encoding="ascii") as file:
-            file.write(key.hex() + "\n")
-            file.flush()
-            os.fsync(fd)
-        _sync_folder(path.parent)
-    except OSError as error:
-        path.unlink(missing_ok=True)  # half a key would stop the next attempt
         raise SigningError(f"cannot write the key {path}: {error.strerror or error}; check its folder") from error
 
 
 def read_key(path: Path) -> bytes:
     """Read a key from a file that only this user can read or change. Raises SigningError."""
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe must not block
-        with os.fdopen(fd, "rb") as file:
-            facts = os.fstat(fd)
-            text = file.read(1024)
+        file = key_files.read(path)
     except OSError as error:
         raise SigningError(
             f"cannot read the signing key {path}: {error.strerror or error}; make one with dappled mavlink key"
         ) from error
-    if not stat.S_ISREG(facts.st_mode) or facts.st_uid not in (0, os.geteuid()):
+    if not file.own:
         raise SigningError(f"the signing key {path} belongs to another user; give it to this one with chown")
-    if facts.st_mode & 0o077:
+    if not file.private:
         raise SigningError(f"the signing key {path} can be used by others; run: chmod 600 {path}")
-    try:
-        key = bytes.fromhex(text.decode("ascii").strip())
-    except ValueError:
-        key = b""
-    if len(key) != KEY_BYTES:
-        raise SigningError(
-            f"the signing key {path} is not {2 * KEY_BYTES} hexadecimal digits; make one with dappled mavlink key"
-        )
+    key = key_files.key_in(file.data)
+    if key is None:
+        raise SigningError(f"the signing key {path} is not 64 hexadecimal digits; make one with dappled mavlink key")
     return key
 
 
@@ -133,15 +116,8 @@ class SigningTime:
         if not ending and all(now + margin // 2 <= kept for now, kept in zip(times, self._kept, strict=True)):
             return
         used, accepted = (min(_LATEST, each + margin) for each in times)
-        fresh = self._path.with_name(self._path.name + ".new")
         try:
-            fd = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-            with os.fdopen(fd, "w", encoding="ascii") as file:
-                file.write(f"{used} {accepted}\n")
-                file.flush()
-                os.fsync(fd)
-            os.replace(fresh, self._path)
-            _sync_folder(self._path.parent)
+            durable.write_file(self._path, f"{used} {accepted}\n".encode(), 0o600)
         except OSError as error:
             raise SigningError(
                 f"cannot keep the signing times in {self._path}: {error.strerror or error}; check its folder"
@@ -177,15 +153,6 @@ class SigningTime:
                 "keys and remove the file"
             ) from error
         return min(max(used, 0), _LATEST), min(max(accepted, 0), _LATEST)
-
-
-def _sync_folder(path: Path) -> None:
-    """Make the names in a folder durable: else a power cut could bring back older times."""
-    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 @dataclass(frozen=True, slots=True)
