@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from pathlib import Path
 
 import numpy as np
@@ -113,3 +114,40 @@ def test_the_command_keeps_the_lens_in_a_profile(
     assert main([*words, "--focal-length", "50", "--board", "nine"]) == 1
     assert "--board nine" in capsys.readouterr().err
     assert math.isfinite(lens.distortion[0])
+
+
+def _dim(picture: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+    """The picture with little contrast, and as much noise as that."""
+    return 0.4 + 0.02 * picture + 0.008 * np.random.default_rng(seed).standard_normal(picture.shape)
+
+
+def test_a_board_of_as_much_noise_as_contrast_is_found(pictures: list[NDArray[np.float64]]) -> None:
+    clear, dim = (chessboard.corners(one, BOARD) for one in (pictures[5], _dim(pictures[5], 3)))
+    assert clear is not None
+    assert dim is not None
+    assert np.sqrt(np.mean((dim - clear) ** 2)) < 2.0
+
+
+@pytest.mark.slow
+def test_eight_boards_of_two_megapixels_take_five_seconds_of_cpu(
+    pictures: list[NDArray[np.float64]], tmp_path: Path
+) -> None:
+    camera = tmp_path / "mine.toml"
+    camera.write_text(
+        "law = 'geometric'\nmask_distance_mm = 0.48\n[[raw]]\nname = 'whole'\nshape = [1222, 1622]\n"
+        "row_mm = [0.01136, 0.0]\ncolumn_mm = [0.0, 0.01137]\n"
+    )
+    frames = []
+    for number, picture in enumerate([*pictures, pictures[0]]):
+        large = np.asarray(Image.fromarray(picture.astype(np.float32)).resize((1622, 1222), Image.Resampling.BICUBIC))
+        noisy = 0.4 + 0.02 * large + 0.003 * np.random.default_rng(number).standard_normal(large.shape)
+        frames.append(str(tmp_path / f"{number}.png"))
+        Image.fromarray(np.round(65535 * np.clip(noisy, 0, 1)).astype(np.uint16)).save(frames[-1])
+    began = time.process_time()
+    words = ["calibrate", "--lens", *frames, "--camera", str(camera), "--focal-length", "50", "-o"]
+    assert main([*words, str(tmp_path / "lens.toml")]) == 0
+    took = time.process_time() - began
+    assert took < 5.0
+    lens = profiles.camera(str(tmp_path / "lens.toml")).lens(50.0)
+    assert lens is not None
+    assert lens.v_mm == pytest.approx(TRUE.v_mm, rel=0.01)
