@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import mmap
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 _PART = ".part"
+_PIECE_BYTES = 1 << 20
 
 
 def temporary(path: Path) -> Path:
@@ -99,15 +101,24 @@ def hash_file(path: Path) -> str:
 def hash_descriptor(fd: int, size: int) -> str:
     """SHA-256 (hex) of the first `size` bytes of a file or memfd; its offset stays. Raises OSError, EOFError."""
     sha256 = hashlib.sha256()
-    buffer = memoryview(bytearray(1 << 20))
+    for piece in pieces(fd, size):
+        sha256.update(piece)
+    return sha256.hexdigest()
+
+
+def pieces(fd: int, size: int) -> Iterator[memoryview]:
+    """The first `size` bytes of a file or memfd, piece by piece in one buffer; its offset stays.
+
+    Places and buffer are aligned as O_DIRECT needs it. Raises OSError, and EOFError where the file is shorter.
+    """
+    buffer = memoryview(mmap.mmap(-1, _PIECE_BYTES))
     done = 0
     while done < size:
-        got = os.preadv(fd, [buffer[: size - done]], done)
+        got = min(os.preadv(fd, [buffer], done), size - done)
         if got == 0:
             raise EOFError(f"only {done} of {size} bytes arrived")
-        sha256.update(buffer[:got])
+        yield buffer[:got]
         done += got
-    return sha256.hexdigest()
 
 
 def _put(path: Path, fill: Callable[[int], None], mode: int = 0o644) -> None:

@@ -236,7 +236,7 @@ def test_what_is_there_already_is_read_back_from_the_disk_too(
 def test_a_copy_that_can_be_read_from_memory_only_proves_nothing(
     closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(read_back, "_direct", lambda name, folder: None)
+    monkeypatch.setattr(read_back, "_direct", lambda name, folder, size: None)
     monkeypatch.setattr(read_back, "_in_memory", lambda fd, size: True)
     done = go(closed, tmp_path / "disk")
     assert done.read_back == ("page cache",)

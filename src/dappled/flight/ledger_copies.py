@@ -6,10 +6,11 @@ import hashlib
 import sqlite3
 from contextlib import closing
 
+from dappled import durable
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.pruning import Proved
-from dappled.flight.trees import FileIdentity, Tree, pieces
+from dappled.flight.trees import FileIdentity, Tree
 
 _GROWS = ("chain", "frames", "companions", "strays", "poses", "tags", "results", "events")
 """Tables whose rows are added and never changed. Of shots the state changes, of facts the value."""
@@ -74,7 +75,7 @@ def _content(tree: Tree, name: str) -> bytes:
     if tree.stat(name) is None:
         return b""
     with tree.reading(name) as fd:
-        return b"".join(bytes(piece) for piece in pieces(fd, FileIdentity.of_fd(fd).size, lambda _: None))
+        return b"".join(bytes(piece) for piece in durable.pieces(fd, FileIdentity.of_fd(fd).size))
 
 
 def _proved(there: Tree, name: str, image: bytes) -> Proved:

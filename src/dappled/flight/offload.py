@@ -10,7 +10,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +24,7 @@ from dappled.flight.ledger import LedgerReader
 from dappled.flight.pruning import Proved
 from dappled.flight.read_back import ReadBack
 from dappled.flight.records import Frame, Stray
-from dappled.flight.trees import FileIdentity, Tree, pieces
+from dappled.flight.trees import FileIdentity, Tree
 
 PRUNES = "offload --prune"
 FACT = "offloaded"  # of flights that a version before 1.0 pruned
@@ -146,9 +146,15 @@ class _Copying:
     def _copy(self, name: str) -> Proved:
         """Copy a file; the hash is that of the bytes which were written."""
         sha256 = hashlib.sha256()
+
+        def hashed(pieces: Iterator[memoryview]) -> Iterator[memoryview]:
+            for piece in pieces:
+                sha256.update(piece)
+                yield piece
+
         with self._source.reading(name) as fd:
             before = FileIdentity.of_fd(fd)
-            self._there.write(name, pieces(fd, before.size, sha256.update))
+            self._there.write(name, hashed(durable.pieces(fd, before.size)))
             self._refuse_changed(name, before, FileIdentity.of_fd(fd))
         return Proved(before, sha256.hexdigest())
 

@@ -20,7 +20,7 @@ from dappled.flight.chain import canonical
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader
-from dappled.flight.trees import FileIdentity, Tree, pieces
+from dappled.flight.trees import FileIdentity, Tree
 
 RECORD = "offloaded.jsonl"
 EVENT = "offloaded"
@@ -91,7 +91,7 @@ def remove(  # noqa: PLR0917  # the two trees, and what was proved of each
                 raise FlightError(f"{there.path / name} is not the file any more that was read back: {name} stays here")
             source.unlink(name)
             if copy_of(there, name) != copies[name]:  # one file under two names that nothing told apart
-                source.write(name, pieces(fd, one.identity.size, lambda _: None))
+                source.write(name, durable.pieces(fd, one.identity.size))
                 source.sync()
                 raise FlightError(
                     f"{there.path / name} vanished with {source.path / name}: they are one file under two names; it "

@@ -7,16 +7,16 @@ and a probe (preadv2 with RWF_NOWAIT) says whether they are gone. On a network t
 from __future__ import annotations
 
 import errno
-import hashlib
 import mmap
 import os
 from typing import Literal
+
+from dappled import durable
 
 ReadBack = Literal["O_DIRECT", "dropped pages", "page cache"]
 """How a file was read: past the cache in two ways, or from it, which proves nothing about the disk."""
 
 _REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
-_CHUNK = 1 << 20
 
 
 def hash_on_disk(name: str, folder: int) -> tuple[str, ReadBack]:
@@ -25,17 +25,19 @@ def hash_on_disk(name: str, folder: int) -> tuple[str, ReadBack]:
     try:
         os.fsync(fd)
         os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
-        direct = _direct(name, folder)
+        size = os.fstat(fd).st_size
+        direct = _direct(name, folder, size)
         if direct is not None:
             return direct, "O_DIRECT"
-        size = os.fstat(fd).st_size
         how: ReadBack = "page cache" if _in_memory(fd, size) else "dropped pages"
-        return _hash(fd), how
+        return durable.hash_descriptor(fd, size), how
+    except EOFError as error:
+        raise OSError(errno.EIO, str(error)) from error
     finally:
         os.close(fd)
 
 
-def _direct(name: str, folder: int) -> str | None:
+def _direct(name: str, folder: int, size: int) -> str | None:
     """The hash by O_DIRECT; None where the file system refuses it."""
     try:
         fd = os.open(name, os.O_RDONLY | os.O_DIRECT | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
@@ -44,26 +46,13 @@ def _direct(name: str, folder: int) -> str | None:
             return None
         raise
     try:
-        return _hash(fd)
+        return durable.hash_descriptor(fd, size)
     except OSError as error:
         if error.errno in _REFUSED:
             return None
         raise
     finally:
         os.close(fd)
-
-
-def _hash(fd: int) -> str:
-    """The hash of a whole file, read at aligned places into an aligned buffer, as O_DIRECT needs it."""
-    sha256 = hashlib.sha256()
-    with mmap.mmap(-1, _CHUNK) as buffer, memoryview(buffer) as view:
-        done = 0
-        while got := os.preadv(fd, [view], done):
-            sha256.update(view[:got])
-            done += got
-            if got % mmap.PAGESIZE:  # a file's end; a read from here on would not be aligned
-                break
-    return sha256.hexdigest()
 
 
 def _in_memory(fd: int, size: int) -> bool:

@@ -10,7 +10,7 @@ import contextlib
 import errno
 import os
 import stat
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -212,17 +212,3 @@ class Tree:
             if error.errno == errno.ENOTDIR and where.is_symlink():
                 error.errno = errno.ELOOP  # what O_DIRECTORY says of a link
             raise disk_error(doing, where, error) from error
-
-
-def pieces(fd: int, size: int, seen: Callable[[memoryview], object]) -> Iterator[memoryview]:
-    """The first `size` bytes of a file, piece by piece; `seen` gets each before it is given out. Raises OSError, and
-    EOFError where the file is shorter."""
-    buffer = memoryview(bytearray(1 << 20))
-    done = 0
-    while done < size:
-        got = os.preadv(fd, [buffer[: size - done]], done)
-        if got == 0:
-            raise EOFError(f"only {done} of {size} bytes came")
-        seen(buffer[:got])
-        yield buffer[:got]
-        done += got
