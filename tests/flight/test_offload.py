@@ -33,6 +33,7 @@ from dappled.flight import (
     pruning,
     read_back,
     recording,
+    seals,
 )
 from dappled.flight import check as checks
 from dappled.flight.check import check
@@ -77,6 +78,39 @@ def test_a_flight_is_copied_and_verified(closed: Path, tmp_path: Path) -> None:
     again = go(closed, tmp_path / "disk")
     assert (again.copied, again.there_already) == (0, 7)
     assert frames(closed) == TWO
+
+
+def geotag(flight: Path, words: bytes) -> None:
+    """What `dappled geotag` writes: sidecars, lists, and a seal."""
+    with seals.work(layout.open_folder(flight), RecordedClock(START_UTC_NS), "geotag", "geotags flights in", None):
+        (flight / "geotags").mkdir(exist_ok=True)
+        for name in ("frames/000000.cr2.xmp", "geotags/geo.txt"):
+            (flight / name).write_bytes(words)
+
+
+@pytest.mark.parametrize("where", ["here", "at the copy"])
+def test_sidecars_that_were_written_anew_since_go_where_the_older_ones_are(
+    closed: Path, tmp_path: Path, where: str
+) -> None:
+    geotag(closed, b"first")
+    copy = go(closed, tmp_path / "disk").destination
+    geotag(closed if where == "here" else copy, b"second")
+    done = go(closed, tmp_path / "disk", prune=True)
+    assert (done.copied, done.pruned) == (4 if where == "here" else 0, 2)
+    assert {(copy / name).read_bytes() for name in ("frames/000000.cr2.xmp", "geotags/geo.txt")} == {b"second"}
+    assert check(copy).problems == check(closed).problems == ()
+    assert check(copy).notes == ()
+
+
+def test_a_sidecar_that_another_program_changed_in_the_copy_is_not_overwritten(closed: Path, tmp_path: Path) -> None:
+    geotag(closed, b"first")
+    copy = go(closed, tmp_path / "disk").destination
+    (copy / "frames/000000.cr2.xmp").write_bytes(b"a person's own")
+    geotag(closed, b"second")
+    with pytest.raises(FlightError, match=r"000000.cr2.xmp is there already and differs from .*: move it away first"):
+        go(closed, tmp_path / "disk", prune=True)
+    assert (copy / "frames/000000.cr2.xmp").read_bytes() == b"a person's own"
+    assert frames(closed) == ["000000.cr2", "000000.cr2.xmp", "000001.cr2"]
 
 
 def test_the_manifest_is_one_that_sha256sum_reads(closed: Path, tmp_path: Path) -> None:

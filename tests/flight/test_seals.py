@@ -355,3 +355,40 @@ def test_a_record_that_was_rewritten_with_links_and_a_seal_of_its_own_is_named(f
     assert "the row of frames 1 was written again, which dappled never does" in problems
     for name in ("frames/000001.cr2", "telemetry.tlog"):
         assert f"seal 2 holds another digest of {name} than seal 1: it was changed in between" in problems
+
+
+def test_later_work_is_signed_where_the_key_signed_all_before_it(flights: Path, tmp_path: Path) -> None:
+    key = seal_key.load(key_file(tmp_path))
+    folder = fly(recording.begin(flights, RecordedClock(START_UTC_NS), seal_key=key))
+    with seals.work(folder, LATER, "geotag", "geotags flights in", key):
+        (folder.frames / "000000.cr2.xmp").write_bytes(b"<x:xmpmeta/>")
+    assert check(folder.path, key).verdict == f"intact, sealed with key {key.name}"
+
+
+def added_row(folder: FlightFolder) -> None:
+    with Ledger(folder.ledger, LATER) as ledger:
+        ledger.set_fact("utc_correction", {"correction_ns": 86_400 * 10**9})
+
+
+def changed_sidecar(folder: FlightFolder) -> None:
+    (folder.frames / "000000.cr2.xmp").write_bytes(b"<x:forged/>")
+
+
+def unsigned_seal(folder: FlightFolder) -> None:
+    seals.seal(folder, LATER, "geotag")
+
+
+@pytest.mark.parametrize("attack", [added_row, changed_sidecar, unsigned_seal])
+def test_later_work_does_not_sign_what_somebody_else_did_before_it(
+    flights: Path, tmp_path: Path, attack: Callable[[FlightFolder], None]
+) -> None:
+    key = seal_key.load(key_file(tmp_path))
+    folder = fly(recording.begin(flights, RecordedClock(START_UTC_NS), seal_key=key))
+    with seals.reopened(folder, LATER, "geotag", key):
+        (folder.frames / "000000.cr2.xmp").write_bytes(b"<x:xmpmeta/>")
+    attack(folder)
+    with seals.reopened(folder, LATER, "late tags", key):
+        pass
+    report = check(folder.path, key)
+    assert report.vouched == "not signed"
+    assert f"signed with key {key.name} up to seal 2, then not signed" in report.verdict

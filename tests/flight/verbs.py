@@ -148,7 +148,7 @@ def _pick_up(place: Path, say: Say) -> None:
             name = layout.frame_name(index, group.main.name)
             say(f"safe {flight.name}/{name} {hashlib.sha256(data).hexdigest()}")
 
-        pickup.bring(flight, source, proposal, clock(), said)
+        pickup.bring(flight, source, proposal, clock=clock(), progress=said)
 
 
 def _picked_up(place: Path) -> list[str]:

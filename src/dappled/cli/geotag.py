@@ -13,11 +13,13 @@ from typing import Any
 
 from tqdm import tqdm
 
+from dappled.cli import sealing
 from dappled.clock import TimeOfDayClock
 from dappled.daemon.replay import late_tags
 from dappled.decode.geometry import camera_pose
 from dappled.errors import DappledError, counted
 from dappled.flight import layout, seals
+from dappled.flight.seal_key import SealKey
 from dappled.products.geotags import geotags
 from dappled.products.maps import earth
 from dappled.products.maps.earth import EarthError, Geoid
@@ -54,15 +56,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--copies", type=Path, metavar="DIR", help="also write copies of the frames with their position in EXIF"
     )
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings file, for record.seal_key")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     facts = layout.read_facts(layout.open_folder(arguments.flight))
-    tagged_late = _tag_late(arguments.flight)
+    key = sealing.key_of(arguments.config)
+    tagged_late = _tag_late(arguments.flight, key)
     mounting, geoid = _mounting(arguments, facts), _geoid(arguments.geoid)
     folder = layout.open_folder(arguments.flight)
-    with seals.reopened(folder, TimeOfDayClock(), "geotag") if arguments.output is None else nullcontext():
+    clock = TimeOfDayClock()
+    into_flight = arguments.output is None
+    with seals.work(folder, clock, "geotag", "geotags flights in", key) if into_flight else nullcontext():
         written = geotags.write(
             arguments.flight,
             mounting,
@@ -106,10 +112,10 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _tag_late(flight: Path) -> list[int]:
+def _tag_late(flight: Path, key: SealKey | None) -> list[int]:
     """Tag the frames that a crash left untagged. If that fails, print why, and go on with the others."""
     try:
-        added = late_tags.add_missing(flight, TimeOfDayClock())
+        added = late_tags.add_missing(flight, TimeOfDayClock(), key)
     except DappledError as error:
         print(f"frames without a tag stay without one: {error}", file=sys.stderr)
         return []

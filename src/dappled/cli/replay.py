@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from dappled.cli import sealing
 from dappled.cli.arguments import positive, seconds
 from dappled.cli.terminal import frame_json, frame_line
 from dappled.clock import TimeOfDayClock
@@ -72,7 +73,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--interval", type=seconds, metavar="S", help="time between the frames of a folder (default: 1)"
     )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings file, for endpoints and workers")
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="settings file, for endpoints, workers and record.seal_key"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object per frame")
 
 
@@ -97,7 +100,10 @@ def run(arguments: argparse.Namespace) -> int:
         keep = None
         if is_flight and recipe and (arguments.run_name or _changed(arguments)) and not arguments.verify:
             name = arguments.run_name or datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-            results = stack.enter_context(RunWriter(arguments.flight, Run(name, recipe, flown.names), TimeOfDayClock()))
+            key = sealing.key_of(arguments.config)
+            results = stack.enter_context(
+                RunWriter(arguments.flight, Run(name, recipe, flown.names), TimeOfDayClock(), key)
+            )
             recipe, keep = results.run.recipe, results.decoded
             print(f"storing the results beside the old ones, as run {name}", file=sys.stderr)
         writer = replay.verifier(recording, keep)

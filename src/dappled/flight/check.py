@@ -20,7 +20,6 @@ from dappled.flight.checks.seal_check import LedgerBytes, SealFindings, Vouched
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.pruning import Removed
-from dappled.flight.recovery import SIDECAR
 from dappled.flight.seal_key import SealKey
 from dappled.flight.stored_rows import StoredRows
 
@@ -226,7 +225,7 @@ def _names(folder: FlightFolder, ledger: LedgerReader, closed: bool) -> Iterator
         if durable.is_temporary(name):
             if closed:
                 yield f"frames/{name} is a half-written file"
-        elif f"frames/{name}" not in known and not name.endswith(SIDECAR) and closed:
+        elif f"frames/{name}" not in known and not name.endswith(layout.SIDECAR) and closed:
             yield f"frames/{name} is in no row of the ledger"
 
 

@@ -6,12 +6,14 @@ frames/ and, where asked for, lightfields/. A machine that does not know UTC yet
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
 import secrets
 import shutil
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -26,6 +28,7 @@ from dappled.flight.errors import FlightError, disk_error
 _FLIGHT_NAME = re.compile(r"(\d{8}T\d{6}Z|boot[0-9a-f]{8})-[0-9a-f]{8}")
 _FRAME_NAME = re.compile(r"(\d{6,})\.([a-z0-9]{1,8})")
 _LOCK = ".lock"
+SIDECAR = ".xmp"  # written beside frames by later work; in no row of the ledger
 FEWEST_FILES = 16  # a frame, its companion, temporary files, for each of the shots that may be under way
 JOURNAL_BYTES = 1_000_000  # journal, ledger and telemetry of some seconds
 RECORDS = "records into"  # what the daemon does in a flights folder
@@ -244,7 +247,7 @@ def _plain(value: Any) -> Any:
 
 
 class FlightsLock:
-    """The lock (flock) of the one process that works in a flights folder: the daemon, an offload, a pickup.
+    """The lock (flock) of the one process that writes in a flights folder: the daemon, or work on its closed flights.
 
     Held from creation to `close`, or until the process ends in any way.
     """
@@ -268,7 +271,10 @@ class FlightsLock:
             holder, _, does = os.pread(self._fd, 100, 0).decode("ascii", "replace").strip().partition(" ")
             os.close(self._fd)
             records = (does or RECORDS) == RECORDS
-            what = "stop it, or set record.directory to another folder" if records else "wait until it has ended"
+            what = "wait until it has ended"
+            if records:
+                other = "set record.directory to another folder" if doing == RECORDS else "work on a copy of the flight"
+                what = f"stop it, or {other}"
             raise FlightError(
                 f"another dappled (process {holder or 'unknown'}) {does or RECORDS} {root}; {what}"
             ) from error
@@ -284,6 +290,18 @@ class FlightsLock:
 
     def close(self) -> None:
         os.close(self._fd)
+
+
+def work_lock(root: Path, doing: str, *, needed: bool = False) -> AbstractContextManager[object]:
+    """The lock of a flights folder for work on its closed flights. Where this user can't make it there and no other
+    process holds it, the work goes without, unless it is `needed`. Raises FlightError."""
+    try:
+        return FlightsLock(root, doing)
+    except FlightError as error:
+        why = error.__cause__.errno if isinstance(error.__cause__, OSError) else None
+        if needed or why not in (errno.EACCES, errno.EPERM, errno.EROFS) or is_locked(root):
+            raise
+        return nullcontext()
 
 
 def is_locked(root: Path) -> bool:

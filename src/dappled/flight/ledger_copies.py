@@ -7,6 +7,7 @@ import sqlite3
 from contextlib import closing
 
 from dappled import durable
+from dappled.flight import seals
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.pruning import Proved
@@ -68,6 +69,25 @@ def bring_seals(source: Tree, there: Tree, name: str) -> tuple[bool, Proved] | N
         )
     there.write(name, [ours])
     return True, _proved(there, name, ours)
+
+
+class SealedStates:
+    """Which earlier states of a flight's files the seals of two copies of it show, where one of them has all seals of
+    the other and more: it is the later one."""
+
+    def __init__(self, source: Tree, there: Tree, name: str) -> None:
+        """`name` is that of the file of seals. Raises FlightError."""
+        ours, theirs = _content(source, name), _content(there, name)
+        self.source_is_later = theirs != b"" and ours.startswith(theirs) and ours != theirs
+        self.copy_is_later = ours != b"" and theirs.startswith(ours) and ours != theirs
+        self._states: set[tuple[str, str]] = set()
+        if self.source_is_later or self.copy_is_later:
+            found = seals.parse(max(ours, theirs, key=len), name).seals.values()
+            self._states = {(file, sha256) for seal in found for file, (_, sha256) in seal.files.items()}
+
+    def has(self, name: str, sha256: str) -> bool:
+        """Whether a file that later work may write anew had this content when the flight was sealed."""
+        return not seals.never_changes(name) and (name, sha256) in self._states
 
 
 def _content(tree: Tree, name: str) -> bytes:

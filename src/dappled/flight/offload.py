@@ -7,11 +7,10 @@ frames by that manifest alone, one by one, each only while it is still the file 
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,11 +18,13 @@ from dappled import durable
 from dappled.clock import Clock
 from dappled.flight import check, layout, ledger_copies, places, pruning, read_back, seals
 from dappled.flight.errors import FlightError, disk_error
-from dappled.flight.layout import FlightFolder, FlightsLock
+from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
+from dappled.flight.ledger_copies import SealedStates
 from dappled.flight.pruning import Proved
 from dappled.flight.read_back import ReadBack
 from dappled.flight.records import Frame, Stray
+from dappled.flight.seal_key import SealKey
 from dappled.flight.trees import FileIdentity, Tree
 
 PRUNES = "offload --prune"
@@ -54,10 +55,12 @@ def offload(
     prune: bool,
     same_device: bool = False,
     clock: Clock,
+    key: SealKey | None = None,
     progress: Callable[[int], object] = lambda size: None,
 ) -> Offloaded:
     """Copy a closed flight to `destination/<its name>`, and prove the copy. A second call finishes what the first one
-    left undone. `prune` then removes the frames here; ledger, journal, telemetry, settings and inputs stay.
+    left undone. `prune` then removes the frames here; ledger, journal, telemetry, settings and inputs stay. `key` signs
+    the seal that follows a removal.
 
     Raises FlightError: another process works in the flights folder; the flight is open or not intact; the destination
     is the same folder or, without `same_device`, on the same disk; the copy is different or, for `prune`, can't be
@@ -65,17 +68,17 @@ def offload(
     """
     folder = layout.open_folder(flight.resolve())
     with ExitStack() as stack:
-        stack.enter_context(_lock(folder.path.parent, needed=prune))
+        stack.enter_context(layout.work_lock(folder.path.parent, "offloads from", needed=prune))
         _refuse_unready(folder)
         if prune:
-            _finish_seal(folder, clock)
+            _finish_seal(folder, clock, key)
         source = stack.enter_context(Tree(folder.path))
         names = [name for name in source.walk() if _is_copied(name)]
         there = stack.enter_context(_open_copy(source, destination, same_device=same_device))
         system = places.file_system(there.folders[""])
         if prune:
             _refuse_unprovable(there, system, same_device=same_device)
-        return _Copying(folder, source, there, system).run(names, prune=prune, clock=clock, progress=progress)
+        return _Copying(folder, source, there, system).run(names, prune=prune, clock=clock, key=key, progress=progress)
 
 
 class _Copying:
@@ -84,20 +87,29 @@ class _Copying:
     def __init__(self, folder: FlightFolder, source: Tree, there: Tree, system: str) -> None:
         self._folder, self._source, self._there, self._system = folder, source, there, system
 
-    def run(self, names: list[str], *, prune: bool, clock: Clock, progress: Callable[[int], object]) -> Offloaded:
+    def run(
+        self,
+        names: list[str],
+        *,
+        prune: bool,
+        clock: Clock,
+        key: SealKey | None,
+        progress: Callable[[int], object],
+    ) -> Offloaded:
         """Copy, make durable, read back, check, and remove; see `offload`."""
         # What stands on another machine can't be told apart from the source: it is written anew, which shows.
         anew = prune and self._system in places.NETWORK
         manifest: dict[str, Proved] = {}
         fresh: set[str] = set()
+        states = SealedStates(self._source, self._there, self._folder.seals.name)
         for name in names:
-            found = self._there.stat(name)
-            self._refuse_in_the_way(name, found is not None)
-            if found is None or anew:
-                manifest[name] = self._copy(name)
+            stands = self._there.stat(name) is not None
+            self._refuse_in_the_way(name, stands)
+            known = self._look(name, states) if stands and not anew else None
+            if known is None:
+                known = self._copy(name)
                 fresh.add(name)
-            else:
-                manifest[name] = self._look(name)
+            manifest[name] = known
             progress(manifest[name].identity.size)
         ledger = self._folder.ledger.name
         written, manifest[ledger] = ledger_copies.bring(self._source, self._there, ledger)
@@ -123,7 +135,7 @@ class _Copying:
                 for name, row in rows.items()
                 if name.startswith("frames/") and name in manifest and manifest[name].sha256 == row.sha256
             }
-            with seals.reopened(self._folder, clock, PRUNES) if sure else nullcontext():
+            with seals.reopened(self._folder, clock, PRUNES, key) if sure else nullcontext():
                 pruned = pruning.remove(self._folder, self._source, self._there, sure, copies, clock)
         size = sum(one.identity.size for one in manifest.values())
         already = len(manifest) - len(fresh)
@@ -158,12 +170,21 @@ class _Copying:
             self._refuse_changed(name, before, FileIdentity.of_fd(fd))
         return Proved(before, sha256.hexdigest())
 
-    def _look(self, name: str) -> Proved:
-        """The identity and hash of a file that the copy has already."""
+    def _look(self, name: str, states: SealedStates) -> Proved | None:
+        """The identity of a file that the copy has already, and the hash that it should have there. Of a file that
+        later work wrote anew the later one counts; None where that is ours."""
         with self._source.reading(name) as fd:
             before = FileIdentity.of_fd(fd)
             sha256 = durable.hash_descriptor(fd, before.size)
             self._refuse_changed(name, before, FileIdentity.of_fd(fd))
+        mine_counts = states.source_is_later and not seals.never_changes(name)
+        if mine_counts or (states.copy_is_later and states.has(name, sha256)):
+            with self._there.reading(name) as fd:
+                theirs = durable.hash_descriptor(fd, FileIdentity.of_fd(fd).size)
+            if states.copy_is_later:
+                return Proved(before, theirs)
+            if theirs != sha256 and states.has(name, theirs):
+                return None
         return Proved(before, sha256)
 
     def _refuse_changed(self, name: str, before: FileIdentity, after: FileIdentity) -> None:
@@ -233,20 +254,6 @@ def _is_copied(name: str) -> bool:
     return not (ledger_copies.is_part(name) or name == pruning.RECORD or half)
 
 
-def _lock(root: Path, *, needed: bool) -> AbstractContextManager[object]:
-    """The flights' lock. Where it can't be had because this user may only read there, a copy does without.
-
-    Raises FlightError when another process holds it.
-    """
-    try:
-        return FlightsLock(root, "offloads from")
-    except FlightError as error:
-        why = error.__cause__.errno if isinstance(error.__cause__, OSError) else None
-        if needed or why not in (errno.EACCES, errno.EROFS) or layout.is_locked(root):
-            raise
-        return nullcontext()
-
-
 def _refuse_unready(folder: FlightFolder) -> None:
     """Raise FlightError for a flight that is not closed, or that an early version pruned, and OutsideError where the
     ledger names a file outside it."""
@@ -262,7 +269,7 @@ def _refuse_unready(folder: FlightFolder) -> None:
         raise FlightError(f"{folder.path} was offloaded to {facts[FACT]['destination']} and pruned already")
 
 
-def _finish_seal(folder: FlightFolder, clock: Clock) -> None:
+def _finish_seal(folder: FlightFolder, clock: Clock, key: SealKey | None) -> None:
     """Seal a flight again where a prune was cut short between announcing a seal and writing it. Raises FlightError."""
     with LedgerReader.open(folder.ledger) as ledger:
         count, missing = seals.announced(ledger.facts())

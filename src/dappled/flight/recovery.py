@@ -24,7 +24,6 @@ from dappled.flight.records import Frame, Stray
 from dappled.flight.seal_key import SealKey
 from dappled.flight.stored_rows import ledger_damage
 
-SIDECAR = ".xmp"
 _JPEG = (".jpg", ".jpeg")
 LOST = "the recording ended before its file came"
 
@@ -151,7 +150,7 @@ def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
     # JPEGs last: beside a raw frame they are companions
     for file_name in sorted(os.listdir(folder.frames), key=lambda one: (one.endswith(_JPEG), one)):
         name = f"frames/{file_name}"
-        if name in known or file_name.endswith(SIDECAR):
+        if name in known or file_name.endswith(layout.SIDECAR):
             continue
         path = folder.frames / file_name
         if path.is_symlink():

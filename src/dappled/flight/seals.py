@@ -17,7 +17,7 @@ from pathlib import Path
 
 from dappled import durable
 from dappled.clock import Clock
-from dappled.flight import pruning
+from dappled.flight import layout, pruning
 from dappled.flight.chain import canonical
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
@@ -107,21 +107,53 @@ def seal(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None = Non
 
 
 @contextmanager
-def reopened(folder: FlightFolder, clock: Clock, why: str) -> Iterator[None]:
+def work(folder: FlightFolder, clock: Clock, why: str, doing: str, key: SealKey | None) -> Iterator[None]:
+    """Hold the flights' lock, and open the flight again (see `reopened`). `doing` is a verb for those who find the lock
+    held: "tags frames in". Raises FlightError, also where another process holds the lock."""
+    with layout.work_lock(folder.path.resolve().parent, doing), reopened(folder, clock, why, key):
+        yield
+
+
+@contextmanager
+def reopened(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None = None) -> Iterator[None]:
     """Work on a closed flight: the ledger says so first, and the flight is sealed again after the work, also where that
     raised. Should the work be killed, `flight check` says what is not sealed. A flight that is still open is left to
-    the daemon. Raises FlightError."""
+    the daemon.
+
+    `key` signs the seal only where it had signed all that was there before: otherwise its signature would cover what
+    somebody else did in between. Raises FlightError."""
     with LedgerReader.open(folder.ledger) as reader:
         closed = "closed_utc_ns" in reader.facts()
     if not closed:
         yield
         return
+    signs = key if key is not None and is_signed(folder, key) else None
     with Ledger(folder.ledger, clock) as ledger:
         ledger.add_event("opened again", why)
     try:
         yield
     finally:
-        seal(folder, clock, why)
+        seal(folder, clock, why, signs)
+
+
+def is_signed(folder: FlightFolder, key: SealKey) -> bool:
+    """Whether the newest seal is signed by this key, and covers all links of the chain and every file that the ledger
+    has no digest of. Raises FlightError."""
+    last = read(folder).last
+    if last is None or last.key != key.name or not key.signed(last.signed_part(), last.mac or ""):
+        return False
+    with LedgerReader.open(folder.ledger) as ledger:
+        head, recorded = ledger.last_link(), recorded_files(ledger)
+    if head is None or (last.links, last.head) != (head.number, head.link):
+        return False
+    try:
+        return all(
+            last.files.get(name) == (path.stat().st_size, durable.hash_file(path))
+            for name, path in ((path.relative_to(folder.path).as_posix(), path) for path in sealed_paths(folder))
+            if name not in recorded and path != folder.ledger
+        )
+    except OSError as error:
+        raise disk_error("read the files of", folder.path, error) from error
 
 
 def is_sealed(folder: FlightFolder) -> bool:
@@ -138,9 +170,14 @@ def read(folder: FlightFolder) -> SealFile:
     """The seals of a flight; none where there is no file. A line that is no seal, or does not follow from the line
     before it, is reported. Raises FlightError when the file can't be read."""
     try:
-        lines = _content(folder).split(b"\n")
+        return parse(_content(folder), folder.seals.name)
     except OSError as error:
         raise disk_error("read the seals", folder.seals, error) from error
+
+
+def parse(content: bytes, name: str) -> SealFile:
+    """The seals in the content of a file; see `read`."""
+    lines = content.split(b"\n")
     tail = lines.pop()
     seals: dict[int, Seal] = {}
     problems: list[str] = []
@@ -148,16 +185,16 @@ def read(folder: FlightFolder) -> SealFile:
     for number, line in enumerate(lines, 1):
         found = _parse(line)
         if found is None:
-            problems.append(f"line {number} of {folder.seals.name} was changed: it is no seal")
+            problems.append(f"line {number} of {name} was changed: it is no seal")
         elif found.previous != previous:
-            problems.append(f"line {number} of {folder.seals.name} does not follow from the line before it")
+            problems.append(f"line {number} of {name} does not follow from the line before it")
         elif found.seal in seals:
-            problems.append(f"line {number} of {folder.seals.name} is seal {found.seal} again")
+            problems.append(f"line {number} of {name} is seal {found.seal} again")
         if found is not None:
             seals.setdefault(found.seal, found)
         previous = hashlib.sha256(line).hexdigest()
     if tail:
-        problems.append(f"the last line of {folder.seals.name} is torn ({len(tail)} bytes)")
+        problems.append(f"the last line of {name} is torn ({len(tail)} bytes)")
     return SealFile(seals, tuple(problems))
 
 
@@ -193,6 +230,12 @@ def of_flight(facts: Mapping[str, object]) -> str:
     """The name that a flight was recorded under, from the ledger's facts; the folder may be called otherwise by now."""
     value = facts.get("chain")
     return str(value.get("flight", "")) if isinstance(value, dict) else ""
+
+
+def never_changes(name: str) -> bool:
+    """Whether a file is of the recording itself: later work adds files and sidecars, and changes none of these."""
+    recorded = name in ("flight.toml", "telemetry.tlog", "shots.jsonl") or name.startswith(("frames/", "inputs/"))
+    return recorded and not name.endswith(layout.SIDECAR)
 
 
 def announced(facts: Mapping[str, object]) -> tuple[int, frozenset[int]]:

@@ -123,9 +123,15 @@ def test_without_the_ledger_s_times_the_wish_s_time_stands(killed: Path, capsys:
     assert main(["replay", str(killed), "--verify"]) == 0
 
 
-def test_while_a_daemon_records_there_nothing_is_tagged(killed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_while_a_daemon_records_there_nothing_is_written_into_a_flight(
+    killed: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     recovery.recover_flight(layout.open_folder(killed), TimeOfDayClock())
+    before = sorted(killed.rglob("*"))
     with FlightsLock(killed.parent):
-        assert main(["geotag", str(killed)]) == 0
+        assert main(["geotag", str(killed)]) == 1
+        assert "stop it, or work on a copy of the flight" in capsys.readouterr().err
+        assert main(["geotag", str(killed), "--output", str(killed.parent / "elsewhere")]) == 0
     assert "frames without a tag stay without one: another dappled" in capsys.readouterr().err
     assert tags(killed) == [0]
+    assert sorted(killed.rglob("*")) == before

@@ -15,7 +15,7 @@ from dappled.daemon.replay import runs
 from dappled.daemon.replay.runs import Run, RunWriter
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
-from dappled.flight import LedgerReader, Recording, Result, recording
+from dappled.flight import FlightsLock, LedgerReader, Recording, Result, offload, recording
 from dappled.flight.check import check
 from tests.flight.makers import deliver, request, tag
 
@@ -62,6 +62,19 @@ def test_a_run_stands_beside_the_flight_and_can_be_had_again(flight: Recording, 
     assert Path(again.recipe.white).read_bytes() == b"white"
     with pytest.raises(DappledError, match=r"no run 'third'; it has second"):
         runs.of_flight(moved, "third")
+
+
+def test_one_process_at_a_time_works_in_a_flight(flight: Recording, recipe: Recipe, tmp_path: Path) -> None:
+    flight.close()
+    folder, run = flight.folder.path, Run("second", recipe, NAMES)
+    with (
+        FlightsLock(folder.parent, "offloads from"),
+        pytest.raises(DappledError, match=r"offloads from .*; wait until"),
+    ):
+        RunWriter(folder, run, RecordedClock(5))
+    with RunWriter(folder, run, RecordedClock(5)), pytest.raises(DappledError, match=r"stores a run in .*; wait until"):
+        offload.offload(folder, tmp_path / "disk", prune=False, same_device=True, clock=RecordedClock(5))
+    assert not (tmp_path / "disk").exists()
 
 
 def test_a_run_replaces_nothing(flight: Recording, recipe: Recipe) -> None:

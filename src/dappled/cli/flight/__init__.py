@@ -12,6 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from dappled.cli import sealing
 from dappled.cli.arguments import Actions
 from dappled.cli.flight import lines as flight_lines
 from dappled.cli.flight import pickup
@@ -99,9 +100,7 @@ def _show(flight: Path, as_json: bool) -> int:
 
 
 def _check(flight: Path, config: Path | None, key: Path | None, as_json: bool) -> int:
-    configured = settings.load(config).record.seal_key if key is None else ""
-    file = key or (Path(configured) if configured else None)
-    found = check.check(flight, seal_key.load(file) if file else None)
+    found = check.check(flight, sealing.key_of(config) if key is None else seal_key.load(key))
     _said({**_plain(found), "intact": found.intact}, flight_lines.of_check(found), as_json)
     return 0 if found.intact and (key is None or found.vouched == "signed") else 1
 
@@ -123,6 +122,7 @@ def _offload(flight: Path, arguments: argparse.Namespace) -> int:
             prune=arguments.prune,
             same_device=arguments.same_device,
             clock=SystemClock(),
+            key=sealing.key_of(arguments.config),
             progress=bar.update,
         )
     return _said(_plain(done), flight_lines.of_offload(done), arguments.json)

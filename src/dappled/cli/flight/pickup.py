@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from dappled.cli import sealing
 from dappled.clock import TimeOfDayClock
 from dappled.daemon.replay import pickup
 from dappled.daemon.replay.pickup import Choice, Picked, Proposal
@@ -45,8 +46,9 @@ def run(flight: Path, arguments: argparse.Namespace) -> int:
         picked = None
         if not arguments.dry_run:
             total = sum(group.main.size for _, group in proposal.pairs)
+            key = sealing.key_of(arguments.config)
             with tqdm(total=total, unit="B", unit_scale=True, disable=None, delay=1.0) as bar:
-                picked = pickup.bring(flight, source, proposal, TimeOfDayClock(), bar.update)
+                picked = pickup.bring(flight, source, proposal, clock=TimeOfDayClock(), key=key, progress=bar.update)
     finally:
         source.close()
     (_print_json if arguments.json else _print)(flight, proposal, picked)

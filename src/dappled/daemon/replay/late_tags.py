@@ -19,7 +19,8 @@ from dappled.daemon.replay.replay import RecordedFlight, ReplayProgress
 from dappled.daemon.replay.verifier import ReplayVerifier
 from dappled.drivers.camera import Blob
 from dappled.errors import DappledError
-from dappled.flight import FlightsLock, Frame, Ledger, LedgerReader, Tag, layout, seals
+from dappled.flight import FlightFolder, Frame, Ledger, LedgerReader, Tag, layout, seals
+from dappled.flight.seal_key import SealKey
 
 
 class MissingTagWriter(ReplayVerifier):
@@ -54,32 +55,37 @@ class MissingTagWriter(ReplayVerifier):
         return one.frame is not None and one.tag_sha256 is None
 
 
-def add_missing(flight: Path, clock: Clock) -> list[int]:
-    """Tag the frames of a closed flight that have no tag; their image indices.
+def add_missing(flight: Path, clock: Clock, key: SealKey | None) -> list[int]:
+    """Tag the frames of a closed flight that have no tag; their image indices. `key` signs the seal after it.
 
     Raises DappledError where that can't be done now: a flight that is still recorded, a record that can't be written.
     """
     folder = layout.open_folder(flight)
-    with LedgerReader.open(folder.ledger) as reader:
-        missing = {frame.index for frame in reader.frames()} - reader.tags().keys()
-        closed = "closed_utc_ns" in reader.facts()
-    if not missing:
+    if not _untagged(folder):
         return []
+    with LedgerReader.open(folder.ledger) as reader:
+        closed = "closed_utc_ns" in reader.facts()
     if not closed:
         raise DappledError(f"{flight} is still being recorded, or was never closed: the next `dappled run` repairs it")
     facts = layout.read_facts(folder)
     if "settings" not in facts or "names" not in facts:
         raise DappledError(f"{folder.settings} lacks the settings that the flight was flown with")
     settings = configuration.of_tables(facts["settings"], str(folder.settings))
-    recording = replay.of_flight(flight)
-    recording = replace(recording, shots=[shot for shot in recording.shots if shot.index <= max(missing)])
     flown = FlownWith(Names(**facts["names"]), BodyLatency.of(settings.camera), settings)
     with ExitStack() as stack:
-        stack.enter_context(FlightsLock(flight.resolve().parent, "tags frames in"))
-        stack.enter_context(seals.reopened(folder, clock, "late tags"))
+        stack.enter_context(seals.work(folder, clock, "late tags", "tags frames in", key))
+        last = max(_untagged(folder), default=-1)  # another process may have tagged them meanwhile
+        recording = replay.of_flight(flight)
+        recording = replace(recording, shots=[shot for shot in recording.shots if shot.index <= last])
         ledger = stack.enter_context(Ledger(folder.ledger, clock))
         writer = MissingTagWriter(recording, ledger)
         playback.run(recording, writer, ReplayProgress(), flown)
         for index in writer.added:
             ledger.add_event("tagged late", "the recording ended before it was tagged; it is tagged now", index)
     return writer.added
+
+
+def _untagged(folder: FlightFolder) -> set[int]:
+    """The image indices of the frames that have no tag. Raises FlightError."""
+    with LedgerReader.open(folder.ledger) as reader:
+        return {frame.index for frame in reader.frames()} - reader.tags().keys()

@@ -28,6 +28,7 @@ from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, grou
 from dappled.errors import DappledError, counted
 from dappled.flight import FlightsLock, Frame, ImageIndex, Ledger, LedgerReader, Recorder, ShotRow, layout, seals
 from dappled.flight.index import IndexEntry
+from dappled.flight.seal_key import SealKey
 
 
 class PickupError(DappledError):
@@ -115,9 +116,18 @@ def propose(flight: Path, source: FileSource, choice: Choice) -> Proposal:
     )
 
 
-def bring(flight: Path, source: FileSource, proposal: Proposal, clock: Clock, progress: Callable[[int], Any]) -> Picked:
-    """Record, tag and index what was proposed. `progress` gets the bytes of each file. What was brought when an
-    error comes stays; doing it again brings the rest. Raises FlightError, CameraError."""
+def bring(
+    flight: Path,
+    source: FileSource,
+    proposal: Proposal,
+    *,
+    clock: Clock,
+    key: SealKey | None = None,
+    progress: Callable[[int], Any],
+) -> Picked:
+    """Record, tag and index what was proposed. `key` signs the seal after it. `progress` gets the bytes of each file.
+
+    What was brought when an error comes stays; doing it again brings the rest. Raises FlightError, CameraError."""
     folder = layout.open_folder(flight)
     facts = layout.read_facts(folder)
     settings = configuration.of_tables(facts.get("settings", {}), str(folder.settings))
@@ -135,7 +145,7 @@ def bring(flight: Path, source: FileSource, proposal: Proposal, clock: Clock, pr
     with ExitStack() as stack:
         stack.enter_context(FlightsLock(root, "picks up files into"))
         index = stack.enter_context(ImageIndex(root))
-        stack.enter_context(seals.reopened(folder, clock, "pickup"))
+        stack.enter_context(seals.reopened(folder, clock, "pickup", key))
         ledger = stack.enter_context(Ledger(folder.ledger, clock))
         recorder = Recorder(folder, ledger)
         for number, group in proposal.pairs:

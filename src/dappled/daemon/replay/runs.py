@@ -19,6 +19,7 @@ from dappled.daemon.pipeline.recipes import Names
 from dappled.drivers.raw.darkroom import FILES, Recipe
 from dappled.errors import DappledError
 from dappled.flight import LIVE, Ledger, LedgerReader, Result, layout, provenance, seals
+from dappled.flight.seal_key import SealKey
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -35,14 +36,15 @@ class Run:
 class RunWriter:
     """Writes one run's results into a closed flight's ledger."""
 
-    def __init__(self, flight: Path, run: Run, clock: Clock) -> None:
-        """Begin a run: its inputs are copied, and the ledger says what it is. Raises DappledError: no such name, one
-        that is there already, a flight that is still recorded, a disk that refuses."""
+    def __init__(self, flight: Path, run: Run, clock: Clock, key: SealKey | None = None) -> None:
+        """Begin a run: its inputs are copied, and the ledger says what it is. The flights' lock is held until its end;
+        then the flight is sealed again, signed by `key`. Raises DappledError: no such name, one that is there already,
+        a flight that is still recorded, another process that works there, a disk that refuses."""
         folder = layout.open_folder(flight)
         if not _NAME.fullmatch(run.name) or run.name == LIVE:
             raise DappledError(f"{run.name!r} can't name a run: use letters, digits, dots and dashes, not {LIVE!r}")
         with LedgerReader.open(folder.ledger) as ledger:
-            facts, runs = ledger.facts(), ledger.runs()
+            facts = ledger.facts()
         if "closed_utc_ns" not in facts:
             held = layout.is_locked(flight.absolute().parent)
             what = (
@@ -51,10 +53,13 @@ class RunWriter:
                 else "was never closed: the next `dappled run` closes it"
             )
             raise DappledError(f"{flight} {what}, or replay it without another recipe")
-        if run.name in runs or _fact(run.name) in facts:
-            raise DappledError(f"{flight} has a run {run.name!r} already: give another name with --run")
         with ExitStack() as stack:
-            stack.enter_context(seals.reopened(folder, clock, f"run {run.name}"))
+            stack.enter_context(layout.work_lock(flight.resolve().parent, "stores a run in"))
+            with LedgerReader.open(folder.ledger) as ledger:
+                known = run.name in ledger.runs() or _fact(run.name) in ledger.facts()
+            if known:
+                raise DappledError(f"{flight} has a run {run.name!r} already: give another name with --run")
+            stack.enter_context(seals.reopened(folder, clock, f"run {run.name}", key))
             kept = recipes.keep(run.recipe, flight, run.name)
             self.run = replace(run, recipe=kept)
             self._ledger = stack.enter_context(Ledger(folder.ledger, clock))

@@ -9,11 +9,10 @@ from typing import Any, Literal
 from dappled import durable
 from dappled.confined import OutsideError
 from dappled.errors import counted
-from dappled.flight import seals
+from dappled.flight import layout, seals
 from dappled.flight.chain import ChainLink
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
-from dappled.flight.recovery import SIDECAR
 from dappled.flight.seal_key import SealKey
 from dappled.flight.seals import Seal
 
@@ -74,7 +73,7 @@ def compare(
             "of the chain and the files written since are not sealed yet"
         )
     for name, text in _files(folder, last, _vouched_by_ledger(ledger, facts)):
-        (notes if unsealed and not _never_changes(name) else problems).append(text)
+        (notes if unsealed and not seals.never_changes(name) else problems).append(text)
     notes += _added(folder, last, ledger, problems if not unsealed else notes)
     if not unsealed:
         problems += _ledger_file(last, before)
@@ -120,17 +119,11 @@ def _rewritten(found: Mapping[int, Seal]) -> Iterator[str]:
     first: dict[str, tuple[int, tuple[int, str]]] = {}
     for number, seal in sorted(found.items()):
         for name, digest in seal.files.items():
-            if not _never_changes(name):
+            if not seals.never_changes(name):
                 continue
             before, was = first.setdefault(name, (number, digest))
             if was != digest:
                 yield f"seal {number} holds another digest of {name} than seal {before}: it was changed in between"
-
-
-def _never_changes(name: str) -> bool:
-    """Whether a file is of the recording itself: later work adds files and sidecars, and changes none of these."""
-    recorded = name in ("flight.toml", "telemetry.tlog", "shots.jsonl") or name.startswith(("frames/", "inputs/"))
-    return recorded and not name.endswith(SIDECAR)
 
 
 def _vouched_by_ledger(ledger: LedgerReader, facts: Mapping[str, Any]) -> dict[str, tuple[int | None, str]]:
@@ -176,7 +169,7 @@ def _added(folder: FlightFolder, last: Seal, ledger: LedgerReader, problems: lis
             continue
         if name.startswith("inputs/"):
             problems.append(f"{name} was added since seal {last.seal}")
-        elif not name.startswith("frames/") or name.endswith(SIDECAR):  # other frames are missed in the ledger
+        elif not name.startswith("frames/") or name.endswith(layout.SIDECAR):  # other frames are missed in the ledger
             yield f"{name} was added since seal {last.seal}: no seal covers it"
 
 

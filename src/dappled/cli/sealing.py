@@ -1,0 +1,16 @@
+"""Find the key that signs a flight's seals, for the verbs that write into a flight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dappled.config import settings
+from dappled.flight import seal_key
+from dappled.flight.seal_key import SealKey
+
+
+def key_of(config: Path | None) -> SealKey | None:
+    """The key that a settings file names as record.seal_key; None where it names none. Raises ConfigError, and
+    FlightError where the key can't be read."""
+    file = settings.load(config).record.seal_key
+    return seal_key.load(Path(file)) if file else None
