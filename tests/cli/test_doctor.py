@@ -57,10 +57,10 @@ def test_a_test_shot_that_is_no_picture_is_no_go(tmp_path: Path, capfd: pytest.C
 
 def test_a_camera_that_can_t_be_had_is_not_fired(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "dappled.toml"
-    path.write_text('[camera]\ndriver = "folder"\npickup = "/no/such"\n')
+    path.write_text('[camera]\nport = "usb:099,099"\n')
     assert main(["doctor", "--config", str(path), "--latency", "3"]) == 1
     out = capfd.readouterr().out
-    assert "/no/such" in out
+    assert "WRONG    camera" in out
     assert "no shot was fired" in out
 
 

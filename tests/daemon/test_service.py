@@ -13,19 +13,28 @@ from pathlib import Path
 import pytest
 
 from dappled.config import settings as configuration
-from dappled.config.settings import MaskSettings, PoseSettings, PublishSettings, RecordSettings, Settings
+from dappled.config.settings import (
+    DecodeSettings,
+    MaskSettings,
+    PoseSettings,
+    PublishSettings,
+    RecordSettings,
+    Settings,
+)
 from dappled.daemon import flight_control
 from dappled.daemon import service as module
 from dappled.daemon.flight_handover import FlightHandover
-from dappled.daemon.health import resources
+from dappled.daemon.health import go_no_go, resources
+from dappled.daemon.health.go_no_go import Check
 from dappled.daemon.navigation import UtcCorrection
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import AGAIN_NS, PeriodicTask, Service
-from dappled.drivers.camera import CameraError, Setting, SettingsChanged
+from dappled.drivers.camera import CameraError, Identity, Setting, SettingsChanged, StateChanged
 from dappled.errors import DappledError
 from dappled.flight import FlightError, LedgerReader, Recording, check, layout
 from tests.daemon.fakes import CallingObserver, FakeCamera, eventually, good
+from tests.daemon.test_settings_check import MASK, calibration
 
 S = 10**9
 
@@ -339,3 +348,48 @@ def test_one_that_fails_is_tried_again_and_told_once(error: Exception, caplog: p
     with caplog.at_level(logging.WARNING):
         task.turn(do, 11 * S)
     assert len(caplog.records) == 2
+
+
+def test_a_calibration_of_another_camera_is_no_go_before_the_first_shot_and_refuses_none(
+    camera: FakeCamera, settings: Settings, tmp_path: Path
+) -> None:
+    """The body says who it is when it is connected: only then can its frames' size be compared."""
+    settings = replace(
+        settings,
+        mask=MaskSettings(MASK),
+        decode=DecodeSettings(calibration=str(calibration(tmp_path / "c.toml"))),
+    )
+    shots: list[PendingShot] = []
+    service = started(settings, shots)
+    assert decoding(service).text == f"{MASK}, calibrated"
+    other = Identity("FUJIFILM", "FinePix S5200", "", "usb:")
+    camera.say(StateChanged("ready", "", 1, other))
+    eventually(lambda: decoding(service).state == "no-go", "no-go")
+    assert "which fujifilm-s5200 doesn't make: calibrate with that camera" in decoding(service).text
+    assert any("frames can't be decoded" in text for text in service.health()["problems"])
+    assert service.request(CaptureRequest("test", "console", 1)).accepted
+    camera.say(StateChanged("ready", "", 1, Identity("Canon", "Canon EOS 450D", "", "usb:")))
+    eventually(lambda: decoding(service).text == f"{MASK}, calibrated", "the right camera")
+    service.stop()
+
+
+def test_frames_that_do_not_decode_are_a_caution_then_no_go_and_are_recorded(
+    camera: FakeCamera, settings: Settings
+) -> None:
+    settings = replace(settings, mask=MaskSettings(MASK), decode=DecodeSettings(enabled=True))
+    shots: list[PendingShot] = []
+    service = started(settings, shots)
+    for index, state in enumerate(["caution", "caution", "no-go", "no-go"]):  # the fake camera's files are no pictures
+        assert service.request(CaptureRequest("test", "console", index)).accepted
+        eventually(lambda: len(shots) == index + 1, "the shot's end")  # noqa: B023  # called before the next turn
+        assert shots[-1].problem.startswith("not decoded")
+        assert decoding(service).state == state
+    assert any(text.startswith("decoding fails: the last 4 frames") for text in service.health()["problems"])
+    service.stop()
+    assert check.check(service.folder).intact
+    assert len(list((service.folder / "frames").iterdir())) == 4
+
+
+def decoding(service: Service) -> Check:
+    (found,) = [one for one in go_no_go.checks(service.health()) if one.name == "Decoding"]
+    return found

@@ -10,6 +10,7 @@ import tomli_w
 
 from dappled.cli.arguments import Actions
 from dappled.config import profiles, settings
+from dappled.daemon import settings_check
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -34,14 +35,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     if arguments.action == "profiles":
         return _profiles(arguments.json)
-    loaded = settings.load(arguments.file)
     if arguments.action == "check":
-        if loaded.camera.profile != "auto":
-            profiles.camera(loaded.camera.profile)
-        if loaded.mask.profile not in ("", profiles.LENSLET):
-            profiles.mask(loaded.mask.profile)
+        settings_check.checked(settings.examine_file(arguments.file))
         print(f"{arguments.file}: good")
-    elif arguments.json:
+        return 0
+    loaded = settings.load(arguments.file)
+    if arguments.json:
         print(json.dumps(settings.to_tables(loaded), indent=2))
     else:
         _show(settings.to_tables(loaded))

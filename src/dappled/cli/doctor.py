@@ -21,7 +21,7 @@ from dappled.cli.arguments import whole
 from dappled.cli.status import is_listening, stream_endpoint
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.daemon import test_shot
+from dappled.daemon import settings_check, test_shot
 from dappled.daemon.health import frame_checks, go_no_go, host_checks
 from dappled.daemon.health.go_no_go import Check
 from dappled.daemon.pipeline import recipes
@@ -59,9 +59,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    settings = configuration.load(arguments.config)
     if arguments.watch:
         return _watch()
+    settings = settings_check.checked(configuration.examine_file(arguments.config))
     if not arguments.simulate and is_listening(endpoint := stream_endpoint(arguments.config)):
         return _beside(endpoint, settings, arguments)
     with tempfile.TemporaryDirectory(prefix="dpl-") as place, ExitStack() as stack:

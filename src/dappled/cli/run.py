@@ -17,8 +17,11 @@ from dappled.cli.stop_condition import Asker, StopCondition
 from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, RunObserver, Tally, remark
 from dappled.clock import SystemClock
 from dappled.config import settings as configuration
+from dappled.config.schema import refuse
 from dappled.config.settings import Settings
+from dappled.daemon import settings_check
 from dappled.daemon.flight_handover import FlightHandover, flights
+from dappled.daemon.health.go_no_go import FAILING
 from dappled.daemon.health.systemd import Notifier
 from dappled.daemon.service import Service
 from dappled.errors import DappledError
@@ -53,11 +56,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    settings = configuration.load(arguments.config)
+    file = configuration.examine_file(arguments.config)
+    settings = file.settings
     if arguments.console:
         settings = replace(settings, console=replace(settings.console, bind=arguments.console))
     if not arguments.simulate:
-        return _serve(settings, arguments, None)
+        return _serve(settings_check.checked(replace(file, settings=settings)), arguments, None)
+    refuse(file.findings)
     from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # a real flight doesn't load the mocks
 
     if arguments.config is None:
@@ -67,7 +72,7 @@ def _run(arguments: argparse.Namespace) -> int:
         simulation = Simulation(World(seed=arguments.seed), settings, Path(folder))
         remark("simulating a masked camera, an autopilot and a ground station")
         with simulation as simulated:
-            return _serve(simulated, arguments, simulation)
+            return _serve(settings_check.checked(replace(file, settings=simulated)), arguments, simulation)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +128,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, simulation: Simula
             goal.begin(service)
             service.run(turn)
             problems.look(now=True)
+            tally.decoding_fails = service.health()["decode"]["failed_in_a_row"] >= FAILING
             manager.working(time.monotonic_ns(), now=True)  # closing one flight and opening the next takes a while
         return not asked.is_set()
 
@@ -136,7 +142,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, simulation: Simula
         stack.callback(frames.close)
         flights(settings, fly)
     remark(tally.summary())
-    return 1 if goal.short and not asked.is_set() else 0  # a signal is a regular end
+    return 1 if (goal.short or tally.decoding_fails) and not asked.is_set() else 0  # a signal is a regular end
 
 
 def _reload(service: Service, arguments: argparse.Namespace, manager: Notifier) -> None:

@@ -104,9 +104,13 @@ class CameraRemarks:
 
 
 class Tally:
-    """Counts the shots that have ended, over all flights of the process. Any thread may `add`."""
+    """Counts the shots that have ended, over all flights of the process. Any thread may `add`.
+
+    `decoding_fails`: the last frames of the last flight could not be decoded.
+    """
 
     def __init__(self) -> None:
+        self.decoding_fails = False
         self.count = self.safe = self.decoded = self.good = 0
         self._lock = threading.Lock()
 

@@ -74,6 +74,11 @@ class CameraProfile:
             "choose another camera.profile, or add the shape to your own profile"
         )
 
+    def shapes(self) -> set[tuple[int, int]]:
+        """The shapes of its frames, and of staggered ones when they are spread."""
+        spread = {known.sensor.spread().shape for known in self.raw if known.staggered}
+        return {known.sensor.shape for known in self.raw} | spread
+
     def staggered(self, shape: tuple[int, ...]) -> bool:
         """Whether mosaics of this shape are staggered and must be spread before they are decoded."""
         return any(known.staggered and known.sensor.shape == shape for known in self.raw)

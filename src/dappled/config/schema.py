@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -19,9 +19,25 @@ Record = TypeVar("Record")
 
 
 class ConfigError(DappledError):
-    """A setting or a profile is wrong: one sentence with the place, the value, and what to do."""
+    """Settings or a profile are wrong: a sentence for each thing, on a line of its own, with the place, the value, and
+    what to do."""
 
     exit_code = 2
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong in a file: a sentence with the place, and the table and key that it is about."""
+
+    table: str
+    key: str
+    text: str
+
+
+def refuse(findings: Sequence[Finding]) -> None:
+    """Raise ConfigError with all sentences where there are any."""
+    if findings:
+        raise ConfigError("\n".join(finding.text for finding in findings))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -61,6 +77,10 @@ class TomlSource:
         place = f"{self.name}, line {line}" if line else self.name
         return f"{place}: [{table}] {key}" if table else f"{place}: {key}"
 
+    def has(self, table: str, key: str) -> bool:
+        """Whether the key stands in the file on a line of its own."""
+        return self._line(table, key) is not None
+
     def _line(self, table: str, key: str) -> int | None:
         inside = ""
         for number, line in enumerate(self.text.splitlines(), 1):
@@ -91,13 +111,24 @@ def read_toml(path: Path) -> tuple[dict[str, Any], TomlSource]:
 
 def build(cls: type[Record], table: Mapping[str, Any], source: TomlSource, name: str) -> Record:
     """Build the record `cls` from a table. Raises ConfigError, for an unknown key with the nearest known one."""
+    record, findings = examine(cls, table, source, name)
+    refuse(findings)
+    return record
+
+
+def examine(cls: type[Record], table: Mapping[str, Any], source: TomlSource, name: str) -> tuple[Record, list[Finding]]:
+    """Build the record `cls` from what is right in a table, and say what is wrong: there the default stands.
+
+    Raises ConfigError where a key is missing that has no default.
+    """
     hints = get_type_hints(cls)
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]  # cls is a dataclass
+    findings = []
     for key in table:
         if key not in fields:
             near = difflib.get_close_matches(key, fields, 1, 0.4)
             hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(fields)}"
-            raise ConfigError(f"{source.where(name, key)} is not a known key; {hint}")
+            findings.append(Finding(name, key, f"{source.where(name, key)} is not a known key; {hint}"))
     values = {}
     for key, field in fields.items():
         if key not in table:
@@ -105,8 +136,11 @@ def build(cls: type[Record], table: Mapping[str, Any], source: TomlSource, name:
                 raise ConfigError(f"{source.where(name, key)} is missing; it has no default")
             continue
         rule = field.metadata.get("rule", Rule(""))
-        values[key] = _convert(table[key], hints[key], rule, f"{source.where(name, key)}")
-    return cls(**values)
+        try:
+            values[key] = _convert(table[key], hints[key], rule, f"{source.where(name, key)}")
+        except ConfigError as error:
+            findings.append(Finding(name, key, str(error)))
+    return cls(**values), findings
 
 
 def _convert(value: Any, wanted: Any, rule: Rule, where: str) -> Any:

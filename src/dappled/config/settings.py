@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dappled.config.schema import ConfigError, Rule, TomlSource, build, read_toml, setting
+from dappled.config.schema import Finding, Rule, TomlSource, examine, read_toml, refuse, setting
 
 DEPTH_METHODS = ("gradient", "contrast", "combined")  # fast to good
 SOCKET_MODES = ("0600", "0660", "0666")
@@ -189,26 +189,54 @@ class Settings:
 TABLES: dict[str, type] = {f.name: f.default_factory for f in dataclasses.fields(Settings)}  # type: ignore[misc]  # all are classes
 
 
+@dataclass(frozen=True, slots=True)
+class SettingsFile:
+    """Settings as far as a file has them right, the file for error sentences, and what is wrong in it."""
+
+    settings: Settings
+    source: TomlSource
+    findings: tuple[Finding, ...] = ()
+
+
 def load(path: Path | None) -> Settings:
-    """Settings from a file, or the defaults. Raises ConfigError with file, line, key and what to do."""
+    """Settings from a file, or the defaults. Raises ConfigError: all that is wrong, with line, key and what to do."""
+    read = examine_file(path)
+    refuse(read.findings)
+    return read.settings
+
+
+def examine_file(path: Path | None) -> SettingsFile:
+    """Read a file, or the defaults, with a finding for each thing that is wrong in it. Raises ConfigError where it
+    can't be read or is not TOML."""
     if path is None:
-        return resolve(Settings())
+        return SettingsFile(resolve(Settings()), TomlSource("the built-in settings"))
     tables, source = read_toml(path)
-    return resolve(parse(tables, source), path.parent)
+    settings, findings = _examine_tables(tables, source)
+    return SettingsFile(resolve(settings, path.parent), source, tuple(findings))
 
 
 def parse(tables: Mapping[str, Any], source: TomlSource) -> Settings:
-    """Settings from TOML tables."""
+    """Settings from TOML tables. Raises ConfigError."""
+    settings, findings = _examine_tables(tables, source)
+    refuse(findings)
+    return settings
+
+
+def _examine_tables(tables: Mapping[str, Any], source: TomlSource) -> tuple[Settings, list[Finding]]:
     records: dict[str, Any] = {}
+    findings: list[Finding] = []
     for name, table in tables.items():
         if name not in TABLES:
             near = difflib.get_close_matches(name, TABLES, 1, 0.4)
             hint = f"did you mean [{near[0]}]?" if near else f"known: {', '.join(TABLES)}"
-            raise ConfigError(f"{source.where('', name)} is not a known table; {hint}")
-        if not isinstance(table, Mapping):
-            raise ConfigError(f"{source.where('', name)} must be a table: write [{name}] on a line of its own")
-        records[name] = build(TABLES[name], table, source, name)
-    return Settings(**records)
+            findings.append(Finding(name, "", f"{source.where('', name)} is not a known table; {hint}"))
+        elif not isinstance(table, Mapping):
+            text = f"{source.where('', name)} must be a table: write [{name}] on a line of its own"
+            findings.append(Finding(name, "", text))
+        else:
+            records[name], more = examine(TABLES[name], table, source, name)
+            findings += more
+    return Settings(**records), findings
 
 
 def resolve(settings: Settings, beside: Path | None = None) -> Settings:

@@ -33,6 +33,7 @@ from dappled.daemon.flight_control import FlightControl
 from dappled.daemon.flight_handover import FlightHandover, RecipeParameters
 from dappled.daemon.health import record as health
 from dappled.daemon.health.logbook import Logbook, NewProblems
+from dappled.daemon.health.record import DecodingState
 from dappled.daemon.health.status_text import Alarms
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import BodyLatency, Navigation
@@ -209,6 +210,7 @@ class Service:
             component=self._component,
             logbook=self._logbook,
             depth=self._depth,
+            recipe=recipe,
             outside=self._outside,
         )
         self._pipeline = Pipeline(
@@ -355,7 +357,7 @@ class Service:
             folder=self.folder,
             clock=navigation.telemetry.boot_clock(),
             vehicle=navigation.pose_now(),
-            decoding=self._decoder is not None,
+            decoding=DecodingState(self._decoder is not None, self._pipeline.decode_failures, self._events.misfit),
             utc_known=navigation.utc.known,
             dead_threads=[name for part in (*self._vital, *viewers) for name in part.dead_threads()],
             doubts=[text for text in (*doubts, *(task.problem for task in self._tasks)) if text],

@@ -13,6 +13,8 @@ from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Identity, SettingsChanged, StateChanged
 from dappled.drivers.mavlink import mavlink
+from dappled.drivers.raw import calibration_files
+from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
 from dappled.flight import Recording
 
@@ -22,7 +24,8 @@ log = logging.getLogger(__name__)
 class ShotEvents(Observer):
     """Observes a live pipeline. `camera` and `utc` are what is known of the camera and of the time.
 
-    `outside` is called last. `doubt` is a sentence where the camera will soon stop working.
+    `outside` is called last. `doubt` is a sentence where the camera will soon stop working, `misfit` one where the
+    calibration of `recipe` is not for this camera; "" where it is, or nothing is known of the camera.
     """
 
     def __init__(
@@ -35,11 +38,13 @@ class ShotEvents(Observer):
         component: Component,
         logbook: Logbook,
         depth: LiveDepth | None,
+        recipe: Recipe | None,
         outside: Observer,
     ) -> None:
         self._recording, self._camera, self._utc = recording, camera, utc
         self._shutter, self._component, self._logbook = shutter, component, logbook
-        self._depth, self._outside = depth, outside
+        self._depth, self._recipe, self._outside = depth, recipe, outside
+        self.misfit = ""
         self.doubt: str | None = None
 
     def settled(self, index: int, ok: bool) -> None:
@@ -78,6 +83,7 @@ class ShotEvents(Observer):
         self._component.state_changed()
         if change.identity is not None and self._camera.identify(change.identity):
             self._record_camera(change.identity)
+            self._judge_calibration(change.identity.model)
         self._outside.camera_changed(change)
 
     def settings_changed(self, change: SettingsChanged) -> None:
@@ -92,6 +98,14 @@ class ShotEvents(Observer):
             self._recording.index.note_reported(index)
         except DappledError as error:
             report(log, "index", error)
+
+    def _judge_calibration(self, model: str) -> None:
+        """Whether the calibration is for this camera. Its mask and law were judged before the flight began."""
+        if self._recipe is not None:
+            try:
+                self.misfit = calibration_files.misfit(self._recipe, model) or ""
+            except DappledError as error:
+                self.misfit = str(error)
 
     def _record_camera(self, camera: Identity) -> None:
         """Write down which camera it is: the first one, or another."""

@@ -11,6 +11,8 @@ from dappled.daemon.health import go_no_go
 from dappled.daemon.health.go_no_go import Check
 
 VEHICLE = {"latitude_deg": 41.0, "longitude_deg": 1.0, "yaw_deg": 3.0, "position_sigma_m": 1.24, "age_ms": 40.0}
+DECODE = {"mask": "mask-2", "calibration": "c.toml", "running": True, "failed": 0, "failed_in_a_row": 0, "failure": "",
+          "misfit": ""}  # fmt: skip
 LINK = {"urls": 2, "silent": 0, "packets": 500, "positions": 50}
 WELL: dict[str, Any] = {
     "utc_ns": 1_800_000_000 * 10**9,
@@ -22,7 +24,7 @@ WELL: dict[str, Any] = {
     "disk": {"free_bytes": 50 * 10**9, "folder": "/flights/x"},
     "clock": {"source": "timesync", "sigma_ms": 0.31},
     "vehicle": VEHICLE,
-    "decode": {"mask": "mask-2", "calibration": "c.toml", "running": True},
+    "decode": DECODE,
     "min_free_bytes": 5 * 10**8,
 }
 
@@ -67,6 +69,13 @@ def test_all_is_well() -> None:
         ("Decoding", "caution", "off", {"decode": {"mask": "m", "calibration": "", "running": False}}),
         ("Decoding", "caution", "not calibrated", {"decode": {"mask": "m", "calibration": "", "running": True}}),
         ("Decoding", "caution", "fell behind by 2 frames, kept", {"stages": [{"name": "decode", "dropped": 2}]}),
+        ("Decoding", "no-go", "will be kept, not decoded: c.toml", {"decode": DECODE | {"misfit": "c.toml was made"}}),
+        ("Decoding", "caution", "1 frame could not be decoded, kept in the record: dark",
+         {"decode": DECODE | {"failed": 1, "failed_in_a_row": 1, "failure": "dark"}}),
+        ("Decoding", "caution", "4 frames could not",
+         {"decode": DECODE | {"failed": 4, "failed_in_a_row": 0, "failure": "dark"}}),
+        ("Decoding", "no-go", "the last 3 frames could not be decoded, kept in the record: dark",
+         {"decode": DECODE | {"failed": 4, "failed_in_a_row": 3, "failure": "dark"}}),
         ("Service", "no-go", "capture ended: restart dappled", {"dead": ["capture"]}),
         ("Clock", "caution", "not known yet", {"utc_known": False}),
     ],

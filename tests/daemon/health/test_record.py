@@ -11,8 +11,10 @@ import pytest
 
 from dappled.config.settings import MaskSettings, MavlinkSettings, RecordSettings, Settings
 from dappled.daemon.health import record as health
+from dappled.daemon.health.record import DecodingState
 from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline.capture import PendingShots
+from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.drivers.camera import BodyState
@@ -53,6 +55,7 @@ def record(
         utc_known=more.pop("utc_known", True),
         dead_threads=more.pop("dead", ()),
         doubts=more.pop("doubts", ()),
+        decoding=more.pop("decoding", None),
     )
 
 
@@ -81,6 +84,12 @@ def test_well(tmp_path: Path) -> None:
         ({"doubts": ["autopilot 7 is heard"]}, "autopilot 7 is heard"),
         ({"utc_known": False}, "UTC is not known yet"),
         ({"settings": replace(WELL, record=RecordSettings(warn_free_mb=10_000_000))}, "the disk is filling up"),
+        ({"decoding": DecodingState(True, DecodeFailures(1, 1, "dark"))}, "1 frame kept, not decoded: dark"),
+        (
+            {"decoding": DecodingState(True, DecodeFailures(4, 3, "dark"))},
+            "decoding fails: the last 3 frames are kept, not decoded: dark",
+        ),
+        ({"decoding": DecodingState(True, misfit="c.toml was made")}, "frames can't be decoded: c.toml was made"),
         ({"dead": ["mavlink 0"]}, "the mavlink 0 thread has ended: restart dappled"),
         ({"dead": ["capture"]}, "the capture thread has ended: restart dappled"),
         ({"items": 3}, "decode fell behind by 2 frames, kept in the record"),

@@ -16,6 +16,7 @@ from PIL import Image
 
 from dappled.daemon.navigation import clocks
 from dappled.daemon.pipeline import capture
+from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.drivers.camera import Blob, CameraError, CameraEvent, Companion, Deferred
 from dappled.flight import ShotState, check, flight_report
 from tests.daemon.fakes import FakeCamera, arrival, eventually, failed, fired, good, rig
@@ -191,6 +192,20 @@ def test_a_frame_that_does_not_decode_is_told_and_the_next_does(tmp_path: Path) 
         one.request(2)
         assert one.ended(1).problem == ""
         assert "not decoded: no carriers" in one.events()
+
+
+def test_frames_that_do_not_decode_are_counted_until_one_does(tmp_path: Path) -> None:
+    with rig(tmp_path) as one:
+        assert one.decoder is not None
+        for index, problem in enumerate(["", "no carriers", "too dark", "", "no carriers"]):
+            one.decoder.problem = problem
+            one.request(index)
+            one.ended(index)
+            if index == 2:
+                assert one.pipeline.decode_failures == DecodeFailures(2, 2, "too dark")
+            if index == 3:
+                assert one.pipeline.decode_failures == DecodeFailures(2, 0, "too dark")
+        assert one.pipeline.decode_failures == DecodeFailures(3, 1, "no carriers")
 
 
 def test_frames_are_told_as_left_undecoded_where_that_was_switched_off(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -200,15 +201,41 @@ def test_a_port_in_use_is_reported_in_one_sentence() -> None:
 @pytest.mark.parametrize(
     ("url", "words"),
     [
-        ("/dev/ttyNowhere7", "there is no device /dev/ttyNowhere7"),
         ("/dev/null", "is not a serial device"),
         ("/dev/null,12345", "a serial port can't run at 12345 baud"),
-        ("udpin:203.0.113.7:0", "is not an address of this machine"),
     ],
 )
 def test_a_link_that_can_not_be_opened_is_reported_in_one_sentence(url: str, words: str) -> None:
     with pytest.raises(LinkError, match=words):
         Side(url).start()
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("/dev/ttyNowhere7", "there is no device /dev/ttyNowhere7"),
+        ("udpin:203.0.113.7:0", "is not an address of this machine"),
+    ],
+)
+def test_a_device_or_an_address_that_is_not_there_yet_is_waited_for(url: str, words: str) -> None:
+    with Side(url) as side:
+        assert words in (side.links.statistics()[0].error or "")
+
+
+def test_a_serial_device_that_comes_late_is_opened(tmp_path: Path) -> None:
+    device = tmp_path / "ttyLate"
+    far, near = pty.openpty()
+    try:
+        with Side(f"{device},57600") as side:
+            assert side.links.statistics()[0].error is not None
+            device.symlink_to(os.ttyname(near))
+            until = time.monotonic() + 20
+            while side.links.statistics()[0].error is not None:
+                assert time.monotonic() < until
+                time.sleep(0.02)
+    finally:
+        os.close(near)
+        os.close(far)
 
 
 def test_a_log_that_fails_and_a_handler_that_raises_do_not_end_the_link() -> None:

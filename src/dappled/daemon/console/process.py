@@ -44,8 +44,8 @@ class ConsoleRequestError(DappledError):
     """The daemon did not answer the console; one sentence."""
 
 
-def listen(settings: ConsoleSettings) -> tuple[socket.socket, str]:
-    """The listening socket of `console.bind`, and the token ("" on loopback without one).
+def credentials(settings: ConsoleSettings) -> tuple[str, int, str]:
+    """Host and port of `console.bind`, and the token ("" on loopback without one). Nothing is opened but its file.
 
     Raises ConsoleError, or KeyFileError for a token file that others can read.
     """
@@ -60,6 +60,12 @@ def listen(settings: ConsoleSettings) -> tuple[socket.socket, str]:
             f"console.bind = {settings.bind!r} would be open to the network without a token: make one with "
             "`dappled keys token FILE`, and name it in console.token"
         )
+    return host, port, token
+
+
+def listen(settings: ConsoleSettings) -> tuple[socket.socket, str]:
+    """The listening socket of `console.bind`, and the token. Raises like `credentials`."""
+    host, port, token = credentials(settings)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     one = socket.socket(family, socket.SOCK_STREAM)
     one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from dappled.errors import counted
 from dappled.flight.layout import disk_shortage
 
 State = Literal["go", "caution", "no-go"]
 _SURE_M, _SLOW_CLOCK_MS, _FRESH_MS = 5.0, 50.0, 3000.0
+FAILING = 3  # so many frames in a row that can't be decoded are no accident
 _FRAME_BYTES = 20e6  # until a flight has shown its own
 _EARLIEST_UTC_NS = 1_700_000_000 * 10**9  # a machine with a date before 2023 has no clock
 
@@ -119,16 +121,30 @@ def _decoding(health: Mapping[str, Any]) -> Check:
         return Check("Decoding", "caution", "no mask is configured: frames are kept, not decoded")
     if not decode["running"]:
         return Check("Decoding", "caution", "off: frames are kept, not decoded")
+    if (failing := _failing(decode)) is not None:
+        return failing
     left = sum(stage["dropped"] for stage in health["stages"] if stage["name"] == "decode")
     if left:
-        return Check(
-            "Decoding", "caution", f"fell behind by {left} frame{'' if left == 1 else 's'}, kept in the record"
-        )
+        return Check("Decoding", "caution", f"fell behind by {counted(left, 'frame')}, kept in the record")
     if not decode["calibration"]:
         return Check(
             "Decoding", "caution", f"{decode['mask']}, not calibrated: carriers are predicted by the law alone"
         )
     return Check("Decoding", "go", f"{decode['mask']}, calibrated")
+
+
+def _failing(decode: Mapping[str, Any]) -> Check | None:
+    """What is wrong where frames can't be decoded; None where they can. They are recorded in any case."""
+    if decode.get("misfit"):
+        return Check("Decoding", "no-go", f"frames will be kept, not decoded: {decode['misfit']}")
+    failed, in_a_row = decode.get("failed", 0), decode.get("failed_in_a_row", 0)
+    if in_a_row >= FAILING:
+        text = f"the last {counted(in_a_row, 'frame')} could not be decoded, kept in the record: {decode['failure']}"
+        return Check("Decoding", "no-go", text)
+    if failed:
+        text = f"{counted(failed, 'frame')} could not be decoded, kept in the record: {decode['failure']}"
+        return Check("Decoding", "caution", text)
+    return None
 
 
 def _service(dead: Sequence[str]) -> Check:

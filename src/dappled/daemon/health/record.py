@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from dappled.config.settings import Settings
+from dappled.daemon.health.go_no_go import FAILING
 from dappled.daemon.navigation import BootClock, TelemetryStatistics
 from dappled.daemon.pipeline.capture import PendingShots
+from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
@@ -21,6 +23,26 @@ from dappled.flight import FlightError, layout
 from dappled.workers import Statistics
 
 SILENT_NS = 5 * 10**9
+
+
+@dataclass(frozen=True, slots=True)
+class DecodingState:
+    """Whether frames are decoded in flight, what could not be decoded, and why the calibration can't be used ("" where
+    it can)."""
+
+    running: bool = False
+    failures: DecodeFailures = field(default_factory=DecodeFailures)
+    misfit: str = ""
+
+    def problems(self) -> list[str]:
+        """What is wrong, a sentence each."""
+        failed = self.failures
+        found = [f"frames can't be decoded: {self.misfit}"] if self.misfit else []
+        if failed.in_a_row >= FAILING:
+            found.append(f"decoding fails: the last {_frames(failed.in_a_row)} are kept, not decoded: {failed.reason}")
+        elif failed.count:
+            found.append(f"decoding failed: {_frames(failed.count)} kept, not decoded: {failed.reason}")
+        return found
 
 
 def record(
@@ -38,7 +60,7 @@ def record(
     folder: Path,
     clock: BootClock | None = None,
     vehicle: Pose | None = None,
-    decoding: bool = False,
+    decoding: DecodingState | None = None,
     utc_known: bool = True,
     dead_threads: Sequence[str] = (),
     doubts: Sequence[str] = (),
@@ -80,6 +102,8 @@ def record(
         )
     if not settings.mask.profile:
         problems.append("no mask is configured: frames are kept, not decoded (set mask.profile)")
+    decoding = decoding or DecodingState()
+    problems += decoding.problems()
     queues = [asdict(stage) for stage in stages]
     for stage in queues:
         if stage["dropped"]:
@@ -112,7 +136,11 @@ def record(
         "decode": {
             "mask": settings.mask.profile,
             "calibration": settings.decode.calibration,
-            "running": decoding,
+            "running": decoding.running,
+            "failed": decoding.failures.count,
+            "failed_in_a_row": decoding.failures.in_a_row,
+            "failure": decoding.failures.reason,
+            "misfit": decoding.misfit,
         },
         "min_free_bytes": settings.record.min_free_mb * 1_000_000,
     }

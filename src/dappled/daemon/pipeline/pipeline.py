@@ -7,6 +7,7 @@ camera, the writer that records or compares, and the source of poses.
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass, replace
 
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import Capture, Observer, PendingShot, PendingShots, ShotEnds
@@ -20,6 +21,15 @@ from dappled.drivers.camera import Camera
 from dappled.errors import sentence
 from dappled.flight import Tag
 from dappled.workers import Statistics, Worker
+
+
+@dataclass(frozen=True, slots=True)
+class DecodeFailures:
+    """The frames that could not be decoded: all, those since the last one that could, and why the last could not."""
+
+    count: int = 0
+    in_a_row: int = 0
+    reason: str = ""
 
 
 class Pipeline:
@@ -70,6 +80,11 @@ class Pipeline:
             for name in part.dead_threads()
         ]
 
+    @property
+    def decode_failures(self) -> DecodeFailures:
+        """What could not be decoded so far. Frames that decoding had no time for are none of these."""
+        return self._decoding.failures
+
     def statistics(self) -> tuple[Statistics, ...]:
         """Counters of each stage's queue."""
         return self._tagging.worker.statistics(), self._decoding.worker.statistics()
@@ -92,6 +107,7 @@ class Decoding:
     ) -> None:
         self._ends, self._decoder, self._publisher = ends, decoder, publisher
         self._preview_interval_s, self._last_preview_s = preview_interval_s, -1e9
+        self.failures = DecodeFailures()
         self.worker: Worker[PendingShot] = Worker(
             "decode", self._work, capacity=capacity, on_failure=self._failed, on_drop=self._dropped
         )
@@ -115,6 +131,7 @@ class Decoding:
         began = time.monotonic_ns()
         writer = self._ends.writer
         decoded = self._decoder.decode(writer.path(frame), tag.focal_length_mm, tag.f_number)
+        self.failures = replace(self.failures, in_a_row=0)
         pending.decoded = decoded
         writer.decoded(decoded.result(frame.index, (time.monotonic_ns() - began) / 1e6))
         pending.ms["decode"] = (time.monotonic_ns() - began) / 1e6
@@ -124,6 +141,8 @@ class Decoding:
         self._ends.finish(pending)
 
     def _failed(self, pending: PendingShot, error: Exception) -> None:
+        before = self.failures
+        self.failures = DecodeFailures(before.count + 1, before.in_a_row + 1, sentence(error))
         self._ends.leave(pending, "not decoded", sentence(error))
 
     def _dropped(self, pending: PendingShot) -> None:

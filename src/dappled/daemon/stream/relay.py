@@ -105,8 +105,8 @@ class TcpRelay:
                 end_child(process, _END_S)
 
 
-def _listener(endpoint: str) -> socket.socket:
-    """A listening socket for tcp://HOST:PORT; * is every address. Raises WireError."""
+def tcp_address(endpoint: str) -> tuple[str, int]:
+    """(host, port) of tcp://HOST:PORT. Raises WireError."""
     try:
         url = urllib.parse.urlsplit(endpoint)
         host, port = url.hostname or "", url.port or 0
@@ -114,6 +114,12 @@ def _listener(endpoint: str) -> socket.socket:
         host, port = "", 0
     if not host or not port:
         raise WireError(f"{endpoint} must be tcp://HOST:PORT, such as tcp://127.0.0.1:5555")
+    return host, port
+
+
+def _listener(endpoint: str) -> socket.socket:
+    """A listening socket for tcp://HOST:PORT; * is every address. Raises WireError."""
+    host, port = tcp_address(endpoint)
     host = "0.0.0.0" if host == "*" else host  # noqa: S104  # `prepare` asks for keys
     one = None
     try:

@@ -9,7 +9,6 @@ import os
 import socket
 import stat
 import threading
-import urllib.parse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from dappled.daemon.stream import curve
 from dappled.daemon.stream.curve import ServerKeys
-from dappled.daemon.stream.relay import TcpRelay
+from dappled.daemon.stream.relay import TcpRelay, tcp_address
 from dappled.daemon.stream.wire import WireError
 from dappled.refusals import RefusalLog
 from dappled.workers import Loop
@@ -139,16 +138,23 @@ def prepare(endpoint: str, *, keyed: bool = False) -> None:
 
     Raises WireError with what to do.
     """
-    url = urllib.parse.urlsplit(endpoint)
-    if url.scheme == "ipc":
+    check_endpoint(endpoint, keyed=keyed)
+    if endpoint.startswith("ipc://"):
         path = Path(endpoint.removeprefix("ipc://"))
-        if not path.is_absolute() or len(str(path).encode()) > _PATH_BYTES:
-            raise WireError(f"{endpoint} must be an absolute path of at most {_PATH_BYTES} bytes")
         _prepare_folder(path.parent, endpoint)
         if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
             raise WireError(f"{endpoint}: there is a file of this name that is not a socket; choose another endpoint")
-    elif url.scheme == "tcp":
-        if not keyed and not is_loopback(url.hostname or ""):
+
+
+def check_endpoint(endpoint: str, *, keyed: bool) -> None:
+    """Raise WireError, with what to do, where an endpoint can't be bound as it is written. Nothing is opened."""
+    scheme = endpoint.partition("://")[0]
+    if scheme == "ipc":
+        path = Path(endpoint.removeprefix("ipc://"))
+        if not path.is_absolute() or len(str(path).encode()) > _PATH_BYTES:
+            raise WireError(f"{endpoint} must be an absolute path of at most {_PATH_BYTES} bytes")
+    elif scheme == "tcp":
+        if not is_loopback(tcp_address(endpoint)[0]) and not keyed:
             raise WireError(
                 f"{endpoint} would be open to the network without keys: make them with `dappled keys make`, and name "
                 "them in publish.keys and publish.clients; or use ipc:// or tcp://127.0.0.1:PORT"

@@ -3,7 +3,7 @@
 `links` receives and sends packets, `channels` opens connections, `signing` signs and verifies.
 """
 
-from dappled.drivers.mavlink.channels import LinkError
+from dappled.drivers.mavlink.channels import LinkError, parse
 from dappled.drivers.mavlink.links import (
     LinkStatistics,
     MavlinkLinks,
@@ -23,6 +23,7 @@ from dappled.drivers.mavlink.signing import (
     Unsigned,
     make_key,
     open_signing,
+    read_key,
 )
 
 __all__ = [
@@ -43,4 +44,6 @@ __all__ = [
     "mavlink",
     "open_signing",
     "pack",
+    "parse",
+    "read_key",
 ]

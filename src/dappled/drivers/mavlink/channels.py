@@ -37,7 +37,12 @@ _NO_CLIENT = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNABORTED, errno.EPROTO,
 
 
 class LinkError(DappledError):
-    """A link can't be opened: one sentence with the url and what to do."""
+    """A link can't be opened: one sentence with the url and what to do. `may_come`: a device, an address or a peer is
+    not there now, and waiting may mend it."""
+
+    def __init__(self, text: str, *, may_come: bool = False) -> None:
+        super().__init__(text)
+        self.may_come = may_come
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +87,10 @@ def _serial_address(url: str, rest: str) -> Address:
         raise LinkError(f"mavlink.url {url!r} needs a device, as in /dev/ttyAMA0,921600")
     if separator and not (baud.isascii() and baud.isdigit()):
         raise LinkError(f"mavlink.url {url!r}: {baud!r} is not a baud rate; write a number such as {DEFAULT_BAUD}")
-    return Address(url, "serial", device, int(baud) if separator else DEFAULT_BAUD)
+    speed = int(baud) if separator else DEFAULT_BAUD
+    if not hasattr(termios, f"B{speed}"):
+        raise LinkError(f"mavlink.url {url!r}: a serial port can't run at {speed} baud; write 57600, 115200 or 921600")
+    return Address(url, "serial", device, speed)
 
 
 class ByteChannel(Protocol):
@@ -126,7 +134,7 @@ def open_channel(address: Address) -> ByteChannel:
             return UdpIn(_bound(address, socket.SOCK_DGRAM))
         return UdpOut(address)
     except OSError as error:
-        raise LinkError(_sentence(address, error)) from error
+        raise LinkError(_sentence(address, error), may_come=error.errno != errno.EADDRINUSE) from error
 
 
 def _sentence(address: Address, error: OSError) -> str:
@@ -385,12 +393,8 @@ def over_tcp(sock: socket.socket) -> ByteStream:
 
 def over_serial(address: Address) -> ByteStream:
     """Open a serial device in raw mode, 8N1, without flow control. Raises OSError, and LinkError for another kind of
-    file or an impossible speed."""
-    speed = getattr(termios, f"B{address.port}", None)
-    if speed is None:
-        raise LinkError(
-            f"MAVLink link {address.url}: a serial port can't run at {address.port} baud; write 57600, 115200 or 921600"
-        )
+    file."""
+    speed = getattr(termios, f"B{address.port}")
     fd = os.open(address.host, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         attributes = termios.tcgetattr(fd)

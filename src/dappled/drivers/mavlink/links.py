@@ -364,8 +364,8 @@ class MavlinkLinks:
     def open(self) -> None:
         """Open all links, without receiving yet.
 
-        Raises LinkError for what waiting would not mend: a port in use, a missing device. A TCP server that isn't there
-        yet is tried again every second.
+        Raises LinkError for what waiting would not mend: a port in use, a file that is no device. A device, an address
+        or a TCP server that isn't there yet is tried again every second.
         """
         if self._opened:
             return
@@ -374,7 +374,7 @@ class MavlinkLinks:
                 try:
                     link.channel = open_channel(link.address)
                 except LinkError as error:
-                    if link.address.kind != "tcp":
+                    if not error.may_come:
                         raise
                     link.error = str(error)
         except LinkError:

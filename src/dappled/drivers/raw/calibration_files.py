@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import tomli_w
 
 from dappled.bounds.arrays import read_npz
 from dappled.bounds.parsing import parse_toml
+from dappled.config import profiles
 from dappled.config.schema import ConfigError, read_toml
 from dappled.decode import DecodeError
 from dappled.decode.calibration import Calibration
@@ -57,3 +58,43 @@ def load(path: Path) -> Calibration:
         return Calibration.from_dict(tables(path))
     except DecodeError as error:
         raise ConfigError(f"{path}: {error}") from error
+
+
+class Calibrated(Protocol):
+    """What frames are decoded with: `Recipe`. `camera` and `mask` are profiles, `law` is "" for the profile's own."""
+
+    @property
+    def camera(self) -> str: ...
+
+    @property
+    def mask(self) -> str: ...
+
+    @property
+    def law(self) -> str: ...
+
+    @property
+    def calibration(self) -> str: ...
+
+
+def misfit(recipe: Calibrated, model: str = "") -> str | None:
+    """Why the calibration can't be used, in a sentence: it is for another mask, law or frame size. None where it can,
+    or there is none.
+
+    The frame size is judged where the camera is known: by its profile, or by the body's `model`. Raises ConfigError
+    where a file is missing or wrong.
+    """
+    path = recipe.calibration
+    if not path or recipe.mask == profiles.LENSLET:
+        return None
+    known, mask = load(Path(path)), profiles.mask(recipe.mask)
+    if known.mask != mask.mask:
+        return f"{path} was made with another mask than {mask.name}: calibrate again, or choose its mask"
+    if recipe.law and known.law != recipe.law:
+        return f"{path} was made by the law {known.law}, not {recipe.law}: calibrate again, or choose its law"
+    camera = profiles.camera_for_model(model) if recipe.camera == "auto" else profiles.camera(recipe.camera)
+    if camera is None or known.shape in camera.shapes():
+        return None
+    height, width = known.shape
+    return (
+        f"{path} is for frames of {height} × {width} px, which {camera.name} doesn't make: calibrate with that camera"
+    )

@@ -210,13 +210,13 @@ class Darkroom:
         self._lineariser = FrameLineariser(recipe)
 
     def check(self) -> None:
-        """Raise DappledError when the recipe names something that is missing or wrong."""
+        """Raise DappledError when the recipe names something that is missing, wrong, or for another camera or mask."""
         if self.recipe.camera != "auto":
             profiles.camera(self.recipe.camera)
         if self.recipe.mask != profiles.LENSLET:
             profiles.mask(self.recipe.mask)
-        if self.recipe.calibration and self.recipe.mask != profiles.LENSLET:
-            self._calibration()
+        if (wrong := calibration_files.misfit(self.recipe)) is not None:
+            raise DarkroomError(wrong)
         if self.recipe.taper and self.recipe.mask == profiles.LENSLET:
             raise DarkroomError(
                 "a taper is for the bands of a printed mask; the bands of lenslets fill the whole spectrum"

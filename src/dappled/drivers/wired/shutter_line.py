@@ -178,8 +178,8 @@ def parse_line(text: str) -> ShutterLine:
 
 def _gpio(parts: list[str]) -> ShutterLine:
     chip, line, *low = parts
-    if low not in ([], ["low"]):
-        raise ValueError(low)
+    if low not in ([], ["low"]) or int(line) < 0:
+        raise ValueError(parts)
     return GpioLine(chip, int(line), active_low=bool(low))
 
 

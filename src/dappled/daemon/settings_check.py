@@ -1,0 +1,187 @@
+"""Find everything in settings that can't work, at once. `config check`, `run` and `doctor` refuse the same.
+
+Nothing is opened but files that the settings name, and nothing is changed. Hardware that is not there is no finding: it
+may come, and the daemon waits for it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from dappled.config import profiles
+from dappled.config.schema import ConfigError, Finding, refuse
+from dappled.config.settings import TABLES, Settings, SettingsFile
+from dappled.daemon.console import placement
+from dappled.daemon.console import process as console_process
+from dappled.daemon.stream import curve, sockets
+from dappled.drivers.mavlink import LinkError, parse, read_key
+from dappled.drivers.raw import calibration_files, reading
+from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.registry import open_camera
+from dappled.errors import DappledError
+from dappled.flight import seal_key
+
+_KEY = re.compile(rf"\b({'|'.join(TABLES)})\.([a-z_]+)\b")
+
+
+@dataclass(frozen=True, slots=True)
+class SettingsRule:
+    """One thing that must be so. `place` is the setting to blame where the sentence names none; `reads` are further
+    ones that `check` needs, as "table.key". `check` raises DappledError: what is wrong, a line for each thing."""
+
+    place: str
+    check: Callable[[Settings], object]
+    reads: tuple[str, ...] = ()
+
+
+def findings(file: SettingsFile) -> list[Finding]:
+    """What is wrong in a settings file: what can't be read, and what can't work. A rule that reads a setting which is
+    wrong already is left out."""
+    found = list(file.findings)
+    wrong = {f"{finding.table}.{finding.key}" if finding.key else finding.table for finding in found}
+    for rule in RULES:
+        read = {rule.place, *rule.reads}
+        if read & wrong or {name.partition(".")[0] for name in read} & wrong:
+            continue
+        try:
+            rule.check(file.settings)
+        except DappledError as error:
+            for text in str(error).splitlines():
+                if not any(text in other.text for other in found):  # a rule may need what another one checks
+                    found.append(_finding(file, rule.place, text))
+    return found
+
+
+def checked(file: SettingsFile) -> Settings:
+    """The settings of a file. Raises ConfigError with everything that is wrong."""
+    refuse(findings(file))
+    return file.settings
+
+
+def _finding(file: SettingsFile, place: str, text: str) -> Finding:
+    """A finding at the setting that the sentence names, if the file has it; else at `place`."""
+    table, _, key = place.partition(".")
+    named = (match[2] for match in _KEY.finditer(text) if match[1] == table)
+    key = next((name for name in named if file.source.has(table, name)), key)
+    return Finding(table, key, f"{file.source.where(table, key)}: {text}")
+
+
+def _links(settings: Settings) -> None:
+    wrong = []
+    for url in dict.fromkeys(settings.mavlink.url):
+        try:
+            parse(url)
+        except LinkError as error:
+            wrong.append(str(error))
+        if settings.mavlink.url.count(url) > 1:
+            wrong.append(f"mavlink.url names {url!r} twice; remove one")
+    if wrong:
+        raise ConfigError("\n".join(wrong))
+
+
+def _link_keys(settings: Settings) -> None:
+    keys, links = settings.mavlink.keys, len(settings.mavlink.url)
+    if len(keys) not in (0, 1, links):
+        raise ConfigError(
+            f'mavlink.keys names {len(keys)} files for {links} links; name one for each link ("" for none), or one'
+        )
+    for key in filter(None, keys):
+        read_key(Path(key))
+
+
+def _directory(settings: Settings) -> None:
+    folder = Path(settings.record.directory)
+    place = next(one for one in (folder, *folder.parents) if os.path.exists(one))
+    if not place.is_dir():
+        raise ConfigError(f"{place} is not a folder: move it away, or set record.directory")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise ConfigError(f"{place} can't be written to: make {folder} yours, or set record.directory")
+
+
+def _seal(settings: Settings) -> None:
+    if settings.record.seal_key:
+        seal_key.load(Path(settings.record.seal_key))
+
+
+def _camera_profile(settings: Settings) -> None:
+    if settings.camera.profile != "auto":
+        profiles.camera(settings.camera.profile)
+
+
+def _mask_profile(settings: Settings) -> None:
+    if settings.mask.profile not in ("", profiles.LENSLET):
+        profiles.mask(settings.mask.profile)
+
+
+def _calibration(settings: Settings) -> None:
+    decode = settings.decode
+    if not settings.mask.profile:  # it is read only with a mask
+        if decode.calibration:
+            calibration_files.load(Path(decode.calibration))
+        return
+    wrong = calibration_files.misfit(
+        Recipe(
+            camera=settings.camera.profile,
+            mask=settings.mask.profile,
+            law=decode.law,
+            calibration=decode.calibration,
+        )
+    )
+    if wrong is not None:
+        raise ConfigError(wrong)
+
+
+def _white(settings: Settings) -> None:
+    if settings.decode.white:
+        reading.read_metadata(Path(settings.decode.white))
+
+
+def _dark(settings: Settings) -> None:
+    if settings.decode.dark:
+        reading.read_metadata(Path(settings.decode.dark))
+
+
+def _stream(settings: Settings) -> None:
+    sockets.check_endpoint(settings.publish.slices, keyed=bool(settings.publish.keys))
+
+
+def _ask(settings: Settings) -> None:
+    if settings.publish.ask:
+        sockets.check_endpoint(settings.publish.ask, keyed=bool(settings.publish.keys))
+
+
+def _console(settings: Settings) -> None:
+    if settings.console.bind:
+        console_process.credentials(settings.console)
+
+
+def _map(settings: Settings) -> None:
+    if settings.console.map:
+        placement.load_background(Path(settings.console.map))
+
+
+RULES: tuple[SettingsRule, ...] = (
+    SettingsRule(
+        "camera.driver",
+        lambda settings: open_camera(settings.camera),
+        tuple(f"camera.{key}" for key in ("shutter", "pickup", "port", "serial", "options", "file_timeout_s")),
+    ),
+    SettingsRule("camera.profile", _camera_profile),
+    SettingsRule("mask.profile", _mask_profile),
+    SettingsRule("mavlink.url", _links),
+    SettingsRule("mavlink.keys", _link_keys, ("mavlink.url",)),
+    SettingsRule("record.directory", _directory),
+    SettingsRule("record.seal_key", _seal),
+    SettingsRule("decode.calibration", _calibration, ("camera.profile", "mask.profile", "decode.law")),
+    SettingsRule("decode.white", _white),
+    SettingsRule("decode.dark", _dark),
+    SettingsRule("publish.slices", _stream, ("publish.keys",)),
+    SettingsRule("publish.ask", _ask, ("publish.keys",)),
+    SettingsRule("publish.keys", lambda settings: curve.server(settings.publish.keys, settings.publish.clients)),
+    SettingsRule("console.bind", _console, ("console.token",)),
+    SettingsRule("console.map", _map),
+)
