@@ -13,7 +13,6 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
 
@@ -28,7 +27,7 @@ from dappled.daemon.camera_protocol.earlier_outcomes import IndexedOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters
 from dappled.daemon.console import process as console_process
-from dappled.daemon.console.process import Console
+from dappled.daemon.console.process import Console, ConsoleRequests
 from dappled.daemon.flight_control import FlightControl
 from dappled.daemon.flight_handover import FlightHandover, RecipeParameters
 from dappled.daemon.health import record as health
@@ -112,7 +111,9 @@ class Service:
             names, recipe = recipes.recipe(settings)
             camera = open_camera(settings.camera)
             listener = console_process.open_listener(settings, stack)
-            self._publisher = Publisher.of(settings.publish, private=listener.private if listener else "")
+            self._publisher = Publisher.of(
+                settings.publish, private=listener.private if listener else "", clock=self._clock
+            )
             stack.callback(self._publisher.stop)
             self._links = _configured_links(settings, self._clock)
             self._links.open()
@@ -122,9 +123,9 @@ class Service:
             self._start_parts(names, stack)
             if listener:
                 self.console_url = listener.url
-                act = partial(console_process.answer, shutter=self._shutter, logbook=self._logbook)
+                requests = ConsoleRequests(self._shutter, self._logbook)
                 self._console = console_process.start(
-                    listener, settings, stack, recipe=recipe, act=act, logbook=self._logbook
+                    listener, settings, stack, recipe=recipe, requests=requests, clock=self._clock
                 )
             self._started = True
             self._stack = stack.pop_all()

@@ -23,7 +23,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -212,22 +212,28 @@ def _parsed(raw: bytes, flags: int) -> dict[str, Any]:
 # --- in the parent
 
 
-def start_child(module: str, *arguments: str, quiet: bool = False) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
-    """Start `python -m module` with a channel to it; for processes that load libgphoto2.
+def start_child(
+    module: str,
+    *arguments: str,
+    descriptors: Sequence[int] = (),
+    environment: Mapping[str, str] | None = None,
+    quiet: bool = False,
+) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
+    """Start `python -m module` with a channel to it.
 
-    The child's arguments are the channel's descriptor, this process' id, and `arguments`. `quiet` discards what it
-    writes to standard error. Raises OSError.
+    The child's arguments are the channel's descriptor, this process' id, and `arguments`. It inherits `descriptors`,
+    and `environment` in addition to this process' own. `quiet` discards what it writes to standard error. Raises
+    OSError.
     """
     channel, other = ProcessChannel.pair()
     with other:
         try:
             process = subprocess.Popen(
                 [sys.executable, "-m", module, str(other.fileno()), str(os.getpid()), *arguments],
-                pass_fds=(other.fileno(),),
+                pass_fds=(other.fileno(), *descriptors),
                 stdin=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL if quiet else None,
-                # libgphoto2 keeps settings (capture target, ...) under HOME and would let one run change the next.
-                env={**os.environ, "HOME": "/nonexistent"},
+                env={**os.environ, **(environment or {})},
             )
         except OSError:
             channel.close()

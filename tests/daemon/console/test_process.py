@@ -9,7 +9,7 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +21,7 @@ import pytest
 from dappled.clock import RecordedClock, SystemClock
 from dappled.config.settings import ConsoleSettings, PublishSettings, Settings
 from dappled.daemon.console import process
-from dappled.daemon.console.process import Console, ConsoleError
+from dappled.daemon.console.process import Console, ConsoleError, ConsoleRequests
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.daemon.stream.curve import KeyFileError
@@ -99,7 +99,14 @@ def setup(folder: Path) -> dict[str, Any]:
 
 
 def running(console: Console) -> subprocess.Popen[bytes] | None:
-    return console._process
+    return console._process._process
+
+
+class Handler:
+    """Answers by a function of the test."""
+
+    def __init__(self, act: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> None:
+        self.answer = act
 
 
 def test_a_console_that_dies_is_started_again_and_the_socket_stays(tmp_path: Path) -> None:
@@ -111,7 +118,7 @@ def test_a_console_that_dies_is_started_again_and_the_socket_stays(tmp_path: Pat
 
     listener, _ = process.listen(ConsoleSettings(bind="127.0.0.1:0"))
     url = process.url(listener)
-    console = Console(listener, setup(tmp_path), act)
+    console = Console(listener, setup(tmp_path), Handler(act), SystemClock())
     console.start()
     try:
         with httpx.Client(base_url=url, timeout=30, headers={"origin": url.rstrip("/")}, trust_env=False) as client:
@@ -145,7 +152,7 @@ def test_a_console_that_keeps_dying_is_not_started_for_ever(
 
     monkeypatch.setattr(subprocess, "Popen", die)
     listener, _ = process.listen(ConsoleSettings(bind="127.0.0.1:0"))
-    console = Console(listener, setup(tmp_path), lambda _: {}, RestartBudget(2, 3600.0))
+    console = Console(listener, setup(tmp_path), Handler(lambda _: {}), SystemClock(), RestartBudget(2, 3600.0))
     console.start()
     try:
         eventually(lambda: "too often; the next attempt is in 3600 s" in caplog.text, "it waits")
@@ -166,7 +173,7 @@ def test_an_answer_that_fails_ends_one_process_and_not_the_console(tmp_path: Pat
 
     listener, _ = process.listen(ConsoleSettings(bind="127.0.0.1:0"))
     url = process.url(listener)
-    console = Console(listener, setup(tmp_path), act)
+    console = Console(listener, setup(tmp_path), Handler(act), SystemClock())
     console.start()
     try:
         until, answer = time.monotonic() + 30, None
@@ -192,7 +199,7 @@ def pipeline(tmp_path: Path) -> Any:
 
 
 def do(shutter: Shutter, **request: Any) -> dict[str, Any]:
-    return process.answer(request, shutter, Logbook(RecordedClock(0)))
+    return ConsoleRequests(shutter, Logbook(RecordedClock(0))).answer(request)
 
 
 def test_a_number_that_comes_twice_is_one_wish(pipeline: Rig) -> None:
@@ -227,6 +234,6 @@ def test_the_log_is_told_from_a_number_on(pipeline: Rig) -> None:
     book = Logbook(RecordedClock(7))
     book.add("one")
     book.add("two", "warning")
-    told = process.answer({"do": "log", "after": 1}, pipeline.shutter, book)
+    told = ConsoleRequests(pipeline.shutter, book).answer({"do": "log", "after": 1})
     assert told["lines"] == [{"number": 2, "utc_ns": 7, "level": "warning", "text": "two"}]
-    assert process.answer({"do": "nothing"}, pipeline.shutter, book) == {"ok": True}
+    assert ConsoleRequests(pipeline.shutter, book).answer({"do": "nothing"}) == {"ok": True}

@@ -10,6 +10,7 @@ import time
 
 import pytest
 
+from dappled.clock import SystemClock
 from dappled.daemon.stream.publisher import Publisher
 from dappled.daemon.stream.relay import TcpRelay
 from dappled.daemon.stream.subscriber import Subscriber
@@ -23,7 +24,8 @@ def test_a_killed_relay_costs_viewers_a_moment_and_the_publisher_nothing() -> No
     endpoint, ask = (f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}" for _ in range(2))
     one = Publisher(endpoint, ask)
     one.start("f", lambda request, reply: reply(Message("frame", dict(request))))
-    relay = one._sockets._relay
+    relay = one._sockets._relay._process
+    assert relay is not None
     try:
         with Subscriber(endpoint, ask) as viewer:
 
@@ -76,4 +78,4 @@ def test_the_last_message_arrives_when_the_publisher_ends() -> None:
 @pytest.mark.parametrize("endpoint", ["tcp://127.0.0.1", "tcp://127.0.0.1:x", "tcp://:5555", "tcp://127.0.0.1:70000"])
 def test_an_endpoint_without_host_and_port_is_refused(endpoint: str) -> None:
     with pytest.raises(WireError, match="must be tcp://HOST:PORT"):
-        TcpRelay(RefusalLog(logging.getLogger())).listen(endpoint)
+        TcpRelay(RefusalLog(logging.getLogger()), SystemClock()).listen(endpoint)

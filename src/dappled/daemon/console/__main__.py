@@ -1,4 +1,4 @@
-"""The console's process: `python -m dappled.daemon.console CHANNEL_FD LISTENER_FD`. It ends with the daemon."""
+"""The console's process: `python -m dappled.daemon.console CHANNEL_FD PARENT LISTENER_FD`. It ends with the daemon."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def main() -> int:
     goes_first(CONSOLE_GOES)
     reuse_large_blocks()
     channel = ProcessChannel(socket.socket(fileno=int(sys.argv[1])))
-    listener = socket.socket(fileno=int(sys.argv[2]))
+    listener = socket.socket(fileno=int(sys.argv[3]))
     first = channel.receive(10)
     if first is None:
         return 1

@@ -5,16 +5,14 @@ from __future__ import annotations
 import logging
 import os
 import socket
-import subprocess
-import sys
 import threading
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
+from dappled.clock import Clock
 from dappled.config import settings as configuration
 from dappled.config.settings import ConsoleSettings, Settings
 from dappled.daemon.health.logbook import Logbook
@@ -22,18 +20,16 @@ from dappled.daemon.pipeline.repeats import CaptureRequest
 from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
 from dappled.daemon.stream.curve import read_private
 from dappled.daemon.stream.sockets import is_loopback
-from dappled.drivers.child_process import ChannelError, ProcessChannel, RestartBudget, end_child
+from dappled.daemon.supervised_process import ChildProgram, SupervisedProcess
+from dappled.drivers.child_process import ChannelError, ChannelMessage, ProcessChannel, RestartBudget
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.errors import DappledError, report
-from dappled.workers import Loop
+from dappled.errors import DappledError
 
 log = logging.getLogger(__name__)
-_STOP_S, _END_S = 5.0, 2.0
+_STOP_S = 5.0
 _BACKLOG = 32
 _TOKEN_CHARACTERS = 12
 _ANSWER_S = 3.0
-
-Act = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
 class ConsoleError(DappledError):
@@ -95,70 +91,68 @@ def url(listener: socket.socket) -> str:
     return f"http://{host}:{port}/"
 
 
-class Console:
-    """Keeps the console's process running, and answers its requests with `act`.
+class RequestHandler(Protocol):
+    """Answers what the console asks of the daemon: `ConsoleRequests`."""
 
-    The process has a low priority. When it ends it is started again, at most five times a minute; the listening socket
-    stays open meanwhile, so that browsers wait instead of failing.
+    def answer(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Do what is asked; the answer goes to the page."""
+
+
+class Console:
+    """Keeps the console's process running, and answers its requests by `handler`.
+
+    The process has a low priority. When it ends it is started again; the listening socket stays open meanwhile, so that
+    browsers wait instead of failing.
     """
 
     def __init__(
-        self, listener: socket.socket, setup: Mapping[str, Any], act: Act, budget: RestartBudget | None = None
+        self,
+        listener: socket.socket,
+        setup: Mapping[str, Any],
+        handler: RequestHandler,
+        clock: Clock,
+        budget: RestartBudget | None = None,
     ) -> None:
-        self._listener, self._setup, self._act = listener, setup, act
-        self._process: subprocess.Popen[bytes] | None = None
-        self._budget = budget or RestartBudget(limit=5, window_s=60.0)
-        self._loop = Loop("console", self._run)
+        self._listener = listener
+        program = ChildProgram(
+            "the console's process",
+            "dappled.daemon.console",
+            (str(listener.fileno()),),
+            (listener.fileno(),),
+            # One thread for its arithmetic: the other cores are for the flight.
+            {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+        )
+        self._process = SupervisedProcess("console", program, _PageRequests(setup, handler), clock, budget)
 
     def start(self) -> None:
         """Start the process."""
-        self._loop.start()
+        self._process.start()
 
     def stop(self) -> None:
         """End the process, and close the listening socket."""
-        self._loop.stop(_STOP_S)
+        self._process.stop(_STOP_S)
         self._listener.close()
 
     def dead_threads(self) -> list[str]:
         """See `Loop.dead_threads`."""
-        return self._loop.dead_threads()
+        return self._process.dead_threads()
 
-    def _run(self) -> None:
-        while not self._loop.stopping.is_set():
-            if wait_ns := self._budget.wait_ns(time.monotonic_ns()):
-                log.warning("the console's process ended too often; the next attempt is in %.0f s", wait_ns / 1e9)
-                self._loop.stopping.wait(wait_ns / 1e9)
-                continue
-            self._budget.spend(time.monotonic_ns())
-            try:
-                self._serve()
-            except Exception as error:  # noqa: BLE001  # it is started again in any case, at most five times a minute
-                report(log, "the console ended", error)
 
-    def _serve(self) -> None:
-        channel, there = ProcessChannel.pair()
-        try:
-            with there:
-                self._process = subprocess.Popen(
-                    [sys.executable, "-m", "dappled.daemon.console", str(there.fileno()), str(self._listener.fileno())],
-                    pass_fds=[there.fileno(), self._listener.fileno()],
-                    stdin=subprocess.DEVNULL,
-                    # One thread for its arithmetic: the other cores are for the flight.
-                    env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-                )
-            channel.send(self._setup, timeout_s=5.0)
-            while not self._loop.stopping.is_set():
-                question = channel.receive(0.2)
-                if question is not None:
-                    channel.send({**self._act(question.body), "number": question.body.get("number")})
-        except ChannelError as error:
-            if not self._loop.stopping.is_set():
-                log.warning("the console ended: %s", error)
-        finally:
-            channel.close()  # this ends the process
-            process, self._process = self._process, None
-            if process is not None:
-                end_child(process, _END_S)
+@dataclass(frozen=True, slots=True)
+class _PageRequests:
+    """The daemon's side of the console: sends `setup`, and answers its requests one by one."""
+
+    setup: Mapping[str, Any]
+    handler: RequestHandler
+
+    def begun(self, channel: ProcessChannel) -> None:
+        """See ProcessPeer."""
+        channel.send(self.setup, timeout_s=5.0)
+
+    def turn(self, channel: ProcessChannel, message: ChannelMessage | None) -> None:
+        """See ProcessPeer."""
+        if message is not None:
+            channel.send({**self.handler.answer(message.body), "number": message.body.get("number")})
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +180,13 @@ def open_listener(settings: Settings, stack: ExitStack) -> ConsoleListener | Non
 
 
 def start(
-    opened: ConsoleListener, settings: Settings, stack: ExitStack, *, recipe: Recipe | None, act: Act, logbook: Logbook
+    opened: ConsoleListener,
+    settings: Settings,
+    stack: ExitStack,
+    *,
+    recipe: Recipe | None,
+    requests: ConsoleRequests,
+    clock: Clock,
 ) -> Console:
     """Start the console; the stack ends it. `recipe` is how frames are decoded."""
     publish = settings.publish
@@ -200,9 +200,9 @@ def start(
         "mount": list(settings.pose.mount),
     }
     logger = logging.getLogger("dappled")
-    logger.addHandler(logbook)
-    stack.callback(logger.removeHandler, logbook)
-    console = Console(opened.listener, setup, act)
+    logger.addHandler(requests.logbook)
+    stack.callback(logger.removeHandler, requests.logbook)
+    console = Console(opened.listener, setup, requests, clock)
     console.start()
     stack.callback(console.stop)
     return console
@@ -232,25 +232,29 @@ class DaemonChannel:
         raise ConsoleRequestError("the daemon did not answer: check whether the shot was taken before you ask again")
 
 
-def answer(request: Mapping[str, Any], shutter: Shutter, logbook: Logbook) -> dict[str, Any]:
-    """Do what the console asks of the daemon: a shot, an interval, its end, or the last lines of the log.
+@dataclass(frozen=True, slots=True)
+class ConsoleRequests:
+    """Does what the console asks of the daemon: a shot, an interval, its end, or the last lines of the log."""
 
-    A capture request follows the same rules as one over MAVLink: the page numbers its requests, and the same number
-    twice is one request.
-    """
-    match request.get("do"):
-        case "shoot":
-            return _decided(shutter.request(CaptureRequest("console", "console", request["sequence"])))
-        case "interval":
-            one = CaptureRequest("console", "console interval", request["sequence"])
-            return _decided(shutter.start_interval(one, float(request["interval_s"]), int(request["count"])))
-        case "stop interval":
-            ran = shutter.stop_interval()
-            return {"ok": True, "text": "the interval is stopped" if ran else "no interval was running"}
-        case "log":
-            return {"ok": True, "lines": logbook.after(request["after"])}
-        case _:
-            return {"ok": True}
+    shutter: Shutter
+    logbook: Logbook
+
+    def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """A capture request follows the same rules as one over MAVLink: the page numbers its requests, and the same
+        number twice is one request."""
+        match request.get("do"):
+            case "shoot":
+                return _decided(self.shutter.request(CaptureRequest("console", "console", request["sequence"])))
+            case "interval":
+                one = CaptureRequest("console", "console interval", request["sequence"])
+                return _decided(self.shutter.start_interval(one, float(request["interval_s"]), int(request["count"])))
+            case "stop interval":
+                ran = self.shutter.stop_interval()
+                return {"ok": True, "text": "the interval is stopped" if ran else "no interval was running"}
+            case "log":
+                return {"ok": True, "lines": self.logbook.after(request["after"])}
+            case _:
+                return {"ok": True}
 
 
 def _decided(decision: ShotDecision) -> dict[str, Any]:

@@ -6,20 +6,26 @@ without a copy.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import mmap
 import os
 import socket
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
 from dappled.clock import Clock, SystemClock
-from dappled.drivers.child_process import ChannelError, ChannelMessage, MessageSizeError, ProcessChannel, RestartBudget
+from dappled.drivers.child_process import (
+    ChannelError,
+    ChannelMessage,
+    MessageSizeError,
+    ProcessChannel,
+    RestartBudget,
+    end_child,
+    start_child,
+)
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import Result
@@ -201,13 +207,7 @@ class DecodeProcess:
                 f"the decoder keeps crashing: it starts again in {wait_ns / 1e9:.0f} s; frames stay in the record"
             )
         self._budget.spend(self._clock.monotonic_ns())
-        self._channel, there = ProcessChannel.pair()
-        with there:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "dappled.daemon.pipeline.decode_worker", str(there.fileno()), str(os.getpid())],
-                pass_fds=[there.fileno()],
-                stdin=subprocess.DEVNULL,
-            )
+        self._process, self._channel = start_child("dappled.daemon.pipeline.decode_worker")
         self._channel.send({"do": "set up", "recipe": asdict(self._recipe), "preview_px": self._preview_px})
         return self._channel
 
@@ -217,12 +217,8 @@ class DecodeProcess:
         process, self._process, self._channel = self._process, None, None
         if process is None:
             return None
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            return process.wait(0.5)
-        process.kill()
-        with contextlib.suppress(subprocess.TimeoutExpired):  # the kernel holds it; it ends when that lets go
-            return process.wait(5)
-        return None
+        end_child(process, 0.5)
+        return process.returncode
 
 
 def _manner(code: int | None) -> str:

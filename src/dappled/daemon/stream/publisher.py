@@ -21,6 +21,7 @@ from typing import Any, Self
 
 import zmq
 
+from dappled.clock import Clock, SystemClock
 from dappled.config.settings import PublishSettings
 from dappled.daemon.stream import curve, wire
 from dappled.daemon.stream.curve import ServerKeys
@@ -90,7 +91,9 @@ class Publisher:
         keys: ServerKeys | None = None,
         mode: int = 0o660,
         private: str = "",
+        clock: Clock | None = None,
     ) -> None:
+        self._clock = clock or SystemClock()
         self._flight = ""
         self._answer: Answer | None = None
         self._capacity = capacity
@@ -100,12 +103,12 @@ class Publisher:
         self._dropped = dict.fromkeys(wire.TOPICS, 0)
         self._frame_of: dict[int, int] = {}
         self._questions = self._refused = self._open_questions = 0
-        self._grace_s = self._patient_until_s = 0.0
+        self._grace_s, self._patient_until_ns = 0.0, 0
         self._start: Message | None = None
         self._unread_stacks, self._unread_answers = InFlightLimit(UNREAD_STACKS), InFlightLimit(UNREAD_ANSWERS)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._closed = False
-        self._sockets = Sockets(keys, mode)
+        self._sockets = Sockets(keys, mode, self._clock)
         try:
             self._pub = self._sockets.open(zmq.PUB, [private, slices], high_water_mark)
             asked_at = [private and f"{private}.ask", ask]
@@ -116,7 +119,7 @@ class Publisher:
         self._loop = Loop("publisher", self._run)
 
     @classmethod
-    def of(cls, settings: PublishSettings, *, private: str = "") -> Self:
+    def of(cls, settings: PublishSettings, *, private: str = "", clock: Clock | None = None) -> Self:
         """A publisher at the endpoints of these settings. Raises WireError, KeyFileError."""
         return cls(
             settings.slices,
@@ -125,6 +128,7 @@ class Publisher:
             keys=curve.server(settings.keys, settings.clients),
             mode=int(settings.socket_mode, 8),
             private=private,
+            clock=clock,
         )
 
     def start(self, flight: str, answer: Answer) -> None:
@@ -239,7 +243,7 @@ class Publisher:
                     self._dropped[message.topic] += 1
                 return
         self._send_patiently(_parts(message.topic, header, body))
-        self._patient_until_s = max(self._patient_until_s, time.monotonic() + patience_s)
+        self._patient_until_ns = max(self._patient_until_ns, self._clock.monotonic_ns() + round(patience_s * 1e9))
         with self._lock:
             self._sent[message.topic] += 1
             self._remember(message, header)
@@ -249,12 +253,12 @@ class Publisher:
 
         So queues can be short, and what follows a stack of slices at once is not lost.
         """
-        while (left_s := self._patient_until_s - time.monotonic()) > 0:
+        while (left_ns := self._patient_until_ns - self._clock.monotonic_ns()) > 0:
             self._pub.setsockopt(zmq.XPUB_NODROP, 1)
             try:
                 self._pub.send_multipart(parts, flags=zmq.NOBLOCK, copy=False)
             except zmq.Again:
-                time.sleep(min(left_s, 0.002))
+                time.sleep(min(left_ns / 1e9, 0.002))
             else:
                 return
         self._pub.setsockopt(zmq.XPUB_NODROP, 0)

@@ -9,38 +9,31 @@ wait while that process is started again.
 from __future__ import annotations
 
 import errno
-import logging
 import os
 import secrets
 import socket
-import subprocess
-import sys
-import time
 import urllib.parse
+from dataclasses import dataclass
 
+from dappled.clock import Clock
 from dappled.config import settings as configuration
 from dappled.daemon.stream.wire import WireError
-from dappled.drivers.child_process import ChannelError, ProcessChannel, RestartBudget, end_child
-from dappled.errors import report
+from dappled.daemon.supervised_process import ChildProgram, SupervisedProcess
+from dappled.drivers.child_process import ChannelMessage, ProcessChannel
 from dappled.refusals import RefusalLog
-from dappled.workers import Loop
 
-log = logging.getLogger(__name__)
 _BACKLOG = 128
 _END_S = 3.0  # the process itself waits 2 s for viewers to read what it has
 _STOP_S = 6.0
 
 
 class TcpRelay:
-    """Keeps the relaying process running where there is a tcp endpoint, started at most five times a minute. Whom it
-    refused is written to `refusals`."""
+    """Keeps the relaying process running where there is a tcp endpoint. Whom it refused is written to `refusals`."""
 
-    def __init__(self, refusals: RefusalLog, budget: RestartBudget | None = None) -> None:
-        self._refusals = refusals
+    def __init__(self, refusals: RefusalLog, clock: Clock) -> None:
+        self._refusals, self._clock = refusals, clock
         self._routes: dict[str, socket.socket] = {}  # by path
-        self._process: subprocess.Popen[bytes] | None = None
-        self._budget = budget or RestartBudget(limit=5, window_s=60.0)
-        self._loop = Loop("relay", self._run)
+        self._process: SupervisedProcess | None = None
 
     def listen(self, endpoint: str) -> str:
         """Listen on a tcp endpoint; returns the ipc endpoint to bind in its place. Raises WireError."""
@@ -51,58 +44,44 @@ class TcpRelay:
 
     def start(self) -> None:
         """Start the process, if there is anything to listen on."""
-        if self._routes:
-            self._loop.start()
+        if not self._routes:
+            return
+        program = ChildProgram(
+            "the process for TCP viewers",
+            "dappled.daemon.stream.relay_process",
+            tuple(str(part) for path, listener in self._routes.items() for part in (listener.fileno(), path)),
+            tuple(listener.fileno() for listener in self._routes.values()),
+            end_s=_END_S,
+        )
+        self._process = SupervisedProcess("relay", program, _RefusalReports(self._refusals), self._clock)
+        self._process.start()
 
     def stop(self) -> None:
         """End the process when viewers have read what it has, in two seconds at most, and close the sockets."""
-        self._loop.stop(_STOP_S)
+        if self._process is not None:
+            self._process.stop(_STOP_S)
         for listener in self._routes.values():
             listener.close()
 
     def dead_threads(self) -> list[str]:
         """See `Loop.dead_threads`."""
-        return self._loop.dead_threads()
+        return [] if self._process is None else self._process.dead_threads()
 
-    def _run(self) -> None:
-        while not self._loop.stopping.is_set():
-            if wait_ns := self._budget.wait_ns(time.monotonic_ns()):
-                log.warning("the process for TCP viewers ended too often; the next attempt is in %.0f s", wait_ns / 1e9)
-                self._loop.stopping.wait(wait_ns / 1e9)
-                continue
-            self._budget.spend(time.monotonic_ns())
-            try:
-                self._relay()
-            except Exception as error:  # noqa: BLE001  # it is started again in any case, at most five times a minute
-                report(log, "the process for TCP viewers", error)
 
-    def _relay(self) -> None:
-        channel, there = ProcessChannel.pair()
-        try:
-            with there:
-                routes = [(listener.fileno(), path) for path, listener in self._routes.items()]
-                self._process = subprocess.Popen(
-                    [
-                        sys.executable,
-                        *("-m", "dappled.daemon.stream.relay_process", str(there.fileno())),
-                        *(str(part) for route in routes for part in route),
-                    ],
-                    pass_fds=[there.fileno(), *(descriptor for descriptor, _ in routes)],
-                    stdin=subprocess.DEVNULL,
-                )
-            while not self._loop.stopping.is_set():
-                self._refusals.settle()
-                message = channel.receive(0.2)
-                for address, reason, count in message.body.get("refused", ()) if message is not None else ():
-                    self._refusals.refused(str(address), str(reason), int(count))
-        except ChannelError as error:
-            if not self._loop.stopping.is_set():
-                log.warning("the process for TCP viewers ended: %s", error)
-        finally:
-            channel.close()  # this ends the process
-            process, self._process = self._process, None
-            if process is not None:
-                end_child(process, _END_S)
+@dataclass(frozen=True, slots=True)
+class _RefusalReports:
+    """The daemon's side: writes down whom the process has refused."""
+
+    refusals: RefusalLog
+
+    def begun(self, channel: ProcessChannel) -> None:
+        """See ProcessPeer. The process has all that it needs."""
+
+    def turn(self, channel: ProcessChannel, message: ChannelMessage | None) -> None:
+        """See ProcessPeer."""
+        self.refusals.settle()
+        for address, reason, count in message.body.get("refused", ()) if message is not None else ():
+            self.refusals.refused(str(address), str(reason), int(count))
 
 
 def tcp_address(endpoint: str) -> tuple[str, int]:

@@ -296,7 +296,7 @@ def main() -> int:
     os.nice(NICENESS)
     goes_first(CONSOLE_GOES)
     near = socket.socket(fileno=int(sys.argv[1]))
-    given = iter(sys.argv[2:])
+    given = iter(sys.argv[3:])  # after the parent's process id
     relay = Relay({socket.socket(fileno=int(fd)): path for fd, path in zip(given, given, strict=True)})
     relay.watch(near)
     clock = SystemClock()

@@ -16,6 +16,7 @@ from typing import Any
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from dappled.clock import Clock
 from dappled.daemon.stream import curve
 from dappled.daemon.stream.curve import ServerKeys
 from dappled.daemon.stream.relay import TcpRelay, tcp_address
@@ -39,13 +40,13 @@ class Sockets:
     """Opens sockets of one context and closes them all. `keys` turn CURVE on for tcp, `mode` is the file mode of ipc
     sockets. A process of its own listens on tcp, see `TcpRelay`. One thread calls it."""
 
-    def __init__(self, keys: ServerKeys | None, mode: int) -> None:
+    def __init__(self, keys: ServerKeys | None, mode: int, clock: Clock) -> None:
         self._keys, self._mode = keys, mode
         self._context = niced_context()
         self._bound: list[str] = []
         self._sockets: list[zmq.Socket[Any]] = []
-        self._refusals = RefusalLog(log)
-        self._relay = TcpRelay(self._refusals)
+        self._refusals = RefusalLog(log, clock)
+        self._relay = TcpRelay(self._refusals, clock)
         self.wrong_keys = 0
         self._monitors: list[zmq.Socket[Any]] = []
         self._judge: zmq.Socket[Any] | None = None

@@ -42,7 +42,7 @@ from dappled.drivers.child_process import (
     start_child,
 )
 from dappled.drivers.gphoto2.messages import LATE_LIMIT, Carryover, lost_file, message_event
-from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
+from dappled.drivers.gphoto2.settings import NO_HOME, GPhoto2Settings, parse_settings
 from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
@@ -62,7 +62,10 @@ def open_camera(settings: Mapping[str, Any]) -> GPhoto2Camera:
 def spawn_process(settings: GPhoto2Settings, carryover: Carryover) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
     """Start the camera's process; it dies with the calling thread. Raises OSError."""
     return start_child(
-        "dappled.drivers.gphoto2.process", json.dumps(settings.to_json()), json.dumps(carryover.to_json())
+        "dappled.drivers.gphoto2.process",
+        json.dumps(settings.to_json()),
+        json.dumps(carryover.to_json()),
+        environment=NO_HOME,
     )
 
 

@@ -9,6 +9,9 @@ from typing import Any, Literal
 from dappled.drivers.camera import CameraError, check_options
 
 CaptureTarget = Literal["card", "ram"]
+NO_HOME = {"HOME": "/nonexistent"}
+"""For processes that load libgphoto2: it keeps settings (capture target, ...) under HOME, and would let one run change
+the next."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from dappled.drivers.child_process import (
     start_child,
 )
 from dappled.drivers.gphoto2.protocol import CameraFile, Session, SessionError
-from dappled.drivers.gphoto2.settings import GPhoto2Settings
+from dappled.drivers.gphoto2.settings import NO_HOME, GPhoto2Settings
 from dappled.drivers.wired.sources import SUFFIXES, FoundFile
 
 _ANSWER_S = 60.0
@@ -71,7 +71,7 @@ class PtpSource:
     def _ask(self, question: Mapping[str, Any]) -> ChannelMessage:
         try:
             _, channel = self._child = self._child or start_child(
-                "dappled.drivers.wired.ptp_source", self._port, quiet=True
+                "dappled.drivers.wired.ptp_source", self._port, environment=NO_HOME, quiet=True
             )
         except OSError as error:  # no memory, no descriptors
             raise CameraError(
