@@ -42,7 +42,8 @@ class Lens:
 @dataclass(frozen=True, slots=True)
 class CameraProfile:
     """The properties of a body that the prediction of carriers needs. `law` is a name in
-    `dappled.decode.optics.carriers.LAWS`."""
+    `dappled.decode.optics.carriers.LAWS`. No mask can be mounted nearer than `least_mask_distance_mm` to the sensor;
+    the lens has the stops between `f_numbers` (widest, narrowest); None where unknown."""
 
     name: str
     description: str
@@ -52,6 +53,8 @@ class CameraProfile:
     focal_length_mm: tuple[float, float] | None
     raw: tuple[RawShape, ...]
     lenses: tuple[Lens, ...] = ()
+    least_mask_distance_mm: float | None = None
+    f_numbers: tuple[float, float] | None = None
 
     def lens(self, focal_length_mm: float) -> Lens | None:
         """The lens calibrated within 2 % of a focal length; None where there is none."""
@@ -104,6 +107,10 @@ class _CameraTable:
     description: str = setting("", "one line")
     models: tuple[str, ...] = setting((), "model names as EXIF and libgphoto2 write them")
     focal_length_mm: tuple[float, float] | None = setting(None, "shortest and longest", unit="mm", low=0.1, high=10_000)
+    least_mask_distance_mm: float | None = setting(
+        None, "nearest that a mask can be mounted to the sensor: its cover glass", unit="mm", low=0, high=100
+    )
+    f_number: tuple[float, float] | None = setting(None, "widest and narrowest stop of the lens", low=0.5, high=256)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +181,8 @@ def camera(name: str) -> CameraProfile:
         table.focal_length_mm,
         tuple(shapes),
         tuple(lenses),
+        table.least_mask_distance_mm,
+        table.f_number,
     )
 
 

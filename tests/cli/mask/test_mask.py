@@ -94,7 +94,30 @@ def test_design_from_altitude_to_film(tmp_path: Path, capsys: pytest.CaptureFixt
     best = _json(["mask", "design", *camera, "--mask", "mask-2"], capsys)
     assert best["slices_mm"] == pytest.approx(13.4, abs=0.05)
     assert main(["mask", "plan", *camera, "--focal-length", "13", "--speed", "8", "--mask", "mask-2"]) == 0
-    assert "frames per minute" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "frames per minute" in out
+    assert "the lens of fujifilm-s5200 only stops down to f/8" in out
+    assert "no shadow can be finer than the mask" in out
+
+
+def test_design_knows_cover_glass_and_stops(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["mask", "design", "--altitude", "10", "--camera", "fujifilm-s5200", "--law", "geometric"]
+    words += ["--focal-length", "63", "--film", "16k"]
+    assert main([*words, "--f-number", "3.5"]) == 1
+    out = capsys.readouterr().out
+    assert "views of 19 × 14 px, fewer than 16 per side" in out
+    assert "buildable: 5 × 5 views of 45 × 33 px at f/8" in out
+    told = _json([*words, "--f-number", "3.5", "--mask-distance", "0.109"], capsys, 1)
+    assert isinstance(told["buildable"], dict)
+    assert told["buildable"]["mask_distance_mm"] == pytest.approx(1.01)
+    assert main([*words, "--f-number", "11"]) == 1
+    assert "stops down: 11 of at most 8" in capsys.readouterr().out
+    assert main([*words, "--f-number", "8"]) == 0
+    capsys.readouterr()
+    rows = _json(["mask", "table", "--mask", "mask-2", "--camera", "fujifilm-s5200"], capsys)
+    assert "from 6 to 52 mm" in str(rows["warnings"])
+    rows = _json(["mask", "table", "--mask", "mask-2", "--camera", "fujifilm-s5200", "--law", "geometric"], capsys)
+    assert rows["warnings"] == []
 
 
 @pytest.mark.parametrize(

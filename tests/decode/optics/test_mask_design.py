@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics import lenses
-from dappled.decode.optics.carrier_tables import fresnel_number, lattice_of
-from dappled.decode.optics.carriers import Sensor
+from dappled.decode.optics.carrier_tables import beyond_mask, fresnel_number, lattice_of
+from dappled.decode.optics.carriers import Mask, Sensor
 from dappled.decode.optics.film import FILMS, film_of
-from dappled.decode.optics.mask_design import DESIGNS, FRESNEL_LIMIT, DesignRequirements
+from dappled.decode.optics.mask_design import DESIGNS, FRESNEL_LIMIT, DesignRequirements, buildable
 from tests.decode.thesis_tables import S5200
 
 REFERENCE = Sensor((2776, 3688), (0.01, 0.0), (0.0, 0.01))
@@ -88,7 +88,10 @@ def test_depth_error_follows_eq_5() -> None:
     ("changed", "said"),
     [
         ({"film": film_of(200, 200, 10.0), "largest_distance_mm": 0.2}, "highest harmonic on film"),
-        ({"mask_distance_mm": 5.0, "f_number": 2.0}, "fewer than 8 a side|no mask of"),
+        ({"mask_distance_mm": 1.01}, "views of 18 × 13 px, fewer than 16 per side"),
+        ({"mask_distance_mm": 0.3, "least_distance_mm": 1.01}, "it can be mounted: 0.3 of at least 1.01 mm"),
+        ({"f_numbers": (4.0, 8.0)}, "f-number as the lens opens: 3.5 of at least 4"),
+        ({"f_number": 11.0, "f_numbers": (3.2, 8.0)}, "f-number as the lens stops down: 11 of at most 8"),
         ({"sensor": REFERENCE}, "height of the mask on film: 27.76 of at most 24 mm"),
         ({"mask_distance_mm": 0.01}, "diffraction|Nyquist"),
     ],
@@ -99,6 +102,32 @@ def test_why_no_mask_does_it(changed: dict[str, Any], said: str) -> None:
         pytest.fail(f"{made}")
     assert made.problem is not None
     assert any(word in made.problem for word in said.split("|"))
+
+
+def test_what_hardware_refuses_is_answered_with_what_can_be_built() -> None:
+    """Behind 1.01 mm of glass a view has about width·f-number/d·(1 − d/v) pixels, 42 at f/8."""
+    wanted = _requirements(mask_distance_mm=0.109, least_distance_mm=1.01, f_numbers=(3.2, 8.0))
+    assert not DESIGNS["geometric"](wanted).works
+    made = buildable(wanted, "geometric")
+    assert made is not None
+    assert made.wanted.f_number == 8
+    assert made.mask_distance_mm == pytest.approx(1.01)
+    assert made.view_shape == (31, 42)
+    assert "views of 42 × 31 px show little" in made.warnings[0]
+    assert buildable(_requirements(sensor=REFERENCE), "geometric") is None  # no film is as large
+
+
+def test_a_law_that_asks_the_mask_for_more_than_it_has_is_warned_of() -> None:
+    """Eq 30 at 13 mm: 2·11.38·1.01/13 mm on a DFT of 4.29 mm and 2776 px is 266.7 cycles/mm; the mask has 22.76."""
+    mask = Mask(11.38, 2, film_px_per_mm=113.8)
+    told = beyond_mask(mask, S5200, lattice_of("fd", mask, S5200, 1.01, 13.0))
+    assert told is not None
+    assert (
+        "×2 at 266.7 cycles/mm on the sensor, but on the mask it has 22.8, and its film draws nothing above 56.9"
+        in told
+    )
+    assert beyond_mask(mask, S5200, lattice_of("geometric", mask, S5200, 1.01, 13.0)) is None
+    assert any("no shadow" in warning for warning in DESIGNS["fd"](_requirements()).warnings)
 
 
 @pytest.mark.parametrize(

@@ -89,3 +89,13 @@ def installed(arguments: argparse.Namespace) -> Installed:
         arguments.law or camera.law,
         camera.mask_distance_mm if arguments.mask_distance is None else arguments.mask_distance,
     )
+
+
+def out_of_reach(camera: CameraProfile, ideal: float) -> str | None:
+    """A sentence where the lens has no stop as small as a mask's ideal f-number; None where it has or nobody knows."""
+    if camera.f_numbers is None or ideal <= camera.f_numbers[1] * 1.05:
+        return None
+    return (
+        f"the lens of {camera.name} only stops down to f/{camera.f_numbers[1]:g}: this mask separates its views at "
+        f"f/{ideal:.3g}; wider open it mixes them, and few carriers can be seen (dappled mask table --visibility)"
+    )

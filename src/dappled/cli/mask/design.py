@@ -14,7 +14,7 @@ from PIL import Image
 from dappled.cli.mask import arguments as mask_arguments
 from dappled.decode.optics import carrier_tables
 from dappled.decode.optics.film import FILMS
-from dappled.decode.optics.mask_design import DESIGNS, Design, DesignRequirements
+from dappled.decode.optics.mask_design import DESIGNS, Design, DesignRequirements, buildable
 from dappled.decode.spectrum import pictures
 
 HELP = "design mask, distance and film for an altitude"
@@ -61,14 +61,17 @@ def run(arguments: argparse.Namespace) -> int:
         shift_sigma_px=arguments.shift_error,
         mask_distance_mm=arguments.mask_distance,
         largest_distance_mm=min(10.0, length) if arguments.room is None else arguments.room,
+        least_distance_mm=camera.least_mask_distance_mm or 0.0,
+        f_numbers=camera.f_numbers,
     )
     made = DESIGNS[law](wanted)
+    instead = None if made.works else buildable(wanted, law)
     if arguments.picture:
         Image.fromarray(_picture(made)).save(arguments.picture)
     if arguments.json:
-        print(json.dumps(_as_json(made), indent=2))
+        print(json.dumps({**_as_json(made), "buildable": None if instead is None else _as_json(instead)}, indent=2))
     else:
-        print(_as_text(made))
+        print(_as_text(made, instead))
     return 0 if made.works else 1
 
 
@@ -87,6 +90,9 @@ def _best(arguments: argparse.Namespace) -> int:
         )
     ideal = one.mask.frequency_per_mm * one.distance_mm
     print(f"by geometry its views are separated at f/{ideal:.3g}, whatever the lens")
+    warning = mask_arguments.out_of_reach(one.camera, ideal)
+    if warning is not None:
+        print(f"warning: {warning}")
     return 0
 
 
@@ -114,7 +120,7 @@ def _as_json(made: Design) -> dict[str, Any]:
     }
 
 
-def _as_text(made: Design) -> str:
+def _as_text(made: Design, instead: Design | None) -> str:
     wanted = made.wanted
     rows, columns = made.view_shape
     lines = [
@@ -134,10 +140,23 @@ def _as_text(made: Design) -> str:
         *(f"{'ok  ' if c.met else 'FAIL'}       {c.sentence}" for c in made.conditions),
     ]
     lines.append(f"film       {', '.join(made.films) or 'none of Table 2'} can print it")
+    lines += [f"warning    {warning}" for warning in made.warnings]
     if made.problem:
         lines.append(made.problem)
+        lines.append(_instead(instead))
     elif made.depth_sigma_m > wanted.altitude_m / 2:
         lines.append(
             "this depth error is too large to measure depth: fly lower, or use a longer lens with a wider aperture"
         )
     return "\n".join(lines)
+
+
+def _instead(made: Design | None) -> str:
+    if made is None:
+        return "nothing can be built here with any stop of this lens or fewer views"
+    (rows, columns), n, stop = made.view_shape, made.wanted.views, made.wanted.f_number
+    return (
+        f"buildable: {n} × {n} views of {columns} × {rows} px at f/{stop:g}, a mask of "
+        f"{made.mask.frequency_per_mm:.3g} periods/mm {made.mask_distance_mm:.3g} mm before the sensor, depth "
+        f"±{made.depth_sigma_m:.2g} m at {made.wanted.altitude_m:g} m (--views {n} --f-number {stop:g})"
+    )

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
 from dataclasses import asdict
 
 from dappled.cli.mask import arguments as mask_arguments
 from dappled.config import profiles
-from dappled.decode.optics import carrier_tables, lenses
+from dappled.config.profiles import CameraProfile
+from dappled.decode.optics import Lattice, Mask, Sensor, carrier_tables, lenses
+from dappled.decode.optics.mask_design import SMALL_VIEW_PX
 
 HELP = "plan a flight: interval, motion blur, frame rate and disk space"
 EXAMPLE = "dappled mask plan --altitude 40 --speed 8 --camera fujifilm-s5200 --focal-length 13"
@@ -35,12 +38,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     camera, sensor, length = mask_arguments.camera_set(arguments)
-    columns = None
+    columns, warnings = None, list[str]()
     if arguments.mask:
         mask = profiles.mask(arguments.mask).mask
         lattice = carrier_tables.lattice_of(camera.law, mask, sensor, camera.mask_distance_mm, length)
         size = carrier_tables.slice_size(lattice, sensor.shape)
         columns = size[1] if size else None
+        warnings = list(_warnings(camera, mask, sensor, lattice, size))
     made = lenses.plan_survey(
         sensor,
         focal_length_mm=length,
@@ -55,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
         sideways=arguments.sideways,
     )
     if arguments.json:
-        print(json.dumps(asdict(made), indent=2))
+        print(json.dumps({**asdict(made), "warnings": warnings}, indent=2))
         return 0
     views = "" if made.view_sample_m is None else f", {made.view_sample_m * 100:.1f} cm per pixel of a view"
     print(f"footprint  {made.footprint_m[1]:.1f} m across, {made.footprint_m[0]:.1f} m along the flight")
@@ -64,4 +68,22 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"body       must sustain {made.frames_per_minute:.1f} frames per minute")
     print(f"blur       {made.blur_px:.2f} px; one pixel at {made.longest_exposure_s * 1e3:.2f} ms")
     print(f"disk       {made.frames} frames, {made.disk_bytes / 1e9:.1f} GB, on the card and again on the disk")
+    for warning in warnings:
+        print(f"warning: {warning}")
     return 0
+
+
+def _warnings(
+    camera: CameraProfile, mask: Mask, sensor: Sensor, lattice: Lattice, size: tuple[int, int] | None
+) -> Iterator[str]:
+    """What the camera's own limits make of this mask."""
+    if size is None:
+        yield "the carriers lie too close together for views"
+    elif min(size) < SMALL_VIEW_PX:
+        yield f"views of {size[1]} × {size[0]} px show little more than large shapes"
+    beyond = carrier_tables.beyond_mask(mask, sensor, lattice)
+    if beyond is not None:
+        yield beyond
+    unreachable = mask_arguments.out_of_reach(camera, mask.frequency_per_mm * camera.mask_distance_mm)
+    if unreachable is not None:
+        yield unreachable

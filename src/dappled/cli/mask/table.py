@@ -51,6 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     only = mask_arguments.only_length(one.camera)
     lengths = arguments.focal_length or (THESIS_FOCAL_LENGTHS_MM if only is None else (only,))
     rows = carrier_tables.table(one.mask, one.sensor, one.distance_mm, lengths, law=one.law)
+    warnings = _beyond(one, lengths)
     if arguments.visibility:
         return _visibility(one, lengths, arguments.f_number, as_json=arguments.json)
     if arguments.carriers or arguments.rotation:
@@ -61,6 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
             "law": one.law,
             "mask_distance_mm": one.distance_mm,
             "rows": [asdict(r) for r in rows],
+            "warnings": warnings,
         }
         print(json.dumps(listed, indent=2))
         return 0
@@ -78,7 +80,24 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{row.focal_length_mm:6g}{cells}  {size}")
     contrasts = ", ".join(f"×{h.multiple} {h.contrast:.2f}" for h in rows[0].harmonics)
     print(f"contrast left by diffraction at 550 nm: {contrasts}")
+    for warning in warnings:
+        print(f"warning: {warning}")
     return 0
+
+
+def _beyond(one: Installed, lengths: Sequence[float]) -> list[str]:
+    """The focal lengths at which the law asks the mask for more than it has; the sentence is the worst one's."""
+    found = {}
+    for length in sorted(lengths):
+        lattice = carrier_tables.lattice_of(one.law, one.mask, one.sensor, one.distance_mm, length)
+        sentence = carrier_tables.beyond_mask(one.mask, one.sensor, lattice)
+        if sentence is not None:
+            found[length] = sentence
+    if not found:
+        return []
+    shortest, longest = min(found), max(found)
+    at = f"at {shortest:g} mm" if len(found) == 1 else f"from {shortest:g} to {longest:g} mm; at {shortest:g} mm"
+    return [f"{at} {found[shortest]}"]
 
 
 def _carriers(one: Installed, lengths: Sequence[float], rotation_rad: float, *, as_json: bool) -> int:

@@ -136,6 +136,26 @@ def table(
     return rows
 
 
+def beyond_mask(mask: Mask, sensor: Sensor, lattice: Lattice) -> str | None:
+    """What is wrong where a lattice puts a mask's highest harmonic at a higher frequency than the mask itself has.
+
+    A shadow of a film on a sensor behind it is never finer than the film. None where the lattice asks for no more.
+    """
+    limit = None if mask.film_px_per_mm is None else mask.film_px_per_mm / 2
+    drawn = [m for m in mask.multiples if limit is None or m * mask.frequency_per_mm <= limit * (1 + 1e-9)]
+    top = max(drawn, default=1)
+    to_mm = np.linalg.inv(np.array([sensor.row_mm, sensor.column_mm])).T
+    asked = top * float(np.hypot(*(lattice.matrix() @ to_mm).T).max())
+    own = top * mask.frequency_per_mm
+    if asked <= own * 1.02:  # the print's scale is not known to better
+        return None
+    film = "" if limit is None else f", and its film draws nothing above {limit:.3g}"
+    return (
+        f"the law puts harmonic ×{top} at {asked:.4g} cycles/mm on the sensor, but on the mask it has {own:.3g}{film}: "
+        "no shadow can be finer than the mask"
+    )
+
+
 def slice_size(lattice: Lattice, shape: tuple[int, int]) -> tuple[int, int] | None:
     """(height, width) in bins of the largest slice that overlaps no neighbour; None where there is no room for any."""
     try:

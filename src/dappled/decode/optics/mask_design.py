@@ -5,6 +5,7 @@ Both laws are supported, each with its own rules (`DESIGNS`, by the law's name):
     of a mask is f_m·d, whatever the lens. Three conditions bound d from below: the slices stay under the sensor's
     Nyquist frequency, the film draws the highest harmonic with two pixels, and diffraction stays at
     λ·d·(p·f_m)² ≤ 0.25. The least d that meets them all gives the views the most pixels.
+    Cover glass is a fourth: a view has about width·f-number/d pixels, so a mask that is 1 mm away wants a small stop.
   - `fd`: the outer slices reach the edge of the spectrum at f_m·d = side·f / (2p + 1) (Eq 30 with the law's 1 mm²),
     with the same conditions on film and diffraction.
 """
@@ -12,16 +13,18 @@ Both laws are supported, each with its own rules (`DESIGNS`, by the law's name):
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.optics.carrier_tables import fresnel_number, lattice_of
-from dappled.decode.optics.carriers import Mask, Sensor
+from dappled.decode.optics.carrier_tables import beyond_mask, fresnel_number, lattice_of
+from dappled.decode.optics.carriers import Lattice, Mask, Sensor
 from dappled.decode.optics.film import FILMS, Film
 from dappled.decode.optics.lenses import depth_sigma_m, ground_sample_m, image_distance_mm, within
 
 FRESNEL_LIMIT = 0.25
+LEAST_VIEW_PX, SMALL_VIEW_PX = 16, 64  # a side: below the first a view is no picture, below the second a poor one
+_STOPS = (1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0, 32.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +33,8 @@ class DesignRequirements:
 
     `shift_sigma_px` is how well a shift from view to view will be known, in pixels of a view (0.02 is a good matcher).
     `mask_distance_mm` is fixed where the camera leaves no choice, None where it may be chosen up to
-    `largest_distance_mm`. `views` is N an axis, odd.
+    `largest_distance_mm`. `views` is N an axis, odd. `least_distance_mm` is how near a mask can be mounted, `f_numbers`
+    the widest and the narrowest stop of the lens, None where unknown.
     """
 
     sensor: Sensor
@@ -43,6 +47,8 @@ class DesignRequirements:
     shift_sigma_px: float = 0.02
     mask_distance_mm: float | None = None
     largest_distance_mm: float = 10.0
+    least_distance_mm: float = 0.0
+    f_numbers: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         """Raises DecodeError for nonsense in any value."""
@@ -75,22 +81,27 @@ class DesignRequirements:
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One condition on the design: what it needs, what is there, and whether that is enough."""
+    """One condition on the design: what it needs, what is there, and whether that is enough. `limit` is the most that
+    the value may be, or the least."""
 
     name: str
     value: float
     limit: float
     unit: str
+    at_least: bool = False
 
     @property
     def met(self) -> bool:
-        """Whether `value` stays at or under `limit`."""
+        """Whether `value` keeps to `limit`."""
+        if self.at_least:
+            return self.value >= self.limit * (1 - 1e-9)
         return self.value <= self.limit * (1 + 1e-9)
 
     @property
     def sentence(self) -> str:
         """The condition in words."""
-        return f"{self.name}: {self.value:.4g} of at most {self.limit:.4g} {self.unit}".rstrip()
+        bound = "least" if self.at_least else "most"
+        return f"{self.name}: {self.value:.4g} of at {bound} {self.limit:.4g} {self.unit}".rstrip()
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +111,7 @@ class Design:
     `view_shape` (rows, columns) of one view, `bandwidth_per_mm` (±, on the sensor) of one view, `spectrum_used` the
     share of the frame's spectrum that slices cover, `baseline_mm` between neighbouring views on the aperture,
     `depth_sigma_m` at the altitude (Eq 5), `ground_sample_m` of a view,
-    `films` the formats of Table 2 that can print it.
+    `films` the formats of Table 2 that can print it. `warnings` say what a working design is still bad at.
     """
 
     wanted: DesignRequirements
@@ -117,6 +128,7 @@ class Design:
     film_period_px: float
     films: tuple[str, ...]
     problem: str | None
+    warnings: tuple[str, ...] = ()
 
     @property
     def works(self) -> bool:
@@ -132,7 +144,7 @@ def design_geometric(wanted: DesignRequirements) -> Design:
         by_sensor = v / (1 + nyquist * aperture / (p + 0.5))  # (p + 1/2)·f_m·(1 − d/v) ≤ nyquist
         by_film = p * v / (aperture * wanted.film.nyquist_per_mm)
         by_light = wanted.wavelength_nm * 1e-6 / FRESNEL_LIMIT * (p * v / aperture) ** 2  # λ·d·(p·f_m)² ≤ 0.25
-        distance_mm = max(by_sensor, by_film, by_light)
+        distance_mm = max(by_sensor, by_film, by_light, wanted.least_distance_mm)
     else:
         distance_mm = wanted.mask_distance_mm
     if distance_mm > min(wanted.largest_distance_mm, 0.99 * v) and wanted.mask_distance_mm is None:
@@ -150,7 +162,8 @@ def design_fd(wanted: DesignRequirements) -> Design:
     if wanted.mask_distance_mm is None:
         by_film = product * p / wanted.film.nyquist_per_mm
         by_light = wanted.wavelength_nm * 1e-6 / FRESNEL_LIMIT * (product * p) ** 2
-        distance_mm = min(max(by_film, by_light), wanted.largest_distance_mm, 0.99 * wanted.focal_length_mm)
+        distance_mm = max(by_film, by_light, wanted.least_distance_mm)
+        distance_mm = min(distance_mm, wanted.largest_distance_mm, 0.99 * wanted.focal_length_mm)
     else:
         distance_mm = wanted.mask_distance_mm
     mask = Mask(product / distance_mm, p)
@@ -160,6 +173,24 @@ def design_fd(wanted: DesignRequirements) -> Design:
 
 
 DESIGNS: dict[str, Callable[[DesignRequirements], Design]] = {"fd": design_fd, "geometric": design_geometric}
+
+
+def buildable(wanted: DesignRequirements, law: str) -> Design | None:
+    """A design that works, near the requirements: another distance, then a smaller stop, then fewer views.
+
+    Of several stops the first whose views are no longer small, else the one with the largest views. None where no
+    design works.
+    """
+    widest, narrowest = wanted.f_numbers or (wanted.f_number, wanted.f_number)
+    first = min(max(wanted.f_number, widest), narrowest)
+    stops = [first, *(n for n in _STOPS if first < n <= narrowest)]
+    for views in range(wanted.views, 2, -2):
+        tried = [DESIGNS[law](replace(wanted, views=views, f_number=n, mask_distance_mm=None)) for n in stops]
+        working = [made for made in tried if made.works]
+        if working:
+            good = (made for made in working if min(made.view_shape) >= SMALL_VIEW_PX)
+            return next(good, max(working, key=lambda made: min(made.view_shape)))
+    return None
 
 
 def _finish(wanted: DesignRequirements, law: str, mask: Mask, distance_mm: float, sensor: Condition) -> Design:
@@ -178,18 +209,19 @@ def _finish(wanted: DesignRequirements, law: str, mask: Mask, distance_mm: float
             FRESNEL_LIMIT,
             "",
         ),
+        *_of_hardware(wanted, distance_mm),
         Condition("height of the mask on film", wanted.sensor.size_mm[0], wanted.film.vertical.length_mm, "mm"),
         Condition("width of the mask on film", wanted.sensor.size_mm[1], wanted.film.horizontal.length_mm, "mm"),
     )
     failed = [c.sentence for c in conditions if not c.met]
-    if min(shape) < 8:
-        failed.append(f"views of {shape[0]} × {shape[1]} px, fewer than 8 per side")
+    if min(shape) < LEAST_VIEW_PX:
+        failed.append(f"views of {shape[1]} × {shape[0]} px, fewer than {LEAST_VIEW_PX} per side")
     problem = None
     if failed:
         problem = (
             f"no mask of {wanted.views} × {wanted.views} views meets every condition at "
             f"{distance_mm:.3g} mm from the sensor: {'; '.join(failed)}. "
-            "Take fewer views, a smaller f-number, finer film, or more room for the mask"
+            "Take fewer views, another f-number, finer film, or another distance of the mask"
         )
     pitch_mm = wanted.sensor.size_mm[1] / max(shape[1], 1)
     baseline = wanted.aperture_mm / wanted.views
@@ -208,7 +240,30 @@ def _finish(wanted: DesignRequirements, law: str, mask: Mask, distance_mm: float
         film_period_px=min(wanted.film.px_per_mm) / mask.frequency_per_mm,
         films=tuple(name for name, film in FILMS.items() if _prints(film, wanted, mask)),
         problem=problem,
+        warnings=tuple(_warnings(wanted, mask, lattice, shape)),
     )
+
+
+def _of_hardware(wanted: DesignRequirements, distance_mm: float) -> list[Condition]:
+    """What camera and lens allow, as far as it is known."""
+    found = []
+    if wanted.least_distance_mm:
+        found.append(
+            Condition("mask as near as it can be mounted", distance_mm, wanted.least_distance_mm, "mm", at_least=True)
+        )
+    if wanted.f_numbers is not None:
+        widest, narrowest = wanted.f_numbers
+        found.append(Condition("f-number as the lens opens", wanted.f_number, widest, "", at_least=True))
+        found.append(Condition("f-number as the lens stops down", wanted.f_number, narrowest, ""))
+    return found
+
+
+def _warnings(wanted: DesignRequirements, mask: Mask, lattice: Lattice, shape: tuple[int, int]) -> Iterator[str]:
+    if LEAST_VIEW_PX <= min(shape) < SMALL_VIEW_PX:
+        yield f"views of {shape[1]} × {shape[0]} px show little more than large shapes: depth will be coarse"
+    beyond = beyond_mask(mask, wanted.sensor, lattice)
+    if beyond is not None:
+        yield beyond
 
 
 def _prints(film: Film, wanted: DesignRequirements, mask: Mask) -> bool:

@@ -202,4 +202,4 @@ def _cover(extent: tuple[float, float, float, float], grid: FineGrid, margin: tu
         n = grid.shape[axis] * FINER
         at = np.arange(n + 2 * margin[axis]) - margin[axis] - (n - 1) / 2
         sides.append(np.clip(np.minimum(at - low * n, high * n - at) + 0.5, 0, 1))
-    return np.outer(*sides).astype(np.float32)
+    return np.asarray(np.outer(sides[0], sides[1]), dtype=np.float32)
