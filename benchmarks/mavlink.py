@@ -31,7 +31,7 @@ import tomli_w
 
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
-from dappled.drivers.mavlink import Message, mavlink, pack
+from dappled.drivers.mavlink import MavlinkMessage, mavlink, pack
 from dappled.flight import flight_report
 from dappled.mocks.simulation import Simulation, World, free_port
 
@@ -214,10 +214,10 @@ class Station:
         self._sequence += 1
         return self._sequence
 
-    def _send(self, message: Message) -> None:
+    def _send(self, message: MavlinkMessage) -> None:
         self._socket.send(pack(message, self._packer, version_1=False))
 
-    def _hear(self, timeout_s: float, kind: str) -> tuple[int, Message] | None:
+    def _hear(self, timeout_s: float, kind: str) -> tuple[int, MavlinkMessage] | None:
         """The next message of this type with the kernel's time of its arrival (ns UTC)."""
         until = time.monotonic() + timeout_s
         while (left := until - time.monotonic()) > 0:

@@ -27,7 +27,7 @@ from dappled.daemon.navigation.clocks import exposure_from_camera, mid_exposure
 from dappled.daemon.navigation.samples import AttitudeSample, PositionSample, attitude, position
 from dappled.daemon.navigation.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
 from dappled.decode.geometry import Pose, metres_per_radian, turn_rad
-from dappled.drivers.mavlink import Message, PacketParser, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink
 from dappled.flight import log_reading
 from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
 from dappled.mocks.autopilot.path import FlightPath
@@ -174,7 +174,7 @@ def _take(called_s: float, rng: random.Random) -> Taken:
     return Taken(called_s, called_s + latency_s + EXPOSURE_S / 2)
 
 
-def _packets(path: FlightPath, taken: Sequence[Taken], rng: random.Random) -> Iterator[tuple[int, Message]]:
+def _packets(path: FlightPath, taken: Sequence[Taken], rng: random.Random) -> Iterator[tuple[int, MavlinkMessage]]:
     """(arrival UTC, message): telemetry, TIMESYNC at 5 Hz, a hot-shoe feedback for each frame."""
     boot = BootTime(drift=DRIFT)
     end_s = taken[-1].middle_s + 2
@@ -206,7 +206,7 @@ def _packets(path: FlightPath, taken: Sequence[Taken], rng: random.Random) -> It
         yield _utc_ns(contact_s + delay_s()), _headed(message)
 
 
-def _received(message: Message, t_s: float, phase: Sequence[float]) -> Message:
+def _received(message: MavlinkMessage, t_s: float, phase: Sequence[float]) -> MavlinkMessage:
     """With the receiver's slow error: each axis a sine of one minute, both together RECEIVER_SIGMA_M rms."""
     north_m, east_m = metres_per_radian(math.radians(message.lat / 1e7), message.alt / 1e3)
     for name, metres, shift in (("lat", north_m, phase[0]), ("lon", east_m, phase[1])):
@@ -215,7 +215,7 @@ def _received(message: Message, t_s: float, phase: Sequence[float]) -> Message:
     return message
 
 
-def _headed(message: Message, component: int = 1) -> Message:
+def _headed(message: MavlinkMessage, component: int = 1) -> MavlinkMessage:
     message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=component))
     return message
 

@@ -15,7 +15,7 @@ from dappled.daemon.navigation import BodyLatency, Telemetry, clocks
 from dappled.daemon.pipeline import tagging
 from dappled.daemon.pipeline.tagging import FrameSettings
 from dappled.decode.geometry import Pose
-from dappled.drivers.mavlink import Message, PacketParser, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink
 from dappled.flight import Cause, LedgerReader, Result, Shot, recording
 from dappled.flight.check import check
 from dappled.mocks.autopilot.autopilot import BootTime, flight
@@ -27,7 +27,7 @@ from tests.flight.makers import held
 START_NS = 1_790_000_000 * 10**9
 PATH = FlightPath(3, speed_m_s=8.0)
 LATENCY = BodyLatency(60.0, 15.0, "test")  # what `again` replays with
-Packets = Iterator[tuple[float, Message]]
+Packets = Iterator[tuple[float, MavlinkMessage]]
 LINK_S = 0.005
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled.drivers.mavlink import Message, PacketParser, mavlink, pack
+from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink, pack
 from dappled.flight import layout, log_reading
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import free_port
@@ -58,7 +58,7 @@ class Ground:
         """Ask for an image by its index."""
         self._send((255, 190), mavlink.MAVLink_command_long_message(1, 100, 512, 0, 263, index, 0, 0, 0, 0, 0))
 
-    def _send(self, who: tuple[int, int], message: Message) -> None:
+    def _send(self, who: tuple[int, int], message: MavlinkMessage) -> None:
         with self._lock:
             self._socket.sendto(pack(message, self._packers[who], version_1=False), self._to)
 
@@ -73,7 +73,7 @@ class Ground:
             except TimeoutError:
                 continue
 
-    def _hear(self, message: Message | None) -> None:
+    def _hear(self, message: MavlinkMessage | None) -> None:
         if message is None or message.get_srcComponent() != 100:
             return
         kind = message.get_type()

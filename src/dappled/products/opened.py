@@ -41,8 +41,46 @@ class OpenError(DappledError):
     """A path can't be opened, or lacks what was requested of it; one sentence."""
 
 
+class Refocusable:
+    """What a light field can be asked for, and a raw frame too: it is decoded for it."""
+
+    def _decoded(self) -> OpenedLightField:
+        raise NotImplementedError
+
+    @property
+    def views(self) -> NDArray[np.float32]:
+        """float32 (V, U, h, w) or (V, U, h, w, 3), linear, 1.0 = sensor white."""
+        return self._decoded().field.views
+
+    def refocus(
+        self,
+        *,
+        alpha: float | None = None,
+        disparity: float | None = None,
+        distance_m: float | None = None,
+        aperture: float | None = None,
+        tilt: tuple[float, float] = (0.0, 0.0),
+    ) -> NDArray[np.float32]:
+        """Return the picture focused at one α (Eq 29), disparity or distance; without one, as it was taken.
+
+        `aperture` is the diameter of a round synthetic aperture as a share of the whole; `tilt` the change of
+        disparity over the picture's height and width. float32 (h, w) or (h, w, 3), NaN where no view sees.
+        """
+        one = self._decoded()
+        at = one.disparity_of(alpha=alpha, disparity=disparity, distance_m=distance_m)
+        weights = None if aperture is None else refocusing.disc(one.stack, aperture)
+        return refocusing.tilted(one.stack, FocalPlane(at, *tilt), weights=weights, workers=one.workers)
+
+    def depth(
+        self, method: str = "combined", *, between: tuple[float, float] | None = None, window: int = depths.WINDOW
+    ) -> DepthMap:
+        """Return disparities with standard errors and confidence, NaN where unknown; `method` is one of `METHODS`."""
+        one = self._decoded()
+        return depths.estimate(one.evidence, method, between=between, window=window, workers=one.workers)
+
+
 @dataclass(frozen=True)
-class OpenedLightField:
+class OpenedLightField(Refocusable):
     """A decoded light field. `field` is the plain value, `path` the file or folder that it was read from.
 
     `focus_m` is the distance at which the lens was focused (inf: infinity), for metres without a calibration.
@@ -53,10 +91,8 @@ class OpenedLightField:
     focus_m: float | None = None
     workers: int = 2
 
-    @property
-    def views(self) -> NDArray[np.float32]:
-        """float32 (V, U, h, w) or (V, U, h, w, 3), linear, 1.0 = sensor white."""
-        return self.field.views
+    def _decoded(self) -> OpenedLightField:
+        return self
 
     @property
     def slices(self) -> NDArray[np.complex64]:
@@ -123,30 +159,6 @@ class OpenedLightField:
             )
         return self.ranging
 
-    def refocus(
-        self,
-        *,
-        alpha: float | None = None,
-        disparity: float | None = None,
-        distance_m: float | None = None,
-        aperture: float | None = None,
-        tilt: tuple[float, float] = (0.0, 0.0),
-    ) -> NDArray[np.float32]:
-        """Return the picture focused at one α (Eq 29), disparity or distance; without one, as it was taken.
-
-        `aperture` is the diameter of a round synthetic aperture as a share of the whole; `tilt` the change of
-        disparity over the picture's height and width. float32 (h, w) or (h, w, 3), NaN where no view sees.
-        """
-        at = self.disparity_of(alpha=alpha, disparity=disparity, distance_m=distance_m)
-        weights = None if aperture is None else refocusing.disc(self.stack, aperture)
-        return refocusing.tilted(self.stack, FocalPlane(at, *tilt), weights=weights, workers=self.workers)
-
-    def depth(
-        self, method: str = "combined", *, between: tuple[float, float] | None = None, window: int = depths.WINDOW
-    ) -> DepthMap:
-        """Return disparities with standard errors and confidence, NaN where unknown; `method` is one of `METHODS`."""
-        return depths.estimate(self.evidence, method, between=between, window=window, workers=self.workers)
-
     def distances(self, depth: DepthMap) -> DistanceMap:
         """Return a depth map in metres with standard errors. Raises DappledError as `metres`."""
         return self.metres().distances(depth, self.stack)
@@ -161,7 +173,7 @@ class OpenedLightField:
 
 
 @dataclass(frozen=True)
-class OpenedFrame:
+class OpenedFrame(Refocusable):
     """A raw frame, decoded once, by `light_field`. `tag` says when and where it was taken; None outside a flight."""
 
     path: Path
@@ -177,30 +189,8 @@ class OpenedFrame:
         made = self.darkroom.decode(self.path, focal_length_mm=length, f_number=stop)
         return OpenedLightField(made.light_field, self.path, self.focus_m)
 
-    @property
-    def views(self) -> NDArray[np.float32]:
-        """The light field's views."""
-        return self.light_field.views
-
-    def refocus(
-        self,
-        *,
-        alpha: float | None = None,
-        disparity: float | None = None,
-        distance_m: float | None = None,
-        aperture: float | None = None,
-        tilt: tuple[float, float] = (0.0, 0.0),
-    ) -> NDArray[np.float32]:
-        """As `OpenedLightField.refocus`."""
-        return self.light_field.refocus(
-            alpha=alpha, disparity=disparity, distance_m=distance_m, aperture=aperture, tilt=tilt
-        )
-
-    def depth(
-        self, method: str = "combined", *, between: tuple[float, float] | None = None, window: int = depths.WINDOW
-    ) -> DepthMap:
-        """As `OpenedLightField.depth`."""
-        return self.light_field.depth(method, between=between, window=window)
+    def _decoded(self) -> OpenedLightField:
+        return self.light_field
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.drivers.camera import Setting, SettingName
-from dappled.drivers.mavlink import MavlinkLinks, Message, Packet, Signing, mavlink, pack
+from dappled.drivers.mavlink import MavlinkLinks, MavlinkMessage, Packet, Signing, mavlink, pack
 from dappled.flight import Cause, Shot
 from dappled.flight.layout import DiskSpace
 from tests.daemon.fakes import eventually
@@ -189,7 +189,7 @@ class Peer:
         self.packer = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(("127.0.0.1", port))
-        self.heard: list[Message] = []
+        self.heard: list[MavlinkMessage] = []
         self._decode = mavlink.MAVLink(None).decode
 
     def __enter__(self) -> Peer:
@@ -200,13 +200,13 @@ class Peer:
     ) -> None:
         self._socket.close()
 
-    def packed(self, message: Message, *, version_1: bool = False) -> bytes:
+    def packed(self, message: MavlinkMessage, *, version_1: bool = False) -> bytes:
         return pack(message, self.packer, version_1=version_1)
 
     def raw(self, data: bytes) -> None:
         self._socket.send(data)
 
-    def send(self, message: Message) -> None:
+    def send(self, message: MavlinkMessage) -> None:
         self.raw(self.packed(message))
 
     def heartbeat(self) -> None:
@@ -218,7 +218,7 @@ class Peer:
         padded = (*parameters, *[0.0] * (7 - len(parameters)))
         self.send(mavlink.MAVLink_command_long_message(*target, name, confirmation, *padded))
 
-    def until(self, wanted: Callable[[Message], bool], what: str, timeout_s: float = 20.0) -> Message:
+    def until(self, wanted: Callable[[MavlinkMessage], bool], what: str, timeout_s: float = 20.0) -> MavlinkMessage:
         """The first message not returned yet that is wanted; others before it are kept in `heard` alone."""
         deadline = time.monotonic() + timeout_s
         while True:
@@ -238,7 +238,7 @@ class Peer:
         message = self.until(lambda m: m.get_type() == "COMMAND_ACK" and m.command == name, f"an answer to {name}")
         return int(message.result)
 
-    def one(self, kind: str) -> Message:
+    def one(self, kind: str) -> MavlinkMessage:
         """The next message of this type."""
         return self.until(lambda m: m.get_type() == kind, kind)
 

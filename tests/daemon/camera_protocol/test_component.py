@@ -18,7 +18,7 @@ from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters, code
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Setting, SettingName, check_change
-from dappled.drivers.mavlink import Message, Packet, mavlink, pack
+from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink, pack
 from dappled.flight.layout import DiskSpace
 from tests.daemon.camera_protocol.rig import NothingEarlier
 from tests.daemon.fakes import FakeSink
@@ -59,7 +59,7 @@ class Rig:
         self.packer = mavlink.MAVLink(None)
         self.copies = 1
         self.trusted = True
-        self.sent: list[Message] = []
+        self.sent: list[MavlinkMessage] = []
         self.well, self.critical = True, False
         self.clock = RecordedClock(10**18, 10**18 - 10**9)
         self.sink = FakeSink()
@@ -101,15 +101,15 @@ class Rig:
     def _decode(self, value: str) -> None:
         self.decode = value
 
-    def send(self, message: Message, link: int | None = None) -> bool:
+    def send(self, message: MavlinkMessage, link: int | None = None) -> bool:
         self.sent.append(message)
         return True
 
-    def of(self, kind: str) -> list[Message]:
+    def of(self, kind: str) -> list[MavlinkMessage]:
         """What was sent of this type."""
         return [m for m in self.sent if m.get_type() == kind]
 
-    def hear(self, message: Message, sender: tuple[int, int] = GCS, link: int = 0) -> None:
+    def hear(self, message: MavlinkMessage, sender: tuple[int, int] = GCS, link: int = 0) -> None:
         self.packer.srcSystem, self.packer.srcComponent = sender
         raw = pack(message, self.packer, version_1=False)
         for _ in range(self.copies):

@@ -8,7 +8,7 @@ import pytest
 
 from dappled.clock import RecordedClock
 from dappled.daemon.camera_protocol.earlier_outcomes import IndexedOutcomes, numbers
-from dappled.drivers.mavlink import Message, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.flight import Recording, recording
 from tests.daemon.camera_protocol.test_component import Rig
 from tests.flight.conftest import START_UTC_NS
@@ -37,17 +37,17 @@ def restarted(flights: Path, at_s: int) -> tuple[Recording, Rig]:
     return after, Rig(earlier=IndexedOutcomes(after.index))
 
 
-def reported(messages: list[Message]) -> list[tuple[int, int, str]]:
+def reported(messages: list[MavlinkMessage]) -> list[tuple[int, int, str]]:
     return [(m.image_index, m.capture_result, m.file_url) for m in messages if m.get_type() == "CAMERA_IMAGE_CAPTURED"]
 
 
-def texts(messages: list[Message]) -> list[str]:
+def texts(messages: list[MavlinkMessage]) -> list[str]:
     return [m.text for m in messages if m.get_type() == "STATUSTEXT"]
 
 
-def hear_out(rig: Rig, seconds: float) -> list[Message]:
+def hear_out(rig: Rig, seconds: float) -> list[MavlinkMessage]:
     """All that is sent in these seconds to a ground station that is there."""
-    said: list[Message] = []
+    said: list[MavlinkMessage] = []
     for _ in range(round(seconds / 0.02)):
         rig.hear(BEAT)
         rig.tick(0.02)

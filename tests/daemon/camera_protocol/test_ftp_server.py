@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.daemon.camera_protocol.ftp_server import FtpServer
-from dappled.drivers.mavlink import Message, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
 DATA = bytes(range(256)) * 40
 NONE, TERMINATE, RESET, LIST, OPEN, READ, CREATE, CRC32, BURST = 0, 1, 2, 3, 4, 5, 6, 14, 15
@@ -27,7 +27,7 @@ class Client:
 
     def send(self, payload: bytes) -> list[bytes]:
         message = mavlink.MAVLink_file_transfer_protocol_message(0, 1, 100, list(payload.ljust(251, b"\0")))
-        heard: Message = mavlink.MAVLink(None).decode(bytearray(message.pack(self.packer)))
+        heard: MavlinkMessage = mavlink.MAVLink(None).decode(bytearray(message.pack(self.packer)))
         replies = self.server.answer(heard, self.now_ns)
         for reply in replies:
             assert (reply.target_system, reply.target_component) == (255, self.packer.srcComponent)

@@ -19,7 +19,7 @@ from dappled.daemon.camera_protocol.parameters import (
     code,
 )
 from dappled.drivers.camera import Setting, SettingName
-from dappled.drivers.mavlink import Message, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
 
 class Body:
@@ -38,14 +38,14 @@ class Body:
         """Asked, and deaf."""
 
 
-def wanted(value: str) -> Message:
+def wanted(value: str) -> MavlinkMessage:
     """A PARAM_EXT_SET as it is received."""
     data = struct.pack("<I", code(value)).ljust(128, b"\0")
     sent = mavlink.MAVLink_param_ext_set_message(1, 100, b"CAM_ISO", data, TYPE)
     return mavlink.MAVLink(None).decode(bytearray(sent.pack(mavlink.MAVLink(None))))
 
 
-def results(replies: list[Message]) -> list[int]:
+def results(replies: list[MavlinkMessage]) -> list[int]:
     return [message.param_result for message in replies]
 
 

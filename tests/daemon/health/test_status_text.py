@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dappled.daemon.health.status_text import AGAIN_NS, AWAY_NS, PIECE_BYTES, Alarms, GroundStations, PilotMessages
-from dappled.drivers.mavlink import Message, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
 
 def test_a_problem_is_told_once_though_its_numbers_change_and_its_end_too() -> None:
@@ -35,7 +35,7 @@ def test_what_lasts_is_told_again_when_it_is_asked_for() -> None:
     assert alarms.lines([], again=True) == []
 
 
-def heartbeat(system: int, kind: int = mavlink.MAV_TYPE_GCS) -> Message:
+def heartbeat(system: int, kind: int = mavlink.MAV_TYPE_GCS) -> MavlinkMessage:
     message = mavlink.MAVLink_heartbeat_message(kind, 8, 0, 0, 4, 3)
     packer = mavlink.MAVLink(None, system, 190)
     message.pack(packer)

@@ -12,7 +12,7 @@ import pytest
 
 from dappled.daemon.navigation import BodyLatency, BootClock, CameraClock, ExposureTime, Telemetry, clocks
 from dappled.daemon.navigation.clocks import Feedback, camera_time, exposure_from_camera, mid_exposure
-from dappled.drivers.mavlink import Message, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath
 
@@ -50,7 +50,7 @@ def test_what_is_far_off_or_of_two_minds_is_not_taken() -> None:
     assert clocks.choose_feedback([event(55)], ExposureTime(EXPECTED.utc_ns, 10 * MS, "given"), CLOCK) is None
 
 
-def made(message: Message, component: int = 1) -> Message:
+def made(message: MavlinkMessage, component: int = 1) -> MavlinkMessage:
     message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=component))
     return message
 
@@ -63,7 +63,7 @@ def test_feedback_in_either_epoch_places_the_frame(kind: str, epoch: str) -> Non
     telemetry = Telemetry()
     contact_s = 8.0585
 
-    def feed(t_s: float, message: Message) -> None:
+    def feed(t_s: float, message: MavlinkMessage) -> None:
         nonlocal number
         telemetry.feed(number, START_NS // 1000 + round(t_s * 1e6), made(message))
         number += 1

@@ -22,14 +22,14 @@ from dappled.decode.geometry import (
     turn_rad,
     turned_by_heading,
 )
-from dappled.drivers.mavlink import Message, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
 START_NS = 1_790_000_000 * 10**9
 LATENCY_NS = 3_000_000
 STEPS = 40  # of 100 ms
 
 
-def headed(message: Message, component: int = 1, system: int = 1) -> Message:
+def headed(message: MavlinkMessage, component: int = 1, system: int = 1) -> MavlinkMessage:
     message.pack(mavlink.MAVLink(None, srcSystem=system, srcComponent=component))
     return message
 
@@ -41,7 +41,7 @@ class Link:
         self.telemetry = Telemetry(**telemetry)  # type: ignore[arg-type]  # only floats are asked for here
         self.number = 0
 
-    def send(self, t_s: float, message: Message, component: int = 1, system: int = 1) -> None:
+    def send(self, t_s: float, message: MavlinkMessage, component: int = 1, system: int = 1) -> None:
         stamp_us = (START_NS + round(t_s * 1e9) + LATENCY_NS) // 1000
         self.telemetry.feed(self.number, stamp_us, headed(message, component, system))
         self.number += 1
@@ -57,7 +57,9 @@ class Link:
         return self.telemetry.pose_at(START_NS + LATENCY_NS + round(t_s * 1e9), sigma_ms * 1e6)
 
 
-def receiver(fix: int = 3, eph: int = 90, epv: int = 150, accuracies: tuple[int, int, int] = (0, 0, 0)) -> Message:
+def receiver(
+    fix: int = 3, eph: int = 90, epv: int = 150, accuracies: tuple[int, int, int] = (0, 0, 0)
+) -> MavlinkMessage:
     return mavlink.MAVLink_gps_raw_int_message(0, fix, 1, 1, 0, eph, epv, 0, 0, 14, 0, *accuracies)
 
 
@@ -93,7 +95,7 @@ def test_the_receivers_word_is_carried_along() -> None:
     ],
 )
 def test_without_accuracies_the_dilution_counts_and_without_that_nothing(
-    message: Message, horizontal_m: float | None, vertical_m: float | None
+    message: MavlinkMessage, horizontal_m: float | None, vertical_m: float | None
 ) -> None:
     link = Link()
     for step in range(STEPS):
@@ -134,7 +136,7 @@ def test_the_autopilots_own_attitude_accuracy_counts() -> None:
     assert math.sqrt(found[0] + found[3] + found[5]) == pytest.approx(0.02)
 
 
-def gimbal(t_s: float, flags: int, boot_s: float = 0.0) -> Message:
+def gimbal(t_s: float, flags: int, boot_s: float = 0.0) -> MavlinkMessage:
     """A head that looks 40° down, and 30° to the right of where its flags count from; turning right at 0.1 rad/s."""
     head = from_euler(0.0, math.radians(-40), math.radians(30) + 0.1 * t_s)
     return mavlink.MAVLink_gimbal_device_attitude_status_message(

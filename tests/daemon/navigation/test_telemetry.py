@@ -19,21 +19,21 @@ from dappled.daemon.navigation.clocks import TimesyncAnswer, from_arrivals, from
 from dappled.daemon.navigation.navigation import HISTORY_NS
 from dappled.daemon.navigation.vehicle_history import MOST_SAMPLES
 from dappled.decode.geometry import Pose, from_euler, hermite, metres_per_radian, normalised, slerp, turn_rad
-from dappled.drivers.mavlink import Message, PacketParser, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink
 from dappled.flight import digest
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 
 START_NS = 1_790_000_000 * 10**9
 BOOT = BootTime()
-Stamped = tuple[int, int, Message]
+Stamped = tuple[int, int, MavlinkMessage]
 
 
-def numbered(events: list[tuple[int, Message]]) -> list[Stamped]:
+def numbered(events: list[tuple[int, MavlinkMessage]]) -> list[Stamped]:
     return [(number, stamp, message) for number, (stamp, message) in enumerate(sorted(events, key=lambda e: e[0]))]
 
 
-def made(message: Message, component: int = 1) -> Message:
+def made(message: MavlinkMessage, component: int = 1) -> MavlinkMessage:
     """With a header, as received."""
     message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=component))
     return message

@@ -25,7 +25,7 @@ from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.daemon.service import Service
-from dappled.drivers.mavlink import Message, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.errors import DappledError
 from dappled.flight import digest, recording
 from tests.daemon.camera_protocol.rig import Peer
@@ -36,12 +36,12 @@ PLACES_DEG = {OURS: 47, THEIRS: 10}
 START_US = 1_790_000_000 * 10**6
 
 
-def position(system: int, boot_ms: int) -> Message:
+def position(system: int, boot_ms: int) -> MavlinkMessage:
     place = PLACES_DEG[system] * 10**7
     return mavlink.MAVLink_global_position_int_message(boot_ms, place, 8 * 10**7, 500_000, 100_000, 0, 0, 0, 0)
 
 
-def packets(seconds: int) -> Iterator[tuple[int, int, Message]]:
+def packets(seconds: int) -> Iterator[tuple[int, int, MavlinkMessage]]:
     """Both at ten a second; theirs is the first, and booted a minute earlier."""
     for step in range(seconds * 10):
         for turn, system in enumerate((THEIRS, OURS)):

@@ -17,7 +17,7 @@ from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.decode.geometry import Pose, field_of_view
 from dappled.drivers.camera import Identity
-from dappled.drivers.mavlink import Message, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.errors import DappledError, report
 from dappled.flight import ImageIndex, LedgerReader
 from dappled.flight.layout import DiskSpace
@@ -131,7 +131,7 @@ class CameraStatus:
         self._model, self._shutter, self._parameters, self._clock = model, shutter, parameters, clock
         self._component_id = component_id
         self._start_ns = clock.monotonic_ns()
-        self._messages: dict[int, Callable[[], Message]] = {
+        self._messages: dict[int, Callable[[], MavlinkMessage]] = {
             mavlink.MAVLINK_MSG_ID_CAMERA_INFORMATION: self.information,
             mavlink.MAVLINK_MSG_ID_CAMERA_SETTINGS: self.settings,
             mavlink.MAVLINK_MSG_ID_STORAGE_INFORMATION: self.disk,
@@ -139,7 +139,7 @@ class CameraStatus:
             mavlink.MAVLINK_MSG_ID_CAMERA_FOV_STATUS: self.view,
         }
 
-    def about(self, message_id: int) -> Message | None:
+    def about(self, message_id: int) -> MavlinkMessage | None:
         """The message of this id; None where the camera has none."""
         make = self._messages.get(message_id)
         return None if make is None else make()
@@ -161,7 +161,7 @@ class CameraStatus:
         """What is served over MAVLink FTP."""
         return {DEFINITION_PATH: self.definition().xml}
 
-    def information(self) -> Message:
+    def information(self) -> MavlinkMessage:
         """CAMERA_INFORMATION."""
         definition = self.definition()
         return _information(
@@ -171,15 +171,15 @@ class CameraStatus:
             definition=(definition.version, definition.uri(self._component_id)),
         )
 
-    def settings(self) -> Message:
+    def settings(self) -> MavlinkMessage:
         """CAMERA_SETTINGS."""
         return _settings(self.mode, self.zoom_percent(), self.boot_ms())
 
-    def disk(self) -> Message:
+    def disk(self) -> MavlinkMessage:
         """STORAGE_INFORMATION."""
         return _storage(self._model.storage(), self.boot_ms())
 
-    def status(self) -> Message:
+    def status(self) -> MavlinkMessage:
         """CAMERA_CAPTURE_STATUS."""
         now = self._shutter.statistics()
         return _capture_status(
@@ -190,7 +190,7 @@ class CameraStatus:
             boot_ms=self.boot_ms(),
         )
 
-    def view(self) -> Message:
+    def view(self) -> MavlinkMessage:
         """CAMERA_FOV_STATUS. Unknown: position INT32_MAX, angles and `q` NaN."""
         facts, pose = self._model.facts(), self._model.pose()
         attitude, ground = field_of_view.look(pose, self._model.mount)
@@ -227,7 +227,7 @@ class CameraStatus:
         return 100.0 * steps.index(zoom.value) / (len(steps) - 1)
 
 
-def image_captured(captured: Captured, boot_ms: int) -> Message:
+def image_captured(captured: Captured, boot_ms: int) -> MavlinkMessage:
     """CAMERA_IMAGE_CAPTURED (263). `q` is (w, x, y, z), vehicle body to north-east-down at mid-exposure.
 
     Unknown: time 0, position INT32_MAX (no place on Earth), `q` NaN.
@@ -258,7 +258,7 @@ def sensor_orientation(mount: Sequence[float]) -> int | None:
     return int(_FORWARD) if forward > 0.9 else None
 
 
-def distance_message(nearest: tuple[float, float], boot_ms: int, mount: Sequence[float]) -> Message | None:
+def distance_message(nearest: tuple[float, float], boot_ms: int, mount: Sequence[float]) -> MavlinkMessage | None:
     """DISTANCE_SENSOR (132) of a distance and its standard error in m; None where the camera looks aside, or the
     distance is out of the message's range."""
     distance_m, sigma_m = nearest
@@ -330,7 +330,7 @@ def _sensor_facts(settings: Settings, model: str) -> dict[str, Any]:
 
 def _information(
     facts: CameraFacts, boot_ms: int, *, zooms: bool = False, definition: tuple[int, str] | None = None
-) -> Message:
+) -> MavlinkMessage:
     """CAMERA_INFORMATION (259): takes photographs, has modes (photo, survey), and zooms where the lens can be set.
 
     `definition`: version and address of the camera definition file."""
@@ -355,12 +355,12 @@ def _information(
     )
 
 
-def _settings(mode: int, zoom_percent: float, boot_ms: int) -> Message:
+def _settings(mode: int, zoom_percent: float, boot_ms: int) -> MavlinkMessage:
     """CAMERA_SETTINGS (260). NaN for a zoom that can't be read; focus never can be."""
     return mavlink.MAVLink_camera_settings_message(boot_ms, mode, zoom_percent, _NAN)
 
 
-def _storage(disk: DiskSpace | None, boot_ms: int) -> Message:
+def _storage(disk: DiskSpace | None, boot_ms: int) -> MavlinkMessage:
     """STORAGE_INFORMATION (261) in MiB. READY, else ground stations disable the shutter; NOT_SUPPORTED: unknown."""
     if disk is None:
         return mavlink.MAVLink_storage_information_message(
@@ -385,7 +385,7 @@ def _storage(disk: DiskSpace | None, boot_ms: int) -> Message:
 
 def _capture_status(
     *, busy: bool, interval_s: float | None, image_count: int, disk: DiskSpace | None, boot_ms: int
-) -> Message:
+) -> MavlinkMessage:
     """CAMERA_CAPTURE_STATUS (262). image_status: bit 0 capturing now, bit 1 an interval runs."""
     return mavlink.MAVLink_camera_capture_status_message(
         boot_ms,

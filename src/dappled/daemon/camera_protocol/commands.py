@@ -14,7 +14,7 @@ from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
 from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
 from dappled.drivers.camera import CameraError
-from dappled.drivers.mavlink import Message, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
 ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
 DENIED = mavlink.MAV_RESULT_DENIED
@@ -40,7 +40,7 @@ class Command:
     broadcast: bool
 
     @classmethod
-    def of(cls, message: Message, link: int) -> Command:
+    def of(cls, message: MavlinkMessage, link: int) -> Command:
         """From a COMMAND_LONG or COMMAND_INT."""
         is_long = message.get_type() == "COMMAND_LONG"
         last = (message.param5, message.param6, message.param7) if is_long else (message.x, message.y, message.z)
@@ -74,7 +74,7 @@ class CommandAnswer:
     """The result of a command, messages that follow the acknowledgement, and text for the pilot."""
 
     result: int
-    then: tuple[Message, ...] = ()
+    then: tuple[MavlinkMessage, ...] = ()
     words: str | None = None
 
 

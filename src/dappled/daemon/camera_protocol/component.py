@@ -27,7 +27,7 @@ from dappled.daemon.camera_protocol.parameters import ParameterReply, Parameters
 from dappled.daemon.health.status_text import GroundStations, PilotMessages
 from dappled.daemon.pipeline.repeats import CaptureRequest, PacketDedup
 from dappled.daemon.pipeline.shutter import Shutter
-from dappled.drivers.mavlink import Message, Packet, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
 
 HEARTBEAT_NS = 10**9
 STATUS_NS = 100_000_000
@@ -176,7 +176,7 @@ class Component:
             for reply in self._files.answer(packet.message, self._clock.monotonic_ns()):
                 self._links.send(reply, packet.link)
 
-    def _is_for_us(self, message: Message) -> bool:
+    def _is_for_us(self, message: MavlinkMessage) -> bool:
         """Our system or all, our component or all."""
         systems = (0, self._links.system_id, self._identity.system_id)
         return message.target_system in systems and message.target_component in (0, self._links.component_id)

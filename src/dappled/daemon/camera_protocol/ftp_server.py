@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from dappled.drivers.mavlink import Message, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
 DATA_BYTES = 239
 SESSIONS = 8
@@ -53,7 +53,7 @@ class _Answered:
     """The last request of a client, its answer, and the session that it opened."""
 
     request: _Request
-    messages: list[Message]
+    messages: list[MavlinkMessage]
     opened: _Session | None
 
 
@@ -68,7 +68,7 @@ class FtpServer:
         self._sessions: dict[int, _Session] = {}
         self._last: dict[tuple[_Client, int], _Answered] = {}  # a retry gets the same answer
 
-    def answer(self, message: Message, now_ns: int) -> list[Message]:
+    def answer(self, message: MavlinkMessage, now_ns: int) -> list[MavlinkMessage]:
         """What to send back for a FILE_TRANSFER_PROTOCOL message. Time is monotonic."""
         client: _Client = (message.get_srcSystem(), message.get_srcComponent())
         request = _parse(bytes(message.payload))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.clock import SystemClock
-from dappled.drivers.mavlink import MavlinkLinks, Message, Packet, mavlink, open_signing
+from dappled.drivers.mavlink import MavlinkLinks, MavlinkMessage, Packet, mavlink, open_signing
 from dappled.errors import DappledError
 from dappled.workers import Loop
 
@@ -37,7 +37,7 @@ class Outcome:
     ok: bool
     reason: str | None
     ack_ms: float | None
-    captured: Message | None
+    captured: MavlinkMessage | None
 
 
 class GroundClient:
@@ -59,7 +59,7 @@ class GroundClient:
             signing=open_signing([key_file], key_file.with_name(f"{key_file.name}.time"), clock) if key_file else None,
         )
         self._changed = threading.Condition()
-        self._heard: deque[Message] = deque(maxlen=_KEPT)
+        self._heard: deque[MavlinkMessage] = deque(maxlen=_KEPT)
         self._camera: tuple[int, int] | None = None
         self._heart = Loop("ground heartbeat", self._beat)
         self._sequence = time.time_ns() // 10**8 % 2**23  # differs from a run just before; exact as a float
@@ -89,7 +89,7 @@ class GroundClient:
             assert self._camera is not None
             return self._camera
 
-    def request(self, message_id: int, parameter: float = 0.0, timeout_s: float = 2.0) -> Message | None:
+    def request(self, message_id: int, parameter: float = 0.0, timeout_s: float = 2.0) -> MavlinkMessage | None:
         """One message of the camera, by MAV_CMD_REQUEST_MESSAGE; None where it didn't arrive."""
         with self._listening() as heard:
             self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, float(message_id), parameter)
@@ -108,7 +108,7 @@ class GroundClient:
                     return int(ack.result), (time.monotonic_ns() - asked) / 1e6
         return None, None
 
-    def send_command(self, message: Message) -> None:
+    def send_command(self, message: MavlinkMessage) -> None:
         """Send one COMMAND_LONG. A simulated ground station with another way of sending overrides this."""
         self._links.sender.send(message)
 
@@ -165,7 +165,7 @@ class GroundClient:
                 )
         return Outcome(sequence, None, False, f"the camera reported nothing about it for {timeout_s:g} s", ack_ms, None)
 
-    def _mine(self, message: Message) -> bool:
+    def _mine(self, message: MavlinkMessage) -> bool:
         own = self._links.sender
         return message.target_system in (0, own.system_id) and message.target_component in (0, own.component_id)
 
@@ -201,11 +201,11 @@ class GroundClient:
 class _Listening:
     """A context in which no message is missed: it searches those that arrived since `with`."""
 
-    def __init__(self, changed: threading.Condition, heard: deque[Message]) -> None:
+    def __init__(self, changed: threading.Condition, heard: deque[MavlinkMessage]) -> None:
         self._changed = changed
         self._heard = heard
 
-    def __enter__(self) -> Callable[[Callable[[Message], bool], float], Message | None]:
+    def __enter__(self) -> Callable[[Callable[[MavlinkMessage], bool], float], MavlinkMessage | None]:
         with self._changed:
             self._known = {id(message) for message in self._heard}
             self._keep = list(self._heard)  # so that no id is used twice
@@ -214,8 +214,8 @@ class _Listening:
     def __exit__(self, *_: object) -> None:
         self._keep.clear()
 
-    def _wait(self, wanted: Callable[[Message], bool], timeout_s: float) -> Message | None:
-        def newer() -> Iterator[Message]:
+    def _wait(self, wanted: Callable[[MavlinkMessage], bool], timeout_s: float) -> MavlinkMessage | None:
+        def newer() -> Iterator[MavlinkMessage]:
             return (m for m in self._heard if id(m) not in self._known and wanted(m))
 
         with self._changed:

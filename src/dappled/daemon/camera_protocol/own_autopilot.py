@@ -7,7 +7,7 @@ from typing import Protocol
 
 from dappled.clock import Clock
 from dappled.daemon.pipeline.repeats import AutopilotCommands
-from dappled.drivers.mavlink import Message, Packet, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
 
 TIMESYNC_NS = 200_000_000
 STREAMS_NS = 5 * 10**9
@@ -28,7 +28,7 @@ class Links(Protocol):
     system_id: int
     component_id: int
 
-    def send(self, message: Message, link: int | None = None) -> bool: ...
+    def send(self, message: MavlinkMessage, link: int | None = None) -> bool: ...
 
 
 class SystemIdentity:
@@ -47,7 +47,7 @@ class SystemIdentity:
         self._start_ns = start_ns
         self._first_heard_ns: int | None = None
 
-    def heard(self, message: Message, link: int, now_ns: int) -> None:
+    def heard(self, message: MavlinkMessage, link: int, now_ns: int) -> None:
         """Take a HEARTBEAT. Times are monotonic."""
         if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID or message.type == mavlink.MAV_TYPE_GCS:
             return
@@ -104,7 +104,7 @@ class AutopilotRequests:
         if message_id in _WANTED:
             self._heard[message_id] = self._heard.get(message_id, 0) + 1
 
-    def due(self, system: int, now_ns: int, utc_ns: int) -> Iterator[Message]:
+    def due(self, system: int, now_ns: int, utc_ns: int) -> Iterator[MavlinkMessage]:
         """The requests that are due by now."""
         if now_ns >= self._time_due_ns:
             self._time_due_ns = now_ns + TIMESYNC_NS
@@ -128,7 +128,7 @@ class OwnAutopilot:
         self._commands = AutopilotCommands()
         self._requests = AutopilotRequests()
 
-    def heard(self, message: Message) -> None:
+    def heard(self, message: MavlinkMessage) -> None:
         """Count a message of its system."""
         self._requests.heard(message.get_msgId())
 
@@ -151,7 +151,7 @@ class OwnAutopilot:
         sent = self._links.send(mavlink.MAVLink_command_long_message(system, 1, number, 0, *seven), link)
         return None if sent else "its link takes no more messages"
 
-    def refusal(self, message: Message) -> str | None:
+    def refusal(self, message: MavlinkMessage) -> str | None:
         """A sentence where a COMMAND_ACK refuses a command of ours."""
         ours = message.get_srcSystem() == self.identity.system_id and message.target_component in (
             0,

@@ -14,7 +14,7 @@ from typing import Protocol
 from xml.sax.saxutils import escape, quoteattr
 
 from dappled.drivers.camera import CameraError, Setting, SettingName
-from dappled.drivers.mavlink import Message, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
 TYPE = mavlink.MAV_PARAM_EXT_TYPE_UINT32
 WAIT_NS = 5 * 10**9
@@ -111,7 +111,7 @@ class Parameters:
 class ParameterReply:
     """Messages for the link that asked, and text for the pilot."""
 
-    messages: tuple[Message, ...]
+    messages: tuple[MavlinkMessage, ...]
     words: str | None = None
 
 
@@ -141,7 +141,7 @@ class ParameterServer:
         parameters = self._parameters.all()
         return ParameterReply(tuple(_value(one, at, len(parameters)) for at, one in enumerate(parameters)))
 
-    def read(self, message: Message) -> ParameterReply:
+    def read(self, message: MavlinkMessage) -> ParameterReply:
         """PARAM_EXT_REQUEST_READ (320): by index, or by name where that is -1. No answer for an unknown one."""
         parameters = self._parameters.all()
         name, index = str(message.param_id), int(message.param_index)
@@ -152,7 +152,7 @@ class ParameterServer:
         ]
         return ParameterReply(tuple(found))
 
-    def changed(self) -> tuple[Message, ...]:
+    def changed(self) -> tuple[MavlinkMessage, ...]:
         """PARAM_EXT_VALUE of each setting that differs from the last call, for all ground stations; nothing the first
         time."""
         parameters = self._parameters.all()
@@ -165,7 +165,7 @@ class ParameterServer:
             if one.value != before.get(one.name, one.value)
         )
 
-    def set(self, message: Message, link: int, now_ns: int) -> ParameterReply:
+    def set(self, message: MavlinkMessage, link: int, now_ns: int) -> ParameterReply:
         """PARAM_EXT_SET (323). Time is monotonic."""
         name = str(message.param_id)
         parameter = self._parameters.find(name)
@@ -278,13 +278,13 @@ def code(value: str) -> int:
     return zlib.crc32(value.encode()) >> 2 | _WORDS_FROM
 
 
-def _value(parameter: Parameter, index: int, count: int) -> Message:
+def _value(parameter: Parameter, index: int, count: int) -> MavlinkMessage:
     return mavlink.MAVLink_param_ext_value_message(
         parameter.name.encode(), _packed(code(parameter.value)), TYPE, count, index
     )
 
 
-def _ack(name: str, value: int, result: int) -> Message:
+def _ack(name: str, value: int, result: int) -> MavlinkMessage:
     return mavlink.MAVLink_param_ext_ack_message(name.encode()[:16], _packed(value), TYPE, result)
 
 
@@ -292,7 +292,7 @@ def _packed(value: int) -> bytes:
     return struct.pack("<I", value).ljust(128, b"\0")
 
 
-def _number(message: Message) -> int | None:
+def _number(message: MavlinkMessage) -> int | None:
     """The value as a number: None for another type than ours."""
     if message.param_type != TYPE:
         return None

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from dappled.daemon.health.logbook import NewProblems
-from dappled.drivers.mavlink import Message, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
 PIECE_BYTES = 50
 LONGEST_BYTES = 4 * PIECE_BYTES
@@ -25,7 +25,7 @@ class PilotMessages:
         self._numbers = itertools.cycle(range(1, 65536))
         self._sent: deque[tuple[str, int]] = deque(maxlen=_REMEMBERED)
 
-    def messages(self, text: str, severity: int, now_ns: int) -> list[Message]:
+    def messages(self, text: str, severity: int, now_ns: int) -> list[MavlinkMessage]:
         """The messages of a sentence; none where it was sent just before. Time is monotonic."""
         if any(sent == text and now_ns - at_ns < AGAIN_NS for sent, at_ns in list(self._sent)):
             return []
@@ -64,7 +64,7 @@ class GroundStations:
         self._heard_ns: dict[tuple[int, int], int] = {}
         self._due_ns: int | None = None
 
-    def heard(self, message: Message, now_ns: int) -> None:
+    def heard(self, message: MavlinkMessage, now_ns: int) -> None:
         """Take note of a heartbeat."""
         if message.type != mavlink.MAV_TYPE_GCS:
             return
@@ -91,7 +91,7 @@ class GroundStations:
         return True
 
 
-def _pieces(text: str, severity: int, number: int) -> list[Message]:
+def _pieces(text: str, severity: int, number: int) -> list[MavlinkMessage]:
     """One message up to 50 bytes; else several with one number, of which the last is not full."""
     raw = text.encode("ascii", "replace")  # all ground stations show ASCII
     if len(raw) <= PIECE_BYTES:

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config.settings import CameraSettings
-from dappled.drivers.mavlink import Message
+from dappled.drivers.mavlink import MavlinkMessage
 from dappled.flight import Shot
 
 Array = NDArray[np.float64]
@@ -222,7 +222,7 @@ class Feedback:
     kind: str
 
 
-def feedback_boot_ns(message: Message, unix_minus_boot_ns: int | None) -> int | None:
+def feedback_boot_ns(message: MavlinkMessage, unix_minus_boot_ns: int | None) -> int | None:
     """When the contact closed, in time since boot; None for a GPS time before SYSTEM_TIME has given the offset."""
     time_us = int(message.time_usec)
     if time_us < EPOCH_US:

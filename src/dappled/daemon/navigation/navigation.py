@@ -42,7 +42,7 @@ from dappled.decode.geometry import (
     turn_rad,
     turned_by_heading,
 )
-from dappled.drivers.mavlink import Message, Packet
+from dappled.drivers.mavlink import MavlinkMessage, Packet
 from dappled.flight import LedgerReader, Recording
 
 HISTORY_NS = TIMESYNC_WINDOW_NS + 60 * 10**9
@@ -87,7 +87,7 @@ class Telemetry:
         self._counts = Counts()
         self._history = VehicleHistory(None, component_id, self._counts)
 
-    def feed(self, number: int, stamp_us: int, message: Message) -> None:
+    def feed(self, number: int, stamp_us: int, message: MavlinkMessage) -> None:
         """Take one packet. Numbers must rise. Messages that are not used only count."""
         with self._lock:
             while self._turns and self._turns[0][0] <= number:
@@ -263,7 +263,7 @@ def recorded_vehicles(ledger: LedgerReader) -> list[tuple[int, int]]:
     return [(packet, system_id) for packet, system_id in ledger.facts().get(_VEHICLES, [])]
 
 
-def first_position_utc_ns(packets: Iterable[tuple[int, int, Message]]) -> int | None:
+def first_position_utc_ns(packets: Iterable[tuple[int, int, MavlinkMessage]]) -> int | None:
     """When the first known position of a log arrived (its stamp), from (number, stamp_us, message), or None."""
     for _, stamp_us, message in packets:
         if message.get_type() == "GLOBAL_POSITION_INT" and (message.lat or message.lon):

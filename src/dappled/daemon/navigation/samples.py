@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 from dappled.decode.geometry import Gnss, Quaternion, Vector3, from_euler, normalised
-from dappled.drivers.mavlink import Message, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
 HALF_MS_NS = 500_000  # time_boot_ms is cut to whole milliseconds: the middle is used
 GIMBAL_COMPONENTS = frozenset({1, 154, 171, 172, 173, 174, 175})  # an autopilot reports for a gimbal without MAVLink
@@ -72,14 +72,14 @@ class GimbalSample:
     kind: str
 
 
-def boot_ns(message: Message) -> int:
+def boot_ns(message: MavlinkMessage) -> int:
     """A message's time since boot, from time_boot_ms or time_usec."""
     if message.get_type() == "ATTITUDE_QUATERNION_COV":
         return int(message.time_usec) * 1000
     return int(message.time_boot_ms) * 10**6 + HALF_MS_NS
 
 
-def position(number: int, stamp_ns: int, message: Message) -> PositionSample | None:
+def position(number: int, stamp_ns: int, message: MavlinkMessage) -> PositionSample | None:
     """A GLOBAL_POSITION_INT; None while the autopilot has no position."""
     if message.lat == 0 and message.lon == 0:
         return None
@@ -95,7 +95,7 @@ def position(number: int, stamp_ns: int, message: Message) -> PositionSample | N
     )
 
 
-def attitude(number: int, stamp_ns: int, message: Message) -> AttitudeSample | None:
+def attitude(number: int, stamp_ns: int, message: MavlinkMessage) -> AttitudeSample | None:
     """An attitude message; None while the autopilot has no attitude (NaN or zeros)."""
     kind, sigma_rad = message.get_type(), None
     if kind == "ATTITUDE":
@@ -115,7 +115,7 @@ def attitude(number: int, stamp_ns: int, message: Message) -> AttitudeSample | N
     return AttitudeSample(number, stamp_ns, boot_ns(message), turned, rates if known else None, sigma_rad)
 
 
-def gnss(number: int, stamp_ns: int, message: Message) -> GnssSample:
+def gnss(number: int, stamp_ns: int, message: MavlinkMessage) -> GnssSample:
     """A GPS_RAW_INT."""
     reported = Gnss(
         int(message.fix_type),
@@ -130,7 +130,7 @@ def gnss(number: int, stamp_ns: int, message: Message) -> GnssSample:
     return GnssSample(number, stamp_ns, reported)
 
 
-def gimbal(number: int, stamp_ns: int, message: Message, epoch: int = 0) -> GimbalSample | None:
+def gimbal(number: int, stamp_ns: int, message: MavlinkMessage, epoch: int = 0) -> GimbalSample | None:
     """A gimbal's attitude; None where it isn't valid. Roll and pitch are against the horizon in both messages."""
     kind = message.get_type()
     if kind == "MOUNT_ORIENTATION":

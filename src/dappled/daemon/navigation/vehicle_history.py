@@ -28,7 +28,7 @@ from dappled.daemon.navigation.samples import (
     GnssSample,
     PositionSample,
 )
-from dappled.drivers.mavlink import Message
+from dappled.drivers.mavlink import MavlinkMessage
 
 NEAREST_NS = 10 * 10**9
 POSITION_GAP_NS = 2_500_000_000
@@ -140,12 +140,12 @@ class AutopilotTime:
         """The packet number at which the boot began that was current below `limit`."""
         return self._boots[max(0, bisect_left(self._boots, limit) - 1)]
 
-    def system_time(self, message: Message) -> None:
+    def system_time(self, message: MavlinkMessage) -> None:
         """Take a SYSTEM_TIME of the autopilot."""
         if message.time_unix_usec > EPOCH_US and message.time_boot_ms > 0:
             self.unix_minus_boot_ns = message.time_unix_usec * 1000 - (message.time_boot_ms * 10**6 + HALF_MS_NS)
 
-    def timesync(self, number: int, stamp_ns: int, message: Message, *, from_autopilot: bool) -> None:
+    def timesync(self, number: int, stamp_ns: int, message: MavlinkMessage, *, from_autopilot: bool) -> None:
         """Take a TIMESYNC, request or answer."""
         if message.tc1 == 0:
             if message.get_srcComponent() == self._component_id and 0 <= stamp_ns - message.ts1 < 10**9:
@@ -203,7 +203,7 @@ class Gimbals:
         self._samples: list[GimbalSample] = []
         self.seen = 0
 
-    def feed(self, number: int, stamp_ns: int, message: Message) -> None:
+    def feed(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         """Take a packet of the vehicle's system. A sample with an older time is a late copy, or a gimbal that
         restarted."""
         if message.get_srcComponent() not in GIMBAL_COMPONENTS:
@@ -263,7 +263,7 @@ class VehicleHistory:
         self._receiver: list[GnssSample] = []
         self._feedbacks: list[Feedback] = []
 
-    def feed(self, number: int, stamp_ns: int, message: Message) -> None:
+    def feed(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         """Take a packet whose message is one of `USED_MESSAGES`. A packet of another vehicle changes nothing."""
         _HANDLERS[message.get_type()](self, number, stamp_ns, message)
 
@@ -312,34 +312,34 @@ class VehicleHistory:
             gimbal_boot_ns,
         )
 
-    def _position(self, number: int, stamp_ns: int, message: Message) -> None:
+    def _position(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         sample = telemetry_samples.position(number, stamp_ns, message)
         if sample is not None and self._believed(sample, message, self._positions):
             self.counts.positions += 1
             _keep(self._positions, sample)
 
-    def _attitude(self, number: int, stamp_ns: int, message: Message) -> None:
+    def _attitude(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         sample = telemetry_samples.attitude(number, stamp_ns, message)
         if sample is not None and self._believed(sample, message, self._attitudes):
             self.counts.attitudes += 1
             _keep(self._attitudes, sample)
 
-    def _gnss(self, number: int, stamp_ns: int, message: Message) -> None:
+    def _gnss(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if self._ours(message):
             _keep(self._receiver, telemetry_samples.gnss(number, stamp_ns, message))
 
-    def _gimbal(self, number: int, stamp_ns: int, message: Message) -> None:
+    def _gimbal(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if message.get_srcSystem() == self.system_id:
             self.gimbals.feed(number, stamp_ns, message)
 
-    def _system_time(self, number: int, stamp_ns: int, message: Message) -> None:
+    def _system_time(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if self._ours(message):
             self.time.system_time(message)
 
-    def _timesync(self, number: int, stamp_ns: int, message: Message) -> None:
+    def _timesync(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         self.time.timesync(number, stamp_ns, message, from_autopilot=self._ours(message))
 
-    def _feedback(self, number: int, stamp_ns: int, message: Message) -> None:
+    def _feedback(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if not self._ours(message):
             return
         boot_ns, now_ns = feedback_boot_ns(message, self.time.unix_minus_boot_ns), self.time.now_boot_ns
@@ -348,7 +348,7 @@ class VehicleHistory:
         self.counts.feedbacks += 1
         _keep(self._feedbacks, Feedback(number, stamp_ns, boot_ns, message.get_type()))
 
-    def _ours(self, message: Message) -> bool:
+    def _ours(self, message: MavlinkMessage) -> bool:
         if message.get_srcComponent() != 1:
             return False
         if self.system_id is None and message.get_type() != "TIMESYNC":
@@ -358,7 +358,7 @@ class VehicleHistory:
     def _believed(
         self,
         sample: PositionSample | AttitudeSample,
-        message: Message,
+        message: MavlinkMessage,
         samples: list[PositionSample] | list[AttitudeSample],
     ) -> bool:
         """Whether a sample counts: our vehicle's, from after the last reboot, no copy, not out of order."""
@@ -371,7 +371,7 @@ class VehicleHistory:
         return True
 
 
-_HANDLERS: dict[str, Callable[[VehicleHistory, int, int, Message], None]] = {
+_HANDLERS: dict[str, Callable[[VehicleHistory, int, int, MavlinkMessage], None]] = {
     "GLOBAL_POSITION_INT": VehicleHistory._position,
     "ATTITUDE_QUATERNION": VehicleHistory._attitude,
     "ATTITUDE_QUATERNION_COV": VehicleHistory._attitude,

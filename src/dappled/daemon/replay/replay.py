@@ -18,7 +18,7 @@ from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_ut
 from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
 from dappled.daemon.replay.verifier import Expected, ReplayVerifier
 from dappled.decode.geometry import Pose
-from dappled.drivers.mavlink import Message, PacketParser
+from dappled.drivers.mavlink import MavlinkMessage, PacketParser
 from dappled.drivers.replay import RecordedShot
 from dappled.errors import DappledError
 from dappled.flight import (
@@ -258,7 +258,7 @@ def _recorded(digests: dict[int, tuple[str, str]], index: int) -> str | None:
     return None if found is None else found[0]
 
 
-def _packets(path: Path) -> Iterator[tuple[int, int, Message]]:
+def _packets(path: Path) -> Iterator[tuple[int, int, MavlinkMessage]]:
     decoder = PacketParser()
     for number, stamp_us, raw in log_reading.read_telemetry(path):
         message = decoder(raw)

@@ -7,7 +7,7 @@ from dappled.drivers.mavlink.channels import LinkError, parse
 from dappled.drivers.mavlink.links import (
     LinkStatistics,
     MavlinkLinks,
-    Message,
+    MavlinkMessage,
     Packet,
     PacketLog,
     PacketParser,
@@ -30,7 +30,7 @@ __all__ = [
     "LinkError",
     "LinkStatistics",
     "MavlinkLinks",
-    "Message",
+    "MavlinkMessage",
     "Packet",
     "PacketLog",
     "PacketParser",

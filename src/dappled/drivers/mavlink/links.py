@@ -26,7 +26,7 @@ __all__ = [
     "LinkError",
     "LinkStatistics",
     "MavlinkLinks",
-    "Message",
+    "MavlinkMessage",
     "Packet",
     "PacketLog",
     "PacketParser",
@@ -36,7 +36,7 @@ __all__ = [
     "pack",
 ]
 
-Message = Any  # pymavlink's message classes have no common typed base
+MavlinkMessage = Any  # pymavlink's message classes have no common typed base
 
 log = logging.getLogger(__name__)
 _MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
@@ -59,7 +59,7 @@ class Packet:
     number: int | None
     stamp_us: int
     link: int
-    message: Message
+    message: MavlinkMessage
     raw: bytes
     sent: bool = False
     trusted: bool = True
@@ -88,7 +88,7 @@ class PacketParser:
     def __init__(self) -> None:
         self._parser = mavlink.MAVLink(None)
 
-    def __call__(self, raw: bytes) -> Message | None:
+    def __call__(self, raw: bytes) -> MavlinkMessage | None:
         """Return the message, or None where the bytes are not one sound packet. An unknown id is `MAVLink_unknown`."""
         try:
             return self._parser.decode(bytearray(raw))
@@ -101,7 +101,7 @@ class Framed:
     """The bytes of one packet as they came, and its message."""
 
     raw: bytes
-    message: Message
+    message: MavlinkMessage
 
     @property
     def version(self) -> int:
@@ -192,7 +192,7 @@ def _next_magic(buffer: bytes, start: int) -> int:
     return min(places, default=len(buffer))
 
 
-def pack(message: Message, packer: Any, *, version_1: bool) -> bytes:
+def pack(message: MavlinkMessage, packer: Any, *, version_1: bool) -> bytes:
     """Pack a message with the packer's ids and next sequence number; in version 1 only where its id fits."""
     version_1 = version_1 and message.get_msgId() <= _MAX_ID_1
     raw: bytes = message.pack(packer, force_mavlink1=version_1)
@@ -237,7 +237,7 @@ class Link:
         self.packets_unsent = self.packets_unlogged = self.failures = 0
         self.last_heard_monotonic_ns: int | None = None
 
-    def packed(self, message: Message, system_id: int, component_id: int) -> bytes:
+    def packed(self, message: MavlinkMessage, system_id: int, component_id: int) -> bytes:
         """Pack a message from this component: signed where there is a key, else in the version that was heard."""
         self.packer.srcSystem, self.packer.srcComponent = system_id, component_id
         if self.guard is None:
@@ -291,7 +291,7 @@ class PacketSender:
         """Send from now on."""
         self._log = packet_log
 
-    def send(self, message: Message, link: int | None = None) -> bool:
+    def send(self, message: MavlinkMessage, link: int | None = None) -> bool:
         """Send on one link, or on all. False where no link took it. Never blocks, never raises for a lost link."""
         taken = False
         for each in self._links if link is None else self._links[link : link + 1]:
@@ -321,7 +321,7 @@ class PacketSender:
             link.failures += 1
             log.exception("A MAVLink packet (%s) could not be handled", packet.message.get_type())
 
-    def _send_on(self, link: Link, message: Message) -> bool:
+    def _send_on(self, link: Link, message: MavlinkMessage) -> bool:
         channel = link.channel
         if channel is None or self._log is None:
             link.packets_unsent += 1

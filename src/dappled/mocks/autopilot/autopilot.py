@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dappled.clock import SystemClock
-from dappled.drivers.mavlink import LinkError, MavlinkLinks, Message, Packet, mavlink
+from dappled.drivers.mavlink import LinkError, MavlinkLinks, MavlinkMessage, Packet, mavlink
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.workers import Loop
 
@@ -48,7 +48,7 @@ class BootTime:
         return round((self.offset_s + t_s) * (1 + self.drift) * 1e9)
 
 
-def telemetry_message(message_id: int, pose: TruePose, boot_ns: int, unix_us: int = 0) -> Message:
+def telemetry_message(message_id: int, pose: TruePose, boot_ns: int, unix_us: int = 0) -> MavlinkMessage:
     """One message of the vehicle's state, in the units, steps and whole milliseconds of MAVLink."""
     boot_ms, v = boot_ns // 10**6, pose.velocity_ned_m_s
     latitude, longitude = round(pose.latitude_deg * 1e7), round(pose.longitude_deg * 1e7)
@@ -79,7 +79,7 @@ def telemetry_message(message_id: int, pose: TruePose, boot_ns: int, unix_us: in
     raise ValueError(f"the simulated autopilot has no message {message_id}")
 
 
-def flight(path: FlightPath, boot: BootTime, start_s: float, stop_s: float) -> Iterator[tuple[float, Message]]:
+def flight(path: FlightPath, boot: BootTime, start_s: float, stop_s: float) -> Iterator[tuple[float, MavlinkMessage]]:
     """All telemetry of a stretch of flight, (simulation time, message) in order, without a link."""
     events = sorted(
         (start_s + step / rate, message_id)
@@ -97,13 +97,13 @@ class Flyer:
     path: FlightPath
     start_monotonic_ns: int
     boot: BootTime
-    send: Callable[[Message], object]
+    send: Callable[[MavlinkMessage], object]
     jitter_s: float = 0.0
     system_id: int = 1
     due_ns: dict[int, int] = field(default_factory=dict)
     interval_ns: dict[int, int] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
-    delayed: deque[tuple[int, Message]] = field(default_factory=deque)
+    delayed: deque[tuple[int, MavlinkMessage]] = field(default_factory=deque)
     random: random.Random = field(default_factory=lambda: random.Random(0))  # noqa: S311 (a simulation)
 
     def __post_init__(self) -> None:
@@ -161,7 +161,7 @@ class Flyer:
             self.interval_ns[int(number)] = max(round(interval_us * 1e3), round(1e9 / _FASTEST_HZ))
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
-    def _later(self, message: Message, now_ns: int) -> None:
+    def _later(self, message: MavlinkMessage, now_ns: int) -> None:
         if self.jitter_s <= 0 and not self.delayed:
             self.send(message)
             return

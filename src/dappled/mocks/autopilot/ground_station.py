@@ -17,7 +17,7 @@ import sys
 from collections.abc import Sequence
 
 from dappled.daemon.camera_protocol.ground_client import ACK_TRIES, GroundClient, GroundStationError, Outcome
-from dappled.drivers.mavlink import LinkError, Message, mavlink
+from dappled.drivers.mavlink import LinkError, MavlinkMessage, mavlink
 
 MANNERS = {
     "deaf": "hears no answer: it sends each command four times, always with confirmation 0",
@@ -33,7 +33,7 @@ class RudeClient(GroundClient):
         super().__init__(url)
         self._manners = manners
 
-    def send_command(self, message: Message) -> None:
+    def send_command(self, message: MavlinkMessage) -> None:
         """See `MANNERS`."""
         if "nan" in self._manners:
             for name in ("param5", "param6", "param7"):
