@@ -51,13 +51,30 @@ def test_modules_are_of_a_size_to_be_read() -> None:
     assert not {module: count for module, count in lines.items() if count > LINES_A_MODULE}
 
 
-def test_a_class_name_means_one_thing() -> None:
+def test_a_class_or_type_name_means_one_thing() -> None:
     found = defaultdict(list)
     for module in MODULES:
         for node in ast.parse(module.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                found[node.name].append(name(module))
+            for title in _types_made(node):
+                found[title].append(name(module))
     assert not {title: places for title, places in found.items() if len(places) > 1}
+
+
+def _types_made(node: ast.stmt) -> list[str]:
+    """The public class or type alias that a statement makes: `class A`, `A = NDArray[…]`, `A = int | str`."""
+    made = ""
+    if isinstance(node, ast.ClassDef):
+        made = node.name
+    elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+        title = node.targets[0].id
+        alias = isinstance(node.value, ast.Name | ast.Attribute | ast.Subscript | ast.BinOp)
+        made = title if alias and title[0].isupper() and not title.isupper() else ""
+    return [made] if made and not made.startswith("_") else []
+
+
+@pytest.mark.parametrize("line", ["class One: ...", "One = NDArray[np.float32]", "One = int | None", "One = Any"])
+def test_a_type_is_seen(line: str) -> None:
+    assert _types_made(ast.parse(line).body[0]) == ["One"]
 
 
 def test_other_rooms_import_a_face_where_there_is_one() -> None:

@@ -13,11 +13,12 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from dappled.config import profiles
+from dappled.decode.array_types import Singles
 from dappled.decode.optics.carriers import Lattice, Mask, Sensor
 from dappled.mocks.scene import lens, synthesis
 from dappled.mocks.scene.bench import Bench, WhiteCard, boards
 from dappled.mocks.scene.dng import Exif
-from dappled.mocks.scene.lens import Floats, Installation, Optics, Rays
+from dappled.mocks.scene.lens import Installation, Optics, Rays
 from dappled.mocks.scene.synthesis import Grid
 
 BLUE_FIRST: synthesis.Sites = (((0, 0), 2), ((0, 1), 1), ((1, 0), 1), ((1, 1), 1))
@@ -56,7 +57,7 @@ class MaskedFinePix:
         """Where the carriers lie, in cycles a row and cycles a half column."""
         return lens.carrier_lattice(self.optics, self.installed, self.chip)
 
-    def expose(self, scene: str, f_number: float, shot_number: int = 0) -> tuple[bytes, Floats]:
+    def expose(self, scene: str, f_number: float, shot_number: int = 0) -> tuple[bytes, Singles]:
         """(RAF, views float32 (5, 5, 3, h, w) at every `Grid.step` rows and half columns) of "white" or "bench"."""
         optics, chip, lattice = self.optics, self.chip, self.lattice
         grid = Grid.of(chip.shape, lattice)
@@ -105,7 +106,7 @@ def _inner(grid: Grid) -> tuple[int, int]:
     return rows.stop - rows.start, columns.stop - columns.start
 
 
-def _stored(blue: Floats, red: Floats) -> NDArray[np.float32]:
+def _stored(blue: Singles, red: Singles) -> NDArray[np.float32]:
     """(2948, 1856) the samples that exist, row by row as in the file, in the colours of `PATTERN`."""
     out = np.empty((blue.shape[0], blue.shape[1] // 2), dtype=np.float32)
     out[1::2] = blue[1::2, 1::2]

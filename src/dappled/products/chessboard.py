@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config.profiles import Lens
+from dappled.decode.array_types import Floats
 from dappled.decode.optics import Sensor
 from dappled.errors import DappledError
 from dappled.products.extras import need
 from dappled.products.maps import eye
 
-Floats = NDArray[np.float64]
 LEAST_BOARDS = 5
 _WORST_V = 0.02  # relative σ of v that is still a calibration
 _LEAST_SPREAD = math.radians(20)  # between the boards' directions

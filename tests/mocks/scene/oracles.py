@@ -7,11 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.array_types import Singles
 from dappled.decode.optics.carriers import Mask
 from dappled.mocks.autopilot.path import TruePose
 from dappled.mocks.scene import lens
 from dappled.mocks.scene.flyover import rotation
-from dappled.mocks.scene.lens import Floats
 from dappled.mocks.scene.masked_camera import Truth
 
 
@@ -30,7 +30,7 @@ def view_points_mm(truth: Truth, n: int) -> NDArray[np.float64]:
     return np.asarray(points @ np.array([[c, s], [-s, c]]))  # Rᵀ applied to each point
 
 
-def project(truth: Truth, points_mm: NDArray[np.float64]) -> Floats:
+def project(truth: Truth, points_mm: NDArray[np.float64]) -> Singles:
     """(..., h, w, 3): the light field at aperture points (..., 2), as far as the mask's carriers can tell.
 
     The views' angular spectrum is taken at the carriers' orders and summed back: what a perfect decoder gets that
@@ -48,7 +48,7 @@ def project(truth: Truth, points_mm: NDArray[np.float64]) -> Floats:
     return np.asarray(flat.reshape(*np.shape(points_mm)[:-1], *truth.views.shape[2:]))
 
 
-def band_views(truth: Truth, n: int) -> Floats:
+def band_views(truth: Truth, n: int) -> Singles:
     """(n, n, h, w, 3): `project` at `view_points_mm`. With n = 2p+1, as many samples, and κ = 1, the views."""
     return project(truth, view_points_mm(truth, n))
 

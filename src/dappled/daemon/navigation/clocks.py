@@ -24,13 +24,12 @@ from pathlib import Path
 from typing import Literal, Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dappled.config.settings import CameraSettings
+from dappled.decode.array_types import Floats
 from dappled.drivers.mavlink import MavlinkMessage
 from dappled.flight import Shot
 
-Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 LATENCY_SOURCE = "trigger call + body latency"
@@ -191,7 +190,7 @@ def from_timesync(answers: Sequence[TimesyncAnswer]) -> BootClock | None:
     )
 
 
-def _line(x: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]:
+def _line(x: Floats, y: Floats, weight: Floats) -> tuple[Floats, Floats, Floats]:
     """Weighted least squares with the prior: (level, slope), the inverse of the normal matrix, the residuals."""
     sides = np.stack([np.ones_like(x), x])
     inverse = np.asarray(np.linalg.inv((sides * weight) @ sides.T + _PRIOR), dtype=np.float64)

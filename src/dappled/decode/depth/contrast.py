@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from dappled.decode.depth.depth_map import DepthMap, Search, box, confidence, judged, peaked, windowed
+from dappled.decode.depth.depth_map import DepthMap, Search, Volume, box, confidence, judged, peaked, windowed
 from dappled.decode.depth.evidence import Evidence
 from dappled.decode.lightfield.light_field import centred
 from dappled.workers import each, spans
 
-Volume = NDArray[np.float32]
 _COARSEST = 0.04  # cycles/pixel: coarser detail carries no depth, and outweighs the detail that does
 _PAD = 16  # px
 _CHUNK = 6  # disparities whose spectra are in memory at once

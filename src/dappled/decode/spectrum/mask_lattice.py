@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from dappled.decode.array_types import Floats
 from dappled.decode.optics import Carrier, Lattice, Order
 from dappled.decode.optics.visibility import OrderStrength
 from dappled.decode.spectrum.lattice import Candidate, candidates
@@ -133,9 +134,6 @@ def should_stand(spectrum: Spectrum, expected: Sequence[OrderStrength]) -> list[
     return [one for one, level in zip(there, levels(spectrum, there), strict=True) if one.least > ABOVE_FLOOR * level]
 
 
-Matrix = NDArray[np.float64]
-
-
 def _hypotheses(
     peaks: PeakList, predicted: Lattice, asked: Sequence[OrderStrength], scales: float
 ) -> list[tuple[float, float]]:
@@ -155,13 +153,13 @@ def _hypotheses(
 
 def _likeliest(
     peaks: PeakList, predicted: Lattice, asked: Sequence[OrderStrength], hypotheses: Sequence[tuple[float, float]]
-) -> list[Matrix]:
+) -> list[Floats]:
     """The lattices (2, 2) in bins of the hypotheses that most peaks speak for, refitted to those peaks."""
     tree = cKDTree(peaks.places)
     information = -np.log(np.minimum(peaks.rank_density() * math.pi * 9.0, 1.0))
     base = predicted.matrix() * peaks.spectrum.padded
     orders = np.array([one.order for one in asked], dtype=np.float64)
-    ranked: list[tuple[float, int, Matrix]] = []
+    ranked: list[tuple[float, int, Floats]] = []
     for n, (scale, turn) in enumerate(hypotheses):
         matrix = scale * _turned(turn) @ base
         at = orders @ matrix
@@ -177,14 +175,14 @@ def _likeliest(
     return [matrix for _, _, matrix in ranked[:_BEST]]
 
 
-def _turned(turn_rad: float) -> Matrix:
+def _turned(turn_rad: float) -> Floats:
     """Turns orders: (ky, kx) counts from the row axis towards the column axis."""
     c, s = math.cos(turn_rad), math.sin(turn_rad)
     return np.array([[c, s], [-s, c]])
 
 
 def _judged(
-    peaks: PeakList, predicted: Lattice, asked: Sequence[OrderStrength], matrix: Matrix, tried: int
+    peaks: PeakList, predicted: Lattice, asked: Sequence[OrderStrength], matrix: Floats, tried: int
 ) -> MaskLattice | None:
     """A hypothesis with its lattice fitted to its peaks and its odds; None where these lie on no lattice of a mask."""
     spectrum = peaks.spectrum

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
+from dappled.decode.array_types import Singles
 from dappled.mocks.autopilot.path import TruePose
 from dappled.mocks.scene.landscape import noise
-from dappled.mocks.scene.lens import Floats, Optics, Rays, Rendering
+from dappled.mocks.scene.lens import Optics, Rays, Rendering
 
 TEXTURE_SIDE = 2048
 THREADS = 2
@@ -44,7 +45,7 @@ class Bench:
     """
 
     planes: tuple[TexturedPlane, ...]
-    texture: Floats
+    texture: Singles
     texel_mm: float
 
     @classmethod
@@ -70,7 +71,7 @@ class Bench:
         h, w = len(rays.y_mm), len(rays.x_mm)
         radiance = np.zeros((len(rays.aperture_mm), 3, h, w), dtype=np.float32)
 
-        def one(view: Floats, theta: NDArray[np.float64]) -> None:
+        def one(view: Singles, theta: NDArray[np.float64]) -> None:
             for number, plane in enumerate(self.planes):
                 self._lay(view, plane, number, rays, theta)
 
@@ -83,7 +84,7 @@ class Bench:
             depth = np.where(_cover(plane, rays, z, side) > 0.5, z, depth)
         return Rendering(radiance, depth.astype(np.float32))
 
-    def _lay(self, view: Floats, plane: TexturedPlane, number: int, rays: Rays, theta: NDArray[np.float64]) -> None:
+    def _lay(self, view: Singles, plane: TexturedPlane, number: int, rays: Rays, theta: NDArray[np.float64]) -> None:
         rays, where = _window(plane, rays, theta)
         view = view[:, *where]
         z, side = _meet(plane, rays, theta)
@@ -133,7 +134,7 @@ def _window(plane: TexturedPlane, rays: Rays, theta: NDArray[np.float64]) -> tup
 
 def _cover(
     plane: TexturedPlane, rays: Rays, z: NDArray[np.float64], side: tuple[NDArray[np.float64], NDArray[np.float64]]
-) -> Floats | float:
+) -> Singles | float:
     """How far each sample is covered, 0 to 1, with an edge one sample wide."""
     if plane.extent_mm is None:
         return 1.0
@@ -200,7 +201,7 @@ class RealViews:
     """Views (n, n, rows, columns, 3) that another camera took, shown to the sensor as they are: view (i, j) is what
     the aperture point of row i and column j sees. They are stretched over the frame."""
 
-    views: Floats
+    views: Singles
     size_mm: tuple[float, float]
 
     @classmethod

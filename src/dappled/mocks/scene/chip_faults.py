@@ -5,15 +5,15 @@ from __future__ import annotations
 import io
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
-Floats = NDArray[np.float32]
+from dappled.decode.array_types import Singles
+
 RGGB = np.array([[0, 1], [1, 2]])
 
 
-def mosaic_of(colours: Floats) -> Floats:
+def mosaic_of(colours: Singles) -> Singles:
     """(H, W) of colours (3, H, W): each pixel behind its own filter, red first."""
     out = np.empty(colours.shape[1:], dtype=np.float32)
     for y in (0, 1):
@@ -22,7 +22,7 @@ def mosaic_of(colours: Floats) -> Floats:
     return out
 
 
-def demosaiced(mosaic: Floats) -> Floats:
+def demosaiced(mosaic: Singles) -> Singles:
     """(H, W, 3): the missing colours as means of their nearest neighbours (bilinear), mirrored at the edges."""
     high, wide = mosaic.shape
     rows, columns = np.indices(mosaic.shape) % 2
@@ -35,7 +35,7 @@ def demosaiced(mosaic: Floats) -> Floats:
     return out
 
 
-def with_dust(light: Floats, specks: int, rng: np.random.Generator) -> Floats:
+def with_dust(light: Singles, specks: int, rng: np.random.Generator) -> Singles:
     """Round soft shadows of 3 to 12 px, up to a third deep, on the cover glass."""
     out = light.copy()
     y, x = np.indices(light.shape, dtype=np.float32)
@@ -46,17 +46,17 @@ def with_dust(light: Floats, specks: int, rng: np.random.Generator) -> Floats:
     return out
 
 
-def with_gain_drift(light: Floats, drift: float) -> Floats:
+def with_gain_drift(light: Singles, drift: float) -> Singles:
     """The gain rises by `drift` from the first row to the last; 1 in the middle."""
     return np.asarray(light * (1 + drift * np.linspace(-0.5, 0.5, len(light), dtype=np.float32)[:, None]))
 
 
-def with_banding(light: Floats, rms: float, rng: np.random.Generator) -> Floats:
+def with_banding(light: Singles, rms: float, rng: np.random.Generator) -> Singles:
     """Each row has an offset of its own, of `rms` of white."""
     return np.asarray(light + rng.normal(0, rms, (len(light), 1)).astype(np.float32))
 
 
-def with_hot_pixels(light: Floats, share: float, rng: np.random.Generator) -> Floats:
+def with_hot_pixels(light: Singles, share: float, rng: np.random.Generator) -> Singles:
     """That share of the pixels is at white whatever the light."""
     hot = rng.choice(light.size, size=round(share * light.size), replace=False)
     out = light.copy()
@@ -64,7 +64,7 @@ def with_hot_pixels(light: Floats, share: float, rng: np.random.Generator) -> Fl
     return out
 
 
-def with_noise(light: Floats, full_well_e: float, read_noise_e: float, rng: np.random.Generator) -> Floats:
+def with_noise(light: Singles, full_well_e: float, read_noise_e: float, rng: np.random.Generator) -> Singles:
     """Shot noise of `full_well_e` electrons at white (0: none) and read noise."""
     if full_well_e == 0:
         return light
@@ -72,13 +72,13 @@ def with_noise(light: Floats, full_well_e: float, read_noise_e: float, rng: np.r
     return np.asarray(light + np.sqrt(variance) * rng.standard_normal(light.shape, dtype=np.float32))
 
 
-def encoded(linear: Floats) -> Floats:
+def encoded(linear: Singles) -> Singles:
     """sRGB's tone curve (IEC 61966-2-1), 0 to 1."""
     x = np.clip(linear, 0, 1)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
-def jpeg_of(linear: Floats, quality: int) -> bytes:
+def jpeg_of(linear: Singles, quality: int) -> bytes:
     """An sRGB JPEG of linear light (H, W) or (H, W, 3), 1.0 = white."""
     file = io.BytesIO()
     Image.fromarray(np.rint(encoded(linear) * 255).astype(np.uint8)).save(file, "JPEG", quality=quality)

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from dappled.decode.array_types import Singles
 from dappled.decode.geometry import Quaternion
 from dappled.mocks.autopilot.path import TruePose
 from dappled.mocks.scene import landscape
 from dappled.mocks.scene.landscape import DETAIL_TEXEL_M, TEXEL_M, Landscape
-from dappled.mocks.scene.lens import Floats, Rays, Rendering
+from dappled.mocks.scene.lens import Rays, Rendering
 
 MARCH_STEP_M = 0.3
 THREADS = 2
@@ -85,7 +86,7 @@ class _Surface:
     """The part of the ground that is in the picture, its colours (3, rows, columns) at the detail map's texel, and the
     landscape's indices (row, column) of its first texel."""
 
-    colours: Floats
+    colours: Singles
     corner: tuple[int, int]
 
     @classmethod
@@ -101,7 +102,7 @@ class _Surface:
         texture = 1 + _look(ground.roughness, at) * detail
         return cls(np.stack([_look(albedo, at) * texture for albedo in ground.albedo]), (corner[0], corner[1]))
 
-    def look(self, at: Floats, out: Floats) -> None:
+    def look(self, at: Singles, out: Singles) -> None:
         """Colours (3, h, w) at (2, h, w) landscape indices, which are used up."""
         at -= np.array(self.corner, dtype=np.float32)[:, None, None]
         at *= np.float32(TEXEL_M / DETAIL_TEXEL_M)
@@ -113,11 +114,11 @@ class _Surface:
 class _Hits:
     """Where centre rays meet the ground, in map texels, and how the place moves for each metre of aperture (y, x)."""
 
-    depth_m: Floats
-    row: Floats
-    column: Floats
-    row_per_m: tuple[Floats, Floats]
-    column_per_m: tuple[Floats, Floats]
+    depth_m: Singles
+    row: Singles
+    column: Singles
+    row_per_m: tuple[Singles, Singles]
+    column_per_m: tuple[Singles, Singles]
 
 
 def _centre_hits(ground: Landscape, rays: Rays, pose: TruePose) -> _Hits:
@@ -130,11 +131,11 @@ def _centre_hits(ground: Landscape, rays: Rays, pose: TruePose) -> _Hits:
 
     home = np.float32(len(ground.relief) // 2)
 
-    def relief(depth: Floats, d_north: float = 0.0, d_east: float = 0.0) -> Floats:
+    def relief(depth: Singles, d_north: float = 0.0, d_east: float = 0.0) -> Singles:
         at = np.stack([-(north0 + d_north + north * depth), east0 + d_east + east * depth])
         return _look(ground.relief, at / np.float32(TEXEL_M) + home)
 
-    def above(depth: Floats) -> Floats:
+    def above(depth: Singles) -> Singles:
         return np.asarray(-(np.float32(down0) + down * depth) - relief(depth))
 
     # March from the level of the highest ground to the lowest's, keeping the last depth above and the first below.
@@ -185,7 +186,9 @@ def _centre_hits(ground: Landscape, rays: Rays, pose: TruePose) -> _Hits:
     )
 
 
-def _relief_range(ground: Landscape, pose: TruePose, north: Floats, east: Floats, down: Floats) -> tuple[float, float]:
+def _relief_range(
+    ground: Landscape, pose: TruePose, north: Singles, east: Singles, down: Singles
+) -> tuple[float, float]:
     """(lowest, highest) ground that the picture may show, with 5 cm to spare."""
     n = len(ground.relief)
     spans = []
@@ -200,7 +203,7 @@ def _relief_range(ground: Landscape, pose: TruePose, north: Floats, east: Floats
     return float(shown.min()) - 0.05, float(shown.max()) + 0.05
 
 
-def _look(plane: Floats, at: NDArray[np.floating]) -> Floats:
+def _look(plane: Singles, at: NDArray[np.floating]) -> Singles:
     """Bilinear value of a cyclic map at (2, h, w) indices."""
     out = np.empty(at.shape[1:], dtype=np.float32)
     ndimage.map_coordinates(plane, at, output=out, order=1, mode="grid-wrap", prefilter=False)

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-Floats = NDArray[np.float32]
+from dappled.decode.array_types import Singles
+
 Reflectance = tuple[float, float, float]
 
 EXTENT_M = 80.0
@@ -56,10 +57,10 @@ class Landscape:
     texture shows; all at TEXEL_M. `detail` (m, m) at DETAIL_TEXEL_M: fine texture of unit variance, clipped at ±2.2.
     """
 
-    albedo: Floats
-    relief: Floats
-    roughness: Floats
-    detail: Floats
+    albedo: Singles
+    relief: Singles
+    roughness: Singles
+    detail: Singles
     targets: tuple[GroundTarget, ...]
     mean_radiance: float
 
@@ -101,7 +102,7 @@ def build(seed: int, finest_period_m: float) -> Landscape:
     )
 
 
-def noise(rng: np.random.Generator, n: int, texel_m: float, *, slope: float, finest_m: float) -> Floats:
+def noise(rng: np.random.Generator, n: int, texel_m: float, *, slope: float, finest_m: float) -> Singles:
     """(n, n) cyclic noise of unit variance, clipped at ±2.2; amplitude falls as frequency^−slope to nothing finer than
     `finest_m` (metres a cycle)."""
     fy, fx = fft.fftfreq(n, texel_m), fft.rfftfreq(n, texel_m)
@@ -117,16 +118,21 @@ def noise(rng: np.random.Generator, n: int, texel_m: float, *, slope: float, fin
 class _Canvas:
     """The maps while they are painted."""
 
-    relief: Floats
-    albedo: Floats
-    rough: Floats
+    relief: Singles
+    albedo: Singles
+    rough: Singles
 
-    def paint(self, cover: Floats, colour: Reflectance, rough: float, shade: Floats | float = 1.0) -> None:
+    def paint(self, cover: Singles, colour: Reflectance, rough: float, shade: Singles | float = 1.0) -> None:
         """Cover the whole map, as far as `cover` (0 to 1) says."""
         self.stamp((slice(None), slice(None)), cover, colour, rough, shade)
 
     def stamp(
-        self, where: tuple[slice, slice], cover: Floats, colour: Reflectance, rough: float, shade: Floats | float = 1.0
+        self,
+        where: tuple[slice, slice],
+        cover: Singles,
+        colour: Reflectance,
+        rough: float,
+        shade: Singles | float = 1.0,
     ) -> None:
         """Cover a part of the map."""
         for plane, value in zip(self.albedo, colour, strict=True):
@@ -141,16 +147,16 @@ class _Patch:
     """A square window of the map around a place, not crossing the map's edge: where, and metres from the place."""
 
     where: tuple[slice, slice]
-    north: Floats
-    east: Floats
+    north: Singles
+    east: Singles
 
-    def turned(self, angle_rad: float) -> tuple[Floats, Floats]:
+    def turned(self, angle_rad: float) -> tuple[Singles, Singles]:
         """(along, across) in metres, axes turned by an angle."""
         c, s = math.cos(angle_rad), math.sin(angle_rad)
         return c * self.north + s * self.east, c * self.east - s * self.north
 
 
-def _patch(axis: Floats, north: float, east: float, radius: float) -> _Patch | None:
+def _patch(axis: Singles, north: float, east: float, radius: float) -> _Patch | None:
     """None where the window would cross an edge of the arrays."""
     n, reach = len(axis), math.ceil(radius / TEXEL_M)
     row, column = n // 2 + round(-north / TEXEL_M), n // 2 + round(east / TEXEL_M)
@@ -160,7 +166,7 @@ def _patch(axis: Floats, north: float, east: float, radius: float) -> _Patch | N
     return _Patch(where, (-axis[where[0]] - north)[:, None], (axis[where[1]] - east)[None, :])
 
 
-def _roads(canvas: _Canvas, north: Floats, east: Floats) -> None:
+def _roads(canvas: _Canvas, north: Singles, east: Singles) -> None:
     wave = 2 * np.pi * north / EXTENT_M
     road = east - 20 - 2.2 * np.sin(wave)
     path = east + 14 - 5.0 * np.sin(wave + 1.0)
@@ -176,7 +182,7 @@ def _roads(canvas: _Canvas, north: Floats, east: Floats) -> None:
         canvas.paint(_step(0.05 - np.abs(np.abs(line) - 1.7), 0.025) * clear, PAINT, 0.05)
 
 
-def _houses(canvas: _Canvas, rng: np.random.Generator, axis: Floats) -> None:
+def _houses(canvas: _Canvas, rng: np.random.Generator, axis: Singles) -> None:
     for number, (north, east) in enumerate(
         ((25, 8), (9, 30), (-9, 25), (-23, 9), (-20, -17), (2, -24), (24, -11), (10, 6))
     ):
@@ -199,7 +205,7 @@ def _houses(canvas: _Canvas, rng: np.random.Generator, axis: Floats) -> None:
         ground += _step(inside, 0.05) * (roof - ground)
 
 
-def _cars(canvas: _Canvas, rng: np.random.Generator, axis: Floats) -> None:
+def _cars(canvas: _Canvas, rng: np.random.Generator, axis: Singles) -> None:
     for number in range(10):
         along = -34 + 7.5 * number + rng.uniform(-1, 1)
         if number % 2:
@@ -225,7 +231,7 @@ def _cars(canvas: _Canvas, rng: np.random.Generator, axis: Floats) -> None:
         ground += _step(cabin, 0.15) * (top + 1.4 - ground)
 
 
-def _trees(canvas: _Canvas, rng: np.random.Generator, axis: Floats) -> None:
+def _trees(canvas: _Canvas, rng: np.random.Generator, axis: Singles) -> None:
     leaves = noise(rng, len(axis), TEXEL_M, slope=0.9, finest_m=0.25)
     for _ in range(120):
         north, east = rng.uniform(-38, 38, 2)
@@ -242,7 +248,7 @@ def _trees(canvas: _Canvas, rng: np.random.Generator, axis: Floats) -> None:
         ground += height * radius * crown * (1 + 0.1 * bumps) * (crown > 0)
 
 
-def _targets(canvas: _Canvas, rng: np.random.Generator, axis: Floats) -> tuple[GroundTarget, ...]:
+def _targets(canvas: _Canvas, rng: np.random.Generator, axis: Singles) -> tuple[GroundTarget, ...]:
     found: list[GroundTarget] = []
     for number in range(40):
         angle, radius = 2 * np.pi * number / 40, rng.uniform(22.5, 27.5)
@@ -262,7 +268,7 @@ def _targets(canvas: _Canvas, rng: np.random.Generator, axis: Floats) -> tuple[G
     return tuple(found)
 
 
-def _sunlight(relief: Floats) -> Floats:
+def _sunlight(relief: Singles) -> Singles:
     """Light on each texel: slope towards the sun, cast shadow, and sky."""
     norm = math.sqrt(sum(c * c for c in SUN))
     north, east, up = (c / norm for c in SUN)
@@ -280,11 +286,11 @@ def _sunlight(relief: Floats) -> Floats:
     return np.asarray(0.35 + 0.85 * np.clip(facing, 0, None) * (1 - shadow), dtype=np.float32)
 
 
-def _step(distance: Floats | NDArray[np.float64], half_width: float) -> Floats:
+def _step(distance: Singles | NDArray[np.float64], half_width: float) -> Singles:
     """0 below −half_width, 1 above +half_width, smooth between: edges that a lens could have made."""
     t = np.clip(np.asarray(distance, dtype=np.float32) / (2 * half_width) + 0.5, 0, 1)
     return np.asarray(t * t * (3 - 2 * t), dtype=np.float32)
 
 
-def _mix(a: Reflectance, b: Reflectance, share: Floats) -> Floats:
+def _mix(a: Reflectance, b: Reflectance, share: Singles) -> Singles:
     return np.stack([x + share * (y - x) for x, y in zip(a, b, strict=True)]).astype(np.float32)

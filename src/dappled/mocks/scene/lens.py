@@ -18,10 +18,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.array_types import Singles
 from dappled.decode.optics import LAWS, Lattice, Mask, Order, Sensor
 from dappled.mocks.autopilot.path import TruePose
-
-Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +119,8 @@ class Rendering:
     """The result of a scene: `radiance` (J, 3, h, w) red, green, blue in the scene's own scale; `depth_m` (h, w) along
     the axis as seen from the aperture's centre, None where it is unknown."""
 
-    radiance: Floats
-    depth_m: Floats | None
+    radiance: Singles
+    depth_m: Singles | None
 
 
 class Scene(Protocol):

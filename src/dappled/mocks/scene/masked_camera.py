@@ -14,12 +14,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.array_types import Singles
 from dappled.decode.optics import Lattice, Mask, Sensor
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.scene import dng, lens, synthesis
 from dappled.mocks.scene.bench import RealViews, WhiteCard, boards
 from dappled.mocks.scene.flyover import TerrainScene, finest_period_m
-from dappled.mocks.scene.lens import Floats, Installation, Optics, Rays, Rendering, Scene
+from dappled.mocks.scene.lens import Installation, Optics, Rays, Rendering, Scene
 from dappled.mocks.scene.synthesis import PASS, Grid
 
 MAKE, MODEL = "dappled", "Simulated Masked Camera"
@@ -152,7 +153,7 @@ class MaskedCamera:
         )
         return Rays(y, x, points_mm, self.optics.focal_length_mm, self.optics.focus_m)
 
-    def _masked(self, radiance: Floats, grid: Grid, lattice: Lattice, points_mm: NDArray[np.float64]) -> Floats:
+    def _masked(self, radiance: Singles, grid: Grid, lattice: Lattice, points_mm: NDArray[np.float64]) -> Singles:
         weights = lens.modulation(self.optics.mask)
         orders = list(weights)
         k = np.array(orders, dtype=np.float64)
@@ -260,7 +261,7 @@ class SensorModel:
         """Shape and pitch in the decoder's words."""
         return Sensor(self.shape, (self.pitch_mm, 0.0), (0.0, self.pitch_mm))
 
-    def develop(self, plane: Floats, rng: np.random.Generator) -> NDArray[np.uint16]:
+    def develop(self, plane: Singles, rng: np.random.Generator) -> NDArray[np.uint16]:
         """Light (1.0 = white) as the numbers of the raw file, with noise, clipped at white."""
         electrons = plane * np.float32(self.full_well_e)
         variance = np.full((), self.read_noise_e**2, dtype=np.float32)
@@ -284,10 +285,10 @@ class Truth:
     `kappa` = f_m·α·A: the used aperture in periods of the mask; 1 is the ideal. `lattice`: where the carriers lie.
     """
 
-    views: Floats
+    views: Singles
     aperture_points_mm: NDArray[np.float64]
-    depth_m: Floats | None
-    disparity_mm_per_mm: Floats | None
+    depth_m: Singles | None
+    disparity_mm_per_mm: Singles | None
     pose: TruePose | None
     mid_exposure_t_s: float
     kappa: float

@@ -16,10 +16,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.array_types import Singles
 from dappled.decode.optics import Lattice, Mask
 from dappled.mocks.scene import chip_faults
 from dappled.mocks.scene.printed_mask import WAVELENGTH_MM, left_by_diffraction, printed
-from dappled.mocks.scene.sharp_boards import FineGrid, Floats, SharpBoard, SharpScene
+from dappled.mocks.scene.sharp_boards import FineGrid, SharpBoard, SharpScene
 from dappled.mocks.scene.stops import StopPoints, StopShape, stop_points
 
 _STRIP = 64  # rows of pixels at a time, so that memory holds them
@@ -201,7 +202,7 @@ class RayCamera:
         )
         return RayFrame(np.clip(plane, 0, 1).astype(np.float32), truth)
 
-    def _summed(self, scene: SharpScene, colours: int) -> tuple[Floats, Floats]:
+    def _summed(self, scene: SharpScene, colours: int) -> tuple[Singles, Singles]:
         """(C, H, W) of light behind the mask on the pixels, and (N², C, H, W) the mean of each view's cell."""
         stop = self.open_stop
         theta = stop.points * self.aperture_mm
@@ -226,8 +227,8 @@ class RayCamera:
         return behind, views
 
     def _angular(
-        self, scene: SharpScene, theta: NDArray[np.float64], kernel: Floats, rows: slice, colours: int
-    ) -> Floats:
+        self, scene: SharpScene, theta: NDArray[np.float64], kernel: Singles, rows: slice, colours: int
+    ) -> Singles:
         """(R, C, rows, columns): light summed over the aperture's points, weighted by each row of a kernel (R, J)."""
         shape = (colours, rows.stop - rows.start, self.grid.shape[1])
         if scene.flat and self.cats_eye == 0:  # every point sees the same
@@ -246,7 +247,7 @@ class RayCamera:
             sums += kernel[:, line] @ lights.reshape(len(line), -1)
         return sums.reshape(len(kernel), *shape)
 
-    def _behind_mask(self, sums: Floats, light: Floats, nodes: NDArray[np.float64], rows: slice) -> Floats:
+    def _behind_mask(self, sums: Singles, light: Singles, nodes: NDArray[np.float64], rows: slice) -> Singles:
         """The light (C, rows, columns) with every order's wave added to its mean."""
         _, strengths, per_mm = self.orders()
         alphas = self._alphas()
@@ -272,7 +273,7 @@ class RayCamera:
         share = (y[:, None] ** 2 + x[None, :] ** 2) / (y[0] ** 2 + x[0] ** 2)
         return np.asarray((self.mask_distance_mm - self.bow_mm * share) / self.v_mm)
 
-    def _vignette(self, theta: NDArray[np.float64], light: Floats, rows: slice) -> None:
+    def _vignette(self, theta: NDArray[np.float64], light: Singles, rows: slice) -> None:
         """Take what the lens loses towards the corners from the light of one aperture point."""
         if self.falloff == 0 and self.cats_eye == 0:
             return
@@ -286,7 +287,7 @@ class RayCamera:
             reach = np.hypot(theta[0] + shift * y[:, None], theta[1] + shift * x[None, :])
             light *= reach <= self.aperture_mm / 2
 
-    def _disparity(self) -> Floats:
+    def _disparity(self) -> Singles:
         """(H, W) dx/dθ as the middle of the stop sees it."""
         out = np.zeros(self.shape, dtype=np.float32)
         for board in self.boards:
@@ -307,9 +308,9 @@ class RayTruth:
     """
 
     camera: RayCamera = field(repr=False)
-    views: Floats
+    views: Singles
     view_weights: NDArray[np.float64]
-    disparity: Floats
+    disparity: Singles
     clipped: float
 
 
@@ -317,7 +318,7 @@ class RayTruth:
 class RayFrame:
     """A frame (H, W), linear, 1.0 = white, and its truth."""
 
-    plane: Floats
+    plane: Singles
     truth: RayTruth = field(repr=False)
 
     def jpeg(self, quality: int = 90) -> bytes:
@@ -336,7 +337,7 @@ def _turn(angle_rad: float) -> NDArray[np.float64]:
     return np.array([[c, s], [-s, c]])
 
 
-def _lagrange(at: NDArray[np.float64], nodes: NDArray[np.float64]) -> list[Floats]:
+def _lagrange(at: NDArray[np.float64], nodes: NDArray[np.float64]) -> list[Singles]:
     """The weights, of `at`'s shape, that interpolate between values at the nodes."""
     found = []
     for i, node in enumerate(nodes):

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-Floats = NDArray[np.float32]
+from dappled.decode.array_types import Singles
+
 FINER = 2  # samples of a board for each of the fine grid, so that a shift between them costs little
 _DARKEST = 0.05  # of the mean: a textured board is nowhere black
 
@@ -35,7 +36,7 @@ class SharpBoard:
     exponent: float = 1.3
     contrast: float = 0.25
     finest: float | None = None
-    picture: Floats | None = None
+    picture: Singles | None = None
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class FineGrid:
         y, x = ((np.arange(n) - (n - 1) / 2) * p / self.finer for n, p in zip(self.shape, self.pitch_mm, strict=True))
         return y, x
 
-    def on_pixels(self, fine: Floats) -> Floats:
+    def on_pixels(self, fine: Singles) -> Singles:
         """(..., H, W): the mean over each pixel's square, of some rows of pixels or all."""
         return np.asarray(fine.reshape(*fine.shape[:-2], -1, self.finer, self.frame[1], self.finer).mean(axis=(-3, -1)))
 
@@ -69,7 +70,7 @@ class SharpScene:
 
     grid: FineGrid
     margin: tuple[int, int]
-    layers: tuple[tuple[float, Floats, Floats | None], ...]
+    layers: tuple[tuple[float, Singles, Singles | None], ...]
 
     @classmethod
     def of(
@@ -117,7 +118,7 @@ class SharpScene:
         return first, np.float32(at - first), self.grid.shape[axis] * FINER
 
 
-Halves = tuple[Floats, Floats]
+Halves = tuple[Singles, Singles]
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ class RowsSeen:
     scene: SharpScene
     boards: list[tuple[float, Halves, Halves | None]]
 
-    def seen_from(self, theta_mm: float, out: Floats) -> None:
+    def seen_from(self, theta_mm: float, out: Singles) -> None:
         """The light (C, rows, columns) on the fine grid from the aperture point at x = `theta_mm`, into `out`."""
         for disparity, light, cover in self.boards:
             first, part, count = self.scene.shift(disparity * theta_mm, 1)
@@ -139,16 +140,16 @@ class RowsSeen:
                 out += moved
 
 
-def _moved_rows(board: Floats, first: int, part: np.float32, count: int) -> Floats:
+def _moved_rows(board: Singles, first: int, part: np.float32, count: int) -> Singles:
     one, two = board[..., first : first + count : FINER, :], board[..., first + 1 : first + 1 + count : FINER, :]
     return np.asarray(one * (1 - part) + two * part)
 
 
-def _halves(board: Floats) -> Halves:
+def _halves(board: Singles) -> Halves:
     return np.ascontiguousarray(board[..., 0::2]), np.ascontiguousarray(board[..., 1::2])
 
 
-def _between(board: Halves, first: int, part: np.float32, count: int) -> Floats:
+def _between(board: Halves, first: int, part: np.float32, count: int) -> Singles:
     """Every second sample from `first` on, linear to its right neighbour."""
     one = board[first % 2][..., first // 2 : first // 2 + count // 2]
     two = board[(first + 1) % 2][..., (first + 1) // 2 : (first + 1) // 2 + count // 2]
@@ -157,7 +158,7 @@ def _between(board: Halves, first: int, part: np.float32, count: int) -> Floats:
 
 def _light(
     board: SharpBoard, grid: FineGrid, shape: tuple[int, int], rng: np.random.Generator, *, grey: bool
-) -> Floats:
+) -> Singles:
     colour = np.array(board.colour, dtype=np.float32)
     if board.picture is not None:
         high, wide = board.picture.shape[:2]
@@ -186,7 +187,7 @@ def _light(
     return np.asarray(colour[:, None, None] * (1 + texture), dtype=np.float32)
 
 
-def _through_lens(light: Floats, grid: FineGrid, cutoff_per_mm: float) -> Floats:
+def _through_lens(light: Singles, grid: FineGrid, cutoff_per_mm: float) -> Singles:
     """The incoherent transfer of a round lens: 2/π·(acos s − s·√(1 − s²)) at s = f/cutoff."""
     steps = [p / grid.finer / FINER for p in grid.pitch_mm]
     fy, fx = fft.fftfreq(light.shape[-2], steps[0])[:, None], fft.rfftfreq(light.shape[-1], steps[1])[None]
@@ -195,7 +196,7 @@ def _through_lens(light: Floats, grid: FineGrid, cutoff_per_mm: float) -> Floats
     return np.asarray(fft.irfft2(fft.rfft2(light, workers=2) * transfer, s=light.shape[-2:], workers=2))
 
 
-def _cover(extent: tuple[float, float, float, float], grid: FineGrid, margin: tuple[int, int]) -> Floats:
+def _cover(extent: tuple[float, float, float, float], grid: FineGrid, margin: tuple[int, int]) -> Singles:
     top, bottom, left, right = extent
     sides = []
     for axis, (low, high) in enumerate(((top, bottom), (left, right))):

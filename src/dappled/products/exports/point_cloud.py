@@ -15,6 +15,7 @@ import pyproj
 from numpy.typing import NDArray
 
 from dappled.config import profiles
+from dappled.decode.array_types import Floats
 from dappled.decode.depth import DistanceMap
 from dappled.decode.lightfield import LightField
 from dappled.errors import DappledError
@@ -22,8 +23,6 @@ from dappled.products.extras import need
 from dappled.products.maps.earth import Projection, utm
 from dappled.products.maps.eye import intrinsics
 from dappled.products.maps.photographs import Station, eye_of, lens_of
-
-Floats = NDArray[np.float64]
 
 
 class PointCloudError(DappledError):

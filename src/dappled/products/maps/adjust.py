@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
+from dappled.decode.array_types import Floats
 from dappled.products.maps.eye import Eye
 from dappled.products.maps.ground import Ground
 
-Floats = NDArray[np.float64]
 _ROBUST = 2.0  # sigmas up to which an observation has its full weight (Huber)
 _INLIER = 3.0
 _STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])  # metres, radians: for derivatives

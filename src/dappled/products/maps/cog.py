@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled import durable
+from dappled.decode.array_types import Singles
 from dappled.products.extras import need
-from dappled.products.maps.eye import Image
 from dappled.products.maps.map_grid import MapError, MapGrid
 
 TILE = 512
 
 
-def display(image: Image, gain: float) -> NDArray[np.uint8]:
+def display(image: Singles, gain: float) -> NDArray[np.uint8]:
     """(h, w, 2) grey and alpha, or (h, w, 4) red, green, blue and alpha: linear values times `gain` in sRGB's curve.
 
     NaN becomes transparent black.
@@ -30,7 +30,7 @@ def display(image: Image, gain: float) -> NDArray[np.uint8]:
     return np.concatenate([np.round(curve * 255), known[..., None] * 255], axis=2).astype(np.uint8)
 
 
-def gain_of(images: Iterable[Image]) -> float:
+def gain_of(images: Iterable[Singles]) -> float:
     """The gain that brings the brightest hundredth of these pictures to 0.9 of white."""
     brightest = [float(np.nanpercentile(image, 99)) for image in images]
     level = float(np.median(brightest)) if brightest else 0.0

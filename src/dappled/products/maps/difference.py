@@ -8,14 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.array_types import Singles
 from dappled.errors import DappledError
 from dappled.products.maps import cog, map_grid
-from dappled.products.maps.eye import Image
 from dappled.products.maps.georeference import Survey
 from dappled.products.maps.map_grid import MapGrid
 from dappled.products.maps.terrain import TerrainModel
-
-Single = NDArray[np.float32]
 
 
 class DifferenceError(DappledError):
@@ -29,7 +27,7 @@ class MapDifference:
     """
 
     grid: MapGrid
-    values: Single
+    values: Singles
     share: float
 
 
@@ -88,7 +86,7 @@ def _common(first: Survey, second: Survey) -> MapGrid:
     return a.part(slice(top, bottom), slice(left, right))
 
 
-def _whole(made: Survey, grid: MapGrid) -> Image:
+def _whole(made: Survey, grid: MapGrid) -> Singles:
     drawn = np.full(grid.shape, np.nan, dtype=np.float32)
     for rows, columns, values in map_grid.pieces(made.photographs, grid, made.ground, made.projection, made.focus_m):
         drawn[rows, columns] = values.mean(axis=2)

@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 import pyproj
-from numpy.typing import NDArray
 from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]  # both are documented
 from pyproj.exceptions import CRSError, ProjError
 
+from dappled.decode.array_types import Floats
 from dappled.errors import DappledError
 
-Floats = NDArray[np.float64]
 GEODETIC = "EPSG:4326"
 _OVERLAP_DEG = 6.0  # how far a projection may be used beyond the area that it was made for
 _SYSTEM_GRIDS = Path("/usr/share/proj")

@@ -14,15 +14,13 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dappled.config.profiles import Lens
+from dappled.decode.array_types import Floats
 from dappled.decode.optics import Sensor
 from dappled.errors import DappledError
 from dappled.products.maps.earth import GridAt
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
 _LOWEST = math.sin(math.radians(3))  # a ray that dips less counts as above the horizon
 
 

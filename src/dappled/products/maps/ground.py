@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.bounds import claims
+from dappled.decode.array_types import Floats
 from dappled.errors import DappledError, first_line
 from dappled.products.extras import need
 from dappled.products.maps.earth import Geoid, Projection, touch
 from dappled.products.maps.eye import Eye
 
-Floats = NDArray[np.float64]
 FLAT_SIGMA_M = 1.5  # from grass to roofs, where nothing better is known
 _STEPS = 400  # at most, along a ray through a raster
 

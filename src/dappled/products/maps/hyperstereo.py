@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from dappled.decode.array_types import Floats, Singles
 from dappled.errors import DappledError
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.map_grid import MapGrid, sample
 from dappled.products.maps.photographs import Photograph
 
-Floats = NDArray[np.float64]
-Single = NDArray[np.float32]
 LEAST_OVERLAP = 0.2  # of a frame, for a pair
 _PIXEL_SIGMA = 0.12  # of a match, in pixels
 _STEP_PX = 0.7  # of parallax between heights
@@ -40,9 +39,9 @@ class Surface:
     place that comes from uncertain poses."""
 
     grid: MapGrid
-    height_m: Single
-    sigma_m: Single
-    score: Single
+    height_m: Singles
+    sigma_m: Singles
+    score: Singles
     level_sigma_m: float = 0.0
 
     @property
@@ -185,7 +184,7 @@ def _parallax(one: Photograph, two: Photograph, east: Floats, north: Floats, lev
     return max(float(np.linalg.norm(raised - two.eye.project(place))), 1e-3)
 
 
-def _seen(one: Photograph, grey: Single, east: Floats, north: Floats, level: float) -> Single:
+def _seen(one: Photograph, grey: Singles, east: Floats, north: Floats, level: float) -> Singles:
     """The frame projected on a plane at a level; NaN outside of it."""
     points = np.stack([east.ravel(), north.ravel(), np.full(east.size, level)], axis=1)
     at = one.eye.project(points)
@@ -194,12 +193,12 @@ def _seen(one: Photograph, grey: Single, east: Floats, north: Floats, level: flo
     return sample(grey, np.where(inside[:, None], at, np.nan).reshape(*east.shape, 2))[..., 0]
 
 
-def _correlation(a: Single, b: Single, window: int) -> Single:
+def _correlation(a: Singles, b: Singles, window: int) -> Singles:
     """Normalised correlation in a window around each cell; NaN where either is unknown in a part of it."""
     known = np.isfinite(a) & np.isfinite(b)
     a, b = np.where(known, a, 0), np.where(known, b, 0)
 
-    def mean(values: Single) -> Single:
+    def mean(values: Singles) -> Singles:
         return np.asarray(ndimage.uniform_filter(values, window, mode="constant"), np.float32)
 
     whole = mean(known.astype(np.float32)) > 1 - 1e-4
@@ -210,6 +209,6 @@ def _correlation(a: Single, b: Single, window: int) -> Single:
     return np.where(whole, np.clip(score, -1, 1), np.nan).astype(np.float32)
 
 
-def _grey(one: Photograph) -> Single:
+def _grey(one: Photograph) -> Singles:
     image = np.asarray(one.image, dtype=np.float32)
     return np.ascontiguousarray(image.mean(axis=2) if image.ndim == 3 else image)[..., None]

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dappled import durable
+from dappled.decode.array_types import Floats
 from dappled.products.maps import cog, kmz, map_grid
 from dappled.products.maps.earth import GEODETIC, Projection
 from dappled.products.maps.georeference import Survey
@@ -19,8 +19,6 @@ from dappled.products.maps.ground import Ground
 from dappled.products.maps.kmz import Overlay
 from dappled.products.maps.map_grid import footprint, unwrapped
 from dappled.products.maps.photographs import Photograph
-
-Floats = NDArray[np.float64]
 
 LARGEST_KMZ = 16_384  # cells on a side: an overlay is held in memory as a whole
 

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.array_types import Floats, Singles
 from dappled.errors import DappledError
 from dappled.products.extras import need
 from dappled.products.maps.earth import GEODETIC, Projection, wrapped
-from dappled.products.maps.eye import Eye, Image, distorted
+from dappled.products.maps.eye import Eye, distorted
 from dappled.products.maps.ground import Flat, Ground
 from dappled.products.maps.photographs import Photograph
 
-Floats = NDArray[np.float64]
 LARGEST = 30_000  # cells on a side
 _NODE = 16  # cells between places that are transformed exactly when the map is in degrees
 _SHARPNESS = 8  # a frame's weight is its distance from the rim to this power: one frame shows at each place
@@ -114,7 +114,7 @@ def unwrapped(longitude_deg: Floats, near_deg: float) -> Floats:
     return np.asarray(near_deg + np.vectorize(wrapped)(longitude_deg - near_deg), dtype=np.float64)
 
 
-def sample(image: Image, at: Floats) -> Image:
+def sample(image: Singles, at: Floats) -> Singles:
     """float32 (rows, columns, c): an image (h, w, c) at pixels (rows, columns, 2); NaN where those are NaN."""
     cv2 = need("cv2")
     inside = np.isfinite(at[..., 0])
@@ -146,7 +146,7 @@ def seen_at(eye: Eye, grid: MapGrid, ground: Ground, projection: Projection) -> 
     return np.where(inside[:, None], at, np.nan).reshape(*grid.shape, 2)
 
 
-def smoothed(image: Image, eye: Eye, grid: MapGrid, ground: Ground) -> Image:
+def smoothed(image: Singles, eye: Eye, grid: MapGrid, ground: Ground) -> Singles:
     """The image (h, w, c), smoothed where the map is much coarser."""
     if image.ndim == 2:
         image = image[..., None]
@@ -156,7 +156,7 @@ def smoothed(image: Image, eye: Eye, grid: MapGrid, ground: Ground) -> Image:
     return smoothed_to(image, step_m / eye.gsd_m(level) if math.isfinite(level) else 1.0)
 
 
-def smoothed_to(image: Image, ratio: float) -> Image:
+def smoothed_to(image: Singles, ratio: float) -> Singles:
     """The image, smoothed for sampling at every `ratio`-th pixel; unchanged below 1.5."""
     if ratio < 1.5:
         return image
@@ -196,7 +196,7 @@ def pieces(
     ground: Ground,
     projection: Projection,
     focus_m: float = math.inf,
-) -> Iterator[tuple[slice, slice, Image]]:
+) -> Iterator[tuple[slice, slice, Singles]]:
     """Yield (rows, columns, float32 (h, w, c)) tiles that cover the grid; NaN where no frame looks.
 
     A frame's weight at a place grows with the distance from its own rim, so that each place is shown by the frame that
@@ -230,7 +230,7 @@ def pieces(
                 yield rows, columns, np.where(weight > 0, total / weight, np.nan).astype(np.float32)
 
 
-def _say(at: NDArray[np.float64], shape: tuple[int, int]) -> Image:
+def _say(at: NDArray[np.float64], shape: tuple[int, int]) -> Singles:
     """(rows, columns, 1): the weight of a view of this shape where its pixels (rows, columns, 2) are looked up."""
     share = (at + 0.5) / (shape[1], shape[0])
     inward = np.minimum(share, 1 - share).min(axis=-1)

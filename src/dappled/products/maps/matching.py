@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.array_types import Floats
 from dappled.products.extras import need
 
-Floats = NDArray[np.float64]
 _LIMIT = 4000  # features per picture
 _PATCHES = 600  # per picture, about
 _RATIO = 0.85  # at most, of the best match's distance to the second best's

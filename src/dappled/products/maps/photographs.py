@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config.profiles import CameraProfile, Lens
+from dappled.decode.array_types import Singles
 from dappled.decode.geometry import Pose, camera_pose
 from dappled.decode.geometry.camera_pose import CameraPose, Matrix
 from dappled.decode.lightfield import LightField
@@ -17,7 +18,7 @@ from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
 from dappled.flight import Frame, LedgerReader, Tag, layout
 from dappled.products.maps.earth import Projection
-from dappled.products.maps.eye import Eye, Image, intrinsics, look, through
+from dappled.products.maps.eye import Eye, intrinsics, look, through
 from dappled.products.mounting import Mounting
 
 DEFAULT_POSITION_SIGMA_M = 3.0
@@ -60,15 +61,15 @@ class Photograph:
 
     name: str
     utc_ns: int
-    image: Image
+    image: Singles
     eye: Eye
     position_sigma_m: float
     attitude_sigma_rad: float
     grid: NDArray[np.float64]
-    views: Image | None = None
+    views: Singles | None = None
     apertures_m: NDArray[np.float64] | None = None
 
-    def layers(self, focus_m: float = math.inf) -> list[tuple[Image, Eye]]:
+    def layers(self, focus_m: float = math.inf) -> list[tuple[Singles, Eye]]:
         """The images that make up the map, each with its eye."""
         if self.views is None or self.apertures_m is None:
             return [(self.image, self.eye)]
@@ -208,7 +209,7 @@ def true_colours(raw: RawFile) -> NDArray[np.float64] | None:
     return np.array([light[name] / light["G"] for name in "RGB"])
 
 
-def mean_view(field: LightField) -> Image:
+def mean_view(field: LightField) -> Singles:
     """The mean of the views; without views the DC slice, which is the same picture in grey."""
     if field.views.shape[0]:
         return np.asarray(field.views.mean(axis=(0, 1), dtype=np.float32))

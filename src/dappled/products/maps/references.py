@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_bytes
+from dappled.decode.array_types import Floats
 from dappled.errors import DappledError, first_line
 from dappled.products.extras import need
 from dappled.products.maps.earth import Projection, touch
 from dappled.products.maps.map_grid import MapGrid, around
-
-Floats = NDArray[np.float64]
-
 
 _MOST_MASK = 256_000_000  # cells
 

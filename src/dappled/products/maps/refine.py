@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dappled.decode.array_types import Floats
 from dappled.products.maps import matching
 from dappled.products.maps.adjust import Marks, Solution, Ties, adjust
 from dappled.products.maps.eye import Eye
@@ -22,7 +22,6 @@ from dappled.products.maps.matching import Features
 from dappled.products.maps.photographs import Photograph
 from dappled.products.maps.references import BaseMap, ControlPoint, ControlPointError
 
-Floats = NDArray[np.float64]
 LEAST_INLIERS = 15
 LEAST_SHARE = 0.25  # of the matches
 _PLANE_PX = 6.0  # generous, as houses rise above the plane of the homography

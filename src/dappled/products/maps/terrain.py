@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from dappled import durable
+from dappled.decode.array_types import Floats
 from dappled.products.extras import need
 from dappled.products.maps import cog, hyperstereo, map_grid
 from dappled.products.maps.earth import Projection
@@ -26,8 +27,6 @@ from dappled.products.maps.georeference import Progress, Survey
 from dappled.products.maps.ground import Flat, Ground
 from dappled.products.maps.hyperstereo import Surface
 from dappled.products.maps.map_grid import MapGrid
-
-Floats = NDArray[np.float64]
 
 VERTICAL = "EPSG:5773"  # EGM96 height: what autopilots call mean sea level
 CELL = 2.0  # of a map's cells: heights are coarser than pictures
