@@ -7,7 +7,7 @@ import logging
 import pytest
 
 from dappled.clock import RecordedClock
-from dappled.refusals import INTERVAL_S, PEERS, RefusalLog
+from dappled.refusals import INTERVAL_S, OTHERS, PEERS, RefusalLog, Refusals
 
 
 @pytest.fixture
@@ -56,3 +56,30 @@ def test_a_thousand_peers_are_as_many_lines_as_a_person_reads(
     clock.advance(INTERVAL_S)
     refusals.settle()
     assert caplog.messages[-1] == f"other peers: refused {1000 - PEERS - 1} more times in 60 s: x"
+
+
+def test_reasons_that_differ_in_numbers_alone_are_one(
+    refusals: RefusalLog, clock: RecordedClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    for left in range(500):
+        refusals.refused("a", f"the disk is nearly full: {left} MB left")
+    clock.advance(INTERVAL_S)
+    (last,) = refusals.settle()
+    assert (len(caplog.messages), last.count, last.reason) == (2, 499, "the disk is nearly full: 499 MB left")
+
+
+@pytest.mark.parametrize(
+    "one",
+    [
+        Refusals("IMAGE_START_CAPTURE from mavlink:7/1", "no camera: it is off", 1),
+        Refusals("interval from mavlink:7/1", "no camera, 3 more times in 4 s: it is off", 512, 60.0),
+        Refusals(OTHERS, "no camera", 70_000, 60.0),
+        Refusals("console", "no camera", 3),
+    ],
+)
+def test_an_event_is_read_as_it_was_written(one: Refusals) -> None:
+    assert Refusals.of_text(one.text()) == one
+
+
+def test_a_text_that_is_no_refusal_counts_nothing() -> None:
+    assert Refusals.of_text("gibberish") is None

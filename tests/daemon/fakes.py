@@ -35,6 +35,7 @@ from dappled.drivers.camera import (
     check_change,
 )
 from dappled.flight import Shot, recording
+from dappled.refusals import Refusals
 
 
 def no_pose(utc_ns: int = 0) -> Pose:
@@ -193,7 +194,7 @@ class FakeSink:
         self.problem: str | None = None
         self.note_error: OSError | None = None
         self.done: list[tuple[str, int]] = []
-        self.refusals: list[str] = []
+        self.refusals: list[Refusals] = []
 
     @property
     def fired(self) -> list[int]:
@@ -210,8 +211,8 @@ class FakeSink:
     def fire(self, shot: Shot) -> None:
         self.done.append(("fire", shot.index))
 
-    def refused(self, request: CaptureRequest, reason: str) -> None:
-        self.refusals.append(reason)
+    def refused(self, refusals: Refusals) -> None:
+        self.refusals.append(refusals)
 
 
 @dataclass(frozen=True)
@@ -230,7 +231,7 @@ class FlightSink:
     def fire(self, shot: Shot) -> None:
         self.shots.fire(shot)
 
-    def refused(self, request: CaptureRequest, reason: str) -> None:
+    def refused(self, refusals: Refusals) -> None:
         """Only the sender hears it."""
 
 

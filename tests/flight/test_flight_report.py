@@ -29,10 +29,12 @@ def test_a_flights_books_by_source(recorded: FlightFolder) -> None:
 
 def test_refused_requests_are_counted_at_their_source(flight: Recording) -> None:
     request(flight, 0)
-    for text in ("IMAGE_START_CAPTURE from mavlink:7/1: no camera", "console from console: no camera", "gibberish"):
+    flood = ("x from mavlink:7/1, 511 more times in 60 s: no camera", "other peers, 9 more times in 60 s: no camera")
+    for text in ("x from mavlink:7/1: no camera", "console from console: no camera", "gibberish", *flood):
         flight.ledger.add_event("refused", text)
     books = {one.source: one for one in by_source(flight.folder.path)}
-    assert (books["mavlink:7/1"].wishes, books["mavlink:7/1"].refused) == (1, 1)
+    assert (books["mavlink:7/1"].wishes, books["mavlink:7/1"].refused) == (512, 512)
+    assert books["other peers"].refused == 9
     assert books["console"].refused == books["unknown"].refused == 1
     balance = flight_report.balance(flight.folder.path)
     assert sum(one.shots for one in books.values()) == balance.wishes

@@ -12,11 +12,11 @@ from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import Navigation
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
-from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import PacketSender
 from dappled.flight import FlightError, Recording, Shot, layout
 from dappled.flight.layout import DiskSpace
+from dappled.refusals import Refusals
 
 LOOK_VALID_NS = 5 * 10**9
 
@@ -78,9 +78,9 @@ class FlightControl:
         """See ShotSink."""
         self._shots.fire(shot)
 
-    def refused(self, request: CaptureRequest, reason: str) -> None:
+    def refused(self, refusals: Refusals) -> None:
         """See ShotSink."""
-        self._writer.later("refused", f"{request.kind} from {request.source}: {reason}")
+        self._writer.later("refused", refusals.text())
 
     # CameraModel
 

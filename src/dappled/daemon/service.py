@@ -268,6 +268,7 @@ class Service:
             _remove_empty(self._recording)
 
     def _publish_end(self) -> None:
+        self._shutter.settle_refusals(all_of_them=True)
         try:
             self._writer.write_later()
         except DappledError as error:

@@ -13,6 +13,7 @@ from dappled.flight import layout
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.records import Frame, LedgerEvent, Result, ShotRow, Stray, Tag
+from dappled.refusals import OTHERS, Refusals
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +106,7 @@ def balance(path: Path) -> Balance:
             closed="closed_utc_ns" in facts,
             following=len(ledger.following()),
             companions=len(ledger.companions()),
-            refused=sum(event.kind == "refused" for event in ledger.events()),
+            refused=_refused(ledger.events()).total(),
             began_utc_ns=None
             if correction_ns is None or "began_utc_ns" not in facts
             else facts["began_utc_ns"] + correction_ns,
@@ -147,7 +148,7 @@ def list_flights(root: Path) -> list[ListedFlight]:
     return listed
 
 
-_REFUSED = re.compile(r"\S+ from (?P<source>\S+): ")  # as the daemon notes it: kind, source, reason
+_PEER = re.compile(r"\S+ from (?P<source>\S+)")  # as the daemon notes it: kind and source
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,10 +189,11 @@ def by_source(path: Path) -> tuple[SourceReport, ...]:
 
 
 def _refused(events: Iterable[LedgerEvent]) -> Counter[str]:
-    """Refused requests by source; "unknown" where the event names none."""
+    """Refused requests by source; "unknown" where the event names none. A flood is one event with a count a minute."""
     found: Counter[str] = Counter()
     for event in events:
         if event.kind == "refused":
-            match = _REFUSED.match(event.text)
-            found[match["source"] if match else "unknown"] += 1
+            one = Refusals.of_text(event.text) or Refusals("", event.text, 1)
+            match = _PEER.fullmatch(one.peer)
+            found[match["source"] if match else OTHERS if one.peer == OTHERS else "unknown"] += one.count
     return found

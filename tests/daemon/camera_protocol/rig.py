@@ -16,11 +16,12 @@ from dappled.daemon.camera_protocol.component import Component
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.navigation import Telemetry
-from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
+from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink import MavlinkLinks, MavlinkMessage, Packet, Signing, mavlink, pack
 from dappled.flight import Cause, Shot
 from dappled.flight.layout import DiskSpace
+from dappled.refusals import Refusals
 from tests.daemon.fakes import eventually
 
 
@@ -130,7 +131,7 @@ class Camera:
     def fire(self, shot: Shot) -> None:
         self._fired.put(shot.index)
 
-    def refused(self, request: CaptureRequest, reason: str) -> None:
+    def refused(self, refusals: Refusals) -> None:
         """Told to the sender alone."""
 
     mount = PoseSettings().mount

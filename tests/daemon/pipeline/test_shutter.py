@@ -13,6 +13,7 @@ from dappled.clock import RecordedClock, SystemClock
 from dappled.daemon.pipeline import shutter as module
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.flight import Shot
+from dappled.refusals import PEERS
 from tests.daemon.fakes import FakeSink, eventually
 
 PILOT = "mavlink:255/190"
@@ -294,8 +295,8 @@ def test_every_refusal_is_told() -> None:
     for sequence in (2, 3):
         shutter.request(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", sequence))
     assert len(sink.refusals) == shutter.statistics().refused == 2
-    assert "an interval must be" in sink.refusals[0]
-    assert "waiting for the camera" in sink.refusals[1]
+    assert "an interval must be" in sink.refusals[0].reason
+    assert "waiting for the camera" in sink.refusals[1].reason
 
 
 def test_a_flood_of_refused_requests_is_one_line_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
@@ -305,3 +306,24 @@ def test_a_flood_of_refused_requests_is_one_line_in_the_log(caplog: pytest.LogCa
         assert not rig.shutter.request(CaptureRequest(PILOT, "x", sequence)).accepted
     assert len(caplog.messages) == 1
     assert "no camera on the bus" in caplog.messages[0]
+
+
+def test_a_flood_of_refused_requests_is_a_few_events_that_count_each_one() -> None:
+    rig = Rig()
+    for sequence in range(5000):
+        rig.sink.problem = f"the disk is nearly full: {sequence} MB left"  # a number that changes defeats no limit
+        rig.shutter.request(CaptureRequest(PILOT, "x", sequence))
+        rig.clock.advance(0.03)
+    rig.shutter.settle_refusals(all_of_them=True)
+    assert len(rig.sink.refusals) == 4  # the first, two minutes, the rest
+    assert sum(one.count for one in rig.sink.refusals) == rig.shutter.statistics().refused == 5000
+
+
+def test_a_flood_from_any_number_of_senders_is_a_few_events_too() -> None:
+    rig = Rig()
+    rig.sink.problem = "no camera on the bus"
+    for sender in range(5000):
+        rig.shutter.request(CaptureRequest(f"mavlink:{sender}/1", "x", 1))
+    rig.shutter.settle_refusals(all_of_them=True)
+    assert len(rig.sink.refusals) == PEERS + 2
+    assert sum(one.count for one in rig.sink.refusals) == 5000

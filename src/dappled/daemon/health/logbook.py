@@ -13,12 +13,11 @@ from typing import Any, Literal
 from dappled.clock import Clock
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.drivers.camera import Setting
-from dappled.errors import sentence
+from dappled.errors import sentence, without_numbers
 
 Level = Literal["info", "warning"]
 LOW_PERCENT = 25
 _LOW_WORDS = ("low", "empty", "exhausted", "critical")
-_NUMBER = re.compile(r"\d+( frames?\b)?")  # "1 frame" and "2 frames" are one kind
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +74,8 @@ class NewProblems:
 
     def among(self, problems: Sequence[str], *, again: bool = False) -> list[str]:
         """The new ones; with `again` all. These are the known ones from now on."""
-        known, self._known = self._known, {_NUMBER.sub("#", text) for text in problems}
-        return [text for text in problems if again or _NUMBER.sub("#", text) not in known]
+        known, self._known = self._known, {without_numbers(text) for text in problems}
+        return [text for text in problems if again or without_numbers(text) not in known]
 
 
 def battery_doubt(settings: Iterable[Setting]) -> str | None:

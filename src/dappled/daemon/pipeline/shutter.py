@@ -12,7 +12,7 @@ from dappled.clock import Clock
 from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
 from dappled.errors import counted, report
 from dappled.flight import Cause, FlightError, Shot
-from dappled.refusals import RefusalLog
+from dappled.refusals import RefusalLog, Refusals
 from dappled.workers import Loop
 
 __all__ = ["CaptureRequest", "ShotDecision", "Shutter", "ShutterStatistics"]
@@ -77,8 +77,8 @@ class ShotSink(Protocol):
     def fire(self, shot: Shot) -> None:
         """Hand a noted shot to the camera."""
 
-    def refused(self, request: CaptureRequest, reason: str) -> None:
-        """A request became no shot."""
+    def refused(self, refusals: Refusals) -> None:
+        """Requests became no shots: the first of a sender for a reason, later how many more."""
 
 
 class Shutter:
@@ -165,6 +165,12 @@ class Shutter:
             if self._interval is not None and self._interval.interval_ns == 0:
                 self._wake.set()
 
+    def settle_refusals(self, *, all_of_them: bool = False) -> None:
+        """Hand the refusals that were only counted to the sink, where a minute is over; at the end of a flight
+        `all_of_them`."""
+        for one in self._refusals.settle(all_of_them=all_of_them):
+            self._sink.refused(one)
+
     def serve(self) -> float:
         """Take the interval's shot if one is due; seconds until there is something to do. The thread's work."""
         with self._lock:
@@ -242,8 +248,8 @@ class Shutter:
 
     def _refuse(self, request: CaptureRequest, reason: str) -> ShotDecision:
         self._refused += 1
-        self._sink.refused(request, reason)
-        self._refusals.refused(f"{request.kind} from {request.source}", reason)
+        for one in self._refusals.refused(f"{request.kind} from {request.source}", reason):
+            self._sink.refused(one)
         return ShotDecision("refused", reason=reason)
 
     def _why_not(self) -> str | None:
@@ -256,7 +262,7 @@ class Shutter:
     def _run(self) -> None:
         while not self._stopped:
             self._wake.clear()
-            self._refusals.settle()
+            self.settle_refusals()
             try:
                 wait_s = self.serve()
             except Exception as error:  # noqa: BLE001  # noting or firing failed: the interval goes on
