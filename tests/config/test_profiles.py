@@ -29,7 +29,9 @@ def test_shipped_masks_load(name: str) -> None:
 
 def test_the_contract_s_profiles_ship() -> None:
     assert {"fujifilm-s5200", "canon-eos-450d", "reference-36mm"} <= set(profiles.shipped("cameras"))
-    assert {f"mask-{n}" for n in range(1, 6)} | {"mask-2-full", "reference-5x5"} <= set(profiles.shipped("masks"))
+    assert {f"mask-{n}" for n in range(1, 6)} | {"mask-2-full", "reference-5x5", "mask-4-linear"} <= set(
+        profiles.shipped("masks")
+    )
 
 
 def test_a_wrong_name_is_answered_with_the_nearest() -> None:

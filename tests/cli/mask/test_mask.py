@@ -66,13 +66,15 @@ def test_diffraction_judges_and_draws(tmp_path: Path, capsys: pytest.CaptureFixt
     bench = tmp_path / "bench.csv"
     bench.write_text("x_mm,y_mm\n" + "".join(f"{a * k},{b * k}\n" for k in (3, 7) for a in (1, -1) for b in (1, -1)))
     for mask, code, said in (
-        ("mask-1", 1, "printed at scale 0.5"),
+        ("mask-1", 1, "printed 2 times as large as designed, or another mask: "),
         ("mask-2", 0, "as designed: 8 spots within 0.54 mm of where they should be\n"),
         ("mask-3", 0, "as designed: 8 spots within 0.54 mm of where they should be; 8 fainter"),
         ("reference-5x5", 1, "not this mask"),
     ):
         assert main(["mask", "diffraction", "--mask", mask, "--measured", str(bench)]) == code
-        assert capsys.readouterr().out.startswith(said)
+        out = capsys.readouterr().out
+        assert out.startswith(said)
+        assert ("these are the spots of mask-2" in out) == (code == 1)
     picture = tmp_path / "wall.png"
     told = _json(["mask", "diffraction", "--mask", "mask-2", "--picture", str(picture)], capsys)
     assert isinstance(told["impulses"], list)

@@ -114,7 +114,8 @@ def test_verdicts(mask: Mask, seen: list[tuple[float, float]], kind: str) -> Non
     verdict = laser_bench.judge(mask, [(0.0, 0.0), *seen])
     assert verdict.kind == kind
     if kind == "scaled":
-        assert "printed at scale 0.5" in verdict.text
+        assert "printed 2 times as large as designed, or another mask" in verdict.text
+        assert "periods on film are 2.0" in verdict.text
         assert verdict.frequency_scale == pytest.approx(0.5, abs=0.03)
 
 

@@ -172,10 +172,10 @@ def judge(
             if unseen := len(expected) - len(seen):
                 text += f"; {unseen} fainter or farther ones were not seen"
             return BenchVerdict("as designed", fitted, rms, len(seen), text)
-        shown = scale if scale in (0.5, 2.0, 1 / 3, 3.0, 0.25, 4.0) else fitted
+        shown = 1 / (scale if scale in (0.5, 2.0, 1 / 3, 3.0, 0.25, 4.0) else fitted)
         text = (
-            f"printed at scale {shown:.2g}: the spots are at {fitted:.3f} of the expected distance, so the periods "
-            f"on film are {1 / fitted:.2f} times the design's; the printer scaled the picture"
+            f"printed {shown:.2g} times as large as designed, or another mask: the spots are at {fitted:.3f} of the "
+            f"expected distance, so the periods on film are {1 / fitted:.2f} times the design's"
         )
         return BenchVerdict("scaled", fitted, rms, len(seen), text)
     text = (
