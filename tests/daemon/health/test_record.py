@@ -47,7 +47,7 @@ def record(
         began_monotonic_ns=more.pop("began", 90 * S),
         shots=shots,
         stages=[stage.statistics()],
-        shutter=ShutterStatistics(3, 2, 1, 0, 0, 2, 0, 2, None),
+        shutter=ShutterStatistics(2, 0, 0, 2, 0, 2, None),
         links=[link],
         telemetry=Telemetry().statistics(),
         publisher=PublisherStatistics({}, {}, 0, 0, 0),

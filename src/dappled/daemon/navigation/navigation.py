@@ -62,7 +62,6 @@ class TelemetryStatistics:
     packets: int
     positions: int
     attitudes: int
-    timesync_answers: int
     reboots: int
     out_of_order: int
     feedbacks: int = 0
@@ -195,7 +194,6 @@ class Telemetry:
                 self._packets,
                 counts.positions,
                 counts.attitudes,
-                history.time.answers_seen,
                 history.time.reboots,
                 counts.out_of_order,
                 counts.feedbacks,

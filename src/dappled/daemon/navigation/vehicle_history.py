@@ -114,7 +114,7 @@ class AutopilotTime:
         self._fitted: tuple[_FitKey | None, BootClock | None] = (None, None)
         self.now_boot_ns: int | None = None
         self.unix_minus_boot_ns: int | None = None
-        self.answers_seen = self.reboots = 0
+        self.reboots = 0
 
     def believe(self, number: int, stamp_ns: int, boot_ns: int) -> bool:
         """Whether a packet's time since boot is plausible.
@@ -161,7 +161,6 @@ class AutopilotTime:
         if self.now_boot_ns is not None and message.tc1 < self.now_boot_ns - REBOOT_BACK_NS:
             return  # from before or after a reboot that the telemetry has yet to show
         del self._requests[message.ts1]  # the same answer on a second link is not a second observation
-        self.answers_seen += 1
         self._answers.append(answer)
 
     def clock(self, limit: int, histories: Sequence[Sequence[Sample]]) -> BootClock | None:

@@ -122,7 +122,6 @@ class DecodeProcess:
         self._process: subprocess.Popen[bytes] | None = None
         self._channel: ProcessChannel | None = None
         self._closed = False
-        self.restarts = 0
 
     def warm_up(self) -> None:
         """Start the worker now, so that the first frame doesn't wait for it. Raises DecodeProcessError for a recipe
@@ -177,21 +176,18 @@ class DecodeProcess:
             raise DecodeProcessError(f"{question.get('path', 'the recipe')} was not decoded: the decoder was stopped")
         if self._process is not None and self._process.poll() is not None:
             self._end()  # it died between two frames: neither is to blame
-            self.restarts += 1
         try:
             channel = self._channel or self._begin()
             channel.send(question, timeout_s=_SEND_S)
             answer = channel.receive(self._timeout_s)
         except ChannelError:
             code = self._end()
-            self.restarts += 1
             raise DecodeProcessError(f"the decoder died ({_manner(code)}) on {question.get('path', 'start')}") from None
         except OSError as error:
             self._end()
             raise DecodeProcessError(f"the decoder's process can't be started: {error.strerror}") from None
         if answer is None:
             self._end()
-            self.restarts += 1
             raise DecodeProcessError(
                 f"decoding {question.get('path', '')} took over {self._timeout_s:g} s and was given up"
             )

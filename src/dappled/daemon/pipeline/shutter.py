@@ -39,14 +39,9 @@ class ShotDecision:
 
 @dataclass(frozen=True, slots=True)
 class ShutterStatistics:
-    """Counters of this flight. requests = shots + duplicates + refused; shots = pending + succeeded + failed.
+    """Counters of this flight. shots = pending + succeeded + failed. `interval_s` is None while no interval runs."""
 
-    An interval's shots each count as a request. `interval_s` is None while no interval runs.
-    """
-
-    requests: int
     shots: int
-    duplicates: int
     refused: int
     pending: int
     succeeded: int
@@ -97,7 +92,7 @@ class Shutter:
         self._refusals = RefusalLog(log, clock)
         self._pending: set[int] = set()
         self._interval: _Interval | None = None
-        self._requests = self._shots = self._duplicates = self._refused = self._succeeded = self._failed = 0
+        self._shots = self._refused = self._succeeded = self._failed = 0
         self._wake = threading.Event()
         self._stopped = False
         self._loop = Loop("shutter intervals", self._run)
@@ -133,7 +128,6 @@ class Shutter:
         """
         if not (math.isfinite(interval_s) and 0 <= interval_s <= 86400) or count < 0:
             with self._lock:
-                self._requests += 1
                 return self._refuse(request, "an interval must be 0 to 86400 s, and a count 0 or more")
         request = replace(request, series=(interval_s, float(count)))
         with self._lock:
@@ -196,9 +190,7 @@ class Shutter:
         """Counters."""
         with self._lock:
             return ShutterStatistics(
-                self._requests,
                 self._shots,
-                self._duplicates,
                 self._refused,
                 len(self._pending),
                 self._succeeded,
@@ -214,12 +206,10 @@ class Shutter:
         self._interval = None
 
     def _judge(self, request: CaptureRequest) -> ShotDecision:
-        self._requests += 1
         now_ns = self._clock.monotonic_ns()
         if request.kind != "interval":
             known = self._recent.same(request, now_ns)
             if known is not None:
-                self._duplicates += 1
                 return ShotDecision("duplicate", index=known)
         reason = self._why_not()
         if reason is None:
