@@ -175,11 +175,61 @@ ATTACKS = [
 ]
 
 
-@pytest.mark.parametrize("attack", ATTACKS, ids=lambda attack: attack.name)
+STRANGERS = [
+    Attack("a link", lambda f: (f.path / "evil").symlink_to("/etc"), "evil is a link"),
+    Attack("a hidden link", lambda f: (f.path / "inputs/.evil").symlink_to("/etc/passwd"), "inputs/.evil is a link"),
+    Attack("a pipe", lambda f: os.mkfifo(f.path / "inputs/pipe"), "inputs/pipe is no file"),
+    Attack("a half-written file", lambda f: (f.path / ".x.part").write_bytes(b"x"), ".x.part is a half-written file"),
+    Attack("one in inputs", lambda f: (f.path / "inputs/.x.part").write_bytes(b"x"), "inputs/.x.part is a half-wr"),
+    Attack("a hidden file", lambda f: (f.path / "inputs/.x").write_bytes(b"x"), "inputs/.x was added since seal 2"),
+    Attack("a hidden frame", lambda f: (f.frames / ".x").write_bytes(b"x"), "frames/.x is in no row of the ledger"),
+    Attack("a folder", lambda f: (f.path / "inputs/new").mkdir(), "inputs/new is an empty folder"),
+    Attack("a rollback journal", lambda f: beside(f, "-journal").write_bytes(b"x" * 9), "so the ledger was not opened"),
+]
+
+
+@pytest.mark.parametrize("attack", [*ATTACKS, *STRANGERS], ids=lambda attack: attack.name)
 def test_an_attack_is_named(sealed: FlightFolder, attack: Attack) -> None:
     attack.do(sealed)
     problems = check(sealed.path).problems
     assert any(attack.words in problem for problem in problems), problems
+
+
+def beside(folder: FlightFolder, suffix: str) -> Path:
+    return folder.ledger.with_name(folder.ledger.name + suffix)
+
+
+@pytest.mark.parametrize(
+    ("do", "words"),
+    [
+        (lambda f: (f.path / "mine").mkdir(), "mine is an empty folder, which no seal covers"),
+        (lambda f: beside(f, "-shm").write_bytes(b"x" * 999), "flight.sqlite-shm stands beside the ledger"),
+        (lambda f: beside(f, "-wal").touch(), "flight.sqlite-wal stands beside the ledger"),
+        (lambda f: (f.path / ".mine").write_bytes(b"x"), ".mine was added since seal 2: no seal covers it"),
+    ],
+)
+def test_what_harms_nothing_is_a_note(sealed: FlightFolder, do: Callable[[FlightFolder], object], words: str) -> None:
+    do(sealed)
+    report = check(sealed.path)
+    assert report.problems == ()
+    assert any(words in note for note in report.notes), report.notes
+
+
+def test_the_name_of_another_flight_is_wrong_and_a_name_of_ones_own_a_note(sealed: FlightFolder) -> None:
+    other, own = (sealed.path.with_name(name) for name in ("20260101T000000Z-deadbeef", "the meadow"))
+    said = f"the flight was recorded as {sealed.name}"
+    shutil.copytree(sealed.path, own)
+    sealed.path.rename(other)
+    assert [said in text for text in check(other).problems] == [True]
+    assert (check(own).problems, [said in text for text in check(own).notes]) == ((), [True])
+
+
+def test_a_rollback_journal_changes_no_byte_of_the_ledger(sealed: FlightFolder) -> None:
+    before = sealed.ledger.read_bytes()
+    beside(sealed, "-journal").write_bytes(b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7" + b"\1" * 2000)
+    assert not check(sealed.path).intact
+    assert sealed.ledger.read_bytes() == before
+    assert beside(sealed, "-journal").exists()
 
 
 def test_a_file_of_ones_own_is_named_and_no_fault(sealed: FlightFolder) -> None:
@@ -321,7 +371,8 @@ def test_a_flight_is_sealed_beside_a_reader_and_under_another_name(sealed: Fligh
         with seals.reopened(copy, LATER, "geotag"):
             pass
         assert check(copy.path).problems == ()
-    assert (check(copy.path).problems, check(copy.path).notes) == ((), ())
+    said = f"the folder is called renamed, and the flight was recorded as {sealed.name}"
+    assert (check(copy.path).problems, check(copy.path).notes) == ((), (said,))
 
 
 def test_a_ledger_that_can_not_be_folded_is_not_sealed(sealed: FlightFolder, monkeypatch: pytest.MonkeyPatch) -> None:

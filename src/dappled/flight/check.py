@@ -13,10 +13,12 @@ from pathlib import Path
 from dappled import durable
 from dappled.confined import OutsideError
 from dappled.errors import DappledError, counted
-from dappled.flight import layout, log_reading, provenance, pruning
-from dappled.flight.checks import chain_check, seal_check, telemetry_check
+from dappled.flight import layout, log_reading, provenance, pruning, seals
+from dappled.flight.checks import chain_check, place_check, seal_check, telemetry_check
 from dappled.flight.checks.chain_check import ChainFindings
+from dappled.flight.checks.place_check import PlaceFindings
 from dappled.flight.checks.seal_check import LedgerBytes, SealFindings, Vouched
+from dappled.flight.errors import FlightError
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.pruning import Removed
@@ -69,18 +71,26 @@ def check(path: Path, key: SealKey | None = None) -> CheckReport:
     sealed = SealFindings("not sealed", "", (), ())
     with _examining("flight.toml", problems):
         layout.read_facts(folder)
+    place = PlaceFindings((), (), (), (), None)
+    closed, recorded_as = False, ""
+    with _examining("the folder", problems):
+        place = place_check.look(folder)
     with _examining("the ledger", problems):
+        if place.rollback is not None:
+            raise FlightError(place.rollback)
         before = LedgerBytes.of(folder)
         chained = _chained(folder, problems)
         notes += [_WITHOUT_CHAIN] if chained.links is None else chained.notes
         with _examining("the flight", problems), LedgerReader.open(folder.ledger) as ledger:
+            closed, recorded_as = "closed_utc_ns" in ledger.facts(), seals.of_flight(ledger.facts())
             _compare(folder, ledger, counts, problems, notes, chain=chained)
             with _examining("the telemetry", problems):
                 problems += telemetry_check.compare(folder.telemetry, chained.links)
             with _examining("the seals", problems):
                 sealed = seal_check.compare(folder, ledger, chained.links, before, key)
-    problems += sealed.problems
-    notes += sealed.notes
+    wrong, odd = place_check.compare(place, folder, recorded_as, closed=closed, at_work=sealed.unsealed > 0)
+    problems += [*sealed.problems, *wrong]
+    notes += [*sealed.notes, *odd]
     return CheckReport(
         flight=folder.name,
         files=counts.files,

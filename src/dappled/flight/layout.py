@@ -100,6 +100,11 @@ def frame_name(index: int, camera_name: str) -> str:
     return f"frames/{index:06d}.{extension(camera_name)}"
 
 
+def is_flight_name(name: str) -> bool:
+    """Whether a folder of this name is a flight's."""
+    return _FLIGHT_NAME.fullmatch(name) is not None
+
+
 def index_of(file_name: str) -> int | None:
     """The image index in the name of a file in frames/; None when it is not a frame's name."""
     match = _FRAME_NAME.fullmatch(file_name)
@@ -161,7 +166,7 @@ def unmade(root: Path) -> list[Path]:
 
 def flights(root: Path) -> list[FlightFolder]:
     """All flights under `root`, by name; empty when the folder is missing. Raises FlightError."""
-    return [FlightFolder(root / name) for name in _folders(root) if _FLIGHT_NAME.fullmatch(name)]
+    return [FlightFolder(root / name) for name in _folders(root) if is_flight_name(name)]
 
 
 def _folders(root: Path) -> list[str]:

@@ -40,12 +40,14 @@ class LedgerBytes:
 
 @dataclass(frozen=True, slots=True)
 class SealFindings:
-    """What the seals show. `verdict` says what they vouch for where nothing is wrong."""
+    """What the seals show. `verdict` says what they vouch for where nothing is wrong; `unsealed` counts the links of
+    the chain after the newest seal."""
 
     vouched: Vouched
     verdict: str
     problems: tuple[str, ...]
     notes: tuple[str, ...]
+    unsealed: int = 0
 
 
 def compare(
@@ -78,7 +80,7 @@ def compare(
     if not unsealed:
         problems += _ledger_file(last, before)
     vouched, verdict = _verdict(file.seals, last, key, unsealed)
-    return SealFindings(vouched, verdict, tuple(problems), tuple(notes))
+    return SealFindings(vouched, verdict, tuple(problems), tuple(notes), unsealed)
 
 
 def _numbers(found: Mapping[int, Seal], links: Mapping[int, ChainLink], facts: Mapping[str, Any]) -> Iterator[str]:
