@@ -15,6 +15,7 @@ from pathlib import Path
 
 _PART = ".part"
 _PIECE_BYTES = 1 << 20
+_CLOEXEC, _NOFOLLOW = (getattr(os, name, 0) for name in ("O_CLOEXEC", "O_NOFOLLOW"))  # Windows has neither
 
 
 def temporary(path: Path) -> Path:
@@ -28,8 +29,13 @@ def is_temporary(name: str) -> bool:
 
 
 def sync_folder(path: Path) -> None:
-    """fsync a folder: its names are durable afterwards. Raises OSError."""
-    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    """fsync a folder: its names are durable afterwards. Windows can't open folders, and keeps names by itself.
+
+    Raises OSError.
+    """
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | _CLOEXEC)
     try:
         os.fsync(fd)
     finally:
@@ -38,7 +44,7 @@ def sync_folder(path: Path) -> None:
 
 def sync_file(path: Path) -> None:
     """fsync a file and its folder: its bytes and its name are durable afterwards. Raises OSError."""
-    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    fd = os.open(path, os.O_RDONLY | _CLOEXEC)
     try:
         os.fsync(fd)
     finally:
@@ -124,13 +130,13 @@ def pieces(fd: int, size: int) -> Iterator[memoryview]:
 def _put(path: Path, fill: Callable[[int], None], mode: int = 0o644) -> None:
     part = temporary(path)
     try:
-        fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
+        fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _NOFOLLOW | _CLOEXEC, mode)
         try:
             fill(fd)
             os.fsync(fd)
         finally:
             os.close(fd)
-        os.rename(part, path)
+        os.replace(part, path)
         sync_folder(path.parent)
     except BaseException:
         with contextlib.suppress(OSError):

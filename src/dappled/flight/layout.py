@@ -7,7 +7,6 @@ frames/ and, where asked for, lightfields/. A machine that does not know UTC yet
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import re
 import secrets
@@ -21,7 +20,7 @@ from typing import Any, Self
 
 import tomli_w
 
-from dappled import confined, durable
+from dappled import confined, durable, file_lock
 from dappled.bounds.parsing import parse_toml, read_bytes
 from dappled.flight.errors import FlightError, disk_error
 
@@ -269,7 +268,7 @@ class FlightsLock:
         except OSError as error:
             raise disk_error("make the lock", path, error) from error
         try:
-            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            file_lock.lock(self._fd)
             os.ftruncate(self._fd, 0)
             os.pwrite(self._fd, f"{os.getpid()} {doing}\n".encode(), 0)
         except BlockingIOError as error:
@@ -319,7 +318,7 @@ def is_locked(root: Path) -> bool:
     except OSError as error:
         raise disk_error("look at the lock", path, error) from error
     try:
-        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        file_lock.lock(fd, shared=True)
         return False
     except BlockingIOError:
         return True

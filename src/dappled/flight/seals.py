@@ -6,7 +6,6 @@ A seal stands outside the files that it covers, names the one before it, and may
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -15,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from dappled import durable
+from dappled import durable, file_lock
 from dappled.clock import Clock
 from dappled.flight import layout, pruning
 from dappled.flight.chain import canonical
@@ -278,7 +277,7 @@ def _alone(path: Path) -> Iterator[None]:
     """Keep other processes from sealing the same flight meanwhile. Raises OSError."""
     fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        fcntl.flock(fd, fcntl.LOCK_EX)
+        file_lock.lock(fd, wait=True)
         yield
     finally:
         os.close(fd)

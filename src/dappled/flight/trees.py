@@ -19,9 +19,11 @@ from typing import Self
 from dappled import durable
 from dappled.flight.errors import FlightError, disk_error
 
-_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-_READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-_WRITE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_CLOEXEC, _HERE, _NONBLOCK = (getattr(os, name, 0) for name in ("O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"))
+"""Flags that Windows lacks. It has no `dir_fd` either: a Tree can't be opened there, but light fields can be read."""
+_FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | _HERE | _CLOEXEC
+_READ = os.O_RDONLY | _HERE | _NONBLOCK | _CLOEXEC
+_WRITE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _HERE | _CLOEXEC
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,6 @@ of JSON for each job, appended and synced, so that a batch that is started again
 from __future__ import annotations
 
 import ctypes
-import fcntl
 import hashlib
 import json
 import os
@@ -20,7 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
-from dappled import __version__, confined, durable
+from dappled import __version__, confined, durable, file_lock
 from dappled.bounds.parsing import parse_json
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError, sentence
@@ -282,7 +281,7 @@ class Manifest:
             durable.make_folder(output)
             self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
             try:
-                fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                file_lock.lock(self._fd)
             except BlockingIOError:
                 os.close(self._fd)
                 raise ManifestError(

@@ -1,8 +1,8 @@
 """Read an HDF5 light field in a process of its own, because libhdf5 can hang or crash on a damaged file.
 
-The child process judges the file first (see `packed_arrays`), writes the arrays end to end into a memfd, and an answer
-in JSON to its standard output: `{"arrays": [[name, dtype, shape], …], "text": …}`, or `{"kind": …, "words": …}` for a
-file that is refused. `python -m dappled.products.exports.h5_reader FILE FD TEXT NAME…`
+The child process judges the file first (see `packed_arrays`), writes the arrays end to end into a temporary file, and
+an answer in JSON to its standard output: `{"arrays": [[name, dtype, shape], …], "text": …}`, or `{"kind": …, "words":
+…}` for a file that is refused. `python -m dappled.products.exports.h5_reader FILE OUT TEXT NAME…`
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from __future__ import annotations
 import json
 import math
 import mmap
-import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -42,36 +42,35 @@ def read(path: Path, names: Sequence[str], text_name: str) -> tuple[dict[str, ND
     Raises ClaimError for a file that claims too much, KeyError for what is missing, ValueError for a damaged file,
     MemoryError, and OSError.
     """
-    fd = os.memfd_create("light field")
-    try:
-        done = subprocess.run(
-            [sys.executable, "-m", _MODULE, str(path), str(fd), text_name, *names],
-            pass_fds=[fd],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=_PATIENCE_S + path.stat().st_size / _BYTES_A_SECOND,
-            check=False,
-        )
+    with tempfile.TemporaryDirectory(prefix="dappled-", ignore_cleanup_errors=True) as folder:
+        out = Path(folder, "arrays")
+        try:
+            done = subprocess.run(
+                [sys.executable, "-m", _MODULE, str(path), str(out), text_name, *names],
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                timeout=_PATIENCE_S + path.stat().st_size / _BYTES_A_SECOND,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise ValueError("the HDF5 library did not come to an end with it") from None
         if done.returncode != 0:
             raise ValueError("the HDF5 library failed on it")
         answer = parse_json(done.stdout, _ANSWER_BYTES)
         if "kind" in answer:
             _refuse(answer)
-        return _mapped(fd, answer["arrays"]), answer["text"]
-    except subprocess.TimeoutExpired:
-        raise ValueError("the HDF5 library did not come to an end with it") from None
-    finally:
-        os.close(fd)
+        return _mapped(out, answer["arrays"]), answer["text"]
 
 
 def _refuse(answer: dict[str, str]) -> NoReturn:
     raise _RAISED[answer["kind"]](answer["words"])
 
 
-def _mapped(fd: int, described: list[tuple[str, str, list[int]]]) -> dict[str, NDArray[Any]]:
-    """The arrays in a memfd. They may be written to: the pages are this process' own from then on."""
-    size = os.fstat(fd).st_size
-    data = memoryview(mmap.mmap(fd, size, access=mmap.ACCESS_COPY)) if size else memoryview(bytearray())
+def _mapped(path: Path, described: list[tuple[str, str, list[int]]]) -> dict[str, NDArray[Any]]:
+    """The arrays in a file. They may be written to: the pages are this process' own from then on."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        data = memoryview(mmap.mmap(file.fileno(), size, access=mmap.ACCESS_COPY)) if size else memoryview(bytearray())
     found, at = {}, 0
     for name, kind, shape in described:
         count = math.prod(shape)
@@ -80,11 +79,11 @@ def _mapped(fd: int, described: list[tuple[str, str, list[int]]]) -> dict[str, N
     return found
 
 
-def _answer(path: str, fd: int, text_name: str, names: Sequence[str]) -> dict[str, Any]:
+def _answer(path: str, target: str, text_name: str, names: Sequence[str]) -> dict[str, Any]:
     import h5py  # noqa: PLC0415  # only the child process loads it
 
     try:
-        with h5py.File(path, "r") as file, open(fd, "wb") as out:
+        with h5py.File(path, "r") as file, open(target, "wb") as out:
             packed_arrays.check_h5(file, names, text_name)
             described = []
             for name in names:
@@ -107,8 +106,8 @@ def _answer(path: str, fd: int, text_name: str, names: Sequence[str]) -> dict[st
 
 def main() -> None:
     """Answer, in the child process."""
-    path, fd, text_name, *names = sys.argv[1:]
-    sys.stdout.write(json.dumps(_answer(path, int(fd), text_name, names)))
+    path, target, text_name, *names = sys.argv[1:]
+    sys.stdout.write(json.dumps(_answer(path, target, text_name, names)))
 
 
 if __name__ == "__main__":

@@ -215,7 +215,7 @@ def _sync(path: Path) -> None:
     """fsync a file, or a folder with its content."""
     files = [Path(base, name) for base, _, names in os.walk(path) for name in names] if path.is_dir() else [path]
     for name in files:
-        fd = os.open(name, os.O_RDONLY)
+        fd = os.open(name, os.O_RDWR)  # Windows flushes no file that is open for reading
         try:
             os.fsync(fd)
         finally:
