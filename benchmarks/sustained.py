@@ -35,7 +35,8 @@ from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.drivers.camera import Arrival, Blob, CameraEvent, Fired, Identity, PlainCamera, StateChanged
-from dappled.flight import check, flight_report, recording
+from dappled.flight import flight_report, recording
+from dappled.flight.checks import flight_check
 
 QUEUE = 4
 
@@ -193,7 +194,7 @@ def _is_memfd(path: Path) -> bool:
 
 
 def _account(flight: Path, count: int) -> dict[str, float]:
-    balance, found = flight_report.balance(flight), check.check(flight)
+    balance, found = flight_report.balance(flight), flight_check.check(flight)
     skipped = sum(event.kind == "not decoded" for event in flight_report.show(flight).events)
     missing = count - balance.safe + max(0, balance.frames - balance.decoded - skipped)
     shutil.rmtree(flight / "frames")

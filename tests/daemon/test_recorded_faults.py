@@ -17,7 +17,7 @@ from dappled.daemon.pipeline.tagging import FrameSettings
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink
 from dappled.flight import Cause, LedgerReader, Result, Shot, recording
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath
 from tests.daemon.fakes import rig

@@ -32,7 +32,8 @@ from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import AGAIN_NS, PeriodicTask, Service
 from dappled.drivers.camera import CameraError, Identity, Setting, SettingsChanged, StateChanged
 from dappled.errors import DappledError
-from dappled.flight import FlightError, LedgerReader, Recording, check, layout
+from dappled.flight import FlightError, LedgerReader, Recording, layout
+from dappled.flight.checks import flight_check
 from tests.daemon.fakes import CallingObserver, FakeCamera, eventually, good
 from tests.daemon.test_settings_check import MASK, calibration
 
@@ -79,7 +80,7 @@ def test_a_wish_goes_to_the_end_and_can_be_looked_up_in_the_next_flight(camera: 
     eventually(lambda: shots, "the shot's end")
     assert service.requested == 1
     service.stop()
-    assert check.check(service.folder).intact
+    assert flight_check.check(service.folder).intact
     assert camera.stopped
     after = started(settings, shots)
     found = after._control.lookup(0)
@@ -386,7 +387,7 @@ def test_frames_that_do_not_decode_are_a_caution_then_no_go_and_are_recorded(
         assert decoding(service).state == state
     assert any(text.startswith("decoding fails: the last 4 frames") for text in service.health()["problems"])
     service.stop()
-    assert check.check(service.folder).intact
+    assert flight_check.check(service.folder).intact
     assert len(list((service.folder / "frames").iterdir())) == 4
 
 

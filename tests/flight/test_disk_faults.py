@@ -19,7 +19,7 @@ import pytest
 from dappled import durable
 from dappled.clock import RecordedClock
 from dappled.flight import FlightError, Frame, Recording, layout, recording
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, flip, request, shot, tag
 
@@ -49,7 +49,7 @@ import json, os, subprocess, sys
 from pathlib import Path
 from dappled.clock import RecordedClock
 from dappled.flight import recording
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from dappled.flight.errors import FlightError
 from tests.flight.makers import deliver, request
 mount = lambda *words: subprocess.run(["mount", *words], check=True)

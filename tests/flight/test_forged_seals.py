@@ -13,7 +13,7 @@ import pytest
 
 from dappled.clock import RecordedClock
 from dappled.flight import Recording, chain, layout, seal_key, seals
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from dappled.flight.seal_key import SealKey
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, mavlink_2, request

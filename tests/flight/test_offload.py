@@ -35,8 +35,8 @@ from dappled.flight import (
     recording,
     seals,
 )
-from dappled.flight import check as checks
-from dappled.flight.check import check
+from dappled.flight.checks import flight_check as checks
+from dappled.flight.checks.flight_check import check
 from dappled.flight.trees import Tree
 from tests.flight.checks.test_chain_check import without_chain
 from tests.flight.conftest import START_UTC_NS

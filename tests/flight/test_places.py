@@ -17,7 +17,7 @@ import pytest
 from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.flight import FlightError, Recording, offload, places, read_back
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from dappled.flight.trees import Tree
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, request

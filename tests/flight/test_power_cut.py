@@ -18,7 +18,7 @@ import pytest
 from dappled import durable
 from dappled.clock import RecordedClock
 from dappled.flight import layout, recording
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from tests.flight.lossy_disk import Call, Left, LossyDisk, listing, record
 
 FRAME_BYTES = 20_000

@@ -16,7 +16,7 @@ import pytest
 from dappled import durable
 from dappled.clock import RecordedClock
 from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Recording, Stray
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from dappled.flight.recording import StrayFileError
 from tests.flight.makers import deliver, held, request
 

@@ -26,7 +26,7 @@ from dappled.flight import (
     recording,
     recovery,
 )
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from dappled.flight.index import IndexEntry, in_order
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, held, logged, mavlink_1, mavlink_2, request, shot

@@ -25,7 +25,7 @@ from dappled.flight import (
     seal_key,
     seals,
 )
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from tests.flight.checks.test_chain_check import attacked, fly, without_chain
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import flip

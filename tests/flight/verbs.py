@@ -19,7 +19,7 @@ from dappled.daemon.replay.pickup import Choice
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
 from dappled.flight import LedgerReader, layout, offload, places, recording
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from dappled.products.geotags import geotags
 from dappled.products.mounting import Mounting
 from tests.flight.makers import deliver, mavlink_2, request, shot, tag

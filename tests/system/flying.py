@@ -15,7 +15,8 @@ from dappled.config.settings import Settings
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision
 from dappled.daemon.service import Service
-from dappled.flight import LedgerReader, check, flight_report
+from dappled.flight import LedgerReader, flight_report
+from dappled.flight.checks import flight_check
 from tests.daemon.fakes import CallingObserver
 
 DEADLINE_S = 30.0
@@ -100,7 +101,7 @@ def flying(settings: Settings) -> Iterator[Flying]:
 
 def assert_whole(flight: Path) -> None:
     """`flight check` is good, the books balance, and every shot is safe or failed."""
-    assert check.check(flight).problems == ()
+    assert flight_check.check(flight).problems == ()
     balance = flight_report.balance(flight)
     assert balance.balanced
     assert balance.closed

@@ -23,7 +23,8 @@ from dappled.config.settings import Settings
 from dappled.daemon.service import Service
 from dappled.drivers.mavlink import LinkError
 from dappled.errors import DappledError
-from dappled.flight import LedgerReader, check, flight_report
+from dappled.flight import LedgerReader, flight_report
+from dappled.flight.checks import flight_check
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.scene.masked_camera import reference_camera
 from tests.system.flying import Flying, assert_whole, eventually, flying, settings_of, told
@@ -449,7 +450,7 @@ def test_a_disk_that_fills_up_keeps_what_is_safe(small_disk: Path, here: Path) -
             shots = [daemon.shoot() for _ in range(3)]
             assert [pending.frame is not None for pending in shots] == [True, True, False]
             assert "the disk is full" in shots[2].problem
-        assert len(check.check(daemon.service.folder).problems) == 0
+        assert len(flight_check.check(daemon.service.folder).problems) == 0
 
 
 @pytest.mark.parametrize("inside", ["", "/deeper"])
@@ -570,7 +571,7 @@ def test_a_killed_daemon_is_put_in_order_by_the_next(here: Path) -> None:
             daemon.process.kill()
             daemon.process.wait(5)
         (killed,) = flights(here)
-        assert check.check(killed).problems  # never closed
+        assert flight_check.check(killed).problems  # never closed
         with flying(before(body, here)) as after:
             assert after.shoot().shot.index == 2
             with LedgerReader.open(after.service.folder / "flight.sqlite") as ledger:

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import rawpy
 
-from dappled.flight import LedgerReader, check, flight_report
+from dappled.flight import LedgerReader, flight_report
+from dappled.flight.checks import flight_check
 from tests.schemas import schema
 from tests.system.conftest import FRAMES, Flown, dappled, flip
 
@@ -28,7 +29,7 @@ def test_every_wish_became_one_frame(flown: Flown) -> None:
 
 
 def test_every_byte_is_intact(flown: Flown) -> None:
-    report = check.check(flown.flight)
+    report = flight_check.check(flown.flight)
     assert report.problems == ()
     assert report.files == FRAMES
     assert report.telemetry_packets > 100

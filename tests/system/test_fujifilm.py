@@ -16,7 +16,8 @@ from dappled.cli import main
 from dappled.drivers.gphoto2 import client
 from dappled.drivers.mavlink import mavlink
 from dappled.drivers.wired import shutter_line
-from dappled.flight import LedgerReader, check, flight_report
+from dappled.flight import LedgerReader, flight_report
+from dappled.flight.checks import flight_check
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from dappled.mocks.simulation import free_port
 from dappled.testing import content, until_shot_ends, until_state
@@ -82,7 +83,7 @@ def test_fired_by_a_wire_and_picked_up_after_landing(
     assert "12.6 mm" in told["zooms"][0]
     balance = flight_report.balance(flight)
     assert (balance.safe, balance.failed, balance.tagged) == (4, 0, 4)
-    assert check.check(flight).problems == ()
+    assert flight_check.check(flight).problems == ()
     with LedgerReader.open(flight / "flight.sqlite") as ledger:
         assert ledger.following() == set()
         for index, frame in enumerate(ledger.frames()):
@@ -113,7 +114,7 @@ def test_a_missing_file_leaves_doubt_that_a_person_settles(
     assert "has no file" in capfd.readouterr().out
     with LedgerReader.open(flight / "flight.sqlite") as ledger:
         assert {frame.index: frame.camera_name for frame in ledger.frames()} == truth
-    assert check.check(flight).problems == ()
+    assert flight_check.check(flight).problems == ()
 
 
 @pytest.mark.parametrize(
@@ -241,7 +242,7 @@ def test_files_are_picked_up_over_ptp_after_landing(here: Path, capfd: pytest.Ca
     assert [(pair["index"], pair["file"][-12:]) for pair in told["pairs"]] == [
         (0, "IMG_0001.CR2"), (1, "IMG_0002.CR2"), (2, "IMG_0003.CR2"),
     ]  # fmt: skip
-    assert check.check(flight).problems == ()
+    assert flight_check.check(flight).problems == ()
     assert (flight_report.balance(flight).safe, flight_report.balance(flight).companions) == (3, 3)
     with LedgerReader.open(flight / "flight.sqlite") as ledger:
         for frame in ledger.frames():

@@ -9,7 +9,8 @@ from pathlib import Path
 from dappled.clock import SystemClock
 from dappled.config.settings import Settings, resolve
 from dappled.daemon.service import Service
-from dappled.flight import ImageIndex, check, flight_report
+from dappled.flight import ImageIndex, flight_report
+from dappled.flight.checks import flight_check
 from dappled.mocks.simulation import Simulation, World
 from dappled.products.geotags import geotags
 from dappled.products.mounting import Mounting
@@ -43,7 +44,7 @@ def test_a_flight_learns_utc_and_replays(tmp_path: Path, sockets: Path) -> None:
         code, _ = station.wait(10)
     assert code == 0
     assert service.folder.name.startswith("boot")
-    assert check.check(service.folder).problems == ()
+    assert flight_check.check(service.folder).problems == ()
     began_utc_ns = flight_report.balance(service.folder).began_utc_ns
     assert began_utc_ns is not None
     assert 0 < time.time_ns() - began_utc_ns < 300 * SECOND_NS

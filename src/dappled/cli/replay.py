@@ -25,7 +25,8 @@ from dappled.daemon.replay.replay import ReplayError, ReplayProgress
 from dappled.daemon.replay.runs import Run, RunWriter
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import counted
-from dappled.flight import LIVE, check, layout
+from dappled.flight import LIVE, layout
+from dappled.flight.checks import flight_check
 
 _OF_FOLDERS = ("telemetry", "match", "start", "interval")
 _GIVEN = ("camera", "mask", "white", "dark", "calibration")
@@ -90,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         if getattr(arguments, option) is not None:
             what = "a recorded flight has its own frames, times and telemetry"
             raise ReplayError(f"--{option} is for a folder of frames: {what}; leave it out, or replay its frames/")
-    problems = list(check.check(arguments.flight).problems) if arguments.verify else []
+    problems = list(flight_check.check(arguments.flight).problems) if arguments.verify else []
     facts = layout.read_facts(layout.open_folder(arguments.flight)) if is_flight else {}
     recipe = _recipe(arguments, facts, settings)
     recording = _recording(arguments, is_flight)

@@ -16,7 +16,8 @@ from pathlib import Path
 
 from dappled import durable
 from dappled.clock import Clock
-from dappled.flight import check, layout, ledger_copies, places, pruning, read_back, seals
+from dappled.flight import layout, ledger_copies, places, pruning, read_back, seals
+from dappled.flight.checks import flight_check
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
@@ -240,7 +241,7 @@ class _Copying:
         return proved
 
     def _check(self) -> None:
-        found = check.check(self._there.path)
+        found = flight_check.check(self._there.path)
         if found.problems:
             raise FlightError(
                 f"the copy {self._there.path} is not intact ({found.problems[0]}): nothing was removed; "

@@ -18,7 +18,8 @@ from dappled.daemon.navigation import clocks
 from dappled.daemon.pipeline import capture
 from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.drivers.camera import Blob, CameraError, CameraEvent, Companion, Deferred
-from dappled.flight import ShotState, check, flight_report
+from dappled.flight import ShotState, flight_report
+from dappled.flight.checks import flight_check
 from tests.daemon.fakes import FakeCamera, arrival, eventually, failed, fired, good, rig
 
 
@@ -37,7 +38,7 @@ def test_a_shot_goes_all_the_way(tmp_path: Path) -> None:
         assert (one.settled, one.tagged, one.camera.released) == ([(0, True)], [0], [0])
         assert one.flight.ledger.result(0) is not None
     assert one.camera.stopped
-    assert check.check(one.flight.folder.path).intact
+    assert flight_check.check(one.flight.folder.path).intact
 
 
 def test_a_driver_that_raises_fails_the_shot_and_the_next_works(tmp_path: Path) -> None:
@@ -77,7 +78,7 @@ def test_a_second_file_of_a_shot_is_a_stray_and_undoes_nothing(tmp_path: Path) -
         one.decoder.gate.set()
         assert one.ended(0).problem == ""
         assert one.settled == [(0, True)]
-    assert check.check(one.flight.folder.path).intact
+    assert flight_check.check(one.flight.folder.path).intact
 
 
 def test_a_failure_after_the_file_undoes_nothing(tmp_path: Path) -> None:
@@ -117,7 +118,7 @@ def test_a_file_of_nobody_is_a_stray(tmp_path: Path) -> None:
         one.camera.say(arrival(77))
         eventually(lambda: len(one.flight.ledger.strays()) == 2, "two strays")
     assert not one.shots
-    assert check.check(one.flight.folder.path).intact
+    assert flight_check.check(one.flight.folder.path).intact
 
 
 def test_an_empty_file_fails_the_shot(tmp_path: Path) -> None:
@@ -289,7 +290,7 @@ def test_every_wish_is_one_shot_and_every_shot_ends_once(plan: list[tuple[list[t
                 if twice:
                     assert (one.request(number).outcome, one.request(number).index) == ("duplicate", number)
         flight = one.flight.folder.path
-        assert check.check(flight).problems == ()
+        assert flight_check.check(flight).problems == ()
         balance = flight_report.balance(flight)
         assert balance.balanced
         assert (balance.wishes, balance.open) == (len(plan), 0)
@@ -320,7 +321,7 @@ def test_a_companion_stands_beside_its_frame_in_the_record(tmp_path: Path) -> No
         assert (one.flight.folder.path / companion.name).read_bytes() == b"jpeg"
         assert one.flight.ledger.strays() == []
         path = one.flight.folder.path
-    assert check.check(path).problems == ()
+    assert flight_check.check(path).problems == ()
 
 
 def deferred(shot: int) -> list[CameraEvent | Exception]:
@@ -343,7 +344,7 @@ def test_a_shot_whose_file_follows_is_told_where_it_was_and_has_failed_until_the
         assert one.flight.ledger.frame(index) is not None
         assert len(one.shots) == 1
         path = one.flight.folder.path
-    assert check.check(path).problems == ()
+    assert flight_check.check(path).problems == ()
 
 
 def test_a_zoom_that_changed_is_told(tmp_path: Path) -> None:

@@ -21,7 +21,8 @@ from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import Service
 from dappled.drivers.mavlink import mavlink
-from dappled.flight import FlightsLock, LedgerReader, check, layout, recovery
+from dappled.flight import FlightsLock, LedgerReader, layout, recovery
+from dappled.flight.checks import flight_check
 from tests.daemon.camera_protocol.rig import Peer
 from tests.daemon.fakes import CallingObserver, FakeCamera, eventually
 
@@ -104,7 +105,7 @@ def test_a_frame_that_a_kill_left_untagged_is_tagged_by_geotag(
     assert late is not None
     assert math.degrees(late.pose.latitude_rad or 0) == pytest.approx(47)
     assert late.time_source.startswith("trigger call")
-    assert check.check(killed).problems == ()
+    assert flight_check.check(killed).problems == ()
     assert main(["replay", str(killed), "--verify"]) == 0
     assert main(["geotag", str(killed), "--json"]) == 0
     assert json.loads(capsys.readouterr().out.partition("\n{")[2].join(("{", "")))["tagged_late"] == []

@@ -16,7 +16,7 @@ from dappled.daemon.replay.runs import Run, RunWriter
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import FlightsLock, LedgerReader, Recording, Result, offload, recording
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from tests.flight.makers import deliver, request, tag
 
 RESULT = Result(0, "a" * 64, 12, 13, "geometric", "calibrated")

@@ -12,7 +12,7 @@ import pytest
 
 from dappled.clock import RecordedClock
 from dappled.flight import FlightFolder, Frame, Ledger, LedgerReader, Recording, Result, Stray
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from dappled.flight.tables import KEYS
 from tests.flight.makers import deliver, held, mavlink_2, request, tag
 

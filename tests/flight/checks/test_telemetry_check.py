@@ -7,7 +7,7 @@ import time
 import pytest
 
 from dappled.flight import FlightFolder, LedgerReader, Recording
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from dappled.flight.logs import BLOCK_BYTES
 from tests.flight.checks.test_chain_check import attacked
 from tests.flight.makers import flip, mavlink_2

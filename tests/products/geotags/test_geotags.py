@@ -27,7 +27,7 @@ from dappled.decode.geometry.camera_pose import FORWARD, NADIR, Angles
 from dappled.drivers.raw.raw_file import read_exif
 from dappled.errors import DappledError
 from dappled.flight import recording
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from dappled.products.geotags import exif_gps, geotags, sidecars
 from dappled.products.geotags.exif_gps import ExifError
 from dappled.products.maps.earth import Geoid

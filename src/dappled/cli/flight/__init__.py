@@ -18,7 +18,8 @@ from dappled.cli.flight import lines as flight_lines
 from dappled.cli.flight import pickup
 from dappled.clock import SystemClock
 from dappled.config import settings
-from dappled.flight import FlightError, check, flight_report, index, offload, seal_key
+from dappled.flight import FlightError, flight_report, index, offload, seal_key
+from dappled.flight.checks import flight_check
 
 _FLIGHT = "~/flights/20261121T101503Z-0a1b2c3d"
 
@@ -100,7 +101,7 @@ def _show(flight: Path, as_json: bool) -> int:
 
 
 def _check(flight: Path, config: Path | None, key: Path | None, as_json: bool) -> int:
-    found = check.check(flight, sealing.key_of(config) if key is None else seal_key.load(key))
+    found = flight_check.check(flight, sealing.key_of(config) if key is None else seal_key.load(key))
     _said({**_plain(found), "intact": found.intact}, flight_lines.of_check(found), as_json)
     return 0 if found.intact and (key is None or found.vouched == "signed") else 1
 

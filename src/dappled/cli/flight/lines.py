@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 
 from dappled.errors import counted
 from dappled.flight import LIVE
-from dappled.flight.check import CheckReport
+from dappled.flight.checks.flight_check import CheckReport
 from dappled.flight.flight_report import Balance, FlightContents, ListedFlight, ShotLine, SourceReport
 from dappled.flight.offload import Offloaded
 

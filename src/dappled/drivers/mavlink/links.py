@@ -317,7 +317,7 @@ class PacketSender:
         """Hand a packet to a receiver. An exception is logged and counted: one packet must not end the link."""
         try:
             receiver.on_packet(packet)
-        except Exception:
+        except Exception:  # whatever the receiver raises, the next packet is handled
             link.failures += 1
             log.exception("A MAVLink packet (%s) could not be handled", packet.message.get_type())
 

@@ -9,7 +9,7 @@ import pytest
 
 from dappled import durable
 from dappled.flight import FlightError, FlightFolder, LedgerReader, Recording, Result, flight_report
-from dappled.flight.check import check
+from dappled.flight.checks.flight_check import check
 from tests.flight.makers import deliver, flip, mavlink_2, request, shot, tag
 
 
