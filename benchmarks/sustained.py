@@ -79,7 +79,9 @@ class SlowDecoder:
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
 
-    def decode(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
+    def decode(
+        self, path: str, focal_length_mm: float | None, f_number: float | None, *, index: int, look: bool = False
+    ) -> DecodedFrame:
         time.sleep(self._seconds)
         body = mmap.mmap(-1, 1 << 20)
         unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]

@@ -24,7 +24,7 @@ PROFILE = (
 )
 
 
-def _file(path: Path, shot: Shot, plane: np.ndarray, *, colours: bool = False) -> Path:
+def dng_of(path: Path, shot: Shot, plane: np.ndarray, *, colours: bool = False) -> Path:
     """A DNG of a plane; `colours` with an RGGB pattern of a warm light."""
     black, white = 1024, 15000
     light = plane.astype(np.float64) * 0.8
@@ -50,7 +50,7 @@ def test_the_readme_s_calibrate_command_works_on_a_450d_behind_mask_2(
         r"^dappled (calibrate white-f22\.cr2 --mask .*?)\s*(?:#.*)?$", Path("README.md").read_text(), re.M
     )
     shot = Shot(MASKS["mask-2"], FULL, 50.0, 22.0, turn_deg=0.7, finer=1)
-    _file(tmp_path / "white-f22.dng", shot, shot.frame(), colours=True)
+    dng_of(tmp_path / "white-f22.dng", shot, shot.frame(), colours=True)
     words = line.replace("white-f22.cr2", str(tmp_path / "white-f22.dng")).split()
     words[words.index("-o") + 1] = str(tmp_path / "calibration.toml")
     assert main(words) == 0, capsys.readouterr().err
@@ -64,7 +64,7 @@ def test_the_readme_s_calibrate_command_works_on_a_450d_behind_mask_2(
 
 def test_the_law_that_the_frame_obeys_is_used_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shot = Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, turn_deg=1.0, scene="texture", seed=2)
-    frame = str(_file(tmp_path / "f.dng", shot, shot.frame()))
+    frame = str(dng_of(tmp_path / "f.dng", shot, shot.frame()))
     words = [frame, *_quarter(tmp_path)]
     assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 0
     assert "by the law geometric (odds against chance: fd shows nothing; geometric 10^" in capsys.readouterr().out
@@ -84,7 +84,7 @@ def test_a_frame_that_must_show_carriers_and_does_not_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shot = Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, scene="white")
-    words = [str(_file(tmp_path / "bare.dng", shot, shot.without_film())), *_quarter(tmp_path)]
+    words = [str(dng_of(tmp_path / "bare.dng", shot, shot.without_film())), *_quarter(tmp_path)]
     assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 1
     told = capsys.readouterr().err
     assert "should stand out at f/22" in told
@@ -103,7 +103,7 @@ def test_a_frame_that_must_show_carriers_and_does_not_is_refused(
 
 def test_where_no_carrier_can_be_seen_that_is_no_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shot = Shot(MASKS["mask-2"], QUARTER, 85.0, 1.8, scene="texture", exponent=1.1, snr=30.0)
-    words = [str(_file(tmp_path / "open.dng", shot, shot.frame())), *_quarter(tmp_path)]
+    words = [str(dng_of(tmp_path / "open.dng", shot, shot.frame())), *_quarter(tmp_path)]
     assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 0
     assert "not observable at this aperture" in capsys.readouterr().out
     assert light_files.load(tmp_path / "f.npz").attributes["carriers_found"] is None

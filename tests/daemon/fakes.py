@@ -124,7 +124,9 @@ class FakeDecoder:
         self.gate.set()
         self.seen: list[str] = []
 
-    def decode(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
+    def decode(
+        self, path: str, focal_length_mm: float | None, f_number: float | None, *, index: int, look: bool = False
+    ) -> DecodedFrame:
         self.seen.append(path)
         assert self.gate.wait(20)
         if self.problem:

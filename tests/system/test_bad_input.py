@@ -262,7 +262,7 @@ def test_a_good_frame_decodes(frame: Path, here: Path) -> None:
     (pending,) = daemon.shots
     assert pending.problem == ""
     assert pending.decoded is not None
-    assert pending.decoded.carriers_found > 20
+    assert (pending.decoded.carriers_found or 0) > 20
     assert pending.tag is not None
     assert pending.tag.pose.source == "none"
     assert pending.tag.pose.latitude_rad is None

@@ -213,7 +213,8 @@ def frame_line(pending: PendingShot) -> str:
         words.append("focal length unknown" if length is None else f"{length:g} mm")
     if pending.decoded:
         done = pending.decoded
-        words.append(f"{done.carriers_found}/{done.carriers_predicted} carriers ({done.carriers_from})")
+        found = "-" if done.carriers_found is None else done.carriers_found  # not observable at this aperture
+        words.append(f"{found}/{done.carriers_predicted} carriers ({done.carriers_from})")
     if pending.frame:
         words.append(f"{pending.frame.size / 1e6:.1f} MB")
     times = " ".join(f"{_SHORT.get(name, name)} {ms:.0f}" for name, ms in pending.ms.items())

@@ -140,7 +140,8 @@ class MaskDecoder:
     (half of the EXIF rounding), which widens the search. `size` of the slices in bins of the padded transform;
     None: as large as the spacing allows. Views need a calibration, or a frame that shows its carriers; else only the
     slices are there, and `views` has the shape (0, 0, h, w). `colours` says that the planes are colour mosaics.
-    `taper` apodises the bands, see `slices.extract`. `at` is this frame's own lattice where a search has found it.
+    `taper` apodises the bands, see `slices.extract`. `at` is this frame's own lattice where a search has found it,
+    `ratio` the matrix, row by row, of the lattice found in a flight over the law's: a print scaled and turned.
     `buffers` are reused from frame to frame.
     """
 
@@ -156,6 +157,7 @@ class MaskDecoder:
     colours: bool = False
     taper: float = 0.0
     at: Lattice | None = None
+    ratio: tuple[float, float, float, float] | None = None
     buffers: SpectrumBuffers = field(default_factory=SpectrumBuffers, repr=False)
 
     def __post_init__(self) -> None:
@@ -174,7 +176,11 @@ class MaskDecoder:
         """The predicted lattice."""
         if self.calibration is not None:
             return self.calibration.lattice_at(focal_length_mm)
-        return LAWS[self.law](self.mask, self.sensor, self.mask_distance_mm, focal_length_mm)
+        lattice = LAWS[self.law](self.mask, self.sensor, self.mask_distance_mm, focal_length_mm)
+        if self.ratio is None:
+            return lattice
+        (ay, ax), (by, bx) = np.reshape(self.ratio, (2, 2)) @ lattice.matrix()
+        return Lattice((float(ay), float(ax)), (float(by), float(bx)))
 
     def predict(self, focal_length_mm: float) -> list[Carrier]:
         """The half plane's carriers that lie on the sensor, (0, 0) first."""
@@ -240,7 +246,7 @@ class MaskDecoder:
         """The largest frequency along columns that slices and searches need, in cycles/pixel."""
         predicted = self.predict(focal_length_mm)
         wide = padded_shape(self.sensor.shape)[1]
-        turned = 0.0 if self.calibration is not None else _ROTATION
+        turned = 0.0 if self._placed else _ROTATION
         longer = self.lattice_at(focal_length_mm + self.focal_sigma_mm).carriers([(c.ky, c.kx) for c in predicted])
         reach = max(abs(c.fx) * (1 + turned) + abs(c.fx - far.fx) for c, far in zip(predicted, longer, strict=True))
         width = self.slice_size(self.lattice_at(focal_length_mm))[1]
@@ -259,10 +265,12 @@ class MaskDecoder:
             return self.at, measure(spectrum, there, 1.0, prominence_nats=ALONE_NATS), "measured"
         lattice = self.lattice_at(focal_length_mm)
         measured = measure(spectrum, predicted, self._radii(predicted, focal_length_mm))
-        least = STRONGER if self.calibration is not None else STRONG
+        least = STRONGER if self._placed else STRONG
         own = own_lattice(spectrum, predicted, measured, least)
         if own is None and self.calibration is not None:
             return lattice, measured, "calibrated"
+        if own is None and self.ratio is not None:
+            return lattice, measured, "predicted"
         own = own or farther_lattice(spectrum, predicted)
         if own is None:
             # Wide searches also find the period of a fence or a roof: peaks on no common lattice are no carriers.
@@ -280,7 +288,7 @@ class MaskDecoder:
         orders = [(c.ky, c.kx) for c in carriers]
         longer = self.lattice_at(focal_length_mm + self.focal_sigma_mm).carriers(orders)
         spacing = min(math.hypot(v[0] * high, v[1] * wide) for v in self.lattice_at(focal_length_mm).matrix())
-        turned = 0.0 if self.calibration is not None else _ROTATION
+        turned = 0.0 if self._placed else _ROTATION
         return [
             min(
                 1.5
@@ -290,6 +298,11 @@ class MaskDecoder:
             )
             for a, b in zip(carriers, longer, strict=True)
         ]
+
+    @property
+    def _placed(self) -> bool:
+        """Whether frames have shown before where the mask is: turn and scale are known."""
+        return self.calibration is not None or self.ratio is not None
 
     def _distance(self, focal_length_mm: float) -> float:
         if self.calibration is not None:

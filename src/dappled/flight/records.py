@@ -82,12 +82,13 @@ class ShotRow:
 class Result:
     """The result of decoding a frame. `run` is "live" for the flight itself; later runs have names of their own.
 
-    `slices_sha256` is the hash of the published body. `decode_ms` is None where it was not measured.
+    `slices_sha256` is the hash of the published body. `decode_ms` is None where it was not measured,
+    `carriers_found` where no carriers can be seen at the frame's aperture.
     """
 
     index: int
     slices_sha256: str
-    carriers_found: int
+    carriers_found: int | None
     carriers_predicted: int
     law: str
     carriers_from: str

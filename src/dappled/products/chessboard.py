@@ -77,7 +77,7 @@ def _search(full: NDArray[np.float32], board: tuple[int, int]) -> NDArray[np.flo
         if seen:
             steps = np.array([full.shape[1] / size[0], full.shape[0] / size[1]])
             there = (np.asarray(found, dtype=np.float64).reshape(board[1], board[0], 2) + 0.5) * steps - 0.5
-            return there.astype(np.float32)
+            return np.asarray(there, dtype=np.float32)
     return None
 
 

@@ -48,11 +48,11 @@ def test_bad_frames_cost_nothing_but_themselves(decoder: DecodeProcess, frame: s
     junk.write_bytes(b"II*\0" + bytes(range(256)) * 100)
     for path in (str(junk), str(tmp_path / "nothing.dng"), str(tmp_path)):
         with pytest.raises(DecodeProcessError) as caught:
-            decoder.decode(path, None, None)
+            decoder.decode(path, None, None, index=0)
         assert path in str(caught.value)
         assert "\n" not in str(caught.value)
     first = pid(decoder)
-    done = decoder.decode(frame, None, None)
+    done = decoder.decode(frame, None, None, index=0)
     assert hashlib.sha256(done.body).hexdigest() == done.sha256
     assert done.arrays[0]["shape"][0] == len(done.carriers)
     assert done.preview.startswith(b"\xff\xd8")
@@ -67,11 +67,11 @@ def test_a_recipe_that_can_t_work_is_told_at_the_warm_up() -> None:
 
 
 def test_a_worker_that_died_between_two_frames_is_replaced_unseen(decoder: DecodeProcess, frame: str) -> None:
-    first, killed = decoder.decode(frame, None, None), pid(decoder)
+    first, killed = decoder.decode(frame, None, None, index=0), pid(decoder)
     os.kill(killed, signal.SIGKILL)
     assert decoder._process is not None
     decoder._process.wait(5)
-    assert decoder.decode(frame, None, None).sha256 == first.sha256
+    assert decoder.decode(frame, None, None, index=0).sha256 == first.sha256
     assert pid(decoder) != killed
 
 
@@ -81,9 +81,9 @@ def test_a_worker_that_hangs_is_given_up_and_replaced(frame: str) -> None:
     os.kill(pid(decoder), signal.SIGSTOP)
     decoder._timeout_s = 0.2
     with pytest.raises(DecodeProcessError, match="given up"):
-        decoder.decode(frame, None, None)
+        decoder.decode(frame, None, None, index=0)
     decoder._timeout_s = 20.0
-    assert decoder.decode(frame, None, None).sha256
+    assert decoder.decode(frame, None, None, index=0).sha256
     decoder.close()
 
 
@@ -98,9 +98,9 @@ def test_a_worker_that_keeps_dying_is_not_started_without_end(frame: str) -> Non
         decoder._process.wait(5)
     clock.advance(20)
     with pytest.raises(DecodeProcessError, match="keeps crashing: it starts again in 40 s"):
-        decoder.decode(frame, None, None)
+        decoder.decode(frame, None, None, index=0)
     clock.advance(41)
-    assert decoder.decode(frame, None, None).sha256
+    assert decoder.decode(frame, None, None, index=0).sha256
     decoder.close()
 
 
@@ -113,7 +113,7 @@ def test_close_does_not_wait_for_a_frame_in_hand(frame: str) -> None:
 
     def decode() -> None:
         try:
-            decoder.decode(frame, None, None)
+            decoder.decode(frame, None, None, index=0)
         except DecodeProcessError as error:
             problems.append(error)
 
@@ -124,7 +124,7 @@ def test_close_does_not_wait_for_a_frame_in_hand(frame: str) -> None:
     thread.join(5)
     assert len(problems) == 1
     with pytest.raises(DecodeProcessError, match="stopped"):
-        decoder.decode(frame, None, None)
+        decoder.decode(frame, None, None, index=0)
 
 
 STARVED = """
@@ -165,7 +165,7 @@ def test_without_descriptors_a_decoded_frame_waits_for_some(frame: str) -> None:
         "        time.sleep(0.01)\n"
         "    free()\n"
         "threading.Thread(target=free_when_it_waits).start()\n"
-        "assert decoder.decode(sys.argv[1], None, None).carriers\n",
+        "assert decoder.decode(sys.argv[1], None, None, index=0).carriers\n",
     )
 
 
@@ -174,13 +174,13 @@ def test_without_descriptors_for_long_one_frame_is_not_decoded_and_says_why(fram
     starved(
         frame,
         "try:\n"
-        "    decoder.decode(sys.argv[1], None, None)\n"
+        "    decoder.decode(sys.argv[1], None, None, index=0)\n"
         "except DecodeProcessError as error:\n"
         "    assert sys.argv[1] in str(error) and 'run out of file descriptors' in str(error), error\n"
         "else:\n"
         "    raise AssertionError('it was received')\n"
         "free()\n"
-        "assert decoder.decode(sys.argv[1], None, None).carriers\n",
+        "assert decoder.decode(sys.argv[1], None, None, index=0).carriers\n",
     )
 
 

@@ -1,14 +1,22 @@
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from dappled.daemon.pipeline.decode_worker import nearest
+from dappled.daemon.pipeline.decode_worker import DecodeWorker, nearest
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.decode.depth.ranging import Ranging
+from dappled.drivers.child_process import ChannelMessage
+from dappled.drivers.raw.recipe import LawDecision, Recipe
 from dappled.products.opened import with_ranging
+from tests.cli.test_thesis_camera import PROFILE, QUARTER, dng_of
+from tests.decode.ray_frames import MASKS, Shot
 from tests.products.fields import DISPARITY, light_field
 
 
@@ -19,3 +27,69 @@ def test_no_distance_is_told_of_another_zoom(length_mm: float | None, known: boo
     found = DepthMap(np.float32(DISPARITY) * one, np.float32(0.01) * one, one, "")
     assert (nearest(with_ranging(light_field(), ranging), found) is not None) is known
     assert nearest(light_field(), found) is None
+
+
+def ask(worker: DecodeWorker, path: Path, index: int, *, look: bool = True) -> Mapping[str, Any]:
+    facts = {"path": str(path), "focal_length_mm": None, "f_number": None, "index": index, "look": look}
+    answer, fds = worker(ChannelMessage({"do": "decode", **facts}))
+    for fd in fds:
+        os.close(fd)
+    assert "error" not in answer
+    return answer
+
+
+def worker_of(recipe: Recipe) -> DecodeWorker:
+    worker = DecodeWorker()
+    worker(ChannelMessage({"do": "set up", "recipe": recipe.as_values(), "preview_px": 64}))
+    return worker
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recipe, list[Path]]:
+    """A recipe with the law `fd`, and frames by rays: one at full aperture, then two at f/22."""
+    folder = tmp_path_factory.mktemp("flown")
+    (folder / "quarter.toml").write_text(PROFILE)
+    shot = Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, turn_deg=1.0, scene="texture", seed=2)
+    shots = [replace(shot, f_number=1.8, exponent=1.1, snr=30.0), shot, replace(shot, seed=3)]
+    frames = [dng_of(folder / f"{n}.dng", one, one.frame()) for n, one in enumerate(shots)]
+    return Recipe(str(folder / "quarter.toml"), "mask-2", try_laws=True), frames
+
+
+def test_the_law_that_the_carriers_obey_is_decided_once_a_flight(flown: tuple[Recipe, list[Path]]) -> None:
+    recipe, frames = flown
+    worker = worker_of(recipe)
+    opened, stopped, later = (ask(worker, path, n) for n, path in enumerate(frames))
+    assert (opened["law"], opened["carriers_found"], opened["decision"]) == ("fd", None, None)
+    assert (stopped["law"], later["law"]) == ("geometric", "geometric")
+    assert stopped["decision"]["first"] == 1
+    assert "geometric 10^" in stopped["decision"]["sentence"]
+    assert stopped["ms"]["laws"] > 0
+    assert later["decision"] is None
+    assert "laws" not in later["ms"]
+    assert stopped["carriers_found"] >= 4
+    (at,) = [row[2:] for row in later["carriers"] if row[:2] == [1, 1]]
+    true = (1, 1) @ Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, turn_deg=1.0).lattice
+    assert np.abs((at - true) * QUARTER.shape).max() < 0.3
+    # a replay goes by the flight's decision, and an older flight by what it was configured with: neither looks
+    decided = LawDecision.of_values(stopped["decision"])
+    replayed = worker_of(replace(recipe, try_laws=False, decided=decided))
+    for n in (2, 0, 1):
+        assert ask(replayed, frames[n], n)["sha256"] == (opened, stopped, later)[n]["sha256"]
+    older = ask(worker_of(replace(recipe, try_laws=False)), frames[1], 1)
+    assert (older["law"], older["decision"]) == ("fd", None)
+    assert "laws" not in older["ms"]
+
+
+def test_carriers_that_must_be_seen_and_are_not_are_a_doubt_about_every_frame(
+    flown: tuple[Recipe, list[Path]], tmp_path: Path
+) -> None:
+    shot = Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, scene="white")
+    bare = dng_of(tmp_path / "bare.dng", shot, shot.without_film())
+    worker = worker_of(flown[0])
+    first, second = ask(worker, bare, 0), ask(worker, bare, 1)
+    for one in (first, second):
+        assert one["carriers_found"] == 0
+        assert "should stand out at f/22" in one["seen"]["doubts"][0]
+    assert "laws" in first["ms"]
+    assert "laws" not in second["ms"]
+    assert "laws" not in ask(worker_of(flown[0]), bare, 0, look=False)["ms"]

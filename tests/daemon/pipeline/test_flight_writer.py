@@ -9,8 +9,9 @@ import pytest
 from dappled.clock import SystemClock
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.drivers.camera import Blob, Fired
+from dappled.drivers.raw.recipe import DECISION, LawDecision, Recipe, of_flight
 from dappled.errors import DappledError
-from dappled.flight import Cause, FlightError, Frame, Shot, Tag, recording
+from dappled.flight import Cause, FlightError, Frame, Shot, Tag, layout, recording
 from tests.daemon.fakes import no_pose
 
 SHOT = Shot(0, Cause("test", "console", 1), 10, 20)
@@ -44,6 +45,26 @@ def test_a_shot_is_entered_fired_and_recorded(tmp_path: Path) -> None:
     entry = flight.index.lookup(0)
     assert entry is not None
     assert (entry.state, entry.frame) == ("safe", frame.name)
+    assert flight.close() == []
+
+
+def test_the_law_of_a_flight_is_written_down_and_read_with_its_recipe(tmp_path: Path) -> None:
+    flight = recording.begin(tmp_path, SystemClock(), {"settings": {"mask": {"profile": "mask-2"}}})
+    decision = LawDecision("geometric", (1.01, 0.02, -0.02, 1.01), 3, "decoded by the law geometric")
+    LedgerWriter(flight, SystemClock()).law_decided(decision)
+    (event,) = [event for event in flight.ledger.events() if event.kind == "law"]
+    assert (event.index, event.text) == (3, "decoded by the law geometric")
+    facts = layout.read_facts(flight.folder)
+    made = of_flight(flight.folder.path, facts, {})
+    assert made is not None
+    assert made.decided == decision
+    assert Recipe.of_values(made.as_values()) == made
+    asked = of_flight(flight.folder.path, facts, {"law": "fd"})
+    assert asked is not None
+    assert asked.decided is None
+    facts[DECISION]["law"] = "none"
+    with pytest.raises(DappledError, match=r"flight\.toml: the law"):
+        of_flight(flight.folder.path, facts, {})
     assert flight.close() == []
 
 

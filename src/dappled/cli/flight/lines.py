@@ -54,7 +54,8 @@ def _of_shot(line: ShotLine, utc_correction_ns: int) -> str:
         words.append(f"{math.degrees(pose.latitude_rad):.7f} {math.degrees(pose.longitude_rad):.7f}")
         words.append(f"{pose.altitude_msl_m:.1f} m")
     if line.result:
-        words.append(f"{line.result.carriers_found}/{line.result.carriers_predicted} carriers")
+        found = "-" if line.result.carriers_found is None else line.result.carriers_found
+        words.append(f"{found}/{line.result.carriers_predicted} carriers")
     return "  ".join(words)
 
 

@@ -291,7 +291,16 @@ def _facts(message: Message) -> dict[str, Any]:
         "shape": shape,
         **{
             name: header.get(name)
-            for name in ("carriers", "carriers_from", "carriers_found", "grid", "frame_shape", "predicted", "law")
+            for name in (
+                "carriers",
+                "carriers_from",
+                "carriers_found",
+                "doubts",
+                "grid",
+                "frame_shape",
+                "predicted",
+                "law",
+            )
         },
     }
 

@@ -69,6 +69,13 @@ def _carriers(made: DecodeResult, recipe: Recipe) -> Check:
     if recipe.mask == profiles.LENSLET or predicted == 0:
         return Check("carriers", "go", f"{made.report.carriers_from}", measured=measured)
     text = f"{seen} of {predicted} where they are predicted"
+    if made.search is not None and made.search.found is not None:
+        law = made.light_field.attributes["law"]
+        says = f"{seen} of {predicted} seen by the law {law}, none where configured; a flight is decoded by it"
+        return Check("carriers", "caution", f"{says} ({made.search.sentence}): calibrate", measured=measured)
+    if not made.observable:
+        text = "none can be seen at this aperture, so mask and focal length were not checked: stop down for a test"
+        return Check("carriers", "caution", text, measured=measured)
     if made.report.doubt:
         return Check("carriers", "caution", f"{seen} of {predicted} seen; {made.report.doubt}", measured=measured)
     if seen >= SEEN_SHARE * predicted:

@@ -98,6 +98,8 @@ def of_shot(pending: PendingShot) -> tuple[str, Level]:
         words[0] += f", {pending.frame.size / 1e6:.1f} MB"
     if pending.decoded:
         done = pending.decoded
-        words.append(f"{done.carriers_found} of {done.carriers_predicted} carriers ({done.carriers_from})")
+        found = "no" if done.carriers_found is None else f"{done.carriers_found} of {done.carriers_predicted}"
+        where = ", not observable at this aperture" if done.carriers_found is None else ""
+        words.append(f"{found} carriers ({done.carriers_from}{where})")
         words.append(f"decoded in {pending.ms.get('decode', 0.0) / 1e3:.1f} s")
     return "; ".join(words), "info"

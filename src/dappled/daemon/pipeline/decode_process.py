@@ -13,7 +13,7 @@ import socket
 import subprocess
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from dappled.clock import Clock, SystemClock
@@ -26,7 +26,7 @@ from dappled.drivers.child_process import (
     end_child,
     start_child,
 )
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import LawDecision, Recipe
 from dappled.errors import DappledError
 from dappled.flight import Result
 from dappled.workers import Loop
@@ -47,7 +47,8 @@ class DecodedFrame:
 
     `carriers` are rows [ky, kx, fy, fx]; `grid` (2, 3) leads from (y, x, 1) of a slice to sensor (row, column).
     `preview` is a JPEG of `preview_size` (width, height). `ms` names what took how long. `seen` is what viewers need
-    besides, in the words of the `slices` schema.
+    besides, in the words of the `slices` schema. `carriers_found` is None where no carriers can be seen at the frame's
+    aperture, `decision` the law for the flight where this frame decided it.
     """
 
     body: mmap.mmap
@@ -55,7 +56,7 @@ class DecodedFrame:
     arrays: list[dict[str, Any]]
     carriers: list[list[float]]
     carriers_from: str
-    carriers_found: int
+    carriers_found: int | None
     carriers_predicted: int
     law: str
     grid: list[list[float]]
@@ -63,6 +64,7 @@ class DecodedFrame:
     preview_size: tuple[int, int]
     ms: Mapping[str, float] = field(default_factory=dict)
     seen: Mapping[str, Any] = field(default_factory=dict)
+    decision: LawDecision | None = None
 
     def result(self, index: int, decode_ms: float | None, run: str = "live") -> Result:
         """The row of the ledger."""
@@ -75,7 +77,7 @@ class DecodedFrame:
             self.carriers_from,
             decode_ms,
             run,
-            {"ms": dict(self.ms)},
+            {"ms": dict(self.ms), **({"doubts": self.seen["doubts"]} if self.seen.get("doubts") else {})},
         )
 
 
@@ -96,8 +98,11 @@ class FrameDepth:
 class FrameDecoder(Protocol):
     """Decodes recorded frames, for the pipeline and for answers to subscribers."""
 
-    def decode(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
-        """Decode the raw file at `path`. Raises DecodeProcessError."""
+    def decode(
+        self, path: str, focal_length_mm: float | None, f_number: float | None, *, index: int, look: bool = False
+    ) -> DecodedFrame:
+        """Decode the raw file of frame `index` at `path`. With `look` it may decide by which law the flight goes on.
+        Raises DecodeProcessError."""
 
 
 class DecodeProcess:
@@ -139,12 +144,16 @@ class DecodeProcess:
         except DecodeProcessError as error:
             log.warning("decoding will fail: %s", error)
 
-    def decode(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedFrame:
+    def decode(
+        self, path: str, focal_length_mm: float | None, f_number: float | None, *, index: int, look: bool = False
+    ) -> DecodedFrame:
         """See FrameDecoder."""
+        frame = {"path": path, "focal_length_mm": focal_length_mm, "f_number": f_number, "index": index, "look": look}
         with self._turn:
-            return _decoded(
-                self._ask({"do": "decode", "path": path, "focal_length_mm": focal_length_mm, "f_number": f_number})
-            )
+            decoded = _decoded(self._ask({"do": "decode", **frame}))
+            if decoded.decision is not None:  # a worker that takes over goes on by it
+                self._recipe = replace(self._recipe, decided=decoded.decision)
+        return decoded
 
     def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> FrameDepth:
         """Decode a frame with its views, and estimate its depth. Raises DecodeProcessError."""
@@ -204,7 +213,7 @@ class DecodeProcess:
             )
         self._budget.spend(self._clock.monotonic_ns())
         self._process, self._channel = start_child("dappled.daemon.pipeline.decode_worker")
-        self._channel.send({"do": "set up", "recipe": asdict(self._recipe), "preview_px": self._preview_px})
+        self._channel.send({"do": "set up", "recipe": self._recipe.as_values(), "preview_px": self._preview_px})
         return self._channel
 
     def _end(self) -> int | None:
@@ -251,6 +260,7 @@ def _decoded(answer: ChannelMessage) -> DecodedFrame:
         preview_size=(facts["preview_size"][0], facts["preview_size"][1]),
         ms=facts["ms"],
         seen=facts["seen"],
+        decision=None if facts["decision"] is None else LawDecision.of_values(facts["decision"]),
     )
 
 

@@ -10,6 +10,7 @@ import socket
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -30,17 +31,27 @@ DEPTH_NICENESS = 14
 WorkerReply = tuple[Mapping[str, Any], tuple[int, ...]]
 
 
+_LOOKS = 4  # at frames of different lens settings, in one flight: a search takes as long as some decodes
+
+
 class DecodeWorker:
-    """Answers the parent's questions with a darkroom that it sets up once."""
+    """Answers the parent's questions with darkrooms that it sets up once: one for the recipe as configured, one for
+    what a flight has decided, which holds from the frame on that decided it."""
 
     def __init__(self) -> None:
         self._darkroom: Darkroom | None = None
+        self._decided: Darkroom | None = None
         self._preview_px = 1024
+        self._looks = False
+        self._laws = LawLooks()
 
     def __call__(self, question: ChannelMessage) -> WorkerReply:
         body = question.body
         if body["do"] == "set up":
-            self._darkroom = Darkroom(Recipe(**body["recipe"]))
+            recipe = Recipe.of_values(body["recipe"])
+            self._darkroom = Darkroom(replace(recipe, decided=None, try_laws=False))
+            self._looks = recipe.try_laws and recipe.decided is None
+            self._decided = None if recipe.decided is None else Darkroom(recipe)
             self._preview_px = body["preview_px"]
             return {}, ()
         assert self._darkroom is not None  # "set up" comes first
@@ -49,17 +60,29 @@ class DecodeWorker:
                 self._darkroom.check()
                 return {"ready": True}, ()
             if body["do"] == "depth":
-                return _depth(self._darkroom, body)
-            return self._decode(self._darkroom, body["path"], body["focal_length_mm"], body["f_number"])
+                return _depth(self._decided or self._darkroom, body)
+            return self._decode(self._darkroom, body)
         except Exception as error:  # noqa: BLE001  # no frame may end the worker: the next one may be good
             return {"error": _naming(body.get("path"), error)}, ()
 
-    def _decode(
-        self, darkroom: Darkroom, path: str, focal_length_mm: float | None, f_number: float | None
-    ) -> WorkerReply:
-        done = darkroom.decode(path, focal_length_mm=focal_length_mm, f_number=f_number, views=False)
-        field = done.light_field
+    def _decode(self, configured: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
+        path, index = asked["path"], asked["index"]
+        known = {"focal_length_mm": asked["focal_length_mm"], "f_number": asked["f_number"], "views": False}
+        decided = self._decided.recipe.decided if self._decided is not None else None
+        in_force = self._decided if decided is not None and index >= decided.first else None
+        done = (in_force or configured).decode(path, **known)
         ms = dict(done.ms)
+        decision = None
+        if asked["look"] and self._looks and self._laws.wanted(done, index):
+            began = time.perf_counter()
+            looked = Darkroom(replace(configured.recipe, try_laws=True))
+            decision = looked.decision(self._laws.keep(looked.decode(path, **known)), index)
+            if decision is not None:
+                self._looks = False
+                self._decided = Darkroom(replace(configured.recipe, decided=decision))
+                done = self._decided.decode(path, **known)
+            ms["laws"] = (time.perf_counter() - began) * 1e3
+        field = done.light_field
         began = time.perf_counter()
         slices = np.ascontiguousarray(field.slices)
         data = memoryview(slices.data).cast("B")
@@ -70,18 +93,20 @@ class DecodeWorker:
         preview, size = self._preview(slices, field.carriers)
         blob = Blob.of(preview, "preview")
         ms["preview"] = (time.perf_counter() - began) * 1e3
+        found, doubts = self._laws.judge(done)
         facts = {
             "sha256": sha256,
             "arrays": [wire.describe_array("slices", slices, "1.0 = sensor white")],
             "carriers": field.carriers.tolist(),
             "carriers_from": done.report.carriers_from,
-            "carriers_found": done.carriers_found,
+            "carriers_found": found,
             "carriers_predicted": done.carriers_predicted,
             "law": field.attributes["law"],
             "grid": field.grid.tolist(),
-            "seen": _seen(done),
+            "seen": {**_seen(done), "doubts": doubts},
             "preview_size": list(size),
             "ms": ms,
+            "decision": None if decision is None else asdict(decision),
         }
         return facts, (body.fd, blob.fd)
 
@@ -91,6 +116,50 @@ class DecodeWorker:
         file = io.BytesIO()
         Image.fromarray(mosaic).save(file, "JPEG", quality=80)
         return file.getvalue(), (mosaic.shape[1], mosaic.shape[0])
+
+
+class LawLooks:
+    """Which frames of a flight were searched near all laws, and what is known since then.
+
+    A frame that shows no carriers where they are predicted is searched, one for each focal length and f-number and
+    `_LOOKS` in all, until one shows them: there, or where a search finds them.
+    """
+
+    def __init__(self) -> None:
+        self._last = -1
+        self._settled = False
+        self._left = _LOOKS
+        self._unseen: dict[tuple[float | None, float | None], str | None] = {}
+
+    def wanted(self, done: DecodeResult, index: int) -> bool:
+        """Whether to search this frame. Not one that was taken before another one that is decoded already."""
+        in_order, self._last = index > self._last, max(index, self._last)
+        if done.report.found > 1:
+            self._settled = True
+        told = None not in _lens(done)
+        blind = done.report.carriers_from in ("predicted", "calibrated")
+        return in_order and told and blind and not self._settled and self._left > 0 and _lens(done) not in self._unseen
+
+    def keep(self, looked: DecodeResult) -> DecodeResult:
+        """Keep what a searched frame showed."""
+        self._left -= 1
+        self._settled = looked.search is not None and looked.search.found is not None
+        if not self._settled:
+            self._unseen[_lens(looked)] = looked.contradiction
+        return looked
+
+    def judge(self, done: DecodeResult) -> tuple[int | None, list[str]]:
+        """How many carriers a frame shows, None where none can be seen with its lens so; and what is in doubt."""
+        doubts = [words for words in (done.report.doubt, done.calibration_doubt) if words]
+        if done.report.found > 1 or _lens(done) not in self._unseen:
+            return done.carriers_found, doubts
+        missing = self._unseen[_lens(done)]
+        return (None, doubts) if missing is None else (done.carriers_found, [missing, *doubts])
+
+
+def _lens(done: DecodeResult) -> tuple[float | None, float | None]:
+    attributes = done.light_field.attributes
+    return attributes.get("focal_length_mm"), attributes.get("f_number")
 
 
 def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from dataclasses import asdict
 from typing import Protocol
 
 from dappled.clock import Clock
 from dappled.drivers.camera import Blob, Fired
+from dappled.drivers.raw.recipe import DECISION, LawDecision
 from dappled.errors import DappledError, report
 from dappled.flight import Frame, Recording, Result, Shot, Tag
 
@@ -47,6 +49,9 @@ class FlightWriter(Protocol):
 
     def tagged(self, tag: Tag) -> None:
         """A frame's tag is known."""
+
+    def law_decided(self, decision: LawDecision) -> None:
+        """A frame showed by which law this flight is decoded. Called before that frame's slices are."""
 
     def decoded(self, result: Result) -> None:
         """A frame's slices are known."""
@@ -112,6 +117,11 @@ class LedgerWriter:
     def tagged(self, tag: Tag) -> None:
         """See FlightWriter."""
         self._recording.ledger.add_tag(tag)
+
+    def law_decided(self, decision: LawDecision) -> None:
+        """See FlightWriter. flight.toml holds it, so that replays and products decode as the flight did."""
+        self._recording.add_facts({DECISION: asdict(decision)})
+        self.event("law", decision.sentence, decision.first)
 
     def decoded(self, result: Result) -> None:
         """See FlightWriter."""

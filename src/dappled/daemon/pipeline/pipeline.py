@@ -130,9 +130,13 @@ class Decoding:
         assert self._decoder is not None
         began = time.monotonic_ns()
         writer = self._ends.writer
-        decoded = self._decoder.decode(writer.path(frame), tag.focal_length_mm, tag.f_number)
+        decoded = self._decoder.decode(
+            writer.path(frame), tag.focal_length_mm, tag.f_number, index=frame.index, look=True
+        )
         self.failures = replace(self.failures, in_a_row=0)
         pending.decoded = decoded
+        if decoded.decision is not None:
+            writer.law_decided(decoded.decision)
         writer.decoded(decoded.result(frame.index, (time.monotonic_ns() - began) / 1e6))
         pending.ms["decode"] = (time.monotonic_ns() - began) / 1e6
         began = time.monotonic_ns()

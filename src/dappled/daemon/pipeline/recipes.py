@@ -47,6 +47,7 @@ def recipe(settings: Settings) -> tuple[Names, Recipe | None]:
         white=settings.decode.white,
         dark=settings.decode.dark,
         workers=settings.decode.workers,
+        try_laws=True,
     )
     Darkroom(made).check()
     return names, made

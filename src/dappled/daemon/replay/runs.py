@@ -87,7 +87,7 @@ def of_flight(flight: Path, name: str) -> Run:
     if fact is None:
         runs = sorted(key.removeprefix("run:") for key in facts if key.startswith("run:"))
         raise DappledError(f"{flight} has no run {name!r}; it has {', '.join(runs) or 'only the flight itself'}")
-    return Run(name, Recipe(**{**fact["recipe"], **_absolute(fact["recipe"], flight)}), Names(**fact["names"]))
+    return Run(name, Recipe.of_values({**fact["recipe"], **_absolute(fact["recipe"], flight)}), Names(**fact["names"]))
 
 
 def _fact(name: str) -> str:
@@ -97,7 +97,7 @@ def _fact(name: str) -> str:
 def _relative(recipe: Recipe, flight: Path) -> dict[str, Any]:
     """The recipe as JSON values; its files relative to the flight, which may be copied elsewhere."""
     top = f"{flight}/"
-    values = asdict(recipe)
+    values = recipe.as_values()
     return {k: v.removeprefix(top) if isinstance(v, str) and v.startswith(top) else v for k, v in values.items()}
 
 

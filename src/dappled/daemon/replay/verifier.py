@@ -8,6 +8,7 @@ from pathlib import Path
 
 from dappled import durable
 from dappled.drivers.camera import Blob, Fired
+from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import DappledError
 from dappled.flight import Frame, Result, Shot, ShotRow, Tag, digest
 
@@ -90,6 +91,9 @@ class ReplayVerifier:
         self._tags[tag.index] = tag
         self._compare(tag.index, "pose", one.pose_sha256, digest(tag.pose))
         self._compare(tag.index, "tag", one.tag_sha256, digest(tag))
+
+    def law_decided(self, decision: LawDecision) -> None:
+        """See FlightWriter: a replay goes by what the flight decided."""
 
     def decoded(self, result: Result) -> None:
         """See FlightWriter."""

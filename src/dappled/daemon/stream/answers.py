@@ -38,8 +38,10 @@ class DecodedSlicesWithBody(DecodedSlices, Protocol):
 class SlicesDecoder(Protocol):
     """Decodes a recorded frame again."""
 
-    def decode(self, path: str, focal_length_mm: float | None, f_number: float | None) -> DecodedSlicesWithBody:
-        """Decode the raw file at `path`. Raises DappledError."""
+    def decode(
+        self, path: str, focal_length_mm: float | None, f_number: float | None, *, index: int
+    ) -> DecodedSlicesWithBody:
+        """Decode the raw file of frame `index` at `path`. Raises DappledError."""
 
 
 class FlightDecoding(Protocol):
@@ -94,7 +96,7 @@ class Answers:
             raise WireError("this flight is not decoded: no mask is configured")
         if self._flight is not None:
             self._flight.wait_decoded()
-        decoded = self._decoder.decode(self._record.path(frame), tag.focal_length_mm, tag.f_number)
+        decoded = self._decoder.decode(self._record.path(frame), tag.focal_length_mm, tag.f_number, index=index)
         return Message("slices", slices_header(tag, decoded), decoded.body)
 
     def _failed(self, item: tuple[Mapping[str, Any], Reply], error: Exception) -> None:

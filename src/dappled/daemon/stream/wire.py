@@ -90,8 +90,8 @@ class DecodedSlices(Protocol):
         """How the carriers' frequencies were found."""
 
     @property
-    def carriers_found(self) -> int:
-        """How many of the predicted carriers were seen in the frame."""
+    def carriers_found(self) -> int | None:
+        """How many of the predicted carriers were seen in the frame; None where none can be seen at its aperture."""
 
     @property
     def grid(self) -> list[list[float]]:

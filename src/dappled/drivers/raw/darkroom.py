@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled import confined
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode import DecodeError
@@ -24,6 +23,7 @@ from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
 from dappled.decode.depth import RANGING
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
+from dappled.decode.optics import LAWS
 from dappled.decode.spectrum import LinearRows, Plane
 from dappled.decode.spectrum import plane as planes
 from dappled.decode.spectrum.lineariser import check_shape, lineariser
@@ -31,42 +31,12 @@ from dappled.decode.spectrum.plane import Places, coloured, find_defects, local_
 from dappled.decode.spectrum.transform import Source, transform
 from dappled.drivers.raw import calibration_files, reading
 from dappled.drivers.raw.reading import RawFile
+from dappled.drivers.raw.recipe import FILES, FOLDER, LawDecision, Recipe, of_flight
 from dappled.errors import DappledError
-
-FOLDER = "inputs"
-"""The folder of a flight that keeps copies of the recipe's files and profiles."""
-FILES = ("calibration", "white", "dark")
-"""The fields of a recipe that name files."""
 
 
 class DarkroomError(DappledError):
     """A frame or a recipe can't be decoded; one sentence."""
-
-
-@dataclass(frozen=True, slots=True)
-class Recipe:
-    """What decoding needs to know; see [camera], [mask] and [decode] of the settings.
-
-    `camera` a profile, a TOML file or "auto" (by the frame's model); `mask` a profile, a TOML file or "lenslet";
-    `law` "" takes the camera's; a file is "" where there is none.
-    `cfa` (as "BGGR", row by row), `black` and `white_level` are for files that don't contain them. `colour` makes
-    views in red, green and blue; `taper`, 0 to 1, makes the bands of a printed mask's slices fall off softly.
-    With `try_laws` a frame without carriers at the prediction is searched near those of all laws.
-    """
-
-    camera: str
-    mask: str
-    law: str = ""
-    calibration: str = ""
-    white: str = ""
-    dark: str = ""
-    workers: int = 1
-    cfa: str = ""
-    black: float | None = None
-    white_level: float | None = None
-    colour: bool = False
-    taper: float = 0.0
-    try_laws: bool = False
 
 
 def read(path: Path | str, recipe: Recipe) -> RawFile:
@@ -94,39 +64,6 @@ def override(raw: RawFile, recipe: Recipe) -> RawFile:
     if recipe.white_level is not None:
         changed["white"] = recipe.white_level
     return replace(raw, **changed) if changed else raw
-
-
-def of_flight(flight: Path, facts: Mapping[str, Any], overrides: Mapping[str, Any]) -> Recipe | None:
-    """Return the recipe that a recorded flight was decoded by, with the flight's own copies of its files.
-
-    `facts` are those of flight.toml. `overrides` that are not None replace fields. None where no mask is named.
-    """
-    settings = facts.get("settings", {})
-    decode, folder = settings.get("decode", {}), flight / FOLDER
-    files: dict[str, Any] = {name: _kept(decode.get(name, ""), folder, name) for name in FILES}
-    made = Recipe(
-        camera=_kept_profile(settings.get("camera", {}).get("profile", "auto"), folder, "cameras"),
-        mask=_kept_profile(settings.get("mask", {}).get("profile", ""), folder, "masks"),
-        law=decode.get("law", ""),
-        workers=decode.get("workers", 1),
-        **files,
-    )
-    made = replace(made, **{name: value for name, value in overrides.items() if value is not None})
-    return made if made.mask else None
-
-
-def _kept(named: str, folder: Path, name: str) -> str:
-    return str(_inside(folder, f"{name}{Path(named).suffix}")) if named else ""
-
-
-def _kept_profile(profile: str, folder: Path, kind: str) -> str:
-    copy = _inside(folder, f"{kind}/{Path(profile).stem}.toml")
-    return str(copy) if copy.is_file() else profile
-
-
-def _inside(folder: Path, name: str) -> Path:
-    """A file of the flight's own inputs. Raises OutsideError where a link leads out of them."""
-    return confined.path(folder.parent, f"{folder.name}/{name}", f"the flight {folder.parent}")
 
 
 @lru_cache(maxsize=64)  # each frame asks, and finding a model reads every profile
@@ -159,15 +96,23 @@ def naming(path: Path | str) -> Iterator[None]:
 
 
 __all__ = [
+    "FILES",
+    "FOLDER",
     "Darkroom",
     "DarkroomError",
     "DecodeResult",
+    "LawDecision",
     "Recipe",
     "at_found",
     "camera_name",
     "known_to",
+    "of_flight",
     "search_frame",
 ]
+
+
+OTHER_LATTICE = "the mask's carriers are not where the calibration has them: calibrate again"
+"""The doubt about a frame whose carriers were found elsewhere; it is decoded without the calibration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +120,8 @@ class DecodeResult:
     """A decoded frame, its report and raw file, and how many milliseconds each step took.
 
     `search` is what the frame shows under all laws, where they were tried. `contradiction` says in a sentence that
-    carriers should be visible and are not; None where there is no such reason for doubt.
+    carriers should be visible and are not; None where there is no such reason for doubt. `calibration_doubt` is what
+    the calibration itself was in doubt about.
     """
 
     light_field: LightField
@@ -184,6 +130,7 @@ class DecodeResult:
     ms: dict[str, float] = field(default_factory=dict)
     search: LawSearch | None = None
     contradiction: str | None = None
+    calibration_doubt: str | None = None
 
     @property
     def observable(self) -> bool:
@@ -267,6 +214,13 @@ class Darkroom:
                         doubt = search.reason if search.expected and search.found is None else None
                     elif report.carriers_from == "calibrated" and report.found <= 1:
                         doubt = missing_at(decoder, plane, focal_length_mm, f_number)
+                        search = search_frame(decoder, plane, focal_length_mm, f_number) if doubt else None
+                        if search is not None and search.found is not None:  # elsewhere than the calibration has it
+                            decoder = at_found(replace(decoder, calibration=None), search)
+                            light_field, report = decoder.decode_reported(
+                                plane, focal_length_mm=focal_length_mm, f_number=f_number, views=views
+                            )
+                            doubt = OTHER_LATTICE
                 if chroma is not None:
                     light_field = replace(
                         light_field, views=coloured(light_field.views, light_field.grid, chroma, plane.shape)
@@ -278,12 +232,23 @@ class Darkroom:
             "decoded_from": "grey" if raw.cfa is None else "mosaic",
             **(self._ranging if views else {}),
         }
-        made = DecodeResult(light_field, report, raw, ms, search, doubt)
-        if self.recipe.try_laws:
-            attributes["doubts"] = [words for words in (doubt, report.doubt, doubt_of(decoder)) if words]
-            if not made.observable:
-                attributes["carriers_found"] = None
+        made = DecodeResult(light_field, report, raw, ms, search, doubt, doubt_of(decoder))
+        attributes["doubts"] = [words for words in (doubt, report.doubt, made.calibration_doubt) if words]
+        if self.recipe.try_laws and not made.observable:
+            attributes["carriers_found"] = None
         return replace(made, light_field=replace(light_field, attributes=attributes))
+
+    def decision(self, made: DecodeResult, index: int) -> LawDecision | None:
+        """Return what the search of frame `index` decides for its flight; None where it found nothing."""
+        search = made.search
+        if search is None or search.found is None or search.law is None:
+            return None
+        shape, length = made.light_field.attributes["shape"], made.light_field.attributes["focal_length_mm"]
+        decoder = self.mask_decoder((shape[0], shape[1]), made.raw.camera_model or "")
+        predicted = LAWS[search.law](decoder.mask, decoder.sensor, decoder.mask_distance_mm, length)
+        (a, b), (c, d) = search.found.lattice.matrix() @ np.linalg.inv(predicted.matrix())
+        sentence = f"decoded by the law {search.law} from frame {index} on: {search.sentence}"
+        return LawDecision(search.law, (float(a), float(b), float(c), float(d)), index, sentence)
 
     def plane(self, raw: RawFile) -> Plane:
         """Return a frame's linear plane: black, white and dark frame; for masks also even colours and white frame."""
@@ -329,13 +294,15 @@ class Darkroom:
             with naming(recipe.white):
                 return LensletDecoder.with_white(self.plane(white), workers=recipe.workers, rolloff=rolloff)
         camera = self.camera(model)
-        known = self._calibration() if recipe.calibration else None
+        known = self._calibration() if recipe.calibration and recipe.decided is None else None
+        law = recipe.law or (camera.law if known is None else known.law)
         return MaskDecoder(
             camera.sensor(shape),
             profiles.mask(recipe.mask).mask,
-            recipe.law or (camera.law if known is None else known.law),
+            law if recipe.decided is None else recipe.decided.law,
             camera.mask_distance_mm,
             calibration=known,
+            ratio=None if recipe.decided is None else recipe.decided.ratio,
             workers=recipe.workers,
             colours=colours,
             taper=recipe.taper,

@@ -113,7 +113,8 @@ function showFacts({ tag, slices }) {
     ["height", fixed(pose.height_above_home_m, 1, "m")],
     ["roll, pitch, yaw", [pose.roll_deg, pose.pitch_deg, pose.yaw_deg].map((one) => fixed(one, 1, "")).join("°, ") + "°"],
     ["lens", `${fixed(tag.focal_length_mm, 0, "mm")}, f/${tag.f_number ?? dash}, ${exposure}, ISO ${tag.iso ?? dash}`],
-    ["carriers", slices ? `${slices.carriers_found ?? dash} seen, ${slices.carriers_from}` : tag.mask ? "not decoded here yet" : "no mask"],
+    ["carriers", slices ? `${slices.carriers_found === null ? "not observable at this aperture" : `${slices.carriers_found} seen`}, ${slices.carriers_from}` : tag.mask ? "not decoded here yet" : "no mask"],
+    ...(slices?.doubts ?? []).map((doubt) => ["doubt", doubt, true]),
     ["file", `${tag.name}, ${fixed(tag.size / 1e6, 1, "MB")}`],
   ]);
 }

@@ -1,0 +1,123 @@
+"""What frames are decoded by: camera, mask, law and files, as asked for, decided, or kept by a recorded flight."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from dappled import confined
+from dappled.decode.optics import LAWS
+from dappled.errors import DappledError
+
+FOLDER = "inputs"
+"""The folder of a flight that keeps copies of the recipe's files and profiles."""
+FILES = ("calibration", "white", "dark")
+"""The fields of a recipe that name files."""
+DECISION = "law_decision"
+"""The entry of flight.toml that holds a LawDecision."""
+
+
+@dataclass(frozen=True, slots=True)
+class LawDecision:
+    """The law that the frames of a flight obey, where it is not the configured one or stands elsewhere.
+
+    `ratio` is the lattice that was found over the law's prediction, row by row: a print of another scale, turned.
+    `first` is the index of the frame that decided: it and those after it are decoded by this law. `sentence` says why.
+    """
+
+    law: str
+    ratio: tuple[float, float, float, float]
+    first: int
+    sentence: str
+
+    @classmethod
+    def of_values(cls, values: Mapping[str, Any]) -> LawDecision:
+        """From plain values. Raises TypeError, KeyError or ValueError for anything else."""
+        a, b, c, d = (float(one) for one in values["ratio"])
+        if values["law"] not in LAWS:
+            raise ValueError(f"unknown law {values['law']!r}")
+        return cls(str(values["law"]), (a, b, c, d), int(values["first"]), str(values["sentence"]))
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What decoding needs to know; see [camera], [mask] and [decode] of the settings.
+
+    `camera` a profile, a TOML file or "auto" (by the frame's model); `mask` a profile, a TOML file or "lenslet";
+    `law` "" takes the camera's; a file is "" where there is none.
+    `cfa` (as "BGGR", row by row), `black` and `white_level` are for files that don't contain them. `colour` makes
+    views in red, green and blue; `taper`, 0 to 1, makes the bands of a printed mask's slices fall off softly.
+    With `try_laws` a frame without carriers at the prediction is searched near those of all laws. `decided` is what
+    such a search has decided for a whole flight: its law goes before `law` and a calibration.
+    """
+
+    camera: str
+    mask: str
+    law: str = ""
+    calibration: str = ""
+    white: str = ""
+    dark: str = ""
+    workers: int = 1
+    cfa: str = ""
+    black: float | None = None
+    white_level: float | None = None
+    colour: bool = False
+    taper: float = 0.0
+    try_laws: bool = False
+    decided: LawDecision | None = None
+
+    def as_values(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def of_values(cls, values: Mapping[str, Any]) -> Recipe:
+        """The inverse of `as_values`. Raises TypeError or KeyError for anything else."""
+        decided = values.get("decided")
+        return cls(**{**values, "decided": None if decided is None else LawDecision.of_values(decided)})
+
+
+def of_flight(flight: Path, facts: Mapping[str, Any], overrides: Mapping[str, Any]) -> Recipe | None:
+    """Return the recipe that a recorded flight was decoded by, with the flight's own copies of its files.
+
+    `facts` are those of flight.toml; the law that the flight decided on is kept, unless another law, mask, camera or
+    calibration is asked for. `overrides` that are not None replace fields. None where no mask is named.
+    """
+    settings = facts.get("settings", {})
+    decode, folder = settings.get("decode", {}), flight / FOLDER
+    files: dict[str, Any] = {name: _kept(decode.get(name, ""), folder, name) for name in FILES}
+    made = Recipe(
+        camera=_kept_profile(settings.get("camera", {}).get("profile", "auto"), folder, "cameras"),
+        mask=_kept_profile(settings.get("mask", {}).get("profile", ""), folder, "masks"),
+        law=decode.get("law", ""),
+        workers=decode.get("workers", 1),
+        **files,
+    )
+    changed = {name: value for name, value in overrides.items() if value is not None}
+    if not any(changed.get(name) for name in ("law", "mask", "camera", "calibration")):
+        made = replace(made, decided=_decided(flight, facts))
+    made = replace(made, **changed)
+    return made if made.mask else None
+
+
+def _decided(flight: Path, facts: Mapping[str, Any]) -> LawDecision | None:
+    try:
+        return None if DECISION not in facts else LawDecision.of_values(facts[DECISION])
+    except (TypeError, KeyError, ValueError, AttributeError) as error:
+        raise DappledError(f"{flight}/flight.toml: the law that the flight decided on can't be read: {error}") from None
+
+
+def _kept(named: str, folder: Path, name: str) -> str:
+    return str(_inside(folder, f"{name}{Path(named).suffix}")) if named else ""
+
+
+def _kept_profile(profile: str, folder: Path, kind: str) -> str:
+    copy = _inside(folder, f"{kind}/{Path(profile).stem}.toml")
+    return str(copy) if copy.is_file() else profile
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """A file of the flight's own inputs. Raises OutsideError where a link leads out of them."""
+    return confined.path(folder.parent, f"{folder.name}/{name}", f"the flight {folder.parent}")
