@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from dappled.daemon.health.go_no_go import Check, verdict
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.mocks.scene.masked_camera import reference_camera
+from tests.cli.test_thesis_camera import PROFILE, QUARTER, dng_of
+from tests.decode.ray_frames import MASKS, Shot
 
 RECIPE = Recipe(camera="reference-36mm", mask="reference-5x5")
 
@@ -114,3 +117,15 @@ def test_focus_and_motion_are_told_apart(seed: int) -> None:
     focus, motion = sharpness(ndimage.convolve(sharp, falling))
     assert motion.state == "no-go"
     assert "falling" in motion.text
+
+
+def test_carriers_by_another_law_or_none_to_be_seen_are_cautions(tmp_path: Path) -> None:
+    (tmp_path / "quarter.toml").write_text(PROFILE)
+    recipe = Recipe(str(tmp_path / "quarter.toml"), "mask-2", try_laws=True)
+    stopped = Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, turn_deg=1.0)
+    opened = replace(stopped, f_number=1.8, scene="texture", exponent=1.1, snr=30.0)
+    for shot, words in ((stopped, "seen by the law geometric, none where configured"), (opened, "none can be seen")):
+        frame = dng_of(tmp_path / f"{shot.f_number}.dng", shot, shot.frame())
+        one = by_name(check_frame(frame, recipe))["carriers"]
+        assert one.state == "caution"
+        assert words in one.text

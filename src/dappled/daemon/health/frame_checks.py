@@ -71,21 +71,22 @@ def _carriers(made: DecodeResult, recipe: Recipe) -> Check:
     text = f"{seen} of {predicted} where they are predicted"
     if made.search is not None and made.search.found is not None:
         law = made.light_field.attributes["law"]
-        says = f"{seen} of {predicted} seen by the law {law}, none where configured; a flight is decoded by it"
-        return Check("carriers", "caution", f"{says} ({made.search.sentence}): calibrate", measured=measured)
-    if not made.observable:
-        text = "none can be seen at this aperture, so mask and focal length were not checked: stop down for a test"
-        return Check("carriers", "caution", text, measured=measured)
-    if made.report.doubt:
-        return Check("carriers", "caution", f"{seen} of {predicted} seen; {made.report.doubt}", measured=measured)
-    if seen >= SEEN_SHARE * predicted:
-        return Check("carriers", "go", text, measured=measured)
-    if recipe.calibration:
-        return Check(
-            "carriers", "caution", f"{text}: the calibration is used instead; stop down to see more", measured=measured
+        text = (
+            f"{seen} of {predicted} seen by the law {law}, none where configured; a flight is decoded by what is seen"
         )
-    advice = "check mask, profile and focal length; stop down for a test, then `dappled calibrate`"
-    return Check("carriers", "no-go", f"{text}: {advice}", measured=measured)
+        return Check("carriers", "caution", f"{text} ({made.search.sentence}): calibrate", measured=measured)
+    if made.report.doubt:
+        text = f"{seen} of {predicted} seen; {made.report.doubt}"
+    elif not made.observable:
+        text = "none can be seen at this aperture, so mask and focal length are not checked: stop down for a test"
+    elif seen >= SEEN_SHARE * predicted:
+        return Check("carriers", "go", text, measured=measured)
+    elif recipe.calibration:
+        text = f"{text}: the calibration is used instead; stop down to see more"
+    else:
+        advice = "check mask, profile and focal length; stop down for a test, then `dappled calibrate`"
+        return Check("carriers", "no-go", f"{text}: {advice}", measured=measured)
+    return Check("carriers", "caution", text, measured=measured)
 
 
 def sharpness(picture: NDArray[Any]) -> list[Check]:
