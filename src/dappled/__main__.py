@@ -1,7 +1,21 @@
-"""`python -m dappled`."""
+"""The command `dappled`, also as `python -m dappled`. An interruption while it loads ends it at once, in silence."""
 
+from __future__ import annotations
+
+import os
+import signal
 import sys
 
-from dappled.cli import main
+INTERRUPTED = 130
 
-sys.exit(main())
+
+def main() -> int:
+    """Run the command line; returns its exit code."""
+    signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))  # nothing is there yet to end in order
+    from dappled.cli import main as command  # noqa: PLC0415  # it loads for a second
+
+    return command(loaded=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

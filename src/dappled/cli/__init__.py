@@ -7,7 +7,7 @@ import importlib
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import dappled
 from dappled.daemon.health import systemd
@@ -61,8 +61,11 @@ def parser(wanted: str | None = None) -> argparse.ArgumentParser:
     return top
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code: 0, 1 for a failure, 2 for a wrong call, 130 when interrupted."""
+def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object] | None = None) -> int:
+    """Run the command line; returns the exit code: 0, 1 for a failure, 2 for a wrong call, 130 when interrupted.
+
+    `loaded` is called when all modules are there and the verb begins.
+    """
     words = list(sys.argv[1:] if arguments is None else arguments)
     wanted = next((word for word in words if not word.startswith("-")), None)
     parsed = parser(wanted).parse_args(words)
@@ -70,6 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.DEBUG if parsed.debug else quiet, handlers=[systemd.handler()])
     logging.getLogger("PIL").setLevel(logging.INFO)
     try:
+        if loaded is not None:
+            loaded()
         code: int = parsed.run(parsed)
         sys.stdout.flush()
     except DappledError as error:

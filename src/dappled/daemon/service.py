@@ -27,7 +27,8 @@ from dappled.daemon.camera_protocol.earlier_outcomes import IndexedOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters
 from dappled.daemon.console import process as console_process
-from dappled.daemon.console.process import Console, ConsoleRequests
+from dappled.daemon.console.process import Console
+from dappled.daemon.console.requests import ConsoleRequests
 from dappled.daemon.flight_control import FlightControl
 from dappled.daemon.flight_handover import FlightHandover, RecipeParameters
 from dappled.daemon.health import record as health
@@ -120,13 +121,13 @@ class Service:
             stack.callback(self._links.stop)
             recipe = self._begin_recording(names, recipe, stack)
             self._build(camera, names, recipe)
-            self._start_parts(names, stack)
-            if listener:
+            if listener:  # before the publisher, so that it ends after it: the pages are told how the flight ended
                 self.console_url = listener.url
-                requests = ConsoleRequests(self._shutter, self._logbook)
+                requests = ConsoleRequests(self._shutter, self._logbook, self._clock)
                 self._console = console_process.start(
                     listener, settings, stack, recipe=recipe, requests=requests, clock=self._clock
                 )
+            self._start_parts(names, stack)
             self._started = True
             self._stack = stack.pop_all()
         for text in self._recording.recovered:

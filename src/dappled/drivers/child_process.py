@@ -232,6 +232,7 @@ def start_child(
                 [sys.executable, "-m", module, str(other.fileno()), str(os.getpid()), *arguments],
                 pass_fds=(other.fileno(), *descriptors),
                 stdin=subprocess.DEVNULL,
+                process_group=0,  # the terminal's ^C is the daemon's to act on, also while this one loads
                 stderr=subprocess.DEVNULL if quiet else None,
                 env={**os.environ, **(environment or {})},
             )

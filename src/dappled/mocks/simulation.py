@@ -49,7 +49,8 @@ class Simulation:
         self.world = world
         self.start_monotonic_ns = time.monotonic_ns()
         self._stack = ExitStack()
-        self._autopilot_port, self._ground_port = free_port(), free_port()
+        self._autopilot_port = free_port()
+        self._ground_port = next(port for port in iter(free_port, None) if port != self._autopilot_port)
         self._settings, self._folder = settings, folder
 
     def __enter__(self) -> Settings:

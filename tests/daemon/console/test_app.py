@@ -168,13 +168,14 @@ def test_the_page_and_its_parts_are_served_under_strict_rules(rig: Rig) -> None:
 
 
 def test_a_wish_goes_to_the_daemon_with_its_number(rig: Rig) -> None:
-    assert rig.post("/api/shoot", {"sequence": 7}).json() == {"ok": True, "text": "shot 0", "lines": []}
-    assert rig.post("/api/interval", {"sequence": 8, "interval_s": 2.5, "count": 3}).status_code == 200
+    clock = {"token": rig.feed.state()["token"], "elapsed_ms": 3}
+    assert rig.post("/api/shoot", {"sequence": 7, **clock}).json() == {"ok": True, "text": "shot 0", "lines": []}
+    assert rig.post("/api/interval", {"sequence": 8, "interval_s": 2.5, "count": 3, **clock}).status_code == 200
     assert rig.post("/api/interval/stop", {}).status_code == 200
     asked = [{key: value for key, value in one.items() if key != "number"} for one in rig.asked]
     assert asked == [
-        {"do": "shoot", "sequence": 7},
-        {"do": "interval", "sequence": 8, "interval_s": 2.5, "count": 3},
+        {"do": "shoot", "sequence": 7, **clock},
+        {"do": "interval", "sequence": 8, "interval_s": 2.5, "count": 3, **clock},
         {"do": "stop interval"},
     ]
 
@@ -192,6 +193,9 @@ def test_a_refusal_comes_with_its_sentence(rig: Rig) -> None:
         ("/api/shoot", {"sequence": -1}, 422),
         ("/api/shoot", {"sequence": True}, 422),
         ("/api/shoot", {"sequence": "1"}, 422),
+        ("/api/shoot", {"sequence": 1, "token": 1}, 422),
+        ("/api/shoot", {"sequence": 1, "token": "x" * 41}, 422),
+        ("/api/outcome", {"sequence": 1, "elapsed_ms": 1.5}, 422),
         ("/api/shoot", [1], 422),
         ("/api/interval", {"sequence": 1, "interval_s": -1, "count": 1}, 422),
         ("/api/interval", {"sequence": 1, "interval_s": "2", "count": 1}, 422),

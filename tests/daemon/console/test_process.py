@@ -18,15 +18,12 @@ from typing import Any
 import httpx
 import pytest
 
-from dappled.clock import RecordedClock, SystemClock
 from dappled.config.settings import ConsoleSettings, PublishSettings, Settings
 from dappled.daemon.console import process
-from dappled.daemon.console.process import Console, ConsoleError, ConsoleRequests
-from dappled.daemon.health.logbook import Logbook
-from dappled.daemon.pipeline.shutter import Shutter
+from dappled.daemon.console.process import Console, ConsoleError
 from dappled.daemon.stream.curve import KeyFileError
 from dappled.drivers.child_process import RestartBudget
-from tests.daemon.fakes import FakeSink, Rig, eventually, rig
+from tests.daemon.fakes import eventually
 
 TOKEN = "a-token-of-many-letters"  # noqa: S105  # it opens nothing
 
@@ -95,7 +92,7 @@ def test_a_stream_over_tcp_gets_an_endpoint_of_the_daemon_s_own(slices: str, pri
 
 def setup(folder: Path) -> dict[str, Any]:
     return {"token": "", "hosts": [], "map": "", "endpoint": f"ipc://{folder}/s", "ask": "", "recipe": None,
-            "mount": [1, 0, 0, 0, 1, 0, 0, 0, 1]}  # fmt: skip
+            "mount": [1, 0, 0, 0, 1, 0, 0, 0, 1], "run": "0000"}  # fmt: skip
 
 
 def running(console: Console) -> subprocess.Popen[bytes] | None:
@@ -188,52 +185,3 @@ def test_an_answer_that_fails_ends_one_process_and_not_the_console(tmp_path: Pat
         assert running(console) is not None
     finally:
         console.stop()
-
-
-@pytest.fixture
-def pipeline(tmp_path: Path) -> Any:
-    with rig(tmp_path) as one:
-        one.shutter.start()
-        yield one
-        one.shutter.stop()
-
-
-def do(shutter: Shutter, **request: Any) -> dict[str, Any]:
-    return ConsoleRequests(shutter, Logbook(RecordedClock(0))).answer(request)
-
-
-def test_a_number_that_comes_twice_is_one_wish(pipeline: Rig) -> None:
-    assert do(pipeline.shutter, do="shoot", sequence=5) == {"ok": True, "index": 0, "text": "shot 0"}
-    assert do(pipeline.shutter, do="shoot", sequence=5)["text"] == "already shot 0"
-    assert do(pipeline.shutter, do="shoot", sequence=6)["index"] == 1
-    pipeline.ended(1)
-    assert pipeline.shutter.statistics().shots == 2
-
-
-def test_an_interval_and_its_end() -> None:
-    shutter = Shutter(FakeSink(), SystemClock(), next_index=0, capacity=1000)
-    shutter.start()
-    assert do(shutter, do="interval", sequence=1, interval_s=0.05, count=0)["ok"]
-    until = time.monotonic() + 20
-    while shutter.statistics().shots < 3:
-        assert time.monotonic() < until
-        threading.Event().wait(0.01)
-    assert do(shutter, do="stop interval")["text"] == "the interval is stopped"
-    assert do(shutter, do="stop interval")["text"] == "no interval was running"
-    answer = do(shutter, do="interval", sequence=2, interval_s=-1, count=0)
-    assert (answer["ok"], answer["error"]) == (False, "an interval must be 0 to 86400 s, and a count 0 or more")
-    shutter.stop()
-
-
-def test_a_refusal_is_told(pipeline: Rig) -> None:
-    pipeline.shutter.stop()
-    assert do(pipeline.shutter, do="shoot", sequence=1)["error"] == "the daemon is stopping"
-
-
-def test_the_log_is_told_from_a_number_on(pipeline: Rig) -> None:
-    book = Logbook(RecordedClock(7))
-    book.add("one")
-    book.add("two", "warning")
-    told = ConsoleRequests(pipeline.shutter, book).answer({"do": "log", "after": 1})
-    assert told["lines"] == [{"number": 2, "utc_ns": 7, "level": "warning", "text": "two"}]
-    assert ConsoleRequests(pipeline.shutter, book).answer({"do": "nothing"}) == {"ok": True}

@@ -52,7 +52,7 @@ def main() -> int:
 async def _serve(channel: ProcessChannel, listener: socket.socket, setup: Mapping[str, Any]) -> None:
     recipe = setup["recipe"]
     studio = Studio(None if recipe is None else Recipe(**recipe), setup["mount"])
-    feed = Feed(setup["endpoint"], setup["ask"], Hub(), studio)
+    feed = Feed(setup["endpoint"], setup["ask"], Hub(), studio, run=setup["run"])
     daemon = DaemonChannel(channel)
     rules = Access(setup["token"], setup["hosts"])
     app = ConsoleApp(feed, studio, daemon, rules, _background(setup["map"]))
@@ -60,7 +60,7 @@ async def _serve(channel: ProcessChannel, listener: socket.socket, setup: Mappin
     tasks = [asyncio.create_task(feed.run()), asyncio.create_task(app.follow_log())]
     for task in tasks:
         task.add_done_callback(lambda done: _end(done, server))
-    waiting = asyncio.create_task(_until_gone(daemon, rules, server))
+    waiting = asyncio.create_task(_until_gone(daemon, rules, feed.hub, server))
     await server.serve(sockets=[listener])
     for task in (*tasks, waiting):
         task.cancel()
@@ -94,7 +94,7 @@ def _end(task: asyncio.Task[None], server: uvicorn.Server) -> None:
         server.should_exit = True
 
 
-async def _until_gone(daemon: DaemonChannel, rules: Access, server: uvicorn.Server) -> None:
+async def _until_gone(daemon: DaemonChannel, rules: Access, hub: Hub, server: uvicorn.Server) -> None:
     """End the server when the daemon has ended: ask every second, because nothing else would show it. Log refusals."""
     loop = asyncio.get_running_loop()
     while not daemon.gone.is_set():
@@ -104,6 +104,7 @@ async def _until_gone(daemon: DaemonChannel, rules: Access, server: uvicorn.Serv
             await loop.run_in_executor(None, daemon.ask, {"do": "nothing"})
         except DappledError as error:
             log.info("%s", error)
+    hub.close()  # a stream that the server cancels ends with a traceback
     server.should_exit = True
     threading.Timer(3.0, os._exit, [1]).start()  # a browser that keeps its connection must not keep the process
 

@@ -36,6 +36,7 @@ _DISPARITY_PX = 8.0
 _FRAME_DIGITS = 10
 _MAP_PX, _GLOBE_BOUNDS_PX, _GLOBE_PICTURE_PX = 320, 320, 1024
 _LOG_EVERY_S = 0.7
+_TOKEN_CHARACTERS = 40
 _STATIC = Path(str(resources.files("dappled.daemon.console") / "static"))
 
 
@@ -60,6 +61,7 @@ class ConsoleApp:
             Route("/api/state", self._state),
             Route("/api/shoot", self._shoot, methods=["POST"]),
             Route("/api/interval", self._interval, methods=["POST"]),
+            Route("/api/outcome", self._outcome, methods=["POST"]),
             Route("/api/interval/stop", self._stop_interval, methods=["POST"]),
             Route("/api/frames/{frame}/{name}", self._frame_picture),
             Route("/api/map", self._map),
@@ -143,15 +145,18 @@ class ConsoleApp:
     # requests to the daemon
 
     async def _shoot(self, request: Request) -> Response:
-        return await self._do({"do": "shoot", "sequence": _whole(await _body(request), "sequence", 0, 2**31)})
+        return await self._do({"do": "shoot", **_numbered(await _body(request))})
+
+    async def _outcome(self, request: Request) -> Response:
+        return await self._do({"do": "outcome", **_numbered(await _body(request))})
 
     async def _interval(self, request: Request) -> Response:
         body = await _body(request)
         seconds = body.get("interval_s")
         if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds <= 86400:
             raise StudioError("interval_s must be a number of seconds from 0 to 86400")
-        count, sequence = _whole(body, "count", 0, 10**6), _whole(body, "sequence", 0, 2**31)
-        return await self._do({"do": "interval", "sequence": sequence, "interval_s": seconds, "count": count})
+        count = _whole(body, "count", 0, 10**6)
+        return await self._do({"do": "interval", **_numbered(body), "interval_s": seconds, "count": count})
 
     async def _stop_interval(self, request: Request) -> Response:
         await _body(request)
@@ -262,6 +267,15 @@ def _whole(body: Mapping[str, Any], name: str, low: int, high: int) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
         raise StudioError(f"{name} must be a whole number from {low} to {high}")
     return value
+
+
+def _numbered(body: Mapping[str, Any]) -> dict[str, Any]:
+    """A request's number, and when it was made by the daemon's clock: see `requests`."""
+    token = body.get("token", "")
+    if not isinstance(token, str) or len(token) > _TOKEN_CHARACTERS:
+        raise StudioError("token must be the one that came with the last state")
+    elapsed_ms = _whole(body, "elapsed_ms", 0, 2**31) if "elapsed_ms" in body else 0
+    return {"sequence": _whole(body, "sequence", 0, 2**31), "token": token, "elapsed_ms": elapsed_ms}
 
 
 def _frame(request: Request) -> int:

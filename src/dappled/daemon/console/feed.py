@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.daemon.console.requests import token
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import go_no_go
 from dappled.daemon.stream import wire
@@ -27,6 +28,7 @@ FRAMES, STACK_BYTES, PATH = 400, 72_000_000, 3600
 PAGES, WAITING = 24, 64
 GLOBE_S = 30.0  # a virtual globe counts as a viewer for so long after it asked
 _ASK_S, _KEEP_ALIVE_S = 20.0, 10.0
+_END = ""  # in a page's queue: nothing follows
 
 Event = dict[str, Any]
 
@@ -57,6 +59,7 @@ class Hub:
             weakref.WeakSet()
         )  # weak: a stream that was never read goes too
         self._globe_s = -1e9
+        self._closed = False
         self.dropped = 0
 
     def __len__(self) -> int:
@@ -85,6 +88,14 @@ class Hub:
                 self.dropped += 1
             page.put_nowait(text)
 
+    def close(self) -> None:
+        """End the streams of all pages in order, after what they still have to read."""
+        self._closed = True
+        for page in self._pages:
+            if page.full():
+                page.get_nowait()
+            page.put_nowait(_END)
+
     def listen(self, first: list[Event]) -> AsyncIterator[str]:
         """Server-sent events for a new page: the first ones at once, a comment when there are none for a while."""
         page: asyncio.Queue[str] = asyncio.Queue(WAITING)
@@ -95,9 +106,11 @@ class Hub:
         try:
             for event in first:
                 yield f"data: {json.dumps(event, separators=(',', ':'))}\n\n"
-            while True:
+            while not (self._closed and page.empty()):
                 try:
-                    yield await asyncio.wait_for(page.get(), _KEEP_ALIVE_S)
+                    if (text := await asyncio.wait_for(page.get(), _KEEP_ALIVE_S)) == _END:
+                        return
+                    yield text
                 except TimeoutError:
                     yield ": still here\n\n"
         finally:
@@ -105,7 +118,8 @@ class Hub:
 
 
 class Feed:
-    """Keeps the stream's messages, and tells `hub` of each. `studio` makes small pictures and footprints for the map.
+    """Keeps the stream's messages, and tells `hub` of each. `studio` makes small pictures and footprints for the map;
+    `run` names the daemon that requests are for, see `requests.token`.
 
     All calls on one event loop.
     """
@@ -116,9 +130,11 @@ class Feed:
         ask: str,
         hub: Hub,
         studio: Studio,
+        *,
+        run: str = "",
     ) -> None:
         self.hub = hub
-        self._endpoints, self._studio = (endpoint, ask), studio
+        self._endpoints, self._studio, self._run = (endpoint, ask), studio, run
         self.health: dict[str, Any] | None = None
         self.start: dict[str, Any] | None = None
         self.frames: OrderedDict[int, FeedState] = OrderedDict()
@@ -180,14 +196,19 @@ class Feed:
         """The newest health record as an event, with its checks."""
         health = self.health
         if health is None:
-            return {"is": "state", "health": None, "checks": [], "verdict": None}
+            return {"is": "state", "health": None, "checks": [], "verdict": None, "token": self._token()}
         checks = go_no_go.checks(health, frame_bytes=self.frame_bytes)
         return {
             "is": "state",
             "health": health,
             "checks": [{"name": one.name, "state": one.state, "text": one.text} for one in checks],
             "verdict": go_no_go.verdict(checks),
+            "token": self._token(),
         }
+
+    def _token(self) -> str:
+        """The daemon's clock, which this process shares."""
+        return token(self._run, time.monotonic_ns())
 
     def frame_event(self, index: int) -> Event:
         """A frame as an event."""

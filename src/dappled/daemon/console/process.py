@@ -15,9 +15,8 @@ from typing import Any, Protocol
 from dappled.clock import Clock
 from dappled.config import settings as configuration
 from dappled.config.settings import ConsoleSettings, Settings
+from dappled.daemon.console.requests import ConsoleRequests
 from dappled.daemon.health.logbook import Logbook
-from dappled.daemon.pipeline.repeats import CaptureRequest
-from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
 from dappled.daemon.stream.curve import read_private
 from dappled.daemon.stream.sockets import is_loopback
 from dappled.daemon.supervised_process import ChildProgram, SupervisedProcess
@@ -198,6 +197,7 @@ def start(
         "ask": f"{opened.private}.ask" if opened.private else publish.ask,
         "recipe": None if recipe is None else asdict(recipe),
         "mount": list(settings.pose.mount),
+        "run": requests.run,
     }
     logger = logging.getLogger("dappled")
     logger.addHandler(requests.logbook)
@@ -230,35 +230,3 @@ class DaemonChannel:
                 self.gone.set()
                 raise ConsoleRequestError("the daemon has ended") from None
         raise ConsoleRequestError("the daemon did not answer: check whether the shot was taken before you ask again")
-
-
-@dataclass(frozen=True, slots=True)
-class ConsoleRequests:
-    """Does what the console asks of the daemon: a shot, an interval, its end, or the last lines of the log."""
-
-    shutter: Shutter
-    logbook: Logbook
-
-    def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """A capture request follows the same rules as one over MAVLink: the page numbers its requests, and the same
-        number twice is one request."""
-        match request.get("do"):
-            case "shoot":
-                return _decided(self.shutter.request(CaptureRequest("console", "console", request["sequence"])))
-            case "interval":
-                one = CaptureRequest("console", "console interval", request["sequence"])
-                return _decided(self.shutter.start_interval(one, float(request["interval_s"]), int(request["count"])))
-            case "stop interval":
-                ran = self.shutter.stop_interval()
-                return {"ok": True, "text": "the interval is stopped" if ran else "no interval was running"}
-            case "log":
-                return {"ok": True, "lines": self.logbook.after(request["after"])}
-            case _:
-                return {"ok": True}
-
-
-def _decided(decision: ShotDecision) -> dict[str, Any]:
-    if not decision.accepted:
-        return {"ok": False, "error": decision.reason, "index": None}
-    text = f"shot {decision.index}" if decision.outcome == "shot" else f"already shot {decision.index}"
-    return {"ok": True, "index": decision.index, "text": text}

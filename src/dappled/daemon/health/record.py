@@ -131,6 +131,13 @@ def record(
         "dead": list(dead_threads),
         "utc_known": utc_known,
         "interval_s": shutter.interval_s,
+        "interval": None
+        if shutter.interval_s is None
+        else {
+            "taken": shutter.interval_taken,
+            "count": shutter.interval_count,
+            "next_s": shutter.interval_next_s,
+        },
         "clock": None if clock is None else {"source": clock.source, "sigma_ms": clock.sigma_ns / 1e6},
         "vehicle": None if vehicle is None or vehicle.latitude_rad is None else _place(vehicle),
         "decode": {

@@ -39,7 +39,11 @@ class ShotDecision:
 
 @dataclass(frozen=True, slots=True)
 class ShutterStatistics:
-    """Counters of this flight. shots = pending + succeeded + failed. `interval_s` is None while no interval runs."""
+    """Counters of this flight. shots = pending + succeeded + failed.
+
+    `interval_s` is None while no interval runs; else `interval_taken` of `interval_count` (None: for ever) are taken or
+    missed, and the next is due in `interval_next_s`.
+    """
 
     shots: int
     refused: int
@@ -48,6 +52,9 @@ class ShutterStatistics:
     failed: int
     next_index: int
     interval_s: float | None
+    interval_taken: int = 0
+    interval_count: int | None = None
+    interval_next_s: float | None = None
 
 
 @dataclass(slots=True)
@@ -189,6 +196,7 @@ class Shutter:
     def statistics(self) -> ShutterStatistics:
         """Counters."""
         with self._lock:
+            interval = self._interval
             return ShutterStatistics(
                 self._shots,
                 self._refused,
@@ -196,7 +204,10 @@ class Shutter:
                 self._succeeded,
                 self._failed,
                 self._next_index,
-                None if self._interval is None else self._interval.interval_ns / 1e9,
+                None if interval is None else interval.interval_ns / 1e9,
+                0 if interval is None else interval.taken,
+                None if interval is None or interval.left is None else interval.taken + interval.left,
+                None if interval is None else max(0, interval.due_ns - self._clock.monotonic_ns()) / 1e9,
             )
 
     def _end_interval(self, source: str | None) -> None:

@@ -203,7 +203,7 @@ class Autopilot:
         ]
         command += ["--start-monotonic-ns", str(start_monotonic_ns), "--jitter", str(jitter_s)]
         command += [f"--booted={booted_s}"]
-        return cls(subprocess.Popen(command, stdin=subprocess.PIPE))
+        return cls(subprocess.Popen(command, stdin=subprocess.PIPE, process_group=0))
 
     def running(self) -> bool:
         """Whether the process lives."""

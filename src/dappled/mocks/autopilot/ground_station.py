@@ -60,7 +60,9 @@ class GroundStation:
         command = [sys.executable, "-m", "dappled.mocks.autopilot.ground_station", "--url", url, "--count", str(count)]
         command += ["--interval", str(interval_s), "--timeout", str(timeout_s)]
         command += [text for one in manners for text in ("--manners", one)]
-        return cls(subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True))
+        return cls(
+            subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True, process_group=0)
+        )
 
     def running(self) -> bool:
         """Whether it is still running."""

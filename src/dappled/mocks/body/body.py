@@ -98,7 +98,7 @@ class SimulatedBody:
     def start(cls, options: BodyOptions | None = None) -> SimulatedBody:
         """Start a body's process. Raises BodyError where it doesn't listen within 30 s."""
         command = [sys.executable, "-m", "dappled.mocks.body.body", *(options or BodyOptions()).arguments()]
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0)
         assert process.stdout is not None  # asked for above
         lines = _Lines(process.stdout.fileno())
         try:

@@ -4,21 +4,23 @@ import { FieldMap } from "./map.js";
 import { Stage } from "./stage.js";
 
 const $ = (id) => document.getElementById(id);
-const STALE_MS = 3500;
+const STALE_MS = 3500, DEADLINE_MS = 2000, AGAIN_MS = 1000;
 const stage = new Stage();
 const map = new FieldMap($("map"));
 const frames = new Map();   // index → frame event
-let chosen = null, heardAt = 0, utcAt = null, connected = false, ended = false, flight = null, lastLine = 0;
+let token = null, tokenAt = 0;   // the daemon's clock, and when it was heard
+let chosen = null, heardAt = 0, utcAt = null, connected = false, ended = null, flight = null, lastLine = 0;
+let interval = null, lastChecks = null, wasStale = false, sending = false, stopping = false, unconfirmed = null;
 let sequence = Math.floor(Math.random() * 2 ** 30);
 
 const handlers = {
   about(event) { map.setBackground(event.map); map.setPath(event.path); if (event.start) began(event.start); },
   start(event) { began(event.start); },
-  state(event) { if (event.health) showState(event); },
+  state(event) { token = event.token; tokenAt = performance.now(); if (event.health) showState(event); },
   frame: showFrame,
   ready() { connected = true; },
   log(event) { showLog(event.lines); },
-  end() { ended = true; },
+  end(event) { ended = event.shots ?? {}; tick(); },
 };
 
 function began(start) {
@@ -30,19 +32,34 @@ function began(start) {
 function showState({ health, checks, verdict }) {
   heardAt = performance.now();
   utcAt = health.utc_ns;
-  ended = false;
+  if (flight && health.flight && health.flight !== flight) location.reload();
+  if (ended) return;   // the daemon's last record: the flight is over
   if (!flight) $("flight").textContent = health.flight;
   showVerdict(verdict, checks);
-  $("checks").replaceChildren(...checks.map((one) => element("li", { "data-state": one.state }, mark(one.state), element("b", {}, one.name), element("span", {}, one.text))));
+  showChecks(checks);
   showCounters(health);
-  const running = health.interval_s !== null && health.interval_s !== undefined;
-  $("interval-go").textContent = running ? "Stop" : "Start";
-  $("interval").dataset.running = running ? health.interval_s : "";
+  interval = health.interval ?? null;
+  showInterval();
   map.setVehicle(health.vehicle);
   const place = health.vehicle;
   $("map-text").textContent = place
     ? `${fixed(place.latitude_deg, 6)}°, ${fixed(place.longitude_deg, 6)}°  ·  ${fixed(place.height_above_home_m, 1, "m")} up  ·  ${fixed(place.speed_m_s, 1, "m/s")}`
     : "no position yet";
+}
+
+// `stale`: what was last heard, which may be wrong by now: grey, and without ticks.
+function showChecks(checks, stale = false) {
+  lastChecks = checks;
+  const state = (one) => (stale ? "unknown" : one.state);
+  $("checks").replaceChildren(...checks.map((one) => element("li", { "data-state": state(one) }, mark(state(one)), element("b", {}, one.name), element("span", {}, one.text))));
+}
+
+function showInterval() {
+  const live = interval && !ended;
+  $("interval").dataset.running = live ? "yes" : "";
+  const due = live && interval.next_s !== null ? Math.max(0, interval.next_s - (performance.now() - heardAt) / 1000) : null;
+  const count = live ? (interval.count === null ? `${interval.taken} taken` : `${interval.taken} of ${interval.count}`) : "";
+  $("progress").textContent = !live ? "" : `${count}, ${due < 0.5 ? "next now" : `next in ${Math.round(due)} s`}`;
 }
 
 function showVerdict(verdict, checks) {
@@ -130,44 +147,127 @@ function showLog(lines) {
 }
 
 function tick() {
-  const age = performance.now() - heardAt, lost = heardAt > 0 && age > STALE_MS;
-  const words = ended && lost ? "the flight has ended" : lost ? `nothing heard for ${Math.round(age / 1000)} s` : connected ? "live" : "connecting";
+  const age = performance.now() - heardAt, lost = heardAt > 0 && age > STALE_MS, stale = lost || Boolean(ended);
+  const words = ended ? "the flight has ended" : lost ? `nothing heard for ${Math.round(age / 1000)} s` : connected ? "live" : "connecting";
   $("contact").textContent = words;
-  $("contact").dataset.state = lost ? "lost" : "live";
-  if (utcAt !== null) $("clock").textContent = utc(utcAt + age * 1e6);
-  if (lost) {
+  $("contact").dataset.state = lost && !ended ? "lost" : "live";
+  if (utcAt !== null && !stale) $("clock").textContent = utc(utcAt + age * 1e6);
+  if (stale !== wasStale) {
+    wasStale = stale;
+    document.body.toggleAttribute("data-stale", stale);
+    if (lastChecks) showChecks(lastChecks, stale);
+  }
+  if (ended) {
+    $("verdict").dataset.state = "ended";
+    $("verdict-word").textContent = "Ended";
+    $("verdict-text").textContent = recorded(ended);
+  } else if (lost) {
     $("verdict").dataset.state = "lost";
-    $("verdict-word").textContent = ended ? "Ended" : "No contact";
-    $("verdict-text").textContent = ended ? "the flight has ended" : `last heard ${Math.round(age / 1000)} s ago`;
+    $("verdict-word").textContent = "No contact";
+    $("verdict-text").textContent = `last heard ${Math.round(age / 1000)} s ago`;
   }
+  showInterval();
+  const able = token !== null && !stale && !sending && !unconfirmed;
+  $("shoot").disabled = !able;
+  $("interval-go").disabled = !able || Boolean(interval);
+  $("interval-stop").disabled = Boolean(ended) || stopping || !(interval || lost);
 }
 
-async function post(path, body) {
-  for (let attempt = 0; ; attempt++) {
+// What a flight brought, in words.
+function recorded({ wished = 0, safe = 0, failed = 0 }) {
+  if (!wished) return "no shot was taken";
+  const counted = (n, word) => `${n} ${word}${n === 1 ? "" : "s"}`;
+  const rest = wished - safe - failed;
+  return [`${counted(wished, "shot")}: ${counted(safe, "frame")} recorded`, failed ? `${failed} failed` : "", rest > 0 ? `${rest} without a file yet` : ""].filter(Boolean).join(", ");
+}
+
+// Throws where no answer comes in time.
+async function post(path, body, patience = DEADLINE_MS) {
+  const answer = await fetch(path, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body), signal: AbortSignal.timeout(patience) });
+  if (answer.status === 401) login();
+  return await answer.json();
+}
+
+function tell(text, state = "") {
+  $("outcome").textContent = text;
+  $("outcome").dataset.state = state;
+}
+
+const tellAnswer = (answer) => tell(answer.ok ? answer.text : answer.error ?? "refused", answer.ok ? "" : "bad");
+
+// A request that may fire is sent once, with the daemon's clock: it refuses what comes later than two seconds.
+async function fire(path, body) {
+  sequence = (sequence + 1) % 2 ** 31;
+  const request = { sequence, token, elapsed_ms: Math.round(performance.now() - tokenAt), ...body };
+  sending = true;
+  tell("sending…", "busy");
+  tick();
+  try {
+    tellAnswer(await post(path, request));
+  } catch {
+    keep(request);
+  }
+  sending = false;
+  tick();
+  if (unconfirmed) settle();
+}
+
+// A request without an answer. It outlives a reload of the page: the question is still open then.
+function keep(request) {
+  unconfirmed = request;
+  try {
+    if (request) sessionStorage.setItem("unconfirmed", JSON.stringify({ sequence: request.sequence, token: request.token, elapsed_ms: request.elapsed_ms }));
+    else sessionStorage.removeItem("unconfirmed");
+  } catch { /* without storage a reload forgets it */ }
+}
+
+// Ask what became of it until the daemon says so.
+async function settle() {
+  const { sequence, token, elapsed_ms } = unconfirmed;
+  while (unconfirmed) {
+    tell("not confirmed; it may have fired", "bad");
     try {
-      const answer = await fetch(path, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body) });
-      if (answer.status === 401) login();
-      return await answer.json();
-    } catch (error) {
-      if (attempt >= 1) return { ok: false, error: "the vehicle can't be reached; check the counters before you try again" };
-    }   // again with the same number: the daemon takes both for one request
+      const answer = await post("/api/outcome", { sequence, token, elapsed_ms });
+      if (answer.ok && answer.state !== "waiting") {
+        keep(null);
+        if (answer.state === "known") tellAnswer(answer.answer);
+        else if (answer.state === "never") tell("nothing was fired: the request did not reach the vehicle in time", "bad");
+        else tell("not confirmed; the daemon was started again since: see whether the frame is there", "bad");
+        break;
+      }
+    } catch { /* no link yet */ }
+    await new Promise((done) => setTimeout(done, AGAIN_MS));
   }
+  tick();
 }
 
-function tell(answer) {
-  $("outcome").textContent = answer.ok ? answer.text : answer.error ?? "refused";
-  $("outcome").dataset.state = answer.ok ? "" : "bad";
-}
-
-const next = () => (sequence = (sequence + 1) % 2 ** 31);
-
-$("shoot").addEventListener("click", async () => tell(await post("/api/shoot", { sequence: next() })));
-$("interval").addEventListener("submit", async (event) => {
+$("shoot").addEventListener("click", () => fire("/api/shoot", {}));
+$("interval").addEventListener("submit", (event) => {
   event.preventDefault();
-  if ($("interval").dataset.running) { tell(await post("/api/interval/stop", {})); return; }
+  if ($("interval-go").disabled) return;
   const seconds = $("interval-s").valueAsNumber, count = $("interval-count").valueAsNumber;
-  if (!(seconds >= 0) || !Number.isInteger(count) || count < 0) { tell({ ok: false, error: "give seconds from 0 and a whole number of frames" }); return; }
-  tell(await post("/api/interval", { sequence: next(), interval_s: seconds, count }));
+  if (!(seconds >= 0) || !Number.isInteger(count) || count < 0) { tell("give seconds from 0 and a whole number of frames", "bad"); return; }
+  fire("/api/interval", { interval_s: seconds, count });
+});
+// To stop is safe at any time: it is sent until the daemon has confirmed it.
+$("interval-stop").addEventListener("click", async () => {
+  stopping = true;
+  tell("stopping…", "busy");
+  tick();
+  for (;;) {
+    try {
+      const answer = await post("/api/interval/stop", {});
+      tellAnswer(answer);
+      if (answer.ok) interval = null;
+      break;
+    } catch {
+      if (ended) break;
+      tell("not confirmed; it may still be shooting: sent again until it is", "bad");
+      await new Promise((done) => setTimeout(done, AGAIN_MS));
+    }
+  }
+  stopping = false;
+  tick();
 });
 $("follow").addEventListener("change", () => { if ($("follow").checked && frames.size) choose([...frames.keys()].at(-1)); });
 $("map-in").addEventListener("click", () => map.zoom(1.5));
@@ -180,7 +280,7 @@ function login() {
 $("login").addEventListener("cancel", (event) => event.preventDefault());
 $("login-form").addEventListener("submit", async (event) => {
   event.preventDefault();
-  const answer = await post("/api/login", { token: $("token").value });
+  const answer = await post("/api/login", { token: $("token").value }, 10_000).catch(() => ({ error: "the vehicle can't be reached: try again" }));
   $("token").value = "";
   if (answer.ok) { $("login").close(); connect(); }
   else $("login-text").textContent = answer.error;
@@ -192,7 +292,7 @@ async function connect() {
   const given = new URLSearchParams(location.hash.slice(1)).get("token");   // after the #, so that it is in no log
   if (given) {
     history.replaceState(null, "", location.pathname);
-    await post("/api/login", { token: given });
+    await post("/api/login", { token: given }, 10_000).catch(() => login());
   }
   let status = 0;
   try { status = (await fetch("/api/state")).status; } catch { /* no connection: tried again below */ }
@@ -204,4 +304,7 @@ async function connect() {
 }
 
 setInterval(tick, 250);
+try { unconfirmed = JSON.parse(sessionStorage.getItem("unconfirmed")); } catch { unconfirmed = null; }
+if (unconfirmed) settle();
+tick();
 connect();

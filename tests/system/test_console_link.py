@@ -1,0 +1,196 @@
+"""The console over a link that is cut, and at a daemon's end: nothing is fired late, and nothing old looks new."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page
+
+from tests.system.test_console import (
+    SCREENSHOTS,
+    TOKEN,
+    Daemon,
+    chromium,
+    client,
+    daemon,
+    flown,
+    leave,
+    shoot,
+    until,
+    until_flown,
+)
+
+__all__ = ["chromium", "daemon", "leave"]  # fixtures
+
+SIZES = {"phone": (390, 844), "phone-on-its-side": (844, 390), "tablet": (1024, 600), "laptop": (1440, 900)}
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+
+class Link:
+    """A TCP link to the console that can be cut: what is on its way then is held, and comes when it is mended."""
+
+    def __init__(self, daemon: Daemon) -> None:
+        self._to = ("127.0.0.1", int(daemon.url.rstrip("/").rpartition(":")[2]))
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}/"
+        self._whole = threading.Event()
+        self._whole.set()
+        self._ended = False
+        self._sockets: list[socket.socket] = [self._listener]
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        self._whole.clear()
+
+    def mend(self) -> None:
+        self._whole.set()
+
+    def close(self) -> None:
+        self._ended = True
+        self._whole.set()
+        for one in self._sockets:
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while not self._ended:
+                near = self._listener.accept()[0]
+                far = socket.create_connection(self._to)
+                self._sockets += [near, far]
+                for pair in ((near, far), (far, near)):
+                    threading.Thread(target=self._carry, args=pair, daemon=True).start()
+
+    def _carry(self, source: socket.socket, target: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65536):
+                self._whole.wait()
+                target.sendall(data)
+        self._whole.wait()
+        with contextlib.suppress(OSError):
+            target.shutdown(socket.SHUT_WR)
+
+
+@pytest.fixture
+def link(daemon: Daemon) -> Iterator[Link]:
+    one = Link(daemon)
+    yield one
+    one.close()
+
+
+def page_of(browser: Browser, url: str, size: str) -> Page:
+    width, height = SIZES[size]
+    touch = {"is_mobile": True, "has_touch": True} if "phone" in size else {}
+    context = browser.new_context(viewport={"width": width, "height": height}, **touch)  # type: ignore[arg-type]  # a plain dict
+    page = context.new_page()
+    page.set_default_timeout(45_000)
+    page.goto(f"{url}#token={TOKEN}")
+    until_flown(page)
+    return page
+
+
+def picture(page: Page, size: str, what: str) -> None:
+    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+    page.screenshot(path=SCREENSHOTS / f"{size}-{what}.png")
+
+
+def requested(daemon: Daemon) -> int:
+    with client(daemon) as one:
+        return int(one.get("/api/state").raise_for_status().json()["health"]["shots"]["wished"])
+
+
+def ticks(page: Page) -> int:
+    return page.locator('#checks svg:not([aria-label="unknown"])').count()
+
+
+def said(what: str) -> str:
+    return f"document.querySelector('#outcome').textContent.includes({what!r})"
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_over_a_cut_link_nothing_is_fired_late_and_nothing_old_looks_new(
+    chromium: Browser, daemon: Daemon, link: Link, size: str
+) -> None:
+    page = page_of(chromium, link.url, size)
+    before = requested(daemon)
+    assert ticks(page) == 7
+    link.cut()
+    page.click("#shoot")
+    until(page, said("sending…"))
+    picture(page, size, "sending")
+    until(page, said("not confirmed; it may have fired"))
+    until(page, "document.querySelector('#verdict').dataset.state === 'lost'")
+    assert page.inner_text("#verdict-word") == "No contact"
+    assert ticks(page) == 0
+    assert page.is_disabled("#shoot")
+    picture(page, size, "cut")
+    link.mend()
+    until_flown(page)
+    until(page, said("nothing was fired"))
+    assert requested(daemon) == before
+    assert ticks(page) == 7
+    shoot(page)
+    assert requested(daemon) == before + 1
+
+
+def test_an_answer_that_was_lost_is_asked_for_by_number(chromium: Browser, daemon: Daemon, link: Link) -> None:
+    page = page_of(chromium, link.url, "laptop")
+    before = requested(daemon)
+    page.route("**/api/shoot", lambda route: (route.fetch(), route.abort()))  # it arrives; the answer does not
+    page.click("#shoot")
+    until(page, said("shot "))
+    assert "not confirmed" not in page.inner_text("#outcome")
+    until(page, f"Number(document.querySelector('#counters dd').textContent) === {before + 1}")
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_what_a_thumb_needs_is_on_the_first_screen(chromium: Browser, daemon: Daemon, size: str) -> None:
+    page = page_of(chromium, daemon.url, size)
+    shoot(page)
+    width, height = SIZES[size]
+    picture(page, size, "flown")
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    for name in ("verdict", "shoot", *(() if size == "phone" else ("panel",))):
+        box = page.locator(f"#{name}").bounding_box()
+        assert box is not None
+        assert box["y"] >= 0, name
+        assert box["y"] + box["height"] <= height, name
+    if width >= 700:
+        stage, button = page.locator(".stage").bounding_box(), page.locator("#shoot").bounding_box()
+        assert stage is not None
+        assert button is not None
+        assert stage["x"] >= button["x"] + button["width"]  # side by side
+    small = page.evaluate(
+        """[...document.querySelectorAll('button, input:not([type=checkbox]), label.follow')]
+           .filter(one => one.offsetParent)
+           .map(one => [one.id || one.textContent, one.getBoundingClientRect()])
+           .filter(([, box]) => box.width < 44 || box.height < 44).map(([name]) => name)"""
+    )
+    assert small == []
+
+
+@pytest.mark.parametrize(("number", "word"), [(signal.SIGTERM, "Ended"), (signal.SIGKILL, "No contact")])
+def test_a_flight_s_end_is_told_and_a_death_is_no_end(
+    chromium: Browser, tmp_path: Path, sockets: Path, number: int, word: str
+) -> None:
+    with flown(tmp_path, sockets) as one:
+        page = page_of(chromium, one.url, "phone")
+        shoot(page)
+        one.process.send_signal(number)
+        until(page, f"document.querySelector('#verdict-word').textContent === {word!r}")
+        one.process.wait(20)
+        picture(page, "phone", word.lower().replace(" ", "-"))
+        page.wait_for_timeout(4000)  # it stays so when nothing is heard any more
+        assert page.inner_text("#verdict-word") == word
+        assert ticks(page) == 0
+        assert page.is_disabled("#shoot")
+        if word == "Ended":
+            assert page.inner_text("#verdict-text") == "1 shot: 1 frame recorded"
