@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
+import pwd
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import tomli_w
 
 from dappled.cli import main
+from dappled.config import settings as configuration
 from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers import usb_bus
 from dappled.drivers.usb_bus import CANON, UsbBody
@@ -142,6 +146,40 @@ def test_a_running_daemon_without_a_camera_is_no_go(
     assert told["verdict"] == "no-go"
     assert told["checks"][0] == {"name": "Camera", "state": "no-go", "text": "absent: no body"}
     assert told["next"]
+
+
+def test_a_file_that_the_daemon_was_not_started_with_is_told_by_its_differences(
+    running: Callable[[dict[str, Any]], Path],
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("dappled.cli.doctor.HEAR_S", 60.0)
+    config = running(WELL | {"disk": WELL["disk"] | {"folder": str(tmp_path)}})
+    flown = configuration.to_tables(configuration.load(config))
+    flown["record"]["min_free_mb"] = 4  # when it began; the health record says what it is now
+    (tmp_path / "flight.toml").write_text(tomli_w.dumps({"settings": flown}))
+    assert main(["doctor", "--config", str(config)]) == 0
+    assert "settings" not in capfd.readouterr().out
+    config.write_text(config.read_text() + '[mask]\nprofile = "mask-2"\n[camera]\nmax_pending = 3\n')
+    assert main(["doctor", "--config", str(config)]) == 1
+    out = capfd.readouterr().out.splitlines()
+    assert [line for line in out if "settings" in line.split()[:2]] == [
+        f"WRONG    settings    camera.max_pending is 3 in {config}, the daemon has 2",
+        f'WRONG    settings    mask.profile is "mask-2" in {config}, the daemon has ""',
+    ]
+    assert "next: restart the daemon with this file" in out[-1]
+
+
+def test_another_user_s_daemon_is_not_reported_as_one_s_own(
+    running: Callable[[dict[str, Any]], Path], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dappled.cli.doctor.HEAR_S", 60.0)
+    config = str(running(WELL))
+    monkeypatch.setattr("dappled.cli.status.os.getuid", lambda: 4711)  # the daemon's is this process' own
+    assert main(["doctor", "--config", config]) == 0
+    who = pwd.getpwuid(os.geteuid()).pw_name
+    assert capfd.readouterr().out.startswith(f"not your own daemon but that of user {who} runs here, flight 2026")
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from dappled.cli import status
 from dappled.cli.arguments import whole
 from dappled.cli.status import is_listening, stream_endpoint
 from dappled.config import settings as configuration
+from dappled.config.schema import read_toml
 from dappled.config.settings import Settings
 from dappled.daemon import settings_check, test_shot
 from dappled.daemon.health import frame_checks, go_no_go, host_checks
@@ -92,7 +93,7 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
             f"a daemon runs at {endpoint} and holds the camera: stop it first (sudo systemctl stop dappled), or ask it "
             "for a photograph (dappled trigger, the ground station, the console)"
         )
-    report = status.health(endpoint, HEAR_S)
+    report, user = status.health(endpoint, HEAR_S), status.stranger(endpoint)
     checks = go_no_go.checks(report)
     looked: list[Check] = []
     if report["camera"]["state"] not in ("ready", "busy", "starting"):  # then another program may hold it
@@ -102,15 +103,45 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
             for one in check(settings, host_checks.Machine())
         ]
     verdict = go_no_go.verdict(checks)
+    if arguments.config is not None:
+        looked += _differences(arguments.config, settings, report)
     todo = go_no_go.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
     if arguments.json:
         facts = [*({"name": one.name, "state": one.state, "text": one.text} for one in checks), *_host_facts(looked)]
-        print(json.dumps({"flight": report["flight"], "checks": facts, "verdict": verdict, "next": todo}, indent=2))
+        found = {"flight": report["flight"], "user": user, "checks": facts, "verdict": verdict, "next": todo}
+        print(json.dumps(found, indent=2))
     else:
-        print(f"a daemon runs here, flight {report['flight']}; it reports")
+        whose = "a daemon runs here" if user is None else f"not your own daemon but that of user {user} runs here"
+        print(f"{whose}, flight {report['flight']}; it reports")
         print("\n".join([*_lines(checks), *_host_lines(looked)]))
         print(f"{_VERDICTS[verdict]}{f'; next: {todo}' if todo else ''}")
-    return 1 if verdict == "no-go" else 0
+    return 1 if verdict == "no-go" or any(one.name == "settings" and one.state == "no-go" for one in looked) else 0
+
+
+def _differences(file: Path, wanted: Settings, report: Mapping[str, Any]) -> list[Check]:
+    """What the daemon was not started with, though the file says it. The flight's folder holds its settings."""
+    flown = Path(report["disk"]["folder"]) / "flight.toml"
+    try:
+        tables, _ = read_toml(flown)
+    except DappledError as error:
+        return [Check("settings", "caution", f"{file} can't be compared with the daemon's settings: {error}")]
+    live = tables.get("settings", {})
+    live.get("record", {})["min_free_mb"] = report.get("min_free_bytes", 0) // 1_000_000  # it can change in flight
+    ours = configuration.to_tables(wanted)
+    todo = (
+        "restart the daemon with this file (sudo systemctl restart dappled), or name the file that it was started with"
+    )
+    return [
+        Check(
+            "settings", "no-go", f"{table}.{key} is {_toml(ours, table, key)} in {file}, the daemon has {there}", todo
+        )
+        for table, key, *_ in configuration.describe()
+        if (there := _toml(live, table, key)) != _toml(ours, table, key)
+    ]
+
+
+def _toml(tables: Mapping[str, Any], table: str, key: str) -> str:
+    return json.dumps(tables.get(table, {}).get(key), ensure_ascii=False)
 
 
 def _lines(checks: Sequence[Check]) -> list[str]:

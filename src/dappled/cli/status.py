@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import pwd
 import socket
+import struct
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -76,6 +78,26 @@ def is_listening(endpoint: str) -> bool:
         except OSError:
             return False
     return True
+
+
+def stranger(endpoint: str) -> str | None:
+    """The user whose daemon listens on an ipc endpoint; None where it is this user's own, or can't be known."""
+    if not endpoint.startswith("ipc://"):
+        return None
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(endpoint.removeprefix("ipc://"))
+            facts = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+        except OSError:
+            return None
+    _, user, _ = struct.unpack("3i", facts)
+    if user == os.getuid():
+        return None
+    try:
+        return pwd.getpwuid(user).pw_name
+    except KeyError:
+        return str(user)
 
 
 def health(endpoint: str, timeout_s: float) -> Mapping[str, Any]:

@@ -18,6 +18,7 @@ from typing import Any
 import httpx
 import pytest
 
+from dappled.clock import SystemClock
 from dappled.config.settings import ConsoleSettings, PublishSettings, Settings
 from dappled.daemon.console import process
 from dappled.daemon.console.process import Console, ConsoleError

@@ -16,7 +16,6 @@ from dappled.clock import Clock
 from dappled.config import settings as configuration
 from dappled.config.settings import ConsoleSettings, Settings
 from dappled.daemon.console.requests import ConsoleRequests
-from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.stream.curve import read_private
 from dappled.daemon.stream.sockets import is_loopback
 from dappled.daemon.supervised_process import ChildProgram, SupervisedProcess

@@ -1,0 +1,77 @@
+"""^C at any moment: no traceback, exit 130, and 0 for a `run` that has ended in order."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from dappled.__main__ import INTERRUPTED
+from dappled.mocks.simulation import free_port
+
+# Sends itself a SIGINT as soon as a module begins to load, as a person's ^C may come at any time.
+_INTERRUPTS_ITSELF = """
+import os, signal, sys
+from importlib.abc import MetaPathFinder
+wanted = sys.argv.pop(1)
+class Watch(MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name == wanted:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Watch())
+from dappled.__main__ import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("module", ["dappled.cli", "numpy", "dappled.cli.config"])
+def test_an_interruption_while_modules_load_ends_without_a_word(module: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _INTERRUPTS_ITSELF, module, "config", "show"],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (INTERRUPTED, "", "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pages", [0, 1, 24])
+def test_a_run_ends_in_order_with_pages_open(tmp_path: Path, sockets: Path, pages: int) -> None:
+    port = free_port(socket.SOCK_STREAM)
+    (tmp_path / "d.toml").write_text(
+        f'[record]\ndirectory = "flights"\n[publish]\nslices = "ipc://{sockets}/s{pages}"\n'
+        f'[console]\nbind = "127.0.0.1:{port}"\n'
+    )
+    with (
+        ExitStack() as stack,
+        subprocess.Popen(
+            [sys.executable, "-m", "dappled", "run", "--simulate", "--config", "d.toml"],
+            cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True,
+        ) as process,
+    ):  # fmt: skip
+        stack.callback(process.kill)
+        assert process.stderr is not None
+        said: list[str] = []
+        for line in process.stderr:
+            said.append(line)
+            if line.startswith("camera ready"):
+                break
+        reader = threading.Thread(target=said.extend, args=[process.stderr])
+        reader.start()
+        for _ in range(pages):
+            page = stack.enter_context(socket.create_connection(("127.0.0.1", port), 60))
+            page.sendall(f"GET /api/events HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode())
+            assert page.recv(12) == b"HTTP/1.1 200"
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the whole group
+        assert process.wait(50) == 0
+        reader.join(10)
+    text = "".join(said)
+    assert "Traceback" not in text
+    assert "died" not in text
+    assert said[-1].startswith("0 shots")
