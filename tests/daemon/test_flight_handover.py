@@ -44,7 +44,7 @@ class Flown:
         clock = RecordedClock(10**18)
         self.shutter = Shutter(FakeSink(), clock, next_index=0)
         recipe = RecipeParameters(names or recipes.called(settings), after, LiveSettings(settings), self.shutter, self)
-        self.parameters = Parameters(NoBody(), recipe.all())
+        self.parameters = Parameters(NoBody(), (recipe,))
 
     def later(self, kind: str, text: str) -> None:
         self.events.append(f"{kind}: {text}")

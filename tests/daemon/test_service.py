@@ -169,7 +169,7 @@ def test_a_flight_that_closes_badly_is_kept(
 
 def test_without_a_mask_decoding_is_off(camera: FakeCamera, settings: Settings) -> None:
     service = started(settings, [])
-    assert service._control.decoding() == "off"
+    assert not service._shots.decoding
     service.stop()
 
 

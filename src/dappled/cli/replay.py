@@ -98,14 +98,14 @@ def run(arguments: argparse.Namespace) -> int:
     flown = _as_recorded(arguments, facts, recipe)
     progress = PrintedProgress(as_json=arguments.json)
     with ExitStack() as stack:
-        keep = None
+        keep: RunWriter | None = None
         if is_flight and recipe and (arguments.run_name or _changed(arguments)) and not arguments.verify:
             name = arguments.run_name or datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
             key = sealing.key_of(arguments.config)
             results = stack.enter_context(
                 RunWriter(arguments.flight, Run(name, recipe, flown.names), TimeOfDayClock(), key)
             )
-            recipe, keep = results.run.recipe, results.decoded
+            recipe, keep = results.run.recipe, results
             print(f"storing the results beside the old ones, as run {name}", file=sys.stderr)
         writer = replay.verifier(recording, keep)
         playback.run(

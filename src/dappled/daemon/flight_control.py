@@ -5,6 +5,7 @@ from __future__ import annotations
 from dappled.clock import Clock
 from dappled.daemon.camera_protocol import camera_status
 from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, ReportedCamera
+from dappled.daemon.camera_protocol.parameters import Parameter
 from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.health import resources
 from dappled.daemon.health.status_text import Alarms
@@ -114,16 +115,7 @@ class FlightControl:
         """See CameraModel."""
         return self._alarms.troubled
 
-    # what parameters and depth lead to
-
-    def decoding(self) -> str:
-        """The value of LF_DECODE."""
-        return "on" if self._shots.decoding else "off"
-
-    def set_decoding(self, value: str) -> None:
-        """Decode in flight, or leave it to the ground."""
-        self._shots.decoding = value == "on"
-        self._writer.later("decoding", f"{value} from now on, by the ground station")
+    # DistanceReceiver
 
     def send_distance(self, nearest_m: tuple[float, float]) -> None:
         """Send the nearest distance and its standard error to the autopilot."""
@@ -131,3 +123,20 @@ class FlightControl:
         message = camera_status.distance_message(nearest_m, boot_ms, self.mount)
         if message is not None:
             self._sender.send(message)
+
+
+class DecodingParameter:
+    """LF_DECODE: decode in flight, or leave it to the ground. Read-only where a flight `decodes` nothing."""
+
+    def __init__(self, shots: PendingShots, writer: LedgerWriter, *, decodes: bool) -> None:
+        self._shots, self._writer, self._decodes = shots, writer, decodes
+
+    def parameters(self) -> tuple[Parameter]:
+        """See OwnParameters."""
+        choices = ("on", "off") if self._decodes else ()
+        return (Parameter("LF_DECODE", "Decode in flight", "on" if self._shots.decoding else "off", choices),)
+
+    def set(self, name: str, value: str) -> None:
+        """See OwnParameters."""
+        self._shots.decoding = value == "on"
+        self._writer.later("decoding", f"{value} from now on, by the ground station")

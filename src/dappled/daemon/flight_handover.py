@@ -13,7 +13,7 @@ from typing import Protocol
 
 from dappled.config import profiles
 from dappled.config.settings import Settings
-from dappled.daemon.camera_protocol.parameters import OwnParameter
+from dappled.daemon.camera_protocol.parameters import Parameter
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.recipes import Names
@@ -100,38 +100,22 @@ class RecipeParameters:
         self._mask, self._law = words(flown)
         self._after, self._settings, self._shutter, self._events = after, settings, shutter, events
 
-    def all(self) -> tuple[OwnParameter, OwnParameter]:
-        """Both, to be read and changed. A change raises CameraError where it would cut something short."""
+    def parameters(self) -> tuple[Parameter, Parameter]:
+        """See OwnParameters."""
+        masks, laws = ((), ()) if self._after is None else (self._after.masks(), self._after.laws())
+        return Parameter("LF_MASK", "Mask", self._mask, masks), Parameter("LF_LAW", "Carrier law", self._law, laws)
+
+    def set(self, name: str, value: str) -> None:
+        """Fly the next flight with this mask or law. Raises CameraError where that would cut something short."""
         after = self._after
-        if after is None:
-            return OwnParameter("LF_MASK", "Mask", self.mask), OwnParameter("LF_LAW", "Carrier law", self.law)
-        return (
-            OwnParameter("LF_MASK", "Mask", self.mask, after.masks(), self.change_mask),
-            OwnParameter("LF_LAW", "Carrier law", self.law, after.laws(), self.change_law),
-        )
-
-    def mask(self) -> str:
-        """The value of LF_MASK."""
-        return self._mask
-
-    def law(self) -> str:
-        """The value of LF_LAW."""
-        return self._law
-
-    def change_mask(self, word: str) -> None:
-        """Fly the next flight with this mask. Raises CameraError."""
-        assert self._after is not None
-        self._begin_next(self._after, self._after.with_mask(self._next(self._after), word), f"mask {word}")
-        self._mask = word
-
-    def change_law(self, word: str) -> None:
-        """Fly the next flight with this carrier law. Raises CameraError."""
-        assert self._after is not None
-        self._begin_next(self._after, self._after.with_law(self._next(self._after), word), f"carrier law {word}")
-        self._law = word
-
-    def _next(self, after: FlightHandover) -> Settings:
-        return after.next or self._settings.now
+        assert after is not None, "without one there is no choice"
+        now = after.next or self._settings.now
+        if name == "LF_MASK":
+            self._begin_next(after, after.with_mask(now, value), f"mask {value}")
+            self._mask = value
+        else:
+            self._begin_next(after, after.with_law(now, value), f"carrier law {value}")
+            self._law = value
 
     def _begin_next(self, after: FlightHandover, following: Settings, text: str) -> None:
         now = self._shutter.statistics()

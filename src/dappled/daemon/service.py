@@ -25,11 +25,11 @@ from dappled.daemon.camera_protocol.camera_status import ReportedCamera
 from dappled.daemon.camera_protocol.component import Component
 from dappled.daemon.camera_protocol.earlier_outcomes import IndexedOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
-from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters
+from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.console import process as console_process
 from dappled.daemon.console.process import Console
 from dappled.daemon.console.requests import ConsoleRequests
-from dappled.daemon.flight_control import FlightControl
+from dappled.daemon.flight_control import DecodingParameter, FlightControl
 from dappled.daemon.flight_handover import FlightHandover, RecipeParameters
 from dappled.daemon.health import record as health
 from dappled.daemon.health.logbook import Logbook, NewProblems
@@ -235,12 +235,9 @@ class Service:
 
     def _parameters(self, camera: Camera, names: Names, *, decodes: bool) -> Parameters:
         """What a ground station may set: the body's settings, decoding in flight, the next flight's mask and law."""
-        control = self._control
-        decoding = OwnParameter(
-            "LF_DECODE", "Decode in flight", control.decoding, ("on", "off"), control.set_decoding if decodes else None
-        )
+        decoding = DecodingParameter(self._shots, self._writer, decodes=decodes)
         recipe = RecipeParameters(names, self._after, self._settings, self._shutter, self._writer)
-        return Parameters(camera, (decoding, *recipe.all()))
+        return Parameters(camera, (decoding, recipe))
 
     def _start_parts(self, names: Names, stack: ExitStack) -> None:
         """Start the last stage first, so that each item finds its receiver. A part that fails is stopped too."""

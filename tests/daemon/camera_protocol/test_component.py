@@ -15,7 +15,7 @@ from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured
 from dappled.daemon.camera_protocol.component import Component
 from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
-from dappled.daemon.camera_protocol.parameters import OwnParameter, Parameters, code
+from dappled.daemon.camera_protocol.parameters import Parameter, Parameters, code
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Setting, SettingName, check_change
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink, pack
@@ -54,7 +54,6 @@ class Rig:
     ) -> None:
         self.body = Body()
         self.decode = "on"
-        own = OwnParameter("LF_DECODE", "Decode in flight", lambda: self.decode, ("on", "off"), self._decode)
         self.system_id, self.component_id = 1, 100
         self.packer = mavlink.MAVLink(None)
         self.copies = 1
@@ -64,7 +63,7 @@ class Rig:
         self.clock = RecordedClock(10**18, 10**18 - 10**9)
         self.sink = FakeSink()
         self.shutter = Shutter(self.sink, self.clock, next_index=5, capacity=capacity)
-        knobs = Parameters(self.body, (own,))
+        knobs = Parameters(self.body, (self,))
         self.autopilot = OwnAutopilot(self, self.clock)
         self.component = Component(
             self,
@@ -98,7 +97,11 @@ class Rig:
     def troubled(self) -> bool:
         return self.critical
 
-    def _decode(self, value: str) -> None:
+    def parameters(self) -> tuple[Parameter]:
+        return (Parameter("LF_DECODE", "Decode in flight", self.decode, ("on", "off")),)
+
+    def set(self, name: str, value: str) -> None:
+        assert name == "LF_DECODE"
         self.decode = value
 
     def send(self, message: MavlinkMessage, link: int | None = None) -> bool:

@@ -16,11 +16,18 @@ NONE, TERMINATE, RESET, LIST, OPEN, READ, CREATE, CRC32, BURST = 0, 1, 2, 3, 4, 
 ACK, NAK = 128, 129
 
 
+class Files:
+    """One file."""
+
+    def files(self) -> dict[str, bytes]:
+        return {"camera.xml": DATA}
+
+
 class Client:
     """Speaks the protocol by hand: what it sends and hears are bytes."""
 
     def __init__(self, server: FtpServer | None = None, component: int = 190) -> None:
-        self.server = server or FtpServer(lambda: {"camera.xml": DATA})
+        self.server = server or FtpServer(Files())
         self.packer = mavlink.MAVLink(None, srcSystem=255, srcComponent=component)
         self.sequence = 0
         self.now_ns = 0

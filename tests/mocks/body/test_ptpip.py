@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from dappled.clock import SystemClock
 from dappled.mocks.body.eos450d import Eos450d
 from dappled.mocks.body.faults import BodyFaults
 from dappled.mocks.body.ptpip import Responder
@@ -43,8 +44,8 @@ def bench() -> Iterator[Bench]:
         assert exposed.wait(20)
         return f"picture {shot_number}".encode() * 10000, "dng"
 
-    faults = BodyFaults(time.monotonic_ns)
-    eos = Eos450d(expose, faults)
+    faults = BodyFaults(SystemClock())
+    eos = Eos450d(expose, faults, SystemClock())
     responder = Responder(eos, faults)
     yield Bench(faults, eos, responder, exposed, triggers)
     exposed.set()
@@ -202,7 +203,7 @@ def test_a_capture_to_memory_needs_room_on_the_computer(bench: Bench, initiator:
 
 def test_a_full_card_refuses_to_shoot_until_something_is_deleted(bench: Bench) -> None:
     bench.exposed.set()
-    eos = Eos450d(lambda _ns, number: (bytes(1000), "cr2"), bench.faults, card_bytes=2500)
+    eos = Eos450d(lambda _ns, number: (bytes(1000), "cr2"), bench.faults, SystemClock(), card_bytes=2500)
     responder = Responder(eos, bench.faults)
     initiator = Initiator(responder.port)
     assert initiator.ask(0x1002, 1)[0] == OK

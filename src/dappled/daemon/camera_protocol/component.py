@@ -59,7 +59,7 @@ class Component:
         self._intervals = MessageIntervals()
         self._commands = CameraCommands(shutter, clock, self._status, parameters, self._intervals)
         self._parameters = ParameterServer(parameters)
-        self._files = FtpServer(self._status.files)
+        self._files = FtpServer(self._status)
         self._dedup = PacketDedup()
         self._lines, self._stations = PilotMessages(), GroundStations()
         self._results: deque[tuple[Command, int]] = deque(maxlen=64)

@@ -11,6 +11,7 @@ import struct
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
@@ -57,14 +58,21 @@ class _Answered:
     opened: _Session | None
 
 
+class ServedFiles(Protocol):
+    """What files there are: `CameraStatus`."""
+
+    def files(self) -> Mapping[str, bytes]:
+        """Their content by name, without folders, as it is now."""
+
+
 class FtpServer:
-    """Serves the files of `files()`, a mapping of names without folders to bytes.
+    """Serves the files of `source`.
 
     At most eight files are open; one that is idle for a minute is closed.
     """
 
-    def __init__(self, files: Callable[[], Mapping[str, bytes]]) -> None:
-        self._files = files
+    def __init__(self, source: ServedFiles) -> None:
+        self._source = source
         self._sessions: dict[int, _Session] = {}
         self._last: dict[tuple[_Client, int], _Answered] = {}  # a retry gets the same answer
 
@@ -114,11 +122,11 @@ class FtpServer:
         return [_Reply()]
 
     def _checksum(self, request: _Request, client: _Client, now_ns: int) -> list[_Reply]:
-        data = self._files().get(_name(request.data))
+        data = self._source.files().get(_name(request.data))
         return [_refusal(_NOT_FOUND) if data is None else _Reply(data=struct.pack("<I", _crc32(data)))]
 
     def _list(self, request: _Request, client: _Client, now_ns: int) -> list[_Reply]:
-        names = [f"F{name}\t{len(data)}\0".encode() for name, data in sorted(self._files().items())]
+        names = [f"F{name}\t{len(data)}\0".encode() for name, data in sorted(self._source.files().items())]
         if _name(request.data) not in ("", "."):
             return [_refusal(_NOT_FOUND)]
         text = b""
@@ -129,7 +137,7 @@ class FtpServer:
         return [_Reply(data=text) if text else _refusal(_END)]
 
     def _open(self, request: _Request, client: _Client, now_ns: int) -> list[_Reply]:
-        data = self._files().get(_name(request.data))
+        data = self._source.files().get(_name(request.data))
         if data is None:
             return [_refusal(_NOT_FOUND)]
         if len(self._sessions) >= SESSIONS:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 import threading
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 from xml.sax.saxutils import escape, quoteattr
@@ -46,15 +46,14 @@ class Parameter:
     choices: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class OwnParameter:
-    """A setting of dappled itself. `change` takes effect at once; None: fixed for the flight."""
+class OwnParameters(Protocol):
+    """Settings of dappled itself: `DecodingParameter`, `RecipeParameters`."""
 
-    name: str
-    title: str
-    value: Callable[[], str]
-    choices: tuple[str, ...] = ()
-    change: Callable[[str], None] | None = None
+    def parameters(self) -> Sequence[Parameter]:
+        """Each as it is now."""
+
+    def set(self, name: str, value: str) -> None:
+        """Take one of the choices of one of them; it has it at once. Raises CameraError."""
 
 
 class BodyParameters(Protocol):
@@ -68,9 +67,8 @@ class BodyParameters(Protocol):
 class Parameters:
     """All settings of a camera, as known in memory: the body's and those of dappled itself."""
 
-    def __init__(self, body: BodyParameters, own: Sequence[OwnParameter] = ()) -> None:
-        self._body = body
-        self._own = {one.name: one for one in own}
+    def __init__(self, body: BodyParameters, own: Sequence[OwnParameters] = ()) -> None:
+        self._body, self._own = body, own
 
     def all(self) -> tuple[Parameter, ...]:
         """The body's first."""
@@ -79,10 +77,7 @@ class Parameters:
             for each in self._body.settings()
             if each.name in _BODY
         ]
-        own = [
-            Parameter(one.name, one.title, one.value(), one.choices if one.change else ()) for one in self._own.values()
-        ]
-        return (*body, *own)
+        return (*body, *(one for several in self._own for one in several.parameters()))
 
     def find(self, name: str) -> Parameter | None:
         """A setting by its name."""
@@ -99,10 +94,10 @@ class Parameters:
         if value not in parameter.choices:
             takes = f"it takes {', '.join(parameter.choices)}" if parameter.choices else "it can't be changed in flight"
             raise CameraError(f"{name} can't be {value}: {takes}")
-        own = self._own.get(name)
-        if own is not None and own.change is not None:
-            own.change(value)
-            return True
+        for several in self._own:
+            if any(one.name == name for one in several.parameters()):
+                several.set(name, value)
+                return True
         self._body.change(_SETTINGS[name], value)
         return False
 

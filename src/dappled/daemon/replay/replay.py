@@ -16,7 +16,7 @@ from dappled.clock import RecordedClock
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_vehicles
 from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
-from dappled.daemon.replay.verifier import Expected, ReplayVerifier
+from dappled.daemon.replay.verifier import Expected, ReplayVerifier, ResultWriter
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser
 from dappled.drivers.replay import RecordedShot
@@ -27,7 +27,6 @@ from dappled.flight import (
     FlightFolder,
     Frame,
     LedgerReader,
-    Result,
     Shot,
     ShotRow,
     layout,
@@ -238,7 +237,7 @@ def play(
                 raise ReplayError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
 
 
-def verifier(recording: RecordedFlight, keep: Callable[[Result], object] | None = None) -> ReplayVerifier:
+def verifier(recording: RecordedFlight, keep: ResultWriter | None = None) -> ReplayVerifier:
     """A writer that compares a replay with this recording; `keep` takes results that are not to be compared."""
     return ReplayVerifier(recording.root, recording.expected, keep)
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 from dappled import durable
 from dappled.drivers.camera import Blob, Fired
@@ -30,15 +31,20 @@ class Expected:
         return self.slices_sha256 is None and "not decoded" in self.events
 
 
+class ResultWriter(Protocol):
+    """What takes results that are not compared: `RunWriter`."""
+
+    def decoded(self, result: Result) -> None:
+        """Take what came out of one frame."""
+
+
 class ReplayVerifier:
     """Compares what the pipeline produces with what was recorded. `differences` are sentences.
 
     `keep`, where given, takes the results of another recipe, which are not compared; else nothing is written.
     """
 
-    def __init__(
-        self, root: Path, expected: Iterable[Expected], keep: Callable[[Result], object] | None = None
-    ) -> None:
+    def __init__(self, root: Path, expected: Iterable[Expected], keep: ResultWriter | None = None) -> None:
         self.root, self._keep = root, keep
         self._tags: dict[int, Tag] = {}
         self._expected = {one.row.shot.index: one for one in expected}
@@ -98,7 +104,7 @@ class ReplayVerifier:
     def decoded(self, result: Result) -> None:
         """See FlightWriter."""
         if self._keep is not None:
-            self._keep(result)
+            self._keep.decoded(result)
             self._seen[result.index].add("slices")
             return
         one = self._expected[result.index]

@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled.clock import SystemClock
 from dappled.errors import DappledError
 from dappled.mocks.body.eos450d import SERIAL, Eos450d, Expose
 from dappled.mocks.body.eos_card import CARD_BYTES
@@ -291,15 +292,17 @@ def _say(text: str) -> None:
 
 def serve(options: BodyOptions, lines: Iterable[str]) -> None:
     """Serve a body until the lines end."""
-    faults = BodyFaults(time.monotonic_ns)
+    machine = SystemClock()
+    clock = SystemClock(machine.utc_minus_monotonic_ns + round(options.clock_offset_s * 1e9))
+    faults = BodyFaults(clock)
     for fault in options.faults:
         faults.command(fault)
     eos = Eos450d(
         exposer(options),
         faults,
+        clock,
         serial=options.serial,
         card_bytes=options.card_bytes,
-        wall_s=lambda: time.time() + options.clock_offset_s,
         pairs=options.pairs,
     )
     responder = Responder(eos, faults, addresses=options.addresses)

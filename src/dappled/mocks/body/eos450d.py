@@ -19,6 +19,7 @@ from typing import TypeAlias
 
 from PIL import Image
 
+from dappled.clock import Clock
 from dappled.mocks.body import ptp
 from dappled.mocks.body.eos_card import CARD_BYTES, FOLDER, STORAGE, Card, StoredObject
 from dappled.mocks.body.faults import BodyFaults
@@ -47,22 +48,20 @@ class Eos450d:
         self,
         expose: Expose,
         faults: BodyFaults,
+        clock: Clock,
         *,
         serial: str = SERIAL,
         card_bytes: int = CARD_BYTES,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
-        wall_s: Callable[[], float] = time.time,
         pairs: bool = False,
     ) -> None:
         self._expose = expose
         self._faults = faults
         self._serial = serial
-        self._clock_ns = clock_ns
-        self._wall_s = wall_s
+        self._clock = clock
         self._lock = threading.Lock()  # held around all that follows
         self._session = self._working = False
         self._releases = 0
-        self._card = Card(card_bytes, faults, int(wall_s()))
+        self._card = Card(card_bytes, faults, clock.utc_ns() // 10**9)
         self._properties = Properties(serial, pairs=pairs)
         self._handlers: dict[int, Handler] = {
             Op.GET_DEVICE_INFO: self._device_info,
@@ -156,7 +155,7 @@ class Eos450d:
     # --- captures
 
     def _release(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
-        triggered_ns = self._clock_ns()
+        triggered_ns = self._clock.monotonic_ns()
         if self._working or self._faults.lasts("busy"):
             return PtpResponse(Code.DEVICE_BUSY)
         if self._faults.take("error"):
@@ -196,7 +195,7 @@ class Eos450d:
         stem = f"IMG_{number % 10000:04d}"
         handle, parent = (2 * number, 0) if to_memory else (FOLDER + 2 * number, FOLDER)
         code = Format.JPEG if extension.lower() in ("jpg", "jpeg") else Format.RAW
-        taken_s = int(self._wall_s())
+        taken_s = self._clock.utc_ns() // 10**9
         made = [StoredObject(handle, parent, f"{stem}.{extension.upper()}", code, data, taken_s)]
         if self._properties.pairs:
             made.append(StoredObject(handle + 1, parent, f"{stem}.JPG", Format.JPEG, thumbnail(number), taken_s))

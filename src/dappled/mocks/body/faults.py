@@ -10,6 +10,8 @@ import math
 import threading
 from collections.abc import Callable
 
+from dappled.clock import Clock
+
 LASTING = ("busy", "silence", "refuse", "unplug", "slow", "full")
 """busy: a release is answered DeviceBusy. silence: nothing is answered. refuse: no new connection is accepted, as if
 another program held the body. unplug: the links are cut, and no new one is accepted. slow: an object's data come
@@ -24,8 +26,8 @@ until "clear". no-focus: a release is answered OK, and no picture is taken."""
 class BodyFaults:
     """The faults in force. All methods may be called from any thread. `drop` is called to cut the links."""
 
-    def __init__(self, clock_ns: Callable[[], int]) -> None:
-        self._clock_ns = clock_ns
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
         self._lock = threading.Lock()
         self._until_ns: dict[str, float] = {}
         self._left: dict[str, int] = {}
@@ -43,7 +45,7 @@ class BodyFaults:
         elif name in LASTING:
             seconds = float(rest[0]) if rest else math.inf
             with self._lock:
-                self._until_ns[name] = self._clock_ns() + seconds * 1e9
+                self._until_ns[name] = self._clock.monotonic_ns() + seconds * 1e9
             if name == "unplug":
                 self.drop()
         elif name in COUNTED:
@@ -56,7 +58,7 @@ class BodyFaults:
     def lasts(self, name: str) -> bool:
         """Whether a lasting fault is in force now."""
         with self._lock:
-            return self._clock_ns() < self._until_ns.get(name, -math.inf)
+            return self._clock.monotonic_ns() < self._until_ns.get(name, -math.inf)
 
     def take(self, name: str) -> bool:
         """Whether a counted fault strikes now; uses one up."""
