@@ -34,7 +34,7 @@ class Flight:
 
 @dataclass
 class World:
-    """Everything that a goal looks at, turned by hand."""
+    """Everything that a condition looks at, turned by hand."""
 
     tally: Tally = field(default_factory=Tally)
     asker: Asker = field(default_factory=Asker)
@@ -50,72 +50,72 @@ class World:
         self.asked += self.asks
         return self.asker if self.asks else None
 
-    def goal(self, frames: int | None = None, seconds: float | None = None) -> StopCondition:
+    def condition(self, frames: int | None = None, seconds: float | None = None) -> StopCondition:
         return StopCondition(self.tally, frames, seconds, around=self, clock=self.clock)
 
 
 def test_without_a_goal_it_never_ends() -> None:
     world = World()
-    goal = world.goal()
-    goal.begin(Flight(0))
+    condition = world.condition()
+    condition.begin(Flight(0))
     for index in range(5):
         world.tally.add(ended(index))
     world.clock.advance(1e6)
-    assert not goal.reached()
-    assert not goal.short
+    assert not condition.reached()
+    assert not condition.short
 
 
 def test_the_time_counts_from_the_first_flight() -> None:
     world = World()
-    goal = world.goal(seconds=60.0)
+    condition = world.condition(seconds=60.0)
     world.clock.advance(1000)
-    assert not goal.reached()
-    goal.begin(Flight(0))
+    assert not condition.reached()
+    condition.begin(Flight(0))
     world.clock.advance(59)
-    goal.begin(Flight(0))  # another flight has begun meanwhile
-    assert not goal.reached()
+    condition.begin(Flight(0))  # another flight has begun meanwhile
+    assert not condition.reached()
     world.clock.advance(1)
-    assert goal.reached()
+    assert condition.reached()
 
 
 def test_so_many_shots_whatever_came_of_them() -> None:
     world = World()
-    goal = world.goal(frames=3)
-    goal.begin(Flight(3))
+    condition = world.condition(frames=3)
+    condition.begin(Flight(3))
     world.tally.add(ended(0))
     world.tally.add(ended(1, "the card is full"))
-    assert not goal.reached()
+    assert not condition.reached()
     world.tally.add(ended(2))
-    assert goal.reached()
-    assert goal.short
+    assert condition.reached()
+    assert condition.short
     assert world.tally.summary() == "3 shots: 2 frames safe, 0 decoded, 1 with a problem"
 
 
 def test_the_ground_station_asks_once_and_only_a_ready_camera() -> None:
     world = World(asks=True)
-    goal = world.goal(frames=2)
-    goal.begin(Flight(0))
-    assert not goal.reached()
+    condition = world.condition(frames=2)
+    condition.begin(Flight(0))
+    assert not condition.reached()
     assert world.asked == 0
     world.is_ready = True
-    assert not goal.reached()
+    assert not condition.reached()
     world.is_ready = False
-    assert not goal.reached()
+    assert not condition.reached()
     assert world.asked == 1
 
 
 @pytest.mark.parametrize("earlier", [0, 2])
 def test_a_ground_station_that_gave_up_ends_it_when_all_it_wished_has_ended(earlier: int) -> None:
-    """Wishes that failed were refused, say; those of flights before have ended and count no more."""
+    """Requests that failed were refused, say; those of flights before have ended and count no more."""
     world = World(asks=True, is_ready=True)
-    goal = world.goal(frames=8)
+    condition = world.condition(frames=8)
     for index in range(earlier):
         world.tally.add(ended(index))
-    goal.begin(Flight(2))
-    assert not goal.reached()
+    condition.begin(Flight(2))
+    assert not condition.reached()
     world.asker.busy = False
     world.tally.add(ended(earlier))
-    assert not goal.reached()
+    assert not condition.reached()
     world.tally.add(ended(earlier + 1))
-    assert goal.reached()
-    assert goal.short
+    assert condition.reached()
+    assert condition.short

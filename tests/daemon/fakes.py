@@ -139,7 +139,7 @@ class FakeDecoder:
 
 @dataclass
 class Rig:
-    """A street with its shutter and book, in front of a fake camera."""
+    """A pipeline with its shutter and writer, in front of a fake camera."""
 
     flight: recording.Recording
     camera: FakeCamera
@@ -155,7 +155,7 @@ class Rig:
         return self.shutter.request(CaptureRequest("test", "console", number))
 
     def ended(self, index: int) -> PendingShot:
-        """The story of a shot, once it is finished."""
+        """A shot, once it is finished."""
         until = time.monotonic() + 20
         while time.monotonic() < until:
             for pending in list(self.shots):
@@ -261,7 +261,7 @@ def rig(
     stop_s: float = 5.0,
     camera: FakeCamera | None = None,
 ) -> Iterator[Rig]:
-    """A street at work on a new flight in `flights`; stopped and closed at the end."""
+    """A pipeline at work on a new flight in `flights`; stopped and closed at the end."""
     clock = SystemClock()
     flight = recording.begin(flights, clock, {})
     writer = LedgerWriter(flight, clock)
@@ -290,7 +290,7 @@ def rig(
         ),
         decode_queue=queue_,
     )
-    now_ns = clock.utc_ns()  # it stands still, so that a slow machine makes no new wish of a retry
+    now_ns = clock.utc_ns()  # it stands still, so that a slow machine makes no new request of a retry
     steady = RecordedClock(now_ns, now_ns - clock.monotonic_ns())
     shutter = Shutter(FlightSink(flight, pending_shots), steady, next_index=flight.next_index, capacity=1000)
     made.append(Rig(flight, camera, pipeline, pending_shots, shutter, decoder))

@@ -94,7 +94,7 @@ def test_what_was_set_is_asked_for_and_a_second_setting_comes_on_top_of_the_firs
     ]
     assert after.next is not None
     assert (after.next.mask.profile, after.next.decode.law) == ("mask-2", "fd")
-    assert [knob.value for knob in found.all()] == ["mask-2", "fd"]  # what all ground stations are told
+    assert [one.value for one in found.all()] == ["mask-2", "fd"]  # what all ground stations are told
 
 
 def test_what_is_refused_is_not_shown() -> None:
@@ -105,13 +105,13 @@ def test_what_is_refused_is_not_shown() -> None:
     for name, word in (("LF_MASK", "mask-2"), ("LF_LAW", "fd")):
         with pytest.raises(CameraError, match="under way"):
             found.change(name, word)
-    assert [knob.value for knob in found.all()] == list(flight_handover.words(recipes.called(CONFIGURED)))
+    assert [one.value for one in found.all()] == list(flight_handover.words(recipes.called(CONFIGURED)))
     assert (after.next, flown.events) == (None, [])
 
 
 def test_where_no_flight_can_follow_they_are_to_be_read() -> None:
     found = Flown(CONFIGURED, None, Names("auto", "", "")).parameters
-    assert [(knob.name, knob.value, knob.choices) for knob in found.all()] == [
+    assert [(one.name, one.value, one.choices) for one in found.all()] == [
         ("LF_MASK", NONE, ()),
         ("LF_LAW", BY_BODY, ()),
     ]

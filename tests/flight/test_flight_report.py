@@ -23,7 +23,7 @@ def recorded(flight: Recording) -> FlightFolder:
     return flight.folder
 
 
-def test_a_flights_books_by_source(recorded: FlightFolder) -> None:
+def test_a_flights_counts_by_source(recorded: FlightFolder) -> None:
     assert by_source(recorded.path) == (SourceReport("mavlink:255/190", 3, 0, 3, 2, 1, 0, 2, 1),)
 
 
@@ -32,13 +32,13 @@ def test_refused_requests_are_counted_at_their_source(flight: Recording) -> None
     flood = ("x from mavlink:7/1, 511 more times in 60 s: no camera", "other peers, 9 more times in 60 s: no camera")
     for text in ("x from mavlink:7/1: no camera", "console from console: no camera", "gibberish", *flood):
         flight.ledger.add_event("refused", text)
-    books = {one.source: one for one in by_source(flight.folder.path)}
-    assert (books["mavlink:7/1"].wishes, books["mavlink:7/1"].refused) == (512, 512)
-    assert books["other peers"].refused == 9
-    assert books["console"].refused == books["unknown"].refused == 1
+    counts = {one.source: one for one in by_source(flight.folder.path)}
+    assert (counts["mavlink:7/1"].wishes, counts["mavlink:7/1"].refused) == (512, 512)
+    assert counts["other peers"].refused == 9
+    assert counts["console"].refused == counts["unknown"].refused == 1
     balance = flight_report.balance(flight.folder.path)
-    assert sum(one.shots for one in books.values()) == balance.wishes
-    assert sum(one.refused for one in books.values()) == balance.refused
+    assert sum(one.shots for one in counts.values()) == balance.wishes
+    assert sum(one.refused for one in counts.values()) == balance.refused
 
 
 def test_the_report_prints_a_line_for_each_source(recorded: FlightFolder, capsys: pytest.CaptureFixture[str]) -> None:

@@ -48,7 +48,7 @@ class Flying:
 
     def __init__(self, service: Service, shots: list[PendingShot], settled: list[tuple[int, bool]]) -> None:
         self.service, self.shots, self.settled = service, shots, settled
-        self._wishes = 0
+        self._requests = 0
 
     @property
     def problems(self) -> str:
@@ -63,8 +63,8 @@ class Flying:
         eventually(lambda: self.camera == "ready", f"camera ready: {self.problems}")
 
     def request(self) -> ShotDecision:
-        self._wishes += 1
-        return self.service.request(CaptureRequest("test", "console", self._wishes))
+        self._requests += 1
+        return self.service.request(CaptureRequest("test", "console", self._requests))
 
     def shoot(self) -> PendingShot:
         """One shot to its end."""
@@ -100,7 +100,7 @@ def flying(settings: Settings) -> Iterator[Flying]:
 
 
 def assert_whole(flight: Path) -> None:
-    """`flight check` is good, the books balance, and every shot is safe or failed."""
+    """`flight check` is good, the counts balance, and every shot is safe or failed."""
     assert flight_check.check(flight).problems == ()
     balance = flight_report.balance(flight)
     assert balance.balanced

@@ -264,10 +264,10 @@ def test_clock_of_the_body_wrong_by_an_hour(here: Path, hours: int) -> None:
         back_in_service(daemon, body)
         flight = daemon.service.folder
         with LedgerReader.open(flight / "flight.sqlite") as ledger:
-            wishes = {row.shot.index: row.shot.wished_utc_ns for row in ledger.shots()}
+            requests = {row.shot.index: row.shot.wished_utc_ns for row in ledger.shots()}
             tags = ledger.tags()
         for number, tag in tags.items():
-            assert abs(tag.utc_ns - wishes[number]) < 60 * 10**9
+            assert abs(tag.utc_ns - requests[number]) < 60 * 10**9
     assert not [text for text in told(flight) if text.startswith("doubt")]
 
 

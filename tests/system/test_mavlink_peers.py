@@ -105,7 +105,7 @@ def test_mavsdk_as_autopilot_whose_system_is_adopted_and_whose_triggers_are_shot
     try:
         eventually(lambda: camera.shots()["safe"] == 3, f"three shots: {camera.shots()}", 60)
         shots = list(camera.flying.shots)
-        eventually(lambda: len(camera.flying.shots) == 3, f"three stories: {shots}")
+        eventually(lambda: len(camera.flying.shots) == 3, f"three shots: {shots}")
     finally:
         autopilot.communicate(timeout=20)
     assert camera.shots()["wished"] == 3

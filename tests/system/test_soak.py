@@ -13,13 +13,13 @@ from dappled.mocks.soak.supervised import Resources
 
 @pytest.mark.slow
 @pytest.mark.timeout(400)
-def test_the_books_balance_after_two_minutes_of_trouble() -> None:
+def test_the_counts_balance_after_two_minutes_of_trouble() -> None:
     with tempfile.TemporaryDirectory(prefix="soak-") as folder:
         told: list[str] = []
         account = soak.soak(soak.SoakPlan(seconds=120, seed=4), Path(folder), told.append)
         log = (Path(folder) / "daemon.log").read_text(encoding="utf-8", errors="replace")
     assert account.problems == [], "\n".join([*account.problems, *told, log[-5000:]])
-    assert account.accepted <= account.shots <= account.asked  # unanswered wishes may have been shots
+    assert account.accepted <= account.shots <= account.asked  # unanswered requests may have been shots
     assert account.safe > account.asked / 3
     assert account.shots == account.safe + account.failed
     assert sum(account.faults.values()) >= 15

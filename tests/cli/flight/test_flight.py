@@ -132,7 +132,7 @@ def test_report_adds_up(closed: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert told["sources"][0]["shots"] == 2
 
 
-def test_books_that_do_not_balance_are_a_failure(closed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_counts_that_do_not_balance_are_a_failure(closed: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with closing(sqlite3.connect(closed / "flight.sqlite")) as ledger:
         ledger.execute("DELETE FROM frames")
         ledger.commit()

@@ -39,7 +39,7 @@ class NothingEarlier:
 
 
 class Camera:
-    """A camera that has each frame `exposure_s` after the wish. `fails` are indices that fail; `hung`: none ever comes.
+    """A camera with each frame `exposure_s` after its request. `fails` are indices that fail; `hung`: none ever comes.
     `settled`: it belongs to system 1 without having listened for autopilots.
 
     `causes` are the shots, in order; `done` how they ended."""

@@ -63,14 +63,14 @@ class Rig:
         self.clock = RecordedClock(10**18, 10**18 - 10**9)
         self.sink = FakeSink()
         self.shutter = Shutter(self.sink, self.clock, next_index=5, capacity=capacity)
-        knobs = Parameters(self.body, (self,))
+        parameters = Parameters(self.body, (self,))
         self.autopilot = OwnAutopilot(self, self.clock)
         self.component = Component(
             self,
             self.autopilot,
             self.shutter,
             self.clock,
-            knobs,
+            parameters,
             model=self,
             earlier=earlier or NothingEarlier(),
             feedback_is_shot=feedback_is_shot,

@@ -49,10 +49,10 @@ WAYS = st.builds(
 
 
 def arrivals(way: Way, gap_s: float, confirms: bool, seed: int) -> list[tuple[float, int, int, bytes]]:
-    """(when, order, link, packet) of 12 numbered wishes, each sent four times every 500 ms on every link."""
+    """(when, order, link, packet) of 12 numbered requests, each sent four times every 500 ms on every link."""
     chance = random.Random(seed)  # noqa: S311  # a test's dice
     packers = [mavlink.MAVLink(None, srcSystem=255, srcComponent=190) for _ in range(way.links)]
-    sent = sorted((wish * gap_s + 0.5 * again, wish + 1, again) for wish in range(12) for again in range(4))
+    sent = sorted((request * gap_s + 0.5 * again, request + 1, again) for request in range(12) for again in range(4))
     come: list[tuple[float, int, int, bytes]] = []
     for at_s, sequence, again in sent:
         for link, packer in enumerate(packers):
@@ -102,7 +102,7 @@ def test_a_trigger_that_nobody_answers_is_one_shot_over_two_links_of_which_one_i
     chance = random.Random(seed)  # noqa: S311  # a test's dice
     packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     come: list[tuple[float, int, int, bytes]] = []
-    now, wishes = 0.0, set[int]()
+    now, requests = 0.0, set[int]()
     # Two without a number that come within 0.3 s are taken for one: the radio's 0.4 s must not bring them so close.
     apart_s = 0.4 if kind == "DO_DIGICAM_CONTROL" else 0.0
     for number, gap_s in enumerate(gaps_s):
@@ -117,7 +117,7 @@ def test_a_trigger_that_nobody_answers_is_one_shot_over_two_links_of_which_one_i
                 # Without a number a trigger that only the slow link brought may be taken for a part of another.
                 if kind == "DO_DIGICAM_CONTROL" or chance.random() >= loss:
                     come.append((now + late_s + chance.uniform(0, 0.4), len(come), link, raw))
-                    wishes.add(number)
+                    requests.add(number)
     rig = Rig(capacity=1000)
     rig.tick(4)
     now = 0.0
@@ -125,7 +125,7 @@ def test_a_trigger_that_nobody_answers_is_one_shot_over_two_links_of_which_one_i
         rig.clock.advance(at_s - now)
         now = at_s
         rig.component.on_packet(Packet(0, 0, link, mavlink.MAVLink(None).decode(bytearray(raw)), raw))
-    assert len(rig.fired) == len(wishes)
+    assert len(rig.fired) == len(requests)
 
 
 HEARD = [0, 76, 75, 112, 180, 110, 320, 321, 323, 111, 33, 30, 31, 24, 2, 77, 253, 20, 4]
@@ -165,8 +165,8 @@ def sound(number: int, payload: bytes, *, version_1: bool = False, source: tuple
 def test_random_bytes_and_torn_packets_on_a_real_link_cost_no_sound_one() -> None:
     chance = random.Random(5)  # noqa: S311  # a test's dice
     with Camera() as camera, Peer(camera.links.port(0)) as peer:
-        for wish in range(1, 6):
-            whole = peer.packed(mavlink.MAVLink_command_long_message(1, 100, 2000, 0, 0, 0, 1, wish, 0, 0, 0))
+        for request in range(1, 6):
+            whole = peer.packed(mavlink.MAVLink_command_long_message(1, 100, 2000, 0, 0, 0, 1, request, 0, 0, 0))
             for _ in range(40):
                 peer.raw(chance.randbytes(chance.randrange(1, 300)))
                 peer.raw(whole[: chance.randrange(1, len(whole))])
@@ -314,11 +314,11 @@ def test_five_thousand_messages_a_second_drown_no_wish_and_fill_no_memory(second
         try:
             eventually(lambda: camera.received() > 2000, "the flood")
             before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-            wishes = 0
+            requests = 0
             while flood.poll() is None:
-                wishes += 1
+                requests += 1
                 for confirmation in range(20):
-                    gcs.command(2000, 0, 0, 1, wishes, confirmation=confirmation)
+                    gcs.command(2000, 0, 0, 1, requests, confirmation=confirmation)
                     try:
                         gcs.until(lambda m: m.get_type() == "COMMAND_ACK" and m.result == ACCEPTED, "ack", 0.5)
                         break
@@ -332,7 +332,7 @@ def test_five_thousand_messages_a_second_drown_no_wish_and_fill_no_memory(second
             code = flood.wait()
         assert code == 0, "the flood did not end by itself"
         grown_mb = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-        assert [cause.sequence for cause in camera.causes] == list(range(1, wishes + 1))
+        assert [cause.sequence for cause in camera.causes] == list(range(1, requests + 1))
         assert camera.failures() == 0
         # Every packet that was sent was handled, or the kernel says itself that its buffer was full.
         sent = 5000 * seconds

@@ -70,10 +70,10 @@ def test_a_refusal_is_told_and_remembered(pipeline: Rig) -> None:
 
 
 def test_the_log_is_told_from_a_number_on(pipeline: Rig) -> None:
-    book = Logbook(RecordedClock(7))
-    book.add("one")
-    book.add("two", "warning")
-    requests = ConsoleRequests(pipeline.shutter, book, SystemClock())
+    logbook = Logbook(RecordedClock(7))
+    logbook.add("one")
+    logbook.add("two", "warning")
+    requests = ConsoleRequests(pipeline.shutter, logbook, SystemClock())
     assert requests.answer({"do": "log", "after": 1})["lines"] == [
         {"number": 2, "utc_ns": 7, "level": "warning", "text": "two"}
     ]

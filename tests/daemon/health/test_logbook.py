@@ -18,29 +18,29 @@ FRAME = Frame(7, "frames/000007.dng", "IMG.DNG", 5_100_000, "0" * 64, 0)
 
 
 def test_lines_are_numbered_and_bounded() -> None:
-    book = Logbook(RecordedClock(3), capacity=4)
+    logbook = Logbook(RecordedClock(3), capacity=4)
     for number in range(10):
-        book.add(f"line {number}")
-    assert [line["number"] for line in book.after(0)] == [7, 8, 9, 10]
-    assert [line["text"] for line in book.after(8)] == ["line 8", "line 9"]
-    assert len(book.after(0, limit=2)) == 2
+        logbook.add(f"line {number}")
+    assert [line["number"] for line in logbook.after(0)] == [7, 8, 9, 10]
+    assert [line["text"] for line in logbook.after(8)] == ["line 8", "line 9"]
+    assert len(logbook.after(0, limit=2)) == 2
 
 
 def test_a_line_said_twice_stands_once() -> None:
-    book = Logbook(RecordedClock(0))
-    book.add("the camera is absent")
-    book.add("the camera is absent")
-    assert len(book.after(0)) == 1
+    logbook = Logbook(RecordedClock(0))
+    logbook.add("the camera is absent")
+    logbook.add("the camera is absent")
+    assert len(logbook.after(0)) == 1
 
 
 def test_warnings_of_the_loggers_are_kept_and_lesser_ones_not() -> None:
-    book = Logbook(RecordedClock(0))
+    logbook = Logbook(RecordedClock(0))
     logger = logging.Logger("dappled.test")
-    logger.addHandler(book)
+    logger.addHandler(logbook)
     logger.warning("link %s is gone", "a")
     logger.info("nothing of note")
     logger.warning("%d", "not a number")
-    texts = [line["text"] for line in book.after(0)]
+    texts = [line["text"] for line in logbook.after(0)]
     assert texts[0] == "link a is gone"
     assert len(texts) == 2
     assert "TypeError" in texts[1]

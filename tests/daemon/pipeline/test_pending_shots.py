@@ -16,7 +16,7 @@ from tests.daemon.fakes import CallingObserver, FakeCamera, arrival, eventually,
 
 
 class Events:
-    """The part of a book that is needed here."""
+    """The part of a flight writer that is needed here."""
 
     def __init__(self) -> None:
         self.told: list[str] = []

@@ -1,4 +1,4 @@
-"""The street with a camera that does what the test says: each shot ends once, and the record says how."""
+"""The pipeline with a camera that does what the test says: each shot ends once, and the record says how."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_a_file_that_comes_twice_is_one_frame(tmp_path: Path) -> None:
 def test_a_second_file_of_a_shot_is_a_stray_and_undoes_nothing(tmp_path: Path) -> None:
     with rig(tmp_path, lambda shot: [*good(shot), arrival(shot, b"other")]) as one:
         assert one.decoder is not None
-        one.decoder.gate.clear()  # the first is still on the street
+        one.decoder.gate.clear()  # the first is still in the pipeline
         one.request(1)
         eventually(one.flight.ledger.strays, "the stray")
         one.decoder.gate.set()
@@ -259,8 +259,10 @@ def scripts(draw: st.DrawFn) -> list[tuple[str, int]]:
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(scripts(), st.booleans(), st.booleans()), min_size=1, max_size=5))
-def test_every_wish_is_one_shot_and_every_shot_ends_once(plan: list[tuple[list[tuple[str, int]], bool, bool]]) -> None:
-    """Events out of order, twice, late, missing, of nobody, exceptions: through the real street, book and shutter."""
+def test_a_request_is_one_shot_and_each_shot_ends_once(
+    plan: list[tuple[list[tuple[str, int]], bool, bool]],
+) -> None:
+    """Events out of order, twice, late, missing, of nobody, exceptions: through pipeline, writer and shutter."""
     late: dict[int, list[tuple[str, int]]] = {}
 
     def event(piece: str, shot: int) -> CameraEvent | Exception:
@@ -296,7 +298,7 @@ def test_every_wish_is_one_shot_and_every_shot_ends_once(plan: list[tuple[list[t
         assert (balance.wishes, balance.open) == (len(plan), 0)
         assert one.camera.fired == list(range(len(plan)))
         assert set(states(flight).values()) <= {"safe", "failed"}
-        eventually(lambda: len(one.shots) == len(plan), "every story is told")
+        eventually(lambda: len(one.shots) == len(plan), "every shot has ended")
         assert sorted(pending.shot.index for pending in one.shots) == list(range(len(plan)))
         counted = one.shutter.statistics()
         assert (counted.shots, counted.pending) == (len(plan), 0)

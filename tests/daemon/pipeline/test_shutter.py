@@ -1,4 +1,4 @@
-"""The shutter: one shot for every wish, and the written rules of what one wish is."""
+"""The shutter: one shot for every capture request, and the written rules of what one request is."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_broadcast_203_without_a_number_is_a_shot_each_time(gaps: list[float]) -
         max_size=40,
     )
 )
-def test_the_books_balance_and_no_index_is_used_twice(messages: list[tuple[float, str, str, int, int]]) -> None:
+def test_the_counts_add_up_and_no_index_is_used_twice(messages: list[tuple[float, str, str, int, int]]) -> None:
     rig = Rig(capacity=5)
     outcomes: list[str] = []
     for gap, source, kind, sequence, link in messages:
@@ -155,9 +155,9 @@ def test_refusals_say_why_and_use_no_index() -> None:
 
 def test_an_interval_counts_to_its_end_and_a_single_shot_does_not_cancel_it() -> None:
     rig = Rig()
-    wish = CaptureRequest(PILOT, "IMAGE_START_CAPTURE", 7)
-    assert rig.shutter.start_interval(wish, 1.0, 3).index == 42
-    assert rig.shutter.start_interval(wish, 1.0, 3).outcome == "duplicate"
+    request = CaptureRequest(PILOT, "IMAGE_START_CAPTURE", 7)
+    assert rig.shutter.start_interval(request, 1.0, 3).index == 42
+    assert rig.shutter.start_interval(request, 1.0, 3).outcome == "duplicate"
     rig.tick(0.5)
     assert rig.press(sequence=8) == "shot"
     assert rig.shutter.statistics().interval_s == 1.0

@@ -1,4 +1,4 @@
-"""A recorded flight, or a folder of frames, down the street again."""
+"""A recorded flight, or a folder of frames, through the pipeline again."""
 
 from __future__ import annotations
 

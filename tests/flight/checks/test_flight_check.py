@@ -141,13 +141,13 @@ def test_what_is_no_flight_is_told(tmp_path: Path) -> None:
             ask(tmp_path)
 
 
-def test_the_books_balance(recorded: FlightFolder) -> None:
-    books = flight_report.balance(recorded.path)
-    assert (books.wishes, books.safe, books.failed, books.open) == (3, 2, 1, 0)
-    assert (books.frames, books.tagged, books.decoded, books.strays, books.size) == (2, 2, 1, 0, 2000)
-    assert books.by_source == {"mavlink:255/190": 3}
-    assert books.closed
-    assert books.balanced
+def test_the_counts_balance(recorded: FlightFolder) -> None:
+    counts = flight_report.balance(recorded.path)
+    assert (counts.wishes, counts.safe, counts.failed, counts.open) == (3, 2, 1, 0)
+    assert (counts.frames, counts.tagged, counts.decoded, counts.strays, counts.size) == (2, 2, 1, 0, 2000)
+    assert counts.by_source == {"mavlink:255/190": 3}
+    assert counts.closed
+    assert counts.balanced
     alter(recorded, "UPDATE shots SET state = 'fired' WHERE idx = 2")
     assert not flight_report.balance(recorded.path).balanced
 

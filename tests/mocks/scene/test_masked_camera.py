@@ -235,7 +235,7 @@ def test_real_views_from_a_folder(shared_data: Path) -> None:
     assert truth.depth_m is None
 
 
-def test_wrong_wishes_are_refused(flying: MaskedCamera) -> None:
+def test_wrong_options_are_refused(flying: MaskedCamera) -> None:
     with pytest.raises(ValueError, match="wider"):
         flying.expose(0.0, 1, f_number=2.0)
     with pytest.raises(ValueError, match="no reference camera"):

@@ -178,9 +178,9 @@ def test_frames_and_control_points_are_the_first_flights_alone(
     short_flight: Flown, later_flight: Path, tmp_path: Path
 ) -> None:
     place = true_pose(short_flight)
-    sighting = f"target,000000,921.5,693.5,{place.latitude_deg},{place.longitude_deg},203.4"
+    row = f"target,000000,921.5,693.5,{place.latitude_deg},{place.longitude_deg},203.4"
     points = tmp_path / "points.csv"
-    points.write_text(f"name,frame,column,row,latitude,longitude,altitude\n{sighting}\n")
+    points.write_text(f"name,frame,column,row,latitude,longitude,altitude\n{row}\n")
     more = ["--as", "difference", "--against", str(later_flight), "--frames", "0", "--gcp", str(points)]
     assert main(words(short_flight, tmp_path / "maps", *more, "--gsd", "0.1")) == 0
     assert (tmp_path / "maps" / "difference.tif").is_file()
