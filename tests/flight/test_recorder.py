@@ -120,6 +120,28 @@ def test_a_disk_fault_fails_the_shot_and_leaves_no_file(
     assert deliver(flight, 0, DATA).name == "frames/000000.cr2"  # the disk is well again and the file comes once more
 
 
+def test_a_file_that_came_is_recorded_where_no_descriptor_is_left(flight: Recording) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    request(flight, 0)
+    request(flight, 1)
+    taken: list[int] = []
+    with held(DATA) as blob:
+        try:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 400), hard))
+            with pytest.raises(OSError, match="Too many open files"):  # noqa: PT012  all that are left
+                while True:
+                    taken.append(os.open(os.devnull, os.O_RDONLY))
+            for index in (0, 1):
+                frame = flight.recorder.record(index, "IMG_0001.CR2", blob, arrived_utc_ns=5)
+                assert frame.sha256 == hashlib.sha256(DATA).hexdigest()
+        finally:
+            for fd in taken:
+                os.close(fd)
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    flight.close()
+    assert check(flight.folder.path).problems == ()
+
+
 def test_a_full_disk_in_the_middle_of_a_frame(flight: Recording) -> None:
     """The kernel itself refuses, after some bytes: a file size limit stands for the full disk."""
     request(flight, 0)

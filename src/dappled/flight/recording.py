@@ -6,10 +6,12 @@ then does `Recorder.record` return; only then may the frame be announced and the
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 import threading
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
@@ -24,6 +26,8 @@ from dappled.flight.ledger import Ledger
 from dappled.flight.logs import ShotJournal, TelemetryLog
 from dappled.flight.records import Frame, Stray
 from dappled.flight.seal_key import SealKey
+
+_RESERVE = 4  # descriptors: a frame takes one at a time, and other threads may take what is given back
 
 
 class FileBytes(Protocol):
@@ -45,11 +49,20 @@ class StrayFileError(FlightError):
 
 
 class Recorder:
-    """Writes the frames of one flight. One thread calls it."""
+    """Writes the frames of one flight. One thread calls it.
+
+    It holds descriptors in reserve until `close`: the file that has come is recorded also where all others are used up.
+    """
 
     def __init__(self, folder: FlightFolder, ledger: Ledger) -> None:
         self._folder = folder
         self._ledger = ledger
+        self._reserve = [os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC) for _ in range(_RESERVE)]
+
+    def close(self) -> None:
+        """Give the reserve back. A second call does nothing."""
+        while self._reserve:
+            os.close(self._reserve.pop())
 
     def record(self, index: int, camera_name: str, blob: FileBytes, *, arrived_utc_ns: int) -> Frame:
         """Make the file of shot `index` safe: on return its bytes, its name and its ledger row are durable.
@@ -109,13 +122,29 @@ class Recorder:
         if blob.size <= 0:
             raise FlightError(f"the camera's file {camera_name} is empty: nothing was recorded")
         try:
-            if path.exists():
-                return self._left_over(path, blob)
-            return durable.copy_in(blob.fd, blob.size, path)
+            try:
+                return self._put(path, blob)
+            except OSError as error:
+                if error.errno not in (errno.EMFILE, errno.ENFILE) or not self._reserve:
+                    raise
+            self.close()
+            try:
+                return self._put(path, blob)
+            finally:
+                self._take_reserve()
         except OSError as error:
             raise disk_error(f"record {camera_name} as", path, error) from error
         except EOFError as error:
             raise FlightError(f"the camera's file {camera_name} ended early ({error}): it was not recorded") from error
+
+    def _put(self, path: Path, blob: FileBytes) -> str:
+        return self._left_over(path, blob) if path.exists() else durable.copy_in(blob.fd, blob.size, path)
+
+    def _take_reserve(self) -> None:
+        """Hold a reserve again, as far as there are descriptors for it."""
+        with suppress(OSError):
+            while len(self._reserve) < _RESERVE:
+                self._reserve.append(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
 
     def _left_over(self, path: Path, blob: FileBytes) -> str:
         """The hash of a file without a row, left by an attempt that was cut short: whole, since it has its final name.
@@ -195,6 +224,7 @@ class Recording:
             stack.callback(self._lock.close)
             stack.callback(self.index.close)
             stack.callback(self.ledger.close)
+            stack.callback(self.recorder.close)
             self.journal.close()
             telemetry = self.telemetry.close()
             report = [text for text in (self.journal.problem, self.telemetry.problem) if text is not None]

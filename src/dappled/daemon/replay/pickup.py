@@ -148,6 +148,7 @@ def bring(
         stack.enter_context(seals.reopened(folder, clock, "pickup", key))
         ledger = stack.enter_context(Ledger(folder.ledger, clock))
         recorder = Recorder(folder, ledger)
+        stack.callback(recorder.close)
         for number, group in proposal.pairs:
             frame = _record(recorder, source, number, group.main, clock.utc_ns())
             ledger.add_event("picked up", f"{group.main.name}: {proposal.reasons[number]}", number)
