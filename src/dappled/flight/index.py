@@ -1,8 +1,8 @@
 """The index over all flights: the flight and the frame of each image index.
 
 The camera's image index goes on over restarts. The index is made from the flights' own ledgers and can be rebuilt from
-them at any time. It alone remembers which shots' outcomes were reported to the ground station: an index that is rebuilt
-has nothing to report.
+them at any time. It alone remembers which shots' outcomes were reported to the ground station: one that is rebuilt has
+those of flights that were cut short to report, and none of others.
 """
 
 from __future__ import annotations
@@ -135,12 +135,14 @@ class ImageIndex(Database):
         """The flights that are closed and fully indexed."""
         return {row[0] for row in self._rows("SELECT name FROM flights WHERE sealed")}
 
-    def take_in(self, folder: FlightFolder, *, seal: bool) -> list[str]:
+    def take_in(self, folder: FlightFolder, *, seal: bool, cut_short: bool = False) -> list[str]:
         """Index all shots of a flight from its ledger. `seal`: no more shots will come. Returns sentences.
 
-        A sealed flight that this index saw begin, and that had a MAVLink link, leaves its unreported shots behind."""
+        A sealed flight that had a MAVLink link leaves its unreported shots behind, if this index saw it begin. One that
+        was `cut_short` does so in any case: an index that lost its reports makes them once more."""
         problems: list[str] = []
-        reports = folder.name in self.flights() and folder.telemetry.exists() and folder.telemetry.stat().st_size > 0
+        known = cut_short or folder.name in self.flights()
+        reports = known and folder.telemetry.exists() and folder.telemetry.stat().st_size > 0
         with LedgerReader.open(folder.ledger) as ledger:
             correction_ns, began_utc_ns = ledger.utc_correction_ns(), ledger.facts().get("began_utc_ns")
             start_utc_ns = None if correction_ns is None or began_utc_ns is None else began_utc_ns + correction_ns

@@ -18,7 +18,7 @@ from dappled.flight import layout, log_reading, logs, seals
 from dappled.flight.errors import disk_error
 from dappled.flight.index import ImageIndex
 from dappled.flight.layout import FlightFolder
-from dappled.flight.ledger import Ledger
+from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.logs import ShotJournal
 from dappled.flight.records import Frame, Stray
 from dappled.flight.seal_key import SealKey
@@ -43,13 +43,23 @@ def recover(root: Path, index: ImageIndex, clock: Clock, key: SealKey | None) ->
         if folder.name in sealed:
             continue
         try:
+            cut_short = not _closed(folder)
             report += [f"flight {folder.name}: {text}" for text in recover_flight(folder, clock)]
             if not seals.is_sealed(folder):
                 seals.seal(folder, clock, "recovered", key)
-            report += index.take_in(folder, seal=True)
+            report += index.take_in(folder, seal=True, cut_short=cut_short)
         except (DappledError, OSError) as error:
             report.append(f"flight {folder.name} could not be repaired: {error}")
     return report
+
+
+def _closed(folder: FlightFolder) -> bool:
+    """Whether the ledger says that the flight was closed; False where it can't be read."""
+    try:
+        with LedgerReader.open(folder.ledger) as ledger:
+            return "closed_utc_ns" in ledger.facts()
+    except DappledError:
+        return False
 
 
 def recover_flight(folder: FlightFolder, clock: Clock) -> list[str]:

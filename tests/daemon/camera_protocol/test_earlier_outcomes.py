@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -133,11 +134,23 @@ def test_a_flight_without_a_link_leaves_nothing_to_report(tmp_path: Path) -> Non
     after.close()
 
 
-def test_an_index_that_was_lost_reports_nothing_of_old_flights(tmp_path: Path) -> None:
-    crash(flown(tmp_path))
-    (tmp_path / "index.sqlite").unlink()
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(b"rotten" * 1000)])
+def test_an_index_that_was_lost_reports_the_flight_that_was_cut_short_and_no_older_one(
+    tmp_path: Path, damage: Callable[[Path], object]
+) -> None:
+    closed = recording.begin(tmp_path, RecordedClock(START_UTC_NS))
+    closed.telemetry.append(1, mavlink_2(b"a"))
+    request(closed, 0)
+    closed.close()
+    flight = recording.begin(tmp_path, RecordedClock(START_UTC_NS + 10**9))
+    flight.telemetry.append(1, mavlink_2(b"a"))
+    for index in (1, 2, 3, 4):
+        request(flight, index)
+    flight.index.note_reported(1)
+    crash(flight)
+    damage(tmp_path / "index.sqlite")
     after, _ = restarted(tmp_path, 60)
-    assert after.index.unreported() == {}
+    assert sorted(after.index.unreported()) == [1, 2, 3, 4]  # 1 once more: who knows?
     entry = after.index.lookup(4)
     assert entry is not None  # it can still be asked for
     assert entry.state == "failed"
