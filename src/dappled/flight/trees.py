@@ -28,16 +28,18 @@ _WRITE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _HERE | _CLOEXEC
 
 @dataclass(frozen=True, slots=True)
 class FileIdentity:
-    """Which file this is, and whether it was written since: device, inode, size in bytes, time of the last change."""
+    """Which file this is, and whether it was written since: device, inode, size in bytes, times of the last change of
+    its bytes (which any program can set) and of anything about it (which the kernel alone sets)."""
 
     device: int
     inode: int
     size: int
     mtime_ns: int
+    ctime_ns: int
 
     @classmethod
     def of(cls, found: os.stat_result) -> Self:
-        return cls(found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns)
+        return cls(found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
 
     @classmethod
     def of_fd(cls, fd: int) -> Self:
