@@ -76,6 +76,8 @@ def test_it_is_one_sentence(
     [
         (PermissionError(13, "Permission denied", "/root/x"), "/root/x: Permission denied"),
         (OSError("odd"), "odd"),
+        (MemoryError(), "not enough memory: close other programs, or use a machine with more memory"),
+        (MemoryError("Unable to allocate 20.0 GiB"), "not enough memory (Unable to allocate 20.0 GiB): close other"),
         (ZeroDivisionError("bug"), "unexpected ZeroDivisionError: bug"),
     ],
 )

@@ -96,10 +96,10 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
     except Exception as error:
         if parsed.debug:
             raise
-        kind = type(error).__name__
-        print(
-            f"dappled {parsed.verb}: unexpected {kind}: {error} (run `dappled --debug {parsed.verb} …`)",
-            file=sys.stderr,
-        )
+        said = f"unexpected {type(error).__name__}: {error} (run `dappled --debug {parsed.verb} …`)"
+        if isinstance(error, MemoryError):
+            wanted = f" ({error})" if str(error) else ""
+            said = f"not enough memory{wanted}: close other programs, or use a machine with more memory"
+        print(f"dappled {parsed.verb}: {said}", file=sys.stderr)
         return 1
     return code
