@@ -24,6 +24,7 @@ from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import free_port
 
 ACK_MS = 50.0
+LATE_MS = 1000.0  # for one acknowledgement in 20, on a machine whose cores are all busy
 PICTURE_BYTES = 100_001
 ADDRESSES = 4  # of the strangers: 127.0.0.2, …
 
@@ -122,6 +123,8 @@ def test_silent_strangers_cost_no_photograph_and_no_viewer(
             outcomes = ground.capture(requests, timeout_s=5)
             assert [each.reason for each in outcomes if not each.ok] == []
             acks = sorted(math.inf if each.ack_ms is None else each.ack_ms for each in outcomes)
+            print(f"{count} strangers: acknowledgements up to {acks[-1]:.1f} ms, median {acks[len(acks) // 2]:.1f} ms")  # noqa: T201  for people who run with -s
+            assert acks[-1] <= LATE_MS  # each one comes
             assert acks[-1 - requests // 20] <= ACK_MS  # one in 20 may wait for other programs of this machine
             until = time.monotonic() + 60
             while (message := viewer.receive(1)) is None or message.topic != "frame":
