@@ -100,7 +100,7 @@ def test_a_file_for_an_unknown_shot_is_kept_as_a_stray(flight: Recording) -> Non
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EIO])
-@pytest.mark.parametrize("call", ["open", "sendfile", "fsync", "rename"])
+@pytest.mark.parametrize("call", ["open", "sendfile", "fsync", "replace"])
 def test_a_disk_fault_fails_the_shot_and_leaves_no_file(
     flight: Recording, monkeypatch: pytest.MonkeyPatch, call: str, number: int
 ) -> None:
