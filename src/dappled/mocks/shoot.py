@@ -3,6 +3,7 @@
 python -m dappled.mocks.shoot frame.dng
 python -m dappled.mocks.shoot white.dng --scene white --f-number 59.2
 python -m dappled.mocks.shoot hard.dng --rays print_scale=1.003 stop=square falloff=0.4 --scale 0.1
+python -m dappled.mocks.shoot hard.jpg --rays --scale 0.1 --super-ccd
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ from dappled.config import profiles
 from dappled.mocks.scene import dng
 from dappled.mocks.scene.masked_camera import EXPOSURE_S, ISO, MAKE, MODEL, reference_camera
 from dappled.mocks.scene.ray_camera import REAL_COLOURS, WHITE, RayCamera
+from dappled.mocks.scene.super_ccd import SuperCcdBody
 
 
 def main(words: list[str] | None = None) -> int:
     """Write the file; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m dappled.mocks.shoot", description="A simulated frame.")
-    parser.add_argument("output", type=Path, metavar="FILE.dng")
+    parser.add_argument("output", type=Path, metavar="FILE", help=".dng, with --rays also .jpg")
     parser.add_argument("--scene", default="bench", choices=("bench", "white", "terrain"), help="default: bench")
     parser.add_argument("--f-number", type=float, metavar="N", help="default: open, f/7.4")
     parser.add_argument(
@@ -35,6 +37,9 @@ def main(words: list[str] | None = None) -> int:
         "--rays", nargs="*", metavar="NAME=VALUE",
         help="ray by ray, with the imperfections named here (RayCamera); mask=PROFILE and colours=yes, too",
     )  # fmt: skip
+    parser.add_argument(
+        "--super-ccd", action="store_true", help="with --rays and .jpg: sampled and processed as by a FinePix S5200"
+    )
     arguments = parser.parse_args(words)
     if arguments.rays is not None:
         return _by_rays(parser, arguments)
@@ -62,6 +67,9 @@ def _by_rays(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> 
         except ValueError as error:
             parser.error(f"--rays {word}: {error}")
     frame = camera.expose()
+    if arguments.output.suffix == ".jpg":
+        arguments.output.write_bytes(SuperCcdBody().jpeg(frame.plane) if arguments.super_ccd else frame.jpeg())
+        return 0
     exif = dng.Exif(
         MAKE, MODEL, f"SIM{arguments.seed:08d}", camera.focal_length_mm, camera.f_number, EXPOSURE_S, ISO, 0
     )

@@ -291,6 +291,12 @@ def test_shoot_writes_a_frame_with_the_imperfections_that_are_named(tmp_path, ca
     assert shoot.main([*words, "stop=square", "moved_mm=0.016,0", "colours=yes", "film=no"]) == 0
     assert out.stat().st_size > 2 * 56 * 74
     assert np.load(truth)["lattice"][0, 0] == pytest.approx(0.155 * 1.003 * (1 - 0.48 / 50))
+    for more in ([], ["--super-ccd"]):
+        picture = tmp_path / f"hard{len(more)}.jpg"
+        assert shoot.main([str(picture), "--scale", "0.02", *more, "--rays", "points_per_view=1"]) == 0
+        with Image.open(picture) as read:
+            assert read.size == (74, 56)
+    assert (tmp_path / "hard0.jpg").read_bytes() != (tmp_path / "hard1.jpg").read_bytes()
     with pytest.raises(SystemExit):
         shoot.main([str(out), "--rays", "print_size=2"])
     assert "print_size=2: no such parameter" in capsys.readouterr().err
