@@ -136,3 +136,11 @@ def test_a_raw_frame_keeps_where_its_lens_was_focused(tmp_path: Path) -> None:
 def test_one_view_has_no_depth() -> None:
     with pytest.raises(DecodeError, match="depth needs views from several places"):
         OpenedLightField(light_field(n=1)).depth()
+
+
+def test_a_light_field_shows_itself_in_a_line(path: Path) -> None:
+    assert repr(dappled.open(path)) == (
+        "<light field a.npz: 5 × 5 views of 60 × 80 px, 3 slices, reference-36mm, 50 mm, f/7.4>"
+    )
+    bare = opened.OpenedLightField(light_field(doubts=["the mask moved"], focal_length_mm=None, camera=None))
+    assert repr(bare) == "<light field 5 × 5 views of 60 × 80 px, 3 slices, f/7.4, 1 doubt>"

@@ -11,6 +11,7 @@ import pytest
 
 import dappled
 from dappled.cli import main
+from dappled.errors import DappledError
 from dappled.products.exports import light_files
 from dappled.products.opened import OpenedFlight, OpenError
 from tests.products.flown import Flown, fly
@@ -33,8 +34,10 @@ def test_a_flight_is_its_frames(flown: Flown) -> None:
     assert frame.refocus(disparity=0.1).shape == frame.views.shape[2:4]
     depth = frame.depth("contrast", between=(-0.3, 0.5))
     assert depth.known_share() > 0.5
-    with pytest.raises(KeyError):
+    with pytest.raises(IndexError, match="has no safe frame of image index 999") as missing:
         flight[999]
+    assert isinstance(missing.value, KeyError)
+    assert isinstance(missing.value, DappledError)
 
 
 def test_without_a_mask_frames_cannot_be_looked_at(flown: Flown) -> None:

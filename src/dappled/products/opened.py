@@ -41,6 +41,12 @@ class OpenError(DappledError):
     """A path can't be opened, or lacks what was requested of it; one sentence."""
 
 
+class NoFrameError(OpenError, IndexError, KeyError):
+    """A flight has no frame of this image index."""
+
+    __str__ = Exception.__str__  # KeyError's own would put the sentence in quotes
+
+
 class Refocusable:
     """What a light field can be asked for, and a raw frame too: it is decoded for it."""
 
@@ -79,7 +85,7 @@ class Refocusable:
         return depths.estimate(one.evidence, method, between=between, window=window, workers=one.workers)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class OpenedLightField(Refocusable):
     """A decoded light field. `field` is the plain value, `path` the file or folder that it was read from.
 
@@ -93,6 +99,17 @@ class OpenedLightField(Refocusable):
 
     def _decoded(self) -> OpenedLightField:
         return self
+
+    def __repr__(self) -> str:
+        """One line: where it is from, how large it is, and what took it."""
+        views, slices, said = self.field.views.shape, self.field.slices.shape[0], self.field.attributes
+        size = f"{views[0]} × {views[1]} views of {views[2]} × {views[3]} px" if views[0] else "no views"
+        stop = said.get("f_number"), said.get("focal_length_mm")
+        taken = [said.get("camera"), said.get("mask"), stop[1] and f"{stop[1]:g} mm", stop[0] and f"f/{stop[0]:g}"]
+        doubts = said.get("doubts") or ()
+        words = [f"{size}, {slices} slices", *(str(one) for one in taken if one)]
+        words += [f"{len(doubts)} doubt{'s' * (len(doubts) > 1)}"] if doubts else []
+        return f"<light field {'' if self.path is None else self.path.name + ': '}{', '.join(words)}>"
 
     @property
     def slices(self) -> NDArray[np.complex64]:
@@ -209,11 +226,11 @@ class OpenedFlight:
         return (self._frame(line) for line in self.record.lines if line.frame is not None)
 
     def __getitem__(self, index: int) -> OpenedFrame:
-        """Return the frame of an image index. Raises KeyError."""
+        """Return the frame of an image index. Raises NoFrameError, which is an IndexError and a KeyError."""
         for line in self.record.lines:
             if line.frame is not None and line.frame.index == index:
                 return self._frame(line)
-        raise KeyError(index)
+        raise NoFrameError(f"{self.path} has no safe frame of image index {index}; iterate over it to see which it has")
 
     def _frame(self, line: flight_report.ShotLine) -> OpenedFrame:
         if self.darkroom is None:

@@ -2,12 +2,15 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
+import xarray
 import zarr
 
 from dappled.decode.lightfield.light_field import LightField
@@ -174,3 +177,51 @@ def test_a_file_that_lacks_an_array_is_told(tmp_path: Path, kind: str, monkeypat
         save(path, light_field())
     with pytest.raises(LightFileError, match=r"not a light field.*grid"):
         load(path)
+
+
+@pytest.mark.parametrize("colour", [False, True])
+def test_xarray_reads_the_axes_and_units(tmp_path: Path, colour: bool) -> None:
+    path = tmp_path / "a.zarr"
+    field = light_field(colour=colour)
+    save(path, field)
+    with xarray.open_zarr(path, consolidated=False, chunks=None) as found:
+        assert found.views.dims == ("v", "u", "y", "x", "channel")[: field.views.ndim]
+        assert found.slices.dims == ("slice", "y", "x")
+        assert found.carriers.attrs["units"] == "cycles/pixel"
+        np.testing.assert_array_equal(found.views.isel(v=1, u=2), field.views[1, 2])
+        assert found.attrs["focal_length_mm"] == field.attributes["focal_length_mm"]
+
+
+def test_hdf5_has_the_axes_and_units_too(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    save(path, light_field())
+    with h5py.File(path) as found:
+        assert [axis.label for axis in found["views"].dims] == ["v", "u", "y", "x"]
+        assert found["grid"].attrs["units"] == "pixel"
+        assert found.attrs["focal_length_mm"] == 50.0
+
+
+def test_slices_of_another_size_have_axes_of_their_own(tmp_path: Path) -> None:
+    field = replace(light_field(), slices=np.ones((3, 10, 20), dtype=np.complex64), carriers=np.zeros((3, 4)))
+    path = tmp_path / "a.zarr"
+    save(path, field)
+    with xarray.open_zarr(path, consolidated=False, chunks=None) as found:
+        assert dict(found.sizes) == {
+            "slice": 3, "slice_y": 10, "slice_x": 20, "v": 3, "u": 3, "y": 4, "x": 6,
+            "carrier": 4, "direction": 2, "term": 3,
+        }  # fmt: skip
+
+
+def test_the_pages_programs_read_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (Path(__file__).parents[3] / "docs" / "lightfield.md").read_text(encoding="utf-8")
+    said = {**ATTRIBUTES, "doubts": ["the mask moved"]}
+    carriers = np.array([[0, 0, 0, 0], [0, 1, 0, 0.1], [1, 0, 0.1, 0], [1, 1, 0.1, 0.1], [1, -1, 0.1, -0.1]])
+    one = replace(light_field(), carriers=carriers, slices=np.ones((5, 4, 6), dtype=np.complex64), attributes=said)
+    save(tmp_path / "frame.npz", one)
+    monkeypatch.chdir(tmp_path)
+    exec(re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0], {})  # noqa: S102  # our own page
+    told = capsys.readouterr().out
+    assert "50.0 mm, doubts: ['the mask moved']" in told
+    assert "order (+1, +0) at (+0.1000, +0.0000) cycles/pixel: 1.0000" in told

@@ -1,7 +1,9 @@
 """Save and load light fields: a Zarr v3 group, .npz or .h5, with the arrays of `LightField` under their names.
 
-The attributes are the group's attributes in Zarr, and the JSON text of the array `attributes` in .npz. In HDF5 they are
-the file's attributes (those without an HDF5 type as JSON text), and all of them as JSON text in `attributes`.
+`docs/lightfield.md` has every array, axis, unit and attribute. In Zarr and HDF5 the axes have names, and the arrays
+have units. The attributes are the group's attributes in Zarr, and the JSON text of the array `attributes` in .npz. In
+HDF5 they are the file's attributes (those without an HDF5 type as JSON text), and all of them as JSON text in
+`attributes`.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "view_offsets": (np.float64, 3),
     "grid": (np.float64, 2),
 }
+_UNITS = {"slices": "1", "carriers": "cycles/pixel", "views": "1", "view_offsets": "1", "grid": "pixel"}
 _ATTRIBUTES = "attributes"
 _NUMBERS = ("focal_length_mm", "f_number", "lenslet_pitch_px", "noise_rms")
 _WORDS = ("camera", "mask", "law", "aperture")
@@ -95,6 +98,19 @@ def load(path: Path) -> LightField:
 _Arrays = dict[str, NDArray[Any]]
 
 
+def axes(arrays: Mapping[str, NDArray[Any]]) -> dict[str, tuple[str, ...]]:
+    """The names of each array's axes. Slices share y and x with the views where both have the same size."""
+    views = arrays["views"].shape
+    own = "" if arrays["slices"].shape[1:] == views[2:4] else "slice_"
+    return {
+        "slices": ("slice", f"{own}y", f"{own}x"),
+        "carriers": ("slice", "carrier"),
+        "views": ("v", "u", "y", "x", "channel")[: len(views)],
+        "view_offsets": ("v", "u", "direction"),
+        "grid": ("direction", "term"),
+    }
+
+
 def _of(path: Path, kinds: Mapping[str, Callable[..., Any]]) -> Callable[..., Any]:
     if path.suffix not in kinds:
         raise LightFileError(
@@ -152,11 +168,19 @@ def _json(path: Path, attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 def _save_zarr(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
     group = _zarr(part).open_group(store=part, mode="w-", zarr_format=3, attributes=attributes)
+    names = axes(arrays)
     for name, values in arrays.items():
         # One chunk for each slice or view: they are read one at a time.
         lead = {"slices": 1, "views": 2}.get(name, 0)
         chunks = tuple(max(1, side) for side in ((1,) * lead + values.shape[lead:]))
-        group.create_array(name, shape=values.shape, dtype=values.dtype, chunks=chunks)[...] = values
+        group.create_array(
+            name,
+            shape=values.shape,
+            dtype=values.dtype,
+            chunks=chunks,
+            dimension_names=names[name],
+            attributes={"units": _UNITS[name]},
+        )[...] = values
 
 
 def _load_zarr(path: Path) -> tuple[_Arrays, dict[str, Any]]:
@@ -180,8 +204,12 @@ def _load_npz(path: Path) -> tuple[_Arrays, dict[str, Any]]:
 
 def _save_h5(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
     with _h5py(part).File(part, "w") as file:
+        names = axes(arrays)
         for name, values in arrays.items():
-            file.create_dataset(name, data=values)
+            made = file.create_dataset(name, data=values)
+            made.attrs["units"] = _UNITS[name]
+            for axis, label in zip(made.dims, names[name], strict=True):
+                axis.label = label
         for key, value in attributes.items():
             file.attrs[key] = value if isinstance(value, str | int | float | bool) else json.dumps(value)
         file.attrs[_ATTRIBUTES] = json.dumps(attributes)
