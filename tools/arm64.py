@@ -24,6 +24,8 @@ from bootstrap import ROOT, fetch_uv, find_uv
 LIMIT_MB = 350
 PLATFORM, PYTHON = "aarch64-manylinux_2_36", "3.11"  # Raspberry Pi OS 12
 SUITE = "bookworm"
+DEBIAN = "python3,coreutils,libc-bin,dash,libstdc++6"
+ARCHIVE = ROOT / "build" / "clean-room" / f"{SUITE}-arm64.tar"
 WITHIN = 1e-5
 """The largest difference of two machines' slices that passes, relative to the largest value; 2e-7 was measured."""
 STEP_S = 300
@@ -69,7 +71,7 @@ def main() -> int:
         if size_mb > LIMIT_MB:
             print(f"more than the {LIMIT_MB} MB that onboard may take: move something to an extra", file=sys.stderr)
             return 1
-        why = emulated()
+        why = emulated() or arm_archive()
         if why:
             print(f"not run under emulation: {why}")
             return 0
@@ -142,19 +144,30 @@ def record_here(folder: Path) -> tuple[Path, Path]:
     return flight, folder / "here.npz"
 
 
+def arm_archive() -> str:
+    """Make the archive of the root where it is missing; why it can't be made, or "".
+
+    Its packages are not configured, which would take minutes under emulation: Python needs none of that.
+    """
+    if ARCHIVE.exists():
+        return ""
+    ARCHIVE.parent.mkdir(parents=True, exist_ok=True)
+    part = ARCHIVE.with_suffix(".part")
+    make = ["mmdebstrap", "--quiet", "--arch=arm64", "--format=tar", "--variant=extract", f"--include={DEBIAN}", SUITE]
+    done = subprocess.run([*make, str(part)], check=False, capture_output=True, text=True)
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["mmdebstrap failed"])[-1]
+        return f"no Debian root for arm64 could be made ({last})"
+    part.rename(ARCHIVE)
+    return ""
+
+
 @contextmanager
 def arm_root(folder: Path) -> Iterator[Path]:
-    """An unpacked Debian root for arm64. Its packages are not configured: Python needs none of that."""
-    archive = ROOT / "build" / "clean-room" / f"{SUITE}-arm64.tar"
-    if not archive.exists():
-        archive.parent.mkdir(parents=True, exist_ok=True)
-        part = archive.with_suffix(".part")
-        make = ["mmdebstrap", "--quiet", "--arch=arm64", "--format=tar", "--variant=extract"]
-        subprocess.run([*make, "--include=python3,coreutils,libc-bin,dash,libstdc++6", SUITE, str(part)], check=True)
-        part.rename(archive)
+    """An unpacked Debian root for arm64."""
     root = folder / "root"
     root.mkdir()
-    subprocess.run(["tar", "-xf", str(archive), "-C", str(root)], check=True)
+    subprocess.run(["tar", "-xf", str(ARCHIVE), "-C", str(root)], check=True)
     (root / "root" / "work").mkdir(parents=True)
     for kind, place in (("proc", root / "proc"), ("tmpfs", root / "dev" / "shm")):
         place.mkdir(parents=True, exist_ok=True)
