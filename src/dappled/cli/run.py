@@ -66,8 +66,9 @@ def _run(arguments: argparse.Namespace) -> int:
     from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # a real flight doesn't load the mocks
 
     if arguments.config is None:
-        here = Path("flights").absolute()
-        settings = replace(settings, record=replace(settings.record, directory=str(here)))
+        settings = replace(
+            settings, record=replace(settings.record, directory=str(configuration.SIMULATED_FLIGHTS.absolute()))
+        )
     with tempfile.TemporaryDirectory(prefix="dappled-") as folder:
         simulation = Simulation(World(seed=arguments.seed), settings, Path(folder))
         remark("simulating a masked camera, an autopilot and a ground station")

@@ -13,6 +13,7 @@ from typing import Any
 from dappled.config.schema import Finding, Rule, TomlSource, examine, read_toml, refuse, setting
 
 DEPTH_METHODS = ("gradient", "contrast", "combined")  # fast to good
+SIMULATED_FLIGHTS = Path("flights")  # where `dappled run --simulate` records without a file
 SOCKET_MODES = ("0600", "0660", "0666")
 
 

@@ -68,6 +68,46 @@ def test_the_folder_and_the_last_flight_come_from_the_settings(
     assert lines(["show", "--config", str(config)], capsys)[0] == closed.name
 
 
+def test_without_a_name_it_is_the_last_flight_with_shots_and_that_is_said(
+    closed: Path, flights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A start without a camera leaves a flight without shots behind."""
+    for hour in (1, 2):
+        recording.begin(flights, RecordedClock(START_UTC_NS + hour * 3600 * 10**9)).close()
+    config = tmp_path / "dappled.toml"
+    config.write_text(f'[record]\ndirectory = "{flights}"\n')
+    for action in ("show", "check", "report"):
+        assert main(["flight", action, "--config", str(config)]) == 0
+        told = capsys.readouterr()
+        assert told.err == f"flight {closed}, the last with shots; 2 later flights without a shot skipped\n"
+        assert closed.name in told.out
+    assert [line.split("  ")[2] for line in lines(["list", str(flights)], capsys)] == [
+        "1 frame, 1 failed, 2.0 MB", "no shot", "no shot",
+    ]  # fmt: skip
+
+
+def test_a_flight_without_a_shot_is_no_success(
+    flights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begun = recording.begin(flights, RecordedClock(START_UTC_NS))
+    begun.close()
+    flight = str(begun.folder.path)
+    assert lines(["report", flight], capsys, code=1)[-1] == "NO SHOT in this flight: there are no counts to compare"
+    assert main(["flight", "report", flight, "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["balanced"] is None
+    (config := tmp_path / "dappled.toml").write_text(f'[record]\ndirectory = "{flights}"\n')
+    assert main(["flight", "report", "--config", str(config)]) == 1
+    assert f"no flight in {flights} has a shot" in capsys.readouterr().err
+
+
+def test_what_a_simulation_recorded_here_is_found_without_a_file(
+    closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert lines(["report"], capsys)[0] == closed.name
+    assert closed.name in lines(["list"], capsys)[0]
+
+
 def test_no_flight_yet_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["flight", "list", str(tmp_path)]) == 0
     assert f"no flights in {tmp_path}" in capsys.readouterr().err

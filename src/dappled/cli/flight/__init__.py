@@ -18,7 +18,8 @@ from dappled.cli.flight import lines as flight_lines
 from dappled.cli.flight import pickup
 from dappled.clock import SystemClock
 from dappled.config import settings
-from dappled.flight import FlightError, flight_report, index, offload, seal_key
+from dappled.errors import counted
+from dappled.flight import FlightError, flight_report, index, layout, offload, seal_key
 from dappled.flight.checks import flight_check
 
 _FLIGHT = "~/flights/20261121T101503Z-0a1b2c3d"
@@ -34,7 +35,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     show = actions.add("show", "show every shot of a flight", f"dappled flight show {_FLIGHT}")
     intact = actions.add("check", "check that every byte is intact; exits 1 if not", f"dappled flight check {_FLIGHT}")
     report = actions.add(
-        "report", "count which requests became frames; exits 1 if the counts don't agree", "dappled flight report"
+        "report",
+        "count which requests became frames; exits 1 if the counts don't agree or there was no shot",
+        "dappled flight report",
     )
     away = actions.add(
         "offload",
@@ -57,7 +60,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="insist that this key signed the seals (default: record.seal_key, if any)",
     )
     for one in (show, intact, report, away, bring):
-        one.add_argument("flight", nargs="?", type=Path, metavar="FLIGHT", help="flight folder (default: the newest)")
+        one.add_argument(
+            "flight", nargs="?", type=Path, metavar="FLIGHT", help="flight folder (default: the last with shots)"
+        )
     for one in actions.all:
         one.add_argument("--config", type=Path, metavar="FILE", help="settings file that names the flights folder")
         one.add_argument("--json", action="store_true", help="print JSON")
@@ -77,14 +82,31 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _last_flight(flights: Path) -> Path:
-    """The newest flight in a folder. Raises FlightError if there is none."""
+    """The last flight with shots in a folder; says which. Raises FlightError if there is none."""
     found = index.in_order(flights)
     if not found:
         raise FlightError(f"there is no flight in {flights} yet; name one, or record one with `dappled run`")
-    return found[-1].path
+    with_shots = [number for number, one in enumerate(found) if not _empty(one)]
+    if not with_shots:
+        raise FlightError(f"no flight in {flights} has a shot; name one to look at it all the same")
+    chosen, skipped = found[with_shots[-1]], len(found) - 1 - with_shots[-1]
+    later = f"; {counted(skipped, 'later flight')} without a shot skipped" if skipped else ""
+    print(f"flight {chosen.path}, the last with shots{later}", file=sys.stderr)
+    return chosen.path
+
+
+def _empty(flight: layout.FlightFolder) -> bool:
+    """Whether no shot was ever noted in a flight. False where that can't be known."""
+    try:
+        return flight.journal.stat().st_size == 0
+    except OSError:
+        return False
 
 
 def _flights(config: Path | None) -> Path:
+    """The settings' folder. Without a file: `flights` here, where `dappled run --simulate` records, if it holds any."""
+    if config is None and layout.flights(settings.SIMULATED_FLIGHTS):
+        return settings.SIMULATED_FLIGHTS
     return Path(settings.load(config).record.directory)
 
 
@@ -109,9 +131,9 @@ def _check(flight: Path, config: Path | None, key: Path | None, as_json: bool) -
 def _report(flight: Path, as_json: bool) -> int:
     found, by_source = flight_report.balance(flight), flight_report.by_source(flight)
     sources = [asdict(one) for one in by_source]
-    values = {**_plain(found), "sources": sources, "balanced": found.balanced}
+    values = {**_plain(found), "sources": sources, "balanced": found.balanced if found.wishes else None}
     _said(values, flight_lines.of_report(found, by_source), as_json)
-    return 0 if found.balanced else 1
+    return 0 if found.balanced and found.wishes else 1
 
 
 def _offload(flight: Path, arguments: argparse.Namespace) -> int:

@@ -20,6 +20,8 @@ def of_list(one: ListedFlight) -> str:
         return f"{one.name}  {one.problem}"
     state = "" if b.closed else "  (open)"
     began = "UTC not known" if b.began_utc_ns is None else _utc(b.began_utc_ns)[:16].replace("T", " ")
+    if not b.wishes:
+        return f"{one.name}  {began}  no shot{state}"
     return f"{one.name}  {began}  {counted(b.frames, 'frame')}, {b.failed} failed, {b.size / 1e6:.1f} MB{state}"
 
 
@@ -88,6 +90,9 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
         yield f"  {counted(found.companions, 'file', 6)} beside frames, such as the JPEG of a raw frame"
     if found.strays:
         yield f"  {counted(found.strays, 'file', 6)} without a shot"
+    if found.balanced and not found.wishes:
+        yield "NO SHOT in this flight: there are no counts to compare"
+        return
     yield "the counts agree" if found.balanced else "THE COUNTS DO NOT AGREE: run `dappled flight check`"
 
 
