@@ -159,6 +159,8 @@ def shoot(page: Page) -> int:
     while not (told := page.inner_text("#outcome")).startswith("shot "):
         # What others asked for may still be under way: then it is refused in words, and a person presses again.
         assert time.monotonic() < deadline, told
+        until(page, "!document.querySelector('#shoot').disabled")
+        page.focus("#shoot")
         page.evaluate("document.querySelector('#outcome').textContent = ''")
         page.keyboard.press("Enter")
         until(page, "document.querySelector('#outcome').textContent !== ''")

@@ -16,7 +16,7 @@ let sequence = Math.floor(Math.random() * 2 ** 30);
 const handlers = {
   about(event) { map.setBackground(event.map); map.setPath(event.path); if (event.start) began(event.start); },
   start(event) { began(event.start); },
-  state(event) { token = event.token; tokenAt = performance.now(); if (event.health) showState(event); },
+  state(event) { token = event.token; tokenAt = performance.now(); if (event.health) showState(event); tick(); },
   frame: showFrame,
   ready() { connected = true; },
   log(event) { showLog(event.lines); },
