@@ -27,7 +27,7 @@ def test_a_source_that_ends_early_leaves_nothing(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-@pytest.mark.parametrize("call", ["sendfile", "fsync", "rename"])
+@pytest.mark.parametrize("call", ["sendfile", "fsync", "replace"])
 def test_a_fault_before_the_rename_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str) -> None:
     def refuse(*_: object) -> None:
         raise OSError(errno.ENOSPC, "no space")
@@ -42,7 +42,7 @@ def test_a_fault_before_the_rename_leaves_nothing(tmp_path: Path, monkeypatch: p
 
 def test_the_order_is_file_then_name_then_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[str] = []
-    fsync, rename = os.fsync, os.rename
+    fsync, rename = os.fsync, os.replace
 
     def watched_fsync(fd: int) -> None:
         seen.append(f"fsync {Path(os.readlink(f'/proc/self/fd/{fd}')).name}")
@@ -53,7 +53,7 @@ def test_the_order_is_file_then_name_then_folder(tmp_path: Path, monkeypatch: py
         rename(old, new)
 
     monkeypatch.setattr(os, "fsync", watched_fsync)
-    monkeypatch.setattr(os, "rename", watched_rename)
+    monkeypatch.setattr(os, "replace", watched_rename)
     with held(b"abc") as blob:
         durable.copy_in(blob.fd, blob.size, tmp_path / "a")
     assert seen == ["fsync .a.part", "rename .a.part a", f"fsync {tmp_path.name}"]

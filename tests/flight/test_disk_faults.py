@@ -215,7 +215,7 @@ def test_a_power_cut_on_a_real_file_system(ext4: Image, tmp_path: Path, monkeypa
         cut()
         return done
 
-    for name in ("fsync", "rename", "sendfile"):
+    for name in ("fsync", "replace", "sendfile"):
         monkeypatch.setattr(os, name, partial(watched, getattr(os, name)))
     flight = recording.begin(ext4.mounted / "flights", RecordedClock(START_UTC_NS))
     for index in range(2):

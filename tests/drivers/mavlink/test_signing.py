@@ -154,7 +154,7 @@ class Disk:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.calls: list[str | int] = []
-        fsync, rename = os.fsync, os.rename
+        fsync, rename = os.fsync, os.replace
 
         def watched_fsync(fd: int) -> None:
             facts = os.fstat(fd)
@@ -166,7 +166,7 @@ class Disk:
             rename(old, new)
 
         monkeypatch.setattr(os, "fsync", watched_fsync)
-        monkeypatch.setattr(os, "rename", watched_rename)
+        monkeypatch.setattr(os, "replace", watched_rename)
 
 
 def test_a_key_is_on_the_disk_when_it_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
