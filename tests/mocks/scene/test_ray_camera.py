@@ -145,7 +145,7 @@ def test_a_frame_is_the_sum_of_its_rays(bow_mm: float) -> None:
     """Every sample of some pixels, from every point of the stop, through the mask at its own place."""
     camera = replace(
         CLEAN, shape=(24, 32), boards=(board(0.125, 0.02, (24, 32)),), points_per_view=2, turn_rad=0.03,
-        shift_mm=(0.011, -0.007), print_scale=1.02, bow_mm=bow_mm, defocus=0.01,
+        shift_mm=(0.011, -0.007), print_scale=1.02, anisotropy=0.02, bow_mm=bow_mm, defocus=0.01,
     )  # fmt: skip
     made = camera.expose()
     y, x = camera.grid.places_mm
@@ -157,7 +157,7 @@ def test_a_frame_is_the_sum_of_its_rays(bow_mm: float) -> None:
     for (ty, tx), weight in zip(camera.open_stop.points * camera.aperture_mm, camera.open_stop.weights, strict=True):
         at_y, at_x = (1 - alpha) * y[:, None] + alpha * ty, (1 - alpha) * x[None, :] + alpha * tx
         own_y, own_x = c * at_y + s * at_x, -s * at_y + c * at_x
-        film = lens.transmission(FULL, own_y * 15.81 + 0.011 * 15.81, own_x * 15.81 - 0.007 * 15.81)
+        film = lens.transmission(FULL, (own_y + 0.011) * 15.81 * 1.01, (own_x - 0.007) * 15.81 * 0.99)
         light = 1 + 0.4 * np.cos(2 * np.pi * 12.5 * (x - 0.03 * tx))
         total += weight * light[None, :] * (film - low) / (high - low)
     expected = total.reshape(24, 3, 32, 3).mean(axis=(1, 3))
@@ -218,6 +218,8 @@ def test_a_board_hides_what_is_behind_it_from_each_view_apart() -> None:
     edges = [int(np.argmax(truth.views[2, u, 24, :, 0] > np.ptp(truth.views[2, u, 24]) / 2)) for u in range(5)]
     step_px = 0.06 * CLEAN.aperture_mm / 5 / 0.01
     assert np.diff(edges) == pytest.approx(step_px, abs=1)
+    middle = truth.views[2, 2, 24, :, 0]
+    assert middle[-4] / middle[3] == pytest.approx(9)  # 0.9 hides the 0.1 behind it
     assert truth.disparity[24, 10] == 0
     assert truth.disparity[24, 50] == pytest.approx(0.06)
 
