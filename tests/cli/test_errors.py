@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
 import pkgutil
 from collections.abc import Iterator
 
@@ -93,3 +94,28 @@ def test_other_errors_are_one_line_too(
 def test_debug_shows_where_it_came_from(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DappledError, match="why"):
         ended(monkeypatch, DappledError("why"), "--debug")
+
+
+def test_with_json_an_error_is_json_too(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    from dappled.cli import config  # noqa: PLC0415  # patched here
+
+    def run(_: object) -> int:
+        raise DappledError("the disk is full; free some space")
+
+    monkeypatch.setattr(config, "run", run)
+    assert cli.main(["profiles", "--json"]) == 1
+    out, err = capfd.readouterr()
+    assert json.loads(out) == {"error": "the disk is full; free some space"}
+    assert err == "dappled profiles: the disk is full; free some space\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"), [(["rn"], "run"), (["flight", "reprot"], "report"), (["config", "chek", "x"], "check")]
+)
+def test_a_word_that_is_nearly_right_is_guessed(
+    words: list[str], meant: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(words)
+    assert ended.value.code == 2
+    assert f"did you mean {meant!r}?" in capfd.readouterr().err

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import importlib
+import json
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
+from typing import NoReturn
 
 import dappled
 from dappled.daemon.health import systemd
@@ -42,7 +46,7 @@ VERBS: dict[str, tuple[str, str]] = {
 
 def parser(wanted: str | None = None) -> argparse.ArgumentParser:
     """The whole command line. Only the module of the wanted verb is loaded."""
-    top = argparse.ArgumentParser(
+    top = SuggestingParser(
         prog="dappled",
         description="Acquisition daemon for masked light-field cameras that fly.",
         epilog="example: dappled run --simulate --frames 8",
@@ -59,6 +63,16 @@ def parser(wanted: str | None = None) -> argparse.ArgumentParser:
             loaded.configure(one)
             one.set_defaults(run=loaded.run)
     return top
+
+
+class SuggestingParser(argparse.ArgumentParser):
+    """A parser that names the nearest of the words that it knows."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print usage and what is wrong, and exit with 2."""
+        wrong = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message)
+        near = difflib.get_close_matches(wrong[1], re.findall(r"[\w.-]+", wrong[2]), 1, 0.5) if wrong else []
+        super().error(f"there is no {wrong[1]!r} here; did you mean {near[0]!r}?" if wrong and near else message)
 
 
 def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object] | None = None) -> int:
@@ -80,8 +94,7 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
     except DappledError as error:
         if parsed.debug:
             raise
-        print(f"dappled {parsed.verb}: {error}", file=sys.stderr)
-        return error.exit_code
+        return _failed(parsed, str(error), error.exit_code)
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
@@ -91,8 +104,7 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
         if parsed.debug:
             raise
         where = f"{error.filename}: " if error.filename else ""
-        print(f"dappled {parsed.verb}: {where}{error.strerror or error}", file=sys.stderr)
-        return 1
+        return _failed(parsed, f"{where}{error.strerror or error}", 1)
     except Exception as error:
         if parsed.debug:
             raise
@@ -100,6 +112,13 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
         if isinstance(error, MemoryError):
             wanted = f" ({error})" if str(error) else ""
             said = f"not enough memory{wanted}: close other programs, or use a machine with more memory"
-        print(f"dappled {parsed.verb}: {said}", file=sys.stderr)
-        return 1
+        return _failed(parsed, said, 1)
+    return code
+
+
+def _failed(parsed: argparse.Namespace, text: str, code: int) -> int:
+    """Say what went wrong: a person on standard error, and with --json a program too, as {"error": …}."""
+    print(f"dappled {parsed.verb}: {text}", file=sys.stderr)
+    if getattr(parsed, "json", False):
+        print(json.dumps({"error": text}))
     return code

@@ -48,7 +48,7 @@ def record(
         shots=shots,
         stages=[stage.statistics()],
         shutter=ShutterStatistics(2, 0, 0, 2, 0, 2, None),
-        links=[link],
+        links=[link, *more.pop("links", ())],
         telemetry=Telemetry().statistics(),
         publisher=PublisherStatistics({}, {}, 0, 0, 0),
         folder=folder,
@@ -110,3 +110,15 @@ def test_a_folder_that_is_gone_is_unknown_not_zero(tmp_path: Path) -> None:
     assert found["disk"]["free_bytes"] is None
     (problem,) = found["problems"]
     assert "new shots are refused" in problem
+
+
+def test_a_link_on_which_no_ground_station_is_yet_is_no_problem(tmp_path: Path) -> None:
+    """As long as another link is heard; one that falls silent, or is refused, is a problem."""
+    never = replace(LINK, url="udpin:127.0.0.1:2", last_heard_monotonic_ns=None)
+    found = record(tmp_path, links=[never])
+    assert (found["problems"], found["link"]["silent"]) == ([], 1)
+    (problem,) = record(tmp_path, links=[replace(never, last_heard_monotonic_ns=95 * S)])["problems"]
+    assert "udpin:127.0.0.1:2: nothing was heard for 5 s" in problem
+    (problem,) = record(tmp_path, links=[replace(never, signing=SigningStatistics(0, 3, 1, 0, 7))])["problems"]
+    assert "3 forged" in problem
+    assert len(record(tmp_path, link=never)["problems"]) == 1

@@ -37,6 +37,7 @@ def main() -> int:
     """Serve until the daemon ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the daemon handles ^C
     logging.basicConfig(level=logging.WARNING, handlers=[systemd.handler()])
+    logging.getLogger("uvicorn.error").addFilter(worth_logging)
     os.nice(NICENESS)
     goes_first(CONSOLE_GOES)
     reuse_large_blocks()
@@ -84,6 +85,13 @@ def configuration(served: ASGIApp) -> uvicorn.Config:
         limit_concurrency=2 * CONNECTIONS,  # twice, because the tasks of closed ones end a moment later
         h11_max_incomplete_event_size=16_384,
     )
+
+
+def worth_logging(record: logging.LogRecord) -> bool:
+    """Whether a line of uvicorn's is no mere sign of the end: it cancels requests that are not answered by then, such
+    as one that waits for the decoder, and logs a traceback of each."""
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, asyncio.CancelledError) and "graceful shutdown" not in record.getMessage()
 
 
 def _end(task: asyncio.Task[None], server: uvicorn.Server) -> None:

@@ -74,14 +74,13 @@ def record(
         problems.append(shots.camera_sentence())
     if not settings.mavlink.url:
         problems.append("no MAVLink link is configured: frames are tagged without poses")
-    silent = 0
-    for link in links:
-        if link.error:
-            silent += 1
-            problems.append(link.error)
-        elif monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS:
-            silent += 1
-            problems.append(f"MAVLink link {link.url}: {_silence(link)}")
+    silent = [
+        link
+        for link in links
+        if link.error or monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS
+    ]
+    heard = any(link.last_heard_monotonic_ns is not None for link in links)
+    problems += [text for link in silent if (text := _link_problem(link, heard=heard))]
     problems += doubts
     if not utc_known:
         problems.append(
@@ -113,7 +112,7 @@ def record(
         "camera": {"state": shots.state, "reason": shots.reason},
         "link": {
             "urls": len(links),
-            "silent": silent,
+            "silent": len(silent),
             "packets": telemetry.packets,
             "positions": telemetry.positions,
             "each": [_counters(link) for link in links],
@@ -153,10 +152,25 @@ def record(
     }
 
 
+def _link_problem(link: LinkStatistics, *, heard: bool) -> str | None:
+    """What is wrong with a silent link. None for one on which nobody was heard yet, where another one is `heard`: no
+    ground station is there, nothing is lost, and the counters show it."""
+    if link.error:
+        return link.error
+    if heard and link.last_heard_monotonic_ns is None and not _refused(link):
+        return None
+    return f"MAVLink link {link.url}: {_silence(link)}"
+
+
+def _refused(link: LinkStatistics) -> bool:
+    """Whether packets came that signing refused."""
+    return link.signing is not None and link.signing.refused > 0
+
+
 def _silence(link: LinkStatistics) -> str:
     """Why a link is not usable, as far as this end knows."""
     signing = link.signing
-    if signing is None or signing.refused == 0:
+    if signing is None or not _refused(link):
         return "nothing was heard for 5 s"
     return (
         f"nothing with a valid signature was heard for 5 s ({counted(signing.unsigned_refused, 'packet')} unsigned, "
