@@ -32,7 +32,7 @@ def test_on_a_machine_without_any_camera_it_ends_with_what_to_do_next(capfd: pyt
     assert main(["doctor", "--json"]) == 1
     told = json.loads(capfd.readouterr().out)
     assert told["next"].startswith("connect the camera")
-    assert {one["state"] for one in told["checks"]} <= {"ok", "note", "wrong"}
+    assert {one["state"] for one in told["checks"]} <= {"go", "caution", "no-go"}
 
 
 def settings(folder: Path, picture: str) -> Path:
@@ -64,7 +64,7 @@ def test_a_camera_that_can_t_be_had_is_not_fired(tmp_path: Path, capfd: pytest.C
     path.write_text('[camera]\nport = "usb:099,099"\n')
     assert main(["doctor", "--config", str(path), "--latency", "3"]) == 1
     out = capfd.readouterr().out
-    assert "WRONG    camera" in out
+    assert "NO GO    camera" in out
     assert "no shot was fired" in out
 
 
@@ -144,7 +144,7 @@ def test_a_running_daemon_without_a_camera_is_no_go(
     assert main(["doctor", "--config", config, "--json"]) == 1
     told = json.loads(capfd.readouterr().out)
     assert told["verdict"] == "no-go"
-    assert told["checks"][0] == {"name": "Camera", "state": "no-go", "text": "absent: no body"}
+    assert told["checks"][0] == {"name": "Camera", "state": "no-go", "text": "absent: no body", "todo": ""}
     assert told["next"]
 
 
@@ -164,9 +164,9 @@ def test_a_file_that_the_daemon_was_not_started_with_is_told_by_its_differences(
     config.write_text(config.read_text() + '[mask]\nprofile = "mask-2"\n[camera]\nmax_pending = 3\n')
     assert main(["doctor", "--config", str(config)]) == 1
     out = capfd.readouterr().out.splitlines()
-    assert [line for line in out if "settings" in line.split()[:2]] == [
-        f"WRONG    settings    camera.max_pending is 3 in {config}, the daemon has 2",
-        f'WRONG    settings    mask.profile is "mask-2" in {config}, the daemon has ""',
+    assert [line for line in out if "settings" in line.split()[:3]] == [
+        f"NO GO    settings    camera.max_pending is 3 in {config}, the daemon has 2",
+        f'NO GO    settings    mask.profile is "mask-2" in {config}, the daemon has ""',
     ]
     assert "next: restart the daemon with this file" in out[-1]
 

@@ -31,7 +31,6 @@ from dappled.drivers import usb_bus
 from dappled.errors import DappledError, counted
 
 _WORDS = {"go": "go", "caution": "caution", "no-go": "NO GO"}
-_HOST_WORDS = {"go": "ok", "caution": "note", "no-go": "WRONG"}
 _VERDICTS = {"go": "GO", "caution": "GO, with the cautions above", "no-go": "NO GO"}
 HEAR_S = 5.0  # a daemon publishes its health every second
 
@@ -71,10 +70,10 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.simulate:
             settings, truth = stack.enter_context(_simulated(settings, arguments.seed, folder))
         checked = host_checks.run(settings)
-        report: dict[str, Any] = {"checks": _host_facts(checked)}
+        report: dict[str, Any] = {"checks": _facts(checked)}
         ready = all(one.state != "no-go" for one in checked if one.name in ("camera", "disk"))
         good = not go_no_go.next_step(checked)
-        lines = _host_lines(checked)
+        lines = _lines(checked)
         if (arguments.test_shot or arguments.latency) and ready:
             more, shot = _shoot(settings, arguments, folder, truth)
             lines, report, good = [*lines, *more], {**report, **shot}, good and shot["verdict"] != "no-go"
@@ -107,13 +106,13 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
         looked += _differences(arguments.config, settings, report)
     todo = go_no_go.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
     if arguments.json:
-        facts = [*({"name": one.name, "state": one.state, "text": one.text} for one in checks), *_host_facts(looked)]
+        facts = _facts([*checks, *looked])
         found = {"flight": report["flight"], "user": user, "checks": facts, "verdict": verdict, "next": todo}
         print(json.dumps(found, indent=2))
     else:
         whose = "a daemon runs here" if user is None else f"not your own daemon but that of user {user} runs here"
         print(f"{whose}, flight {report['flight']}; it reports")
-        print("\n".join([*_lines(checks), *_host_lines(looked)]))
+        print("\n".join(_lines([*checks, *looked])))
         print(f"{_VERDICTS[verdict]}{f'; next: {todo}' if todo else ''}")
     return 1 if verdict == "no-go" or any(one.name == "settings" and one.state == "no-go" for one in looked) else 0
 
@@ -148,15 +147,8 @@ def _lines(checks: Sequence[Check]) -> list[str]:
     return [f"{_WORDS[one.state]:8} {one.name:11} {one.text}" for one in checks]
 
 
-def _host_lines(checks: Sequence[Check]) -> list[str]:
-    return [f"{_HOST_WORDS[one.state]:8} {one.name:11} {one.text}" for one in checks]
-
-
-def _host_facts(checks: Sequence[Check]) -> list[dict[str, str]]:
-    return [
-        {"name": one.name, "state": _HOST_WORDS[one.state].lower(), "text": one.text, "todo": one.todo}
-        for one in checks
-    ]
+def _facts(checks: Sequence[Check]) -> list[dict[str, str]]:
+    return [{"name": one.name, "state": one.state, "text": one.text, "todo": one.todo} for one in checks]
 
 
 def _last(checks: Sequence[Check], verdict: str | None) -> str:
