@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -50,7 +49,7 @@ class GroundClient:
     def __init__(
         self, url: str, *, system_id: int = 255, component_id: int = 190, key_file: Path | None = None
     ) -> None:
-        clock = SystemClock()
+        self._clock = clock = SystemClock()
         self._links = MavlinkLinks(
             [url],
             system_id=system_id,
@@ -62,7 +61,7 @@ class GroundClient:
         self._heard: deque[MavlinkMessage] = deque(maxlen=_KEPT)
         self._camera: tuple[int, int] | None = None
         self._heart = Loop("ground heartbeat", self._beat)
-        self._sequence = time.time_ns() // 10**8 % 2**23  # differs from a run just before; exact as a float
+        self._sequence = clock.utc_ns() // 10**8 % 2**23  # differs from a run just before; exact as a float
 
     def __enter__(self) -> GroundClient:
         self._links.start(self)
@@ -101,11 +100,11 @@ class GroundClient:
         padded = (*parameters, *[0.0] * (7 - len(parameters)))
         with self._listening() as heard:
             for confirmation in range(ACK_TRIES):
-                asked = time.monotonic_ns()
+                asked_ns = self._clock.monotonic_ns()
                 self.send_command(mavlink.MAVLink_command_long_message(system, component, name, confirmation, *padded))
                 ack = heard(lambda m: m.get_type() == "COMMAND_ACK" and m.command == name and self._mine(m), ACK_S)
                 if ack is not None:
-                    return int(ack.result), (time.monotonic_ns() - asked) / 1e6
+                    return int(ack.result), (self._clock.monotonic_ns() - asked_ns) / 1e6
         return None, None
 
     def send_command(self, message: MavlinkMessage) -> None:
@@ -129,14 +128,15 @@ class GroundClient:
             )
         expected = int(status.image_count)
         for _ in range(count):
-            began = time.monotonic()
+            began_ns = self._clock.monotonic_ns()
             outcome = self._capture_one(expected, timeout_s)
             if outcome.index is not None:
                 expected = outcome.index + 1
             outcomes.append(outcome)
             on_outcome(outcome)
             if len(outcomes) < count:
-                self._heart.stopping.wait(max(0.0, began + interval_s - time.monotonic()))
+                left_s = interval_s - (self._clock.monotonic_ns() - began_ns) / 1e9
+                self._clock.wait(self._heart.stopping, left_s)
         return outcomes
 
     def _capture_one(self, expected: int, timeout_s: float) -> Outcome:
@@ -150,11 +150,11 @@ class GroundClient:
                 said = heard(lambda m: m.get_type() == "STATUSTEXT", 0.2)
                 words = f"refused with MAV_RESULT {result}" + (f": {said.text}" if said is not None else "")
                 return Outcome(sequence, None, False, words, ack_ms, None)
-            until = time.monotonic() + timeout_s
-            while time.monotonic() < until:
-                wait_s = min(_ASK_AGAIN_S, until - time.monotonic())
+            until_ns = self._clock.monotonic_ns() + round(timeout_s * 1e9)
+            while (left_ns := until_ns - self._clock.monotonic_ns()) > 0:
+                wait_s = min(_ASK_AGAIN_S, left_ns / 1e9)
                 captured = heard(
-                    lambda m: m.get_type() == "CAMERA_IMAGE_CAPTURED" and m.image_index >= expected, max(0.0, wait_s)
+                    lambda m: m.get_type() == "CAMERA_IMAGE_CAPTURED" and m.image_index >= expected, wait_s
                 )
                 if captured is not None:
                     ok = captured.capture_result == 1
