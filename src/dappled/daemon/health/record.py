@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dappled.config.settings import Settings
+from dappled.config.settings import RecordSettings, Settings
 from dappled.daemon.health.go_no_go import FAILING
 from dappled.daemon.navigation import BootClock, TelemetryStatistics
 from dappled.daemon.pipeline.capture import PendingShots
@@ -23,6 +23,9 @@ from dappled.flight import FlightError, layout
 from dappled.workers import Statistics
 
 SILENT_NS = 5 * 10**9
+_NO_LINK = "no MAVLink link is configured: frames are tagged without poses"
+_NO_MASK = "no mask is configured: frames are kept, not decoded (set mask.profile)"
+_NO_UTC = "UTC is not known yet: all time stamps will be corrected when the autopilot gets it from its satellites"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,55 +72,25 @@ def record(
 
     `doubts` are further problems, found by other parts. `dead_threads` have ended without being asked to.
     """
-    problems = [f"the {name} thread has ended: restart dappled" for name in dead_threads]
-    if shots.state not in ("starting", "ready", "busy"):
-        problems.append(shots.camera_sentence())
-    if not settings.mavlink.url:
-        problems.append("no MAVLink link is configured: frames are tagged without poses")
-    silent = [
-        link
-        for link in links
-        if link.error or monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS
-    ]
-    heard = any(link.last_heard_monotonic_ns is not None for link in links)
-    problems += [text for link in silent if (text := _link_problem(link, heard=heard))]
-    problems += doubts
-    if not utc_known:
-        problems.append(
-            "UTC is not known yet: all time stamps will be corrected when the autopilot gets it from its satellites"
-        )
-    space: layout.DiskSpace | None = None
-    try:
-        space = layout.disk_space(folder)
-        short = space.shortage(settings.record.min_free_mb)
-    except FlightError as error:
-        short = str(error)
-    free = None if space is None else space.available
-    if short is not None:
-        problems.append(f"{short}; new shots are refused")
-    elif free is not None and free < settings.record.warn_free_mb * 1_000_000:
-        problems.append(
-            f"the disk is filling up: {free // 10**6} MB left; shots are refused below {settings.record.min_free_mb} MB"
-        )
-    if not settings.mask.profile:
-        problems.append("no mask is configured: frames are kept, not decoded (set mask.profile)")
     decoding = decoding or DecodingState()
-    problems += decoding.problems()
-    queues = [asdict(stage) for stage in stages]
-    for stage in queues:
-        if stage["dropped"]:
-            problems.append(f"{stage['name']} fell behind by {_frames(stage['dropped'])}, kept in the record")
+    link, silences = _link(settings, links, telemetry, monotonic_ns, began_monotonic_ns)
+    disk, shortages = _disk(settings.record, folder)
+    problems = [
+        *(f"the {name} thread has ended: restart dappled" for name in dead_threads),
+        *([] if shots.state in ("starting", "ready", "busy") else [shots.camera_sentence()]),
+        *silences,
+        *doubts,
+        *([] if utc_known else [_NO_UTC]),
+        *shortages,
+        *([] if settings.mask.profile else [_NO_MASK]),
+        *decoding.problems(),
+        *(f"{one.name} fell behind by {_frames(one.dropped)}, kept in the record" for one in stages if one.dropped),
+    ]
     return {
         "utc_ns": utc_ns,
         "camera": {"state": shots.state, "reason": shots.reason},
-        "link": {
-            "urls": len(links),
-            "silent": len(silent),
-            "packets": telemetry.packets,
-            "positions": telemetry.positions,
-            "each": [_counters(link) for link in links],
-        },
-        "disk": {"free_bytes": free, "free_files": space.files if space else None, "folder": str(folder)},
+        "link": link,
+        "disk": disk,
         "shots": {
             "wished": shutter.shots,
             "safe": shutter.succeeded,
@@ -125,18 +98,12 @@ def record(
             "pending": shutter.pending,
             "refused": shutter.refused,
         },
-        "stages": [*queues, _publish(publisher)],
+        "stages": [*(asdict(one) for one in stages), _publish(publisher)],
         "problems": problems,
         "dead": list(dead_threads),
         "utc_known": utc_known,
         "interval_s": shutter.interval_s,
-        "interval": None
-        if shutter.interval_s is None
-        else {
-            "taken": shutter.interval_taken,
-            "count": shutter.interval_count,
-            "next_s": shutter.interval_next_s,
-        },
+        "interval": _interval(shutter),
         "clock": None if clock is None else {"source": clock.source, "sigma_ms": clock.sigma_ns / 1e6},
         "vehicle": None if vehicle is None or vehicle.latitude_rad is None else _place(vehicle),
         "decode": {
@@ -165,6 +132,54 @@ def _link_problem(link: LinkStatistics, *, heard: bool) -> str | None:
 def _refused(link: LinkStatistics) -> bool:
     """Whether packets came that signing refused."""
     return link.signing is not None and link.signing.refused > 0
+
+
+def _link(
+    settings: Settings,
+    links: Sequence[LinkStatistics],
+    telemetry: TelemetryStatistics,
+    monotonic_ns: int,
+    began_monotonic_ns: int,
+) -> tuple[dict[str, Any], list[str]]:
+    """The state of the links, and a problem for each that should be heard."""
+    silent = [
+        link
+        for link in links
+        if link.error or monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS
+    ]
+    heard = any(link.last_heard_monotonic_ns is not None for link in links)
+    problems = [text for link in silent if (text := _link_problem(link, heard=heard))]
+    facts = {
+        "urls": len(links),
+        "silent": len(silent),
+        "packets": telemetry.packets,
+        "positions": telemetry.positions,
+        "each": [_counters(link) for link in links],
+    }
+    return facts, problems if settings.mavlink.url else [_NO_LINK, *problems]
+
+
+def _disk(record: RecordSettings, folder: Path) -> tuple[dict[str, Any], list[str]]:
+    """What the disk has left, None where that is unknown; and a problem where it is full, or will be."""
+    facts: dict[str, Any] = {"free_bytes": None, "free_files": None, "folder": str(folder)}
+    try:
+        space = layout.disk_space(folder)
+    except FlightError as error:
+        return facts, [f"{error}; new shots are refused"]
+    facts |= {"free_bytes": space.available, "free_files": space.files}
+    if (short := space.shortage(record.min_free_mb)) is not None:
+        return facts, [f"{short}; new shots are refused"]
+    if space.available >= record.warn_free_mb * 1_000_000:
+        return facts, []
+    left = f"{space.available // 10**6} MB left"
+    return facts, [f"the disk is filling up: {left}; shots are refused below {record.min_free_mb} MB"]
+
+
+def _interval(shutter: ShutterStatistics) -> dict[str, Any] | None:
+    """How far an interval has got; None while none runs."""
+    if shutter.interval_s is None:
+        return None
+    return {"taken": shutter.interval_taken, "count": shutter.interval_count, "next_s": shutter.interval_next_s}
 
 
 def _silence(link: LinkStatistics) -> str:
