@@ -89,8 +89,10 @@ def test_bodies_that_come_and_go_are_told(monkeypatch: pytest.MonkeyPatch, capfd
         except StopIteration:
             raise KeyboardInterrupt from None
 
+    monkeypatch.setattr(
+        "dappled.cli.doctor.time.sleep", lambda seconds: None
+    )  # first: it imports what is replaced next
     monkeypatch.setattr(usb_bus, "bodies", bodies)
-    monkeypatch.setattr("dappled.cli.doctor.time.sleep", lambda seconds: None)
     assert main(["doctor", "--watch"]) == 130
     assert [line.split("  ")[0] for line in capfd.readouterr().out.splitlines()] == ["here", "gone"]
 
