@@ -125,3 +125,26 @@ def test_a_calibration_must_be_for_mask_law_and_camera(tmp_path: Path) -> None:
         f'[camera]\nprofile = "fujifilm-s5200"\n[decode]\ncalibration = "c.toml"\n[mask]\nprofile = "{MASK}"\n',
     )
     assert "px, which fujifilm-s5200 doesn't make: calibrate with that camera" in sentence
+
+
+def test_a_folder_that_this_user_can_not_write_to_is_no_fault_of_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The service has a user of its own: a person who checks its file need not be able to write its flights."""
+    file = tmp_path / "d.toml"
+    file.write_text('[record]\ndirectory = "flights"\n')
+    monkeypatch.setattr("dappled.daemon.settings_check.os.access", lambda *_: False)
+    assert main(["config", "check", str(file)]) == 0
+    assert main(["run", "--config", str(file)]) == 2
+    assert f"{tmp_path} can't be written to: make {tmp_path}/flights yours" in capfd.readouterr().err
+
+
+def test_secrets_of_the_service_are_judged_as_the_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "token").write_text("short")
+    file = tmp_path / "d.toml"
+    file.write_text('[console]\nbind = "127.0.0.1:1"\ntoken = "token"\n[record]\nseal_key = "none"\n')
+    read = settings.examine_file(file)
+    assert len(settings_check.findings(read)) == len(settings_check.findings(read, by_this_user=False)) == 2
+    monkeypatch.setattr("dappled.daemon.settings_check.os.getuid", lambda: 4711)  # the token is another user's now
+    (finding,) = settings_check.findings(read, by_this_user=False)
+    assert finding.key == "seal_key"  # a file that isn't there is nobody's

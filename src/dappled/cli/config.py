@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.action == "profiles":
         return _profiles(arguments.json)
     if arguments.action == "check":
-        settings_check.checked(settings.examine_file(arguments.file))
+        settings_check.checked(settings.examine_file(arguments.file), by_this_user=False)
         print(f"{arguments.file}: good")
         return 0
     loaded = settings.load(arguments.file)

@@ -61,7 +61,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     if arguments.watch:
         return _watch()
-    settings = settings_check.checked(configuration.examine_file(arguments.config))
+    settings = settings_check.checked(configuration.examine_file(arguments.config), by_this_user=False)
     if not arguments.simulate and is_listening(endpoint := stream_endpoint(arguments.config)):
         return _beside(endpoint, settings, arguments)
     with tempfile.TemporaryDirectory(prefix="dpl-") as place, ExitStack() as stack:

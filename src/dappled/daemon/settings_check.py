@@ -28,23 +28,47 @@ from dappled.flight import seal_key
 _KEY = re.compile(rf"\b({'|'.join(TABLES)})\.([a-z_]+)\b")
 
 
+def _none(_: Settings) -> tuple[str, ...]:
+    return ()
+
+
 @dataclass(frozen=True, slots=True)
 class SettingsRule:
     """One thing that must be so. `place` is the setting to blame where the sentence names none; `reads` are further
-    ones that `check` needs, as "table.key". `check` raises DappledError: what is wrong, a line for each thing."""
+    ones that `check` needs, as "table.key". `check` raises DappledError: what is wrong, a line for each thing.
+
+    Who runs the daemon decides `of_user` rules, and those of `secrets`: files that only their owner can read.
+    """
 
     place: str
     check: Callable[[Settings], object]
     reads: tuple[str, ...] = ()
+    of_user: bool = False
+    secrets: Callable[[Settings], tuple[str, ...]] = _none
+
+    def depends_on_user(self, settings: Settings) -> bool:
+        """Whether this user can't tell."""
+        return self.of_user or any(_of_another(Path(name)) for name in self.secrets(settings) if name)
 
 
-def findings(file: SettingsFile) -> list[Finding]:
+def _of_another(file: Path) -> bool:
+    try:
+        return file.stat().st_uid != os.getuid()
+    except PermissionError:
+        return True
+    except OSError:
+        return False
+
+
+def findings(file: SettingsFile, *, by_this_user: bool = True) -> list[Finding]:
     """What is wrong in a settings file: what can't be read, and what can't work. A rule that reads a setting which is
-    wrong already is left out."""
+    wrong already is left out, and where another user may run the daemon, a rule that depends on the user."""
     found = list(file.findings)
     wrong = {f"{finding.table}.{finding.key}" if finding.key else finding.table for finding in found}
     for rule in RULES:
         read = {rule.place, *rule.reads}
+        if not by_this_user and rule.depends_on_user(file.settings):
+            continue
         if read & wrong or {name.partition(".")[0] for name in read} & wrong:
             continue
         try:
@@ -56,9 +80,9 @@ def findings(file: SettingsFile) -> list[Finding]:
     return found
 
 
-def checked(file: SettingsFile) -> Settings:
-    """The settings of a file. Raises ConfigError with everything that is wrong."""
-    refuse(findings(file))
+def checked(file: SettingsFile, *, by_this_user: bool = True) -> Settings:
+    """The settings of a file. Raises ConfigError with everything that is wrong, see `findings`."""
+    refuse(findings(file, by_this_user=by_this_user))
     return file.settings
 
 
@@ -93,12 +117,21 @@ def _link_keys(settings: Settings) -> None:
         read_key(Path(key))
 
 
+def _nearest(folder: Path) -> Path:
+    """The folder, or the one above it that exists already."""
+    return next(one for one in (folder, *folder.parents) if os.path.exists(one))
+
+
 def _directory(settings: Settings) -> None:
-    folder = Path(settings.record.directory)
-    place = next(one for one in (folder, *folder.parents) if os.path.exists(one))
+    place = _nearest(Path(settings.record.directory))
     if not place.is_dir():
         raise ConfigError(f"{place} is not a folder: move it away, or set record.directory")
-    if not os.access(place, os.W_OK | os.X_OK):
+
+
+def _writable(settings: Settings) -> None:
+    folder = Path(settings.record.directory)
+    place = _nearest(folder)
+    if place.is_dir() and not os.access(place, os.W_OK | os.X_OK):
         raise ConfigError(f"{place} can't be written to: make {folder} yours, or set record.directory")
 
 
@@ -173,15 +206,20 @@ RULES: tuple[SettingsRule, ...] = (
     SettingsRule("camera.profile", _camera_profile),
     SettingsRule("mask.profile", _mask_profile),
     SettingsRule("mavlink.url", _links),
-    SettingsRule("mavlink.keys", _link_keys, ("mavlink.url",)),
+    SettingsRule("mavlink.keys", _link_keys, ("mavlink.url",), secrets=lambda settings: settings.mavlink.keys),
     SettingsRule("record.directory", _directory),
-    SettingsRule("record.seal_key", _seal),
+    SettingsRule("record.directory", _writable, of_user=True),
+    SettingsRule("record.seal_key", _seal, secrets=lambda settings: (settings.record.seal_key,)),
     SettingsRule("decode.calibration", _calibration, ("camera.profile", "mask.profile", "decode.law")),
     SettingsRule("decode.white", _white),
     SettingsRule("decode.dark", _dark),
     SettingsRule("publish.slices", _stream, ("publish.keys",)),
     SettingsRule("publish.ask", _ask, ("publish.keys",)),
-    SettingsRule("publish.keys", lambda settings: curve.server(settings.publish.keys, settings.publish.clients)),
-    SettingsRule("console.bind", _console, ("console.token",)),
+    SettingsRule(
+        "publish.keys",
+        lambda settings: curve.server(settings.publish.keys, settings.publish.clients),
+        secrets=lambda settings: (settings.publish.keys,),
+    ),
+    SettingsRule("console.bind", _console, ("console.token",), secrets=lambda settings: (settings.console.token,)),
     SettingsRule("console.map", _map),
 )
