@@ -40,7 +40,8 @@ from dappled.decode.geometry import camera_pose
 from dappled.drivers.child_process import ProcessChannel
 from dappled.drivers.raw import calibration_files, reading
 from dappled.errors import DappledError
-from dappled.flight import FlightError, layout, log_reading
+from dappled.flight import FlightError, ImageIndex, flight_report, layout, log_reading, pruning, seals
+from dappled.flight.checks import flight_check
 from dappled.products import opened
 from dappled.products.batch.batch import Manifest
 from dappled.products.exports import mask_files, view_folders
@@ -108,6 +109,8 @@ def _doors(stack: contextlib.ExitStack) -> dict[str, Callable[[Path], object]]:
         "calibration-npz": calibration_files.load,
         "facts": lambda path: layout.read_facts(layout.FlightFolder(path)),
         "journal": log_reading.read_journal,
+        "flight": _flight,
+        "index": _index,
         "telemetry": lambda path: list(replay._packets(path)),
         "dng": _frame,
         "lfp": _frame,
@@ -170,6 +173,26 @@ def _manifest(path: Path) -> None:
 def _sidecar(path: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         sidecars.write(Path(shutil.copy(path, folder)), "content")
+
+
+def _flight(path: Path) -> None:
+    """What `dappled flight check`, `show` and `report` read: ledger, seals, the record of what was removed …"""
+    flight_check.check(path)
+    folder = layout.open_folder(path)
+    seals.read(folder)
+    pruning.removed(folder)
+    flight_report.show(path)
+    flight_report.balance(path)
+    flight_report.by_source(path)
+
+
+def _index(path: Path) -> None:
+    with ImageIndex(path) as one:
+        one.flights()
+        one.highest()
+        one.sealed()
+        for number in one.unreported():
+            one.lookup(number)
 
 
 def _question(path: Path) -> None:

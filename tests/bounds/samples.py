@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import random
@@ -23,13 +24,16 @@ from numcodecs import Zstd
 from numpy.typing import NDArray
 from PIL import Image
 
+from dappled.clock import RecordedClock
 from dappled.config import profiles, settings
 from dappled.decode.calibration import Calibration, LatticeFit
 from dappled.decode.optics import Lattice
 from dappled.drivers.mavlink import mavlink
 from dappled.drivers.raw import calibration_files
+from dappled.flight import Ledger, recording, seals
 from dappled.products.exports import light_files
 from tests.drivers.raw.test_reading import dng
+from tests.flight import makers
 from tests.products.exports.test_light_files import light_field
 from tests.simulated import lytro
 
@@ -42,6 +46,7 @@ _SHAPE = (48, 64)  # of small pictures
 
 DOORS = (
     "zarr", "npz", "h5", "settings", "profile", "calibration", "calibration-npz", "facts", "journal", "telemetry",
+    "flight", "index",
     "manifest", "sidecar", "question", "message", "console", "dng", "lfp", "lytro-raw", "tiff", "png", "jpeg", "npy",
     "views", "mask-png", "mask-tiff", "density", "control-points", "background", "terrain", "base-map",
 )  # fmt: skip
@@ -60,6 +65,10 @@ def honest(folder: Path) -> dict[str, Path]:
             (place / name).write_bytes(data.encode() if isinstance(data, str) else data)
         made[door] = place if door in _FOLDERS else place / next(iter(files))
     made["calibration"], made["calibration-npz"] = calibration_files.save(folder / "c.toml", _calibration())
+    made["flight"] = _flight(folder / "flights")
+    made["index"] = folder / "index"
+    made["index"].mkdir()
+    shutil.copy(folder / "flights" / "index.sqlite", made["index"])
     made["terrain"] = made["base-map"] = _raster(folder / "a.terrain.tif")
     return made
 
@@ -397,6 +406,24 @@ def _request(method: str, path: str, body: str = "", *, length: str = "", chunke
         f"{method} {path} HTTP/1.1\r\nhost: 127.0.0.1\r\norigin: http://127.0.0.1\r\nconnection: close\r\n"
         f"content-type: application/json\r\ncontent-length: {length or len(body)}\r\n{size}\r\n{body}"
     ).encode()
+
+
+def _flight(flights: Path) -> Path:
+    """A closed flight of two frames, one of which was removed after its copy was proved."""
+    clock = RecordedClock(10**18)
+    flight = recording.begin(flights, clock)
+    for number in range(2):
+        makers.request(flight, number)
+        flight.ledger.add_tag(makers.tag(makers.deliver(flight, number, b"raw" * 100)))
+        flight.note_image(number)
+    flight.telemetry.append(1, makers.mavlink_2(b"a"))
+    flight.close()
+    path = flight.folder.path
+    line = b'{"destination":"/d","name":"frames/000001.cr2","sha256":"%s","size":300,"utc_ns":1}\n' % (b"0" * 64)
+    (path / "offloaded.jsonl").write_bytes(line)
+    with seals.reopened(flight.folder, clock, "a test"), Ledger(flight.folder.ledger, clock) as ledger:
+        ledger.add_event("offloaded", f"offloaded.jsonl (SHA-256 {hashlib.sha256(line).hexdigest()}) names each")
+    return path
 
 
 def _telemetry() -> bytes:

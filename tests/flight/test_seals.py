@@ -443,3 +443,17 @@ def test_later_work_does_not_sign_what_somebody_else_did_before_it(
     report = check(folder.path, key)
     assert report.vouched == "not signed"
     assert f"signed with key {key.name} up to seal 2, then not signed" in report.verdict
+
+
+@pytest.mark.parametrize("name", ["shots.jsonl", "seals.jsonl", "offloaded.jsonl"])
+def test_a_file_of_holes_is_judged_before_it_is_read(sealed: FlightFolder, name: str) -> None:
+    with (sealed.path / name).open("ab") as file:
+        file.truncate(1 << 40)
+    problems = check(sealed.path).problems
+    assert any("its content would take" in problem and name in problem for problem in problems), problems
+
+
+def test_a_value_that_no_ledger_holds_is_refused_before_it_is_read(sealed: FlightFolder) -> None:
+    with attacked(sealed) as db:
+        db.execute("UPDATE events SET text = hex(zeroblob(10000000)) WHERE number = 1")
+    assert any("a value in it takes more than 16 MB" in problem for problem in check(sealed.path).problems)

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sized
 from pathlib import Path
 from typing import Any, NoReturn
 
-from dappled.bounds.claims import ClaimError, in_words
+from dappled.bounds.claims import ClaimError, check_size, in_words
 
 MOST_BYTES = 4 << 20
 """Of one text. Python's objects take up to forty times as much."""
@@ -41,6 +42,16 @@ def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
         data = file.read(most + 1)
     _check_length(data, most)
     return data
+
+
+def read_log(path: Path) -> bytes:
+    """Read a file that is only appended to, of any length that its disk bears out: one with holes can claim any. Raises
+    OSError, and ClaimError."""
+    with path.open("rb") as file:
+        found = os.fstat(file.fileno())
+        stored = found.st_blocks * 512 if hasattr(found, "st_blocks") else found.st_size
+        check_size(found.st_size, stored, "content")
+        return file.read()
 
 
 def parse_json(data: bytes | memoryview | str, most: int = MOST_BYTES) -> Any:

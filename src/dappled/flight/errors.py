@@ -45,6 +45,7 @@ _LEDGER_REASONS = {
     "SQLITE_FULL": "the disk is full; free some space or set record.directory to another disk",
     "SQLITE_READONLY": "the disk or the file is read-only; make it writable or set record.directory elsewhere",
     "SQLITE_CANTOPEN": "it can't be opened; check that its folder exists and is accessible",
+    "SQLITE_TOOBIG": "a value in it takes more than 16 MB, which dappled never writes; use another copy of it",
     "SQLITE_BUSY": "another program holds it; close that program",
     "SQLITE_IOERR": "the disk reports an input/output error, or is full; check the disk (df, dmesg)",
 }

@@ -36,6 +36,7 @@ from dappled.flight.tables import (
 
 LIVE = "live"
 BUSY_S = 10.0
+_MOST_VALUE = 16 << 20  # bytes of a value or row; the longest that dappled writes takes some kB
 _ROW_OF = {
     table: f"SELECT * FROM {table} WHERE {' AND '.join(f'{column} = ?' for column in key)}"  # noqa: S608  constants
     for table, key in KEYS.items()
@@ -63,6 +64,7 @@ class Database(ABC):
         self._lock = threading.RLock()
         try:
             self._db = sqlite3.connect(uri, uri=True, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
+            self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_VALUE)
         except sqlite3.Error as error:
             raise self._sentence(error) from error
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import mmap
 import os
 from collections.abc import Callable, Iterator
@@ -10,11 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dappled.bounds.parsing import parse_json
-from dappled.flight.errors import disk_error
+from dappled.bounds.claims import ClaimError
+from dappled.bounds.parsing import parse_json, read_log
+from dappled.errors import counted
+from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.logs import MAVLINK_1, MAVLINK_2, TelemetrySummary, packet_length
 from dappled.flight.records import Cause, Shot
 
+_MOST_LISTED = 1000  # lines that are no shots: a file can have any number of them
 _LINE_BYTES = 1 << 16  # of the journal; a shot takes some 200
 _LATEST_US = 1 << 53  # stamps beyond (year 2255) are damage
 
@@ -33,23 +37,29 @@ def read_journal(path: Path) -> JournalContents:
     Raises FlightError when the file can't be read.
     """
     try:
-        data = path.read_bytes()
+        data = read_log(path)
     except FileNotFoundError:
         return JournalContents((), ())
     except OSError as error:
         raise disk_error("read the shot journal", path, error) from error
-    lines = data.split(b"\n")
-    tail = lines.pop()
+    except ClaimError as error:
+        raise FlightError(f"the shot journal {path} can't be read: {error}") from error
+    tail = data[data.rfind(b"\n") + 1 :]
     shots: dict[int, Shot] = {}
     problems: list[str] = []
-    for number, line in enumerate(lines, 1):
-        shot = _parse(line)
-        if shot is None:
-            problems.append(f"line {number} of {path} is not a shot")
-        elif shot.index in shots:
-            problems.append(f"line {number} of {path} notes shot {shot.index} again")
-        else:
+    unlisted = 0
+    for number, line in enumerate(io.BytesIO(data[: len(data) - len(tail)]), 1):
+        shot = _parse(line.removesuffix(b"\n"))
+        if shot is not None and shot.index not in shots:
             shots[shot.index] = shot
+        elif len(problems) >= _MOST_LISTED:
+            unlisted += 1
+        elif shot is None:
+            problems.append(f"line {number} of {path} is not a shot")
+        else:
+            problems.append(f"line {number} of {path} notes shot {shot.index} again")
+    if unlisted:
+        problems.append(f"and {counted(unlisted, 'line')} more of {path}")
     if tail:
         problems.append(f"the last line of {path} is torn ({len(tail)} bytes)")
     return JournalContents(tuple(shots.values()), tuple(problems))

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled import durable
+from dappled.bounds.claims import ClaimError
+from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
 from dappled.errors import counted
 from dappled.flight.chain import canonical
@@ -51,11 +53,13 @@ def removed(folder: FlightFolder) -> dict[str, Removed]:
     ledger vouches for."""
     path = folder.file(RECORD)
     try:
-        data = path.read_bytes()
+        data = read_log(path)
     except FileNotFoundError:
         return {}
     except OSError as error:
         raise disk_error("read", path, error) from error
+    except ClaimError as error:
+        raise FlightError(f"{path} can't be read: {error}") from error
     with LedgerReader.open(folder.ledger) as ledger:
         texts = [event.text for event in ledger.events() if event.kind == EVENT]
     if hashlib.sha256(data).hexdigest() not in {found for text in texts for found in _SHA256.findall(text)}:

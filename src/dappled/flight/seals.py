@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from dappled import durable, file_lock
+from dappled.bounds.claims import ClaimError
+from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
 from dappled.flight import layout, pruning
 from dappled.flight.chain import canonical
@@ -25,7 +27,7 @@ from dappled.flight.seal_key import SealKey
 
 FACT = "seals"  # {"count": seals announced, "missing": those that were never written}
 _BESIDE_LEDGER = ("-wal", "-shm")
-_MOST_SEALS = 1_000_000
+_MOST_SEALS = 100_000
 _MAC = "mac"
 _DIGEST = "sha256"
 
@@ -176,6 +178,8 @@ def read(folder: FlightFolder) -> SealFile:
 
 def parse(content: bytes, name: str) -> SealFile:
     """The seals in the content of a file; see `read`."""
+    if content.count(b"\n") > _MOST_SEALS:
+        raise FlightError(f"{name} has more than {_MOST_SEALS} lines: it was changed; use another copy of the flight")
     lines = content.split(b"\n")
     tail = lines.pop()
     seals: dict[int, Seal] = {}
@@ -262,9 +266,11 @@ def _parse(line: bytes) -> Seal | None:
 
 def _content(folder: FlightFolder) -> bytes:
     try:
-        return folder.seals.read_bytes()
+        return read_log(folder.seals)
     except FileNotFoundError:
         return b""
+    except ClaimError as error:
+        raise FlightError(f"{folder.seals} can't be read: {error}") from error
 
 
 def _last_digest(content: bytes) -> str:

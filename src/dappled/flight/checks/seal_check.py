@@ -148,7 +148,8 @@ def _files(folder: FlightFolder, last: Seal, known: Mapping[str, tuple[int | Non
             continue
         try:
             path = folder.file(name)
-            now = (path.stat().st_size, durable.hash_file(path))
+            found = path.stat().st_size
+            now = (found, durable.hash_file(path) if found == size else "")
         except OutsideError as error:
             yield name, str(error)
             continue
