@@ -105,6 +105,16 @@ def test_a_worker_that_keeps_dying_is_not_started_without_end(frame: str) -> Non
 
 
 @pytest.mark.timeout(40)  # the frame itself would take for ever
+def test_a_flight_that_ends_while_the_decoder_loads_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    decoder = DecodeProcess(RECIPE)
+    warm_up = threading.Thread(target=decoder._warm_up)  # as `begin_warm_up`, with an end to wait for
+    warm_up.start()
+    eventually(lambda: decoder._channel, "it is started")
+    decoder.close()
+    warm_up.join(20)
+    assert caplog.messages == []
+
+
 def test_close_does_not_wait_for_a_frame_in_hand(frame: str) -> None:
     decoder = DecodeProcess(RECIPE, timeout_s=3600)
     decoder.warm_up()

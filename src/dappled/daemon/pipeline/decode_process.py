@@ -142,7 +142,8 @@ class DecodeProcess:
         try:
             self.warm_up()
         except DecodeProcessError as error:
-            log.warning("decoding will fail: %s", error)
+            if not self._closed:
+                log.warning("decoding will fail: %s", error)
 
     def decode(
         self, path: str, focal_length_mm: float | None, f_number: float | None, *, index: int, look: bool = False
@@ -181,8 +182,9 @@ class DecodeProcess:
         self._turn.release()
 
     def _ask(self, question: Mapping[str, Any]) -> ChannelMessage:
+        stopped = f"{question.get('path', 'the recipe')} was not decoded: the decoder was stopped"
         if self._closed:
-            raise DecodeProcessError(f"{question.get('path', 'the recipe')} was not decoded: the decoder was stopped")
+            raise DecodeProcessError(stopped)
         if self._process is not None and self._process.poll() is not None:
             self._end()  # it died between two frames: neither is to blame
         try:
@@ -191,6 +193,8 @@ class DecodeProcess:
             answer = channel.receive(self._timeout_s)
         except ChannelError:
             code = self._end()
+            if self._closed:  # `close` has killed it
+                raise DecodeProcessError(stopped) from None
             raise DecodeProcessError(f"the decoder died ({_manner(code)}) on {question.get('path', 'start')}") from None
         except OSError as error:
             self._end()
