@@ -2,7 +2,7 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup peers walk clean-room demo test check test-fast coverage test-slow soak faults bench lock arm64 install uninstall clean
+.PHONY: help setup peers walk clean-room demo test check test-fast coverage test-slow soak faults bench lock deb arm64 install uninstall clean
 PREFIX ?= /usr/local
 
 help: ## show this list
@@ -60,6 +60,9 @@ lock: setup ## resolve the locks anew from pyproject.toml: everything, the peers
 	  -o requirements-peers.lock; \
 	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header -c requirements.lock \
 	  --no-annotate pyproject.toml -o requirements-onboard.lock
+
+deb: setup ## build Debian packages for amd64 and arm64 in build/deb (SUITE=trixie for Debian 13)
+	@$(BIN)/python tools/deb.py --suite $(or $(SUITE),bookworm) $(if $(ARCH),--arch $(ARCH))
 
 arm64: setup ## check that the onboard part installs on a Raspberry Pi, and print its size
 	@$(BIN)/python tools/arm64.py

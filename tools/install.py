@@ -21,6 +21,8 @@ from bootstrap import ROOT, fetch_uv, find_uv
 
 SYSTEMD = ROOT / "systemd"
 MANIFEST = "lib/dappled/installed.json"
+FLOWN = "import dappled.cli.run, dappled.daemon.pipeline.decode_worker, dappled.drivers.gphoto2.process"
+"""Makes bytecode of what a flight loads, not of every dialect of MAVLink: the service itself may not write there."""
 
 
 def main() -> int:
@@ -74,16 +76,8 @@ def install(place: Place, python: str, in_system: bool) -> int:
     command = place.prefix / "bin/dappled"
     put(command, f'#!/bin/sh\nexec {home}/bin/python -m dappled "$@"\n')
     place.at(command).chmod(0o755)
-    lib = place.prefix / "lib"
-    unit = (SYSTEMD / "dappled.service").read_text(encoding="utf-8")
-    etc = str(place.sysconfdir / "dappled")
-    unit = unit.replace("/usr/local/bin/dappled", str(command)).replace("/etc/dappled", etc)
-    put(lib / "systemd/system/dappled.service", unit)
-    put(lib / "sysusers.d/dappled.conf", (SYSTEMD / "dappled.sysusers").read_text(encoding="utf-8"))
-    folders = (SYSTEMD / "dappled.tmpfiles").read_text(encoding="utf-8")
-    put(lib / "tmpfiles.d/dappled.conf", folders.replace("/etc/dappled", etc))
-    for rule in sorted(SYSTEMD.glob("*.rules")):
-        put(lib / "udev/rules.d" / rule.name, rule.read_text(encoding="utf-8"))
+    for path, text in service_files(place.prefix, place.sysconfdir, command).items():
+        put(path, text)
     example = (SYSTEMD / "dappled.toml").read_text(encoding="utf-8")
     settings = place.sysconfdir / "dappled/dappled.toml"
     if place.at(settings).exists():
@@ -92,9 +86,23 @@ def install(place: Place, python: str, in_system: bool) -> int:
         put(settings, example)
     manifest = {"files": [str(path) for path in written if path != settings], "settings": str(settings)}
     place.at(place.prefix / MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
-    print(f"installed {command}\nsettings  {settings}\nunit      {lib}/systemd/system/dappled.service")
+    print(f"installed {command}\nsettings  {settings}\nunit      {place.prefix}/lib/systemd/system/dappled.service")
     print(next_steps(place, in_system))
     return 0
+
+
+def service_files(prefix: Path, sysconfdir: Path, command: Path) -> dict[Path, str]:
+    """The unit, the service's user and folders, and the udev rules: where each stands, and its text."""
+    lib, etc = prefix / "lib", str(sysconfdir / "dappled")
+    unit = (SYSTEMD / "dappled.service").read_text(encoding="utf-8")
+    found = {
+        lib / "systemd/system/dappled.service": unit.replace("/usr/local/bin/dappled", str(command)),
+        lib / "sysusers.d/dappled.conf": (SYSTEMD / "dappled.sysusers").read_text(encoding="utf-8"),
+        lib / "tmpfiles.d/dappled.conf": (SYSTEMD / "dappled.tmpfiles").read_text(encoding="utf-8"),
+    }
+    for rule in sorted(SYSTEMD.glob("*.rules")):
+        found[lib / "udev/rules.d" / rule.name] = rule.read_text(encoding="utf-8")
+    return {path: text.replace("/etc/dappled", etc) for path, text in found.items()}
 
 
 def environment(uv: str, python: str, home: Path) -> None:
@@ -111,9 +119,7 @@ def environment(uv: str, python: str, home: Path) -> None:
         call(uv, "pip", "install", "-q", "--no-deps", *into, str(wheel))
     for tests in [path for path in home.glob("lib/python3*/site-packages/*/**/tests") if path.is_dir()]:
         shutil.rmtree(tests)
-    # Bytecode for what a flight loads, not for every dialect of MAVLink: the service itself may not write here.
-    flown = "import dappled.cli.run, dappled.daemon.pipeline.decode_worker, dappled.drivers.gphoto2.process"
-    call(str(home / "bin/python"), "-c", flown)
+    call(str(home / "bin/python"), "-c", FLOWN)
 
 
 def call(*words: str) -> None:

@@ -1,0 +1,64 @@
+"""The Debian packages: what is in them, and that the command of one runs from where it would stand."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TOOL = Path(__file__).parents[2] / "tools" / "deb.py"
+SUITES = {(3, 11): "bookworm", (3, 13): "trixie"}
+
+
+def ask(*words: str | Path, **environment: str) -> str:
+    done = subprocess.run(
+        [str(word) for word in words], capture_output=True, text=True, check=False, env={**os.environ, **environment}
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_package_is_built_for_each_architecture_and_its_command_runs(tmp_path: Path) -> None:
+    if shutil.which("dpkg-deb") is None:
+        pytest.skip("dpkg-deb is missing: no Debian package can be built here")
+    suite = SUITES.get(sys.version_info[:2], "bookworm")
+    said = ask(sys.executable, TOOL, "--suite", suite, "--out", tmp_path)
+    debs = {path.stem.rpartition("_")[2]: path for path in tmp_path.glob("*.deb")}
+    assert sorted(debs) == ["amd64", "arm64"]
+    assert all(str(path) in said for path in debs.values())
+    for arch, deb in debs.items():
+        assert ask("dpkg-deb", "--field", deb, "Package", "Architecture").split() == [
+            "Package:",
+            "dappled",
+            "Architecture:",
+            arch,
+        ]
+        names = ask("dpkg-deb", "--contents", deb)
+        for wanted in (
+            "./usr/bin/dappled",
+            "./etc/dappled/dappled.toml",
+            "./usr/lib/systemd/system/dappled.service",
+            "./usr/lib/sysusers.d/dappled.conf",
+            "./usr/lib/udev/rules.d/70-dappled-camera.rules",
+            "./usr/lib/dappled/dappled/daemon/service.py",
+        ):
+            assert f" {wanted}\n" in names, (arch, wanted)
+        assert "/tests/" not in names
+        assert all(line.split()[1] == "root/root" for line in names.splitlines())
+        machine = {"amd64": "x86_64", "arm64": "aarch64"}[arch]
+        assert machine in names
+        assert ({"x86_64", "aarch64"} - {machine}).pop() + "-linux-gnu.so" not in names
+    machine = {"x86_64": "amd64", "aarch64": "arm64"}.get(os.uname().machine, "")
+    if SUITES.get(sys.version_info[:2]) is None or machine not in debs:
+        return  # no package of these is for this Python and machine
+    ask("dpkg-deb", "--extract", debs[machine], tmp_path / "root")
+    home = tmp_path / "root" / "usr" / "lib" / "dappled"
+    run = (getattr(sys, "_base_executable", sys.executable), "-I", "-c")
+    code = f"import sys; sys.path[:0] = [{str(home)!r}]; import dappled, gphoto2, rawpy, zmq; print(dappled.__file__)"
+    assert ask(*run, code).strip() == str(home / "dappled" / "__init__.py")
