@@ -163,7 +163,7 @@ def shoot(page: Page) -> int:
         page.focus("#shoot")
         page.evaluate("document.querySelector('#outcome').textContent = ''")
         page.keyboard.press("Enter")
-        until(page, "document.querySelector('#outcome').textContent !== ''")
+        until(page, "!['', 'sending…'].includes(document.querySelector('#outcome').textContent)")
     index = int(page.inner_text("#outcome").split()[1])
     page.wait_for_selector(f'#strip [data-frame="{index}"][aria-selected="true"] img')
     until(page, f"document.querySelector('#which').textContent === 'frame {index}'")
