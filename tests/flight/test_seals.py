@@ -183,7 +183,6 @@ STRANGERS = [
     Attack("one in inputs", lambda f: (f.path / "inputs/.x.part").write_bytes(b"x"), "inputs/.x.part is a half-wr"),
     Attack("a hidden file", lambda f: (f.path / "inputs/.x").write_bytes(b"x"), "inputs/.x was added since seal 2"),
     Attack("a hidden frame", lambda f: (f.frames / ".x").write_bytes(b"x"), "frames/.x is in no row of the ledger"),
-    Attack("a folder", lambda f: (f.path / "inputs/new").mkdir(), "inputs/new is an empty folder"),
     Attack("a rollback journal", lambda f: beside(f, "-journal").write_bytes(b"x" * 9), "so the ledger was not opened"),
 ]
 
@@ -202,6 +201,7 @@ def beside(folder: FlightFolder, suffix: str) -> Path:
 @pytest.mark.parametrize(
     ("do", "words"),
     [
+        (lambda f: (f.path / "inputs/new").mkdir(), "inputs/new is an empty folder"),
         (lambda f: (f.path / "mine").mkdir(), "mine is an empty folder, which no seal covers"),
         (lambda f: beside(f, "-shm").write_bytes(b"x" * 999), "flight.sqlite-shm stands beside the ledger"),
         (lambda f: beside(f, "-wal").touch(), "flight.sqlite-wal stands beside the ledger"),

@@ -1,4 +1,4 @@
-"""Every call that changes files fails once, or from then on, in offload, prune, pickup, geotag and recovery.
+"""Every call that changes files fails once, or from then on, in each verb that writes (see `verbs`).
 
 EIO, ENOSPC and EMFILE at each call of Python and of SQLite: the verb says a sentence or ends well, no acknowledged
 frame is lost, and called again it comes to its end.

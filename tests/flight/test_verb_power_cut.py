@@ -1,4 +1,4 @@
-"""The power goes at every step of offload, prune, pickup, geotag and recovery: no acknowledged frame is lost.
+"""The power goes at every step of each verb that writes (see `verbs`): no acknowledged frame is lost.
 
 Each verb runs under strace on a small flight. After each system call that changed a disk the power is cut; the disk of
 the source and that of the copy keep different parts of what was not synced, in the worst way for the frames too: all

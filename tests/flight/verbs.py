@@ -14,11 +14,15 @@ from pathlib import Path
 
 from dappled import durable
 from dappled.clock import RecordedClock
-from dappled.daemon.replay import pickup
+from dappled.config import settings as configuration
+from dappled.daemon.pipeline.recipes import Names
+from dappled.daemon.replay import late_tags, pickup
 from dappled.daemon.replay.pickup import Choice
+from dappled.daemon.replay.runs import Run, RunWriter
+from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
-from dappled.flight import LedgerReader, layout, offload, places, recording
+from dappled.flight import LedgerReader, Result, layout, offload, places, recording, seals
 from dappled.flight.checks.flight_check import check
 from dappled.products.geotags import geotags
 from dappled.products.mounting import Mounting
@@ -167,7 +171,8 @@ def _to_tag(place: Path) -> None:
 
 def _geotag(place: Path, say: Say) -> None:
     for flight in flown(place):
-        geotags.write(flight, Mounting())
+        with seals.work(layout.open_folder(flight), clock(), "geotag", "geotags flights in", None):
+            geotags.write(flight, Mounting())
 
 
 def _geotagged(place: Path) -> list[str]:
@@ -180,6 +185,58 @@ def _geotagged(place: Path) -> list[str]:
 
 def _complete(sidecar: Path) -> bool:
     return sidecar.read_text().endswith('<?xpacket end="w"?>\n')
+
+
+# late tags
+
+
+def _untagged(place: Path) -> None:
+    """Two of three frames lack a tag, as after a crash."""
+    names = {"camera": "reference-36mm", "mask": "reference-5x5", "law": "geometric"}
+    facts = {"settings": configuration.to_tables(configuration.Settings()), "names": names}
+    flight = recording.begin(place / "flights", clock(), facts)
+    for index in range(3):
+        request(flight, index)
+        flight.telemetry.append(index, mavlink_2(b"x"))
+        frame = deliver(flight, index, bytes([index + 1]) * FRAME_BYTES)
+        if index == 0:
+            flight.ledger.add_tag(tag(frame))
+    flight.close()
+
+
+def _tag_late(place: Path, say: Say) -> None:
+    """`dappled geotag` where tags are missing."""
+    for flight in flown(place):
+        late_tags.add_missing(flight, clock(), None)
+    _geotag(place, say)
+
+
+def _tagged_late(place: Path) -> list[str]:
+    (flight,) = flown(place)
+    with LedgerReader.open(flight / "flight.sqlite") as ledger:
+        missing = [f"frame {frame.index} has no tag" for frame in ledger.frames() if ledger.tag(frame.index) is None]
+    return missing + _checked(place)
+
+
+# replay --run
+
+
+def _run(place: Path, say: Say) -> None:
+    """A run that was cut short keeps its name; the next one takes another."""
+    recipe, names = Recipe(camera="reference-36mm", mask="reference-5x5"), Names("reference-36mm", "reference-5x5", "")
+    for flight in flown(place):
+        with LedgerReader.open(flight / "flight.sqlite") as ledger:
+            number = sum(key.startswith("run:") for key in ledger.facts())
+        with RunWriter(flight, Run(f"run-{number}", recipe, names), clock()) as writer:
+            for index in range(3):
+                writer.decoded(Result(index, f"{index:064x}", 12, 13, "geometric", "predicted"))
+
+
+def _ran(place: Path) -> list[str]:
+    (flight,) = flown(place)
+    with LedgerReader.open(flight / "flight.sqlite") as ledger:
+        whole = 3 in ledger.runs().values()
+    return ([] if whole else ["no run has all results"]) + _checked(place)
 
 
 # recovery
@@ -212,6 +269,8 @@ VERBS = {
     "offload of what is there already": Verb(_offloaded_before, _offload, _offload_settled),
     "pickup": Verb(_to_pick_up, _pick_up, _picked_up),
     "geotag": Verb(_to_tag, _geotag, _geotagged),
+    "late tags": Verb(_untagged, _tag_late, _tagged_late),
+    "replay --run": Verb(_to_tag, _run, _ran),
     "recovery": Verb(_crashed, _recover, _checked),
 }
 

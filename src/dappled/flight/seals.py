@@ -129,12 +129,25 @@ def reopened(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None =
         yield
         return
     signs = key if key is not None and is_signed(folder, key) else None
+    _remove_parts(folder)
     with Ledger(folder.ledger, clock) as ledger:
         ledger.add_event("opened again", why)
     try:
         yield
     finally:
         seal(folder, clock, why, signs)
+
+
+def _remove_parts(folder: FlightFolder) -> None:
+    """Remove what earlier work left half-written when it was killed. Raises FlightError."""
+    try:
+        for root, _, names in os.walk(folder.path, onerror=_raise):
+            for name in names:
+                path = Path(root, name)
+                if durable.is_temporary(name) and path.is_file() and not path.is_symlink():
+                    path.unlink()
+    except OSError as error:
+        raise disk_error("remove what was left half-written in", folder.path, error) from error
 
 
 def is_signed(folder: FlightFolder, key: SealKey) -> bool:

@@ -74,7 +74,8 @@ def compare(
         text = f"the folder is called {folder.name}, and the flight was recorded as {recorded_as}"
         (problems if layout.is_flight_name(folder.name) else notes).append(text)
     if closed:
-        for name, text in (*found.half_written, *found.empty):
+        notes += [text for _, text in found.empty]
+        for name, text in found.half_written:
             recorded = name.split("/")[0] in _RECORDED or durable.is_temporary(name)
             (problems if recorded and not at_work else notes).append(text)
         notes += found.left_by_readers
