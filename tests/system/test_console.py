@@ -127,7 +127,15 @@ def opened(browser: Browser, daemon: Daemon, viewport: dict[str, Any], *, log_in
     context = browser.new_context(viewport=viewport, **more)  # type: ignore[arg-type]  # a plain dict is its type
     page = context.new_page()
     wrong: list[str] = []
-    page.on("console", lambda m: wrong.append(f"{m.type}: {m.text}") if m.type in ("error", "warning") else None)
+    # A browser logs every refusal as an error: a 409 is an answer in words, which the page shows.
+    page.on(
+        "console",
+        lambda m: (
+            wrong.append(f"{m.type}: {m.text}")
+            if m.type in ("error", "warning") and "409 (Conflict)" not in m.text
+            else None
+        ),
+    )
     page.on("pageerror", lambda error: wrong.append(f"page error: {error}"))
     page.on("request", lambda r: None if r.url.startswith((daemon.url, "blob:", "data:")) else wrong.append(r.url))
     page.set_default_timeout(DEADLINE_MS)
