@@ -34,8 +34,13 @@ coverage: setup ## run the default tests and report which lines they reach (a th
 	@$(BIN)/coverage erase
 	@$(BIN)/pytest -q --no-header -n auto --dist worksteal -m "not slow" --cov --cov-report=term
 
+# Rooms whose slow tests only compute: they may share the machine. Those of the others watch clocks, and run alone.
+COMPUTING := tests/bounds tests/decode tests/flight tests/products tests/tools
 test-slow: setup peers ## the tests that take longer
-	@$(BIN)/pytest -q --no-header -m slow --durations=25
+	@failed=0; \
+	$(BIN)/pytest -q --no-header -m slow --durations=15 -n auto --dist worksteal $(COMPUTING) || failed=1; \
+	$(BIN)/pytest -q --no-header -m slow --durations=15 $(addprefix --ignore=,$(COMPUTING)) || failed=1; \
+	exit $$failed
 
 walk: setup ## the modules that a command and a frame pass, traced anew and written into ARCHITECTURE.md
 	@$(BIN)/python -m tests.architecture.walk --write
