@@ -121,7 +121,7 @@ def fly(uv: str, folder: Path, packages: Path) -> int:
         (work / "in").mkdir()
         (work / "dappled.toml").write_text(SETTINGS.format(folder="/root/work"), encoding="utf-8")
         passed = [
-            step(root, "doctor", "doctor", good=(0, 1), says="ok       libgphoto2"),
+            step(root, "doctor", "doctor", good=(0, 1), says="go       libgphoto2"),
             step(root, "settings", "config", "check", "dappled.toml"),
             folder_flight(root, work, frame),
             step(root, "replay of a flight recorded here", "replay", "recorded", "--no-publish", says="24/24 carriers"),
