@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -26,7 +26,6 @@ from dappled.decode.lightfield.aperture import (
     transfer,
     used_aperture,
 )
-from dappled.decode.lightfield.frame_refit import mask_shift
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.views import Views, from_slices
 from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Order, Sensor
@@ -336,10 +335,6 @@ class MaskDecoder:
             origin = at_corner(known.origin, lattice, self.sensor.shape)
             transfers = transfer(orders, [magnitudes[order] for order in orders], origin)
             rotation = known.rotation_rad
-            shift = mask_shift(slices.values, transfers, orders, lattice=lattice, shape=self.sensor.shape)
-            if shift is not None:
-                moved = shift.turns(orders, (slices.values.shape[1], slices.values.shape[2]))
-                slices = replace(slices, values=slices.values * moved)
             width = used_aperture(
                 slices.values,
                 transfers,
