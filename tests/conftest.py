@@ -13,6 +13,16 @@ settings.register_profile("dappled", deadline=None, suppress_health_check=[Healt
 settings.load_profile("dappled")
 
 
+SLOW_S = 600.0
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A slow test that names no limit of its own has a long one: a busy machine takes twice as long."""
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SLOW_S))
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real frames and flights beside the project (or DAPPLED_DATA); skips where there is none."""

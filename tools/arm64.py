@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from bootstrap import ROOT, fetch_uv, find_uv
@@ -169,14 +169,12 @@ def arm_root(folder: Path) -> Iterator[Path]:
     root.mkdir()
     subprocess.run(["tar", "-xf", str(ARCHIVE), "-C", str(root)], check=True)
     (root / "root" / "work").mkdir(parents=True)
-    for kind, place in (("proc", root / "proc"), ("tmpfs", root / "dev" / "shm")):
-        place.mkdir(parents=True, exist_ok=True)
-        subprocess.run(["mount", "-t", kind, kind, str(place)], check=True)
-    try:
+    with ExitStack() as mounted:
+        for kind, place in (("proc", root / "proc"), ("tmpfs", root / "dev" / "shm")):
+            place.mkdir(parents=True, exist_ok=True)
+            subprocess.run(["mount", "-t", kind, kind, str(place)], check=True)
+            mounted.callback(subprocess.run, ["umount", "-l", str(place)], check=False)
         yield root
-    finally:
-        for place in (root / "proc", root / "dev" / "shm"):
-            subprocess.run(["umount", "-l", str(place)], check=False)
 
 
 def in_root(root: Path, *words: str) -> subprocess.Popen[str]:

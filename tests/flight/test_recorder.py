@@ -134,6 +134,8 @@ def test_a_file_that_came_is_recorded_where_no_descriptor_is_left(flight: Record
             for index in (0, 1):
                 frame = flight.recorder.record(index, "IMG_0001.CR2", blob, arrived_utc_ns=5)
                 assert frame.sha256 == hashlib.sha256(DATA).hexdigest()
+            with pytest.raises(StrayFileError, match="was never requested: kept as a stray"):
+                flight.recorder.record(7, "IMG_0002.CR2", blob, arrived_utc_ns=6)
         finally:
             for fd in taken:
                 os.close(fd)

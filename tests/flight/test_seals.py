@@ -7,7 +7,9 @@ import json
 import os
 import random
 import shutil
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -457,3 +459,43 @@ def test_a_value_that_no_ledger_holds_is_refused_before_it_is_read(sealed: Fligh
     with attacked(sealed) as db:
         db.execute("UPDATE events SET text = hex(zeroblob(10000000)) WHERE number = 1")
     assert any("a value in it takes more than 16 MB" in problem for problem in check(sealed.path).problems)
+
+
+def missing_sidecar(folder: FlightFolder) -> None:
+    (folder.frames / "000000.cr2.xmp").unlink()
+
+
+def test_later_work_does_not_sign_where_a_file_is_gone(flights: Path, tmp_path: Path) -> None:
+    key = seal_key.load(key_file(tmp_path))
+    folder = fly(recording.begin(flights, RecordedClock(START_UTC_NS), seal_key=key))
+    with seals.reopened(folder, LATER, "geotag", key):
+        (folder.frames / "000000.cr2.xmp").write_bytes(b"<x:xmpmeta/>")
+    missing_sidecar(folder)
+    with seals.reopened(folder, LATER, "late tags", key):
+        pass
+    assert check(folder.path, key).vouched == "not signed"
+
+
+def test_the_start_of_a_daemon_does_not_sign_what_somebody_added(flights: Path, tmp_path: Path) -> None:
+    """A flight that the index does not call sealed is looked at, and sealed again where its chain goes on."""
+    key = seal_key.load(key_file(tmp_path))
+    folder = fly(recording.begin(flights, RecordedClock(START_UTC_NS), seal_key=key))
+    added_row(folder)
+    with closing(sqlite3.connect(flights / "index.sqlite")) as index, index:
+        index.execute("UPDATE flights SET sealed = 0")
+    recording.begin(flights, LATER, seal_key=key).close()
+    report = check(folder.path, key)
+    assert report.vouched == "not signed"
+    assert f"signed with key {key.name} up to seal 1, then not signed" in report.verdict
+
+
+@pytest.mark.parametrize("name", ["flight.toml", "shots.jsonl", "seals.jsonl", "telemetry.tlog"])
+@pytest.mark.timeout(60)
+def test_a_pipe_in_place_of_a_file_is_not_waited_for(sealed: FlightFolder, name: str) -> None:
+    (sealed.path / name).unlink()
+    os.mkfifo(sealed.path / name)
+    try:
+        problems = check(sealed.path).problems
+    except FlightError as error:
+        problems = (str(error),)
+    assert any(name in text for text in problems)

@@ -9,11 +9,13 @@ import json
 import math
 import os
 import re
+import stat
 import tomllib
 from collections.abc import Iterator, Mapping, Sized
 from pathlib import Path
 from typing import Any, NoReturn
 
+from dappled import durable
 from dappled.bounds.claims import ClaimError, check_size, in_words
 
 MOST_BYTES = 4 << 20
@@ -46,9 +48,11 @@ def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
 
 def read_log(path: Path) -> bytes:
     """Read a file that is only appended to, of any length that its disk bears out: one with holes can claim any. Raises
-    OSError, and ClaimError."""
-    with path.open("rb") as file:
+    OSError, and ClaimError, also for a pipe, which would be waited for."""
+    with open(path, "rb", opener=durable.without_waiting) as file:
         found = os.fstat(file.fileno())
+        if not stat.S_ISREG(found.st_mode):
+            raise ClaimError("it is no plain file: somebody put it there; use another copy")
         stored = found.st_blocks * 512 if hasattr(found, "st_blocks") else found.st_size
         check_size(found.st_size, stored, "content")
         return file.read()

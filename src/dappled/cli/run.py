@@ -61,7 +61,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.console:
         settings = replace(settings, console=replace(settings.console, bind=arguments.console))
     if not arguments.simulate:
-        return _serve(settings_check.checked(replace(file, settings=settings)), arguments, None)
+        return _serve(settings_check.checked(replace(file, settings=settings), starting=True), arguments, None)
     refuse(file.findings)
     from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # a real flight doesn't load the mocks
 
@@ -73,7 +73,9 @@ def _run(arguments: argparse.Namespace) -> int:
         simulation = Simulation(World(seed=arguments.seed), settings, Path(folder))
         remark("simulating a masked camera, an autopilot and a ground station")
         with simulation as simulated:
-            return _serve(settings_check.checked(replace(file, settings=simulated)), arguments, simulation)
+            return _serve(
+                settings_check.checked(replace(file, settings=simulated), starting=True), arguments, simulation
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +131,7 @@ def _serve(settings: Settings, arguments: argparse.Namespace, simulation: Simula
             goal.begin(service)
             service.run(turn)
             problems.look(now=True)
-            tally.decoding_fails = service.health()["decode"]["failed_in_a_row"] >= FAILING
+            tally.decoding_fails |= service.health()["decode"]["failed_in_a_row"] >= FAILING
             manager.working(time.monotonic_ns(), now=True)  # closing one flight and opening the next takes a while
         return not asked.is_set()
 

@@ -106,7 +106,7 @@ class CameraRemarks:
 class Tally:
     """Counts the shots that have ended, over all flights of the process. Any thread may `add`.
 
-    `decoding_fails`: the last frames of the last flight could not be decoded.
+    `decoding_fails`: the last frames of a flight could not be decoded.
     """
 
     def __init__(self) -> None:

@@ -37,18 +37,20 @@ class SettingsRule:
     """One thing that must be so. `place` is the setting to blame where the sentence names none; `reads` are further
     ones that `check` needs, as "table.key". `check` raises DappledError: what is wrong, a line for each thing.
 
-    Who runs the daemon decides `of_user` rules, and those of `secrets`: files that only their owner can read.
+    Who runs the daemon decides rules of `secrets`: files that only their owner can read. What `may_come` keeps no
+    daemon from starting: a flight needs no map. Whether flights can be written is seen when one begins: a disk may
+    come late.
     """
 
     place: str
     check: Callable[[Settings], object]
     reads: tuple[str, ...] = ()
-    of_user: bool = False
+    may_come: bool = False
     secrets: Callable[[Settings], tuple[str, ...]] = _none
 
     def depends_on_user(self, settings: Settings) -> bool:
         """Whether this user can't tell."""
-        return self.of_user or any(_of_another(Path(name)) for name in self.secrets(settings) if name)
+        return any(_of_another(Path(name)) for name in self.secrets(settings) if name)
 
 
 def _of_another(file: Path) -> bool:
@@ -60,13 +62,16 @@ def _of_another(file: Path) -> bool:
         return False
 
 
-def findings(file: SettingsFile, *, by_this_user: bool = True) -> list[Finding]:
+def findings(file: SettingsFile, *, by_this_user: bool = True, starting: bool = False) -> list[Finding]:
     """What is wrong in a settings file: what can't be read, and what can't work. A rule that reads a setting which is
-    wrong already is left out, and where another user may run the daemon, a rule that depends on the user."""
+    wrong already is left out; where another user may run the daemon, a rule that depends on the user; and for a daemon
+    that is `starting`, one whose subject may come."""
     found = list(file.findings)
     wrong = {f"{finding.table}.{finding.key}" if finding.key else finding.table for finding in found}
     for rule in RULES:
         read = {rule.place, *rule.reads}
+        if starting and rule.may_come:
+            continue
         if not by_this_user and rule.depends_on_user(file.settings):
             continue
         if read & wrong or {name.partition(".")[0] for name in read} & wrong:
@@ -80,9 +85,9 @@ def findings(file: SettingsFile, *, by_this_user: bool = True) -> list[Finding]:
     return found
 
 
-def checked(file: SettingsFile, *, by_this_user: bool = True) -> Settings:
+def checked(file: SettingsFile, *, by_this_user: bool = True, starting: bool = False) -> Settings:
     """The settings of a file. Raises ConfigError with everything that is wrong, see `findings`."""
-    refuse(findings(file, by_this_user=by_this_user))
+    refuse(findings(file, by_this_user=by_this_user, starting=starting))
     return file.settings
 
 
@@ -128,13 +133,6 @@ def _directory(settings: Settings) -> None:
         raise ConfigError(f"{place} is not a folder: move it away, or set record.directory")
 
 
-def _writable(settings: Settings) -> None:
-    folder = Path(settings.record.directory)
-    place = _nearest(folder)
-    if place.is_dir() and not os.access(place, os.W_OK | os.X_OK):
-        raise ConfigError(f"{place} can't be written to: make {folder} yours, or set record.directory")
-
-
 def _seal(settings: Settings) -> None:
     if settings.record.seal_key:
         seal_key.load(Path(settings.record.seal_key))
@@ -153,8 +151,6 @@ def _mask_profile(settings: Settings) -> None:
 def _calibration(settings: Settings) -> None:
     decode = settings.decode
     if not settings.mask.profile:  # it is read only with a mask
-        if decode.calibration:
-            calibration_files.load(Path(decode.calibration))
         return
     wrong = calibration_files.misfit(
         Recipe(
@@ -169,12 +165,12 @@ def _calibration(settings: Settings) -> None:
 
 
 def _white(settings: Settings) -> None:
-    if settings.decode.white:
+    if settings.decode.white and settings.mask.profile:
         reading.read_metadata(Path(settings.decode.white))
 
 
 def _dark(settings: Settings) -> None:
-    if settings.decode.dark:
+    if settings.decode.dark and settings.mask.profile:
         reading.read_metadata(Path(settings.decode.dark))
 
 
@@ -208,11 +204,10 @@ RULES: tuple[SettingsRule, ...] = (
     SettingsRule("mavlink.url", _links),
     SettingsRule("mavlink.keys", _link_keys, ("mavlink.url",), secrets=lambda settings: settings.mavlink.keys),
     SettingsRule("record.directory", _directory),
-    SettingsRule("record.directory", _writable, of_user=True),
     SettingsRule("record.seal_key", _seal, secrets=lambda settings: (settings.record.seal_key,)),
     SettingsRule("decode.calibration", _calibration, ("camera.profile", "mask.profile", "decode.law")),
-    SettingsRule("decode.white", _white),
-    SettingsRule("decode.dark", _dark),
+    SettingsRule("decode.white", _white, ("mask.profile",)),
+    SettingsRule("decode.dark", _dark, ("mask.profile",)),
     SettingsRule("publish.slices", _stream, ("publish.keys",)),
     SettingsRule("publish.ask", _ask, ("publish.keys",)),
     SettingsRule(
@@ -221,5 +216,5 @@ RULES: tuple[SettingsRule, ...] = (
         secrets=lambda settings: (settings.publish.keys,),
     ),
     SettingsRule("console.bind", _console, ("console.token",), secrets=lambda settings: (settings.console.token,)),
-    SettingsRule("console.map", _map),
+    SettingsRule("console.map", _map, may_come=True),
 )

@@ -21,7 +21,7 @@ from typing import Any, Self
 import tomli_w
 
 from dappled import confined, durable, file_lock
-from dappled.bounds.parsing import parse_toml, read_bytes
+from dappled.bounds.parsing import parse_toml, read_log
 from dappled.flight.errors import FlightError, disk_error
 
 _FLIGHT_NAME = re.compile(r"(\d{8}T\d{6}Z|boot[0-9a-f]{8})-[0-9a-f]{8}")
@@ -235,7 +235,7 @@ def facts_as_toml(facts: Mapping[str, Any]) -> bytes:
 def read_facts(folder: FlightFolder) -> dict[str, Any]:
     """Read flight.toml. Raises FlightError."""
     try:
-        return parse_toml(read_bytes(folder.settings).decode("utf-8"))
+        return parse_toml(read_log(folder.settings).decode("utf-8"))
     except OSError as error:
         raise disk_error("read", folder.settings, error) from error
     except ValueError as error:

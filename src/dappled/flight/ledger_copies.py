@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import sqlite3
 from contextlib import closing
 
 from dappled import durable
+from dappled.bounds.claims import ClaimError, check_size
 from dappled.flight import seals
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
@@ -95,7 +97,12 @@ def _content(tree: Tree, name: str) -> bytes:
     if tree.stat(name) is None:
         return b""
     with tree.reading(name) as fd:
-        return b"".join(bytes(piece) for piece in durable.pieces(fd, FileIdentity.of_fd(fd).size))
+        found = os.fstat(fd)
+        try:
+            check_size(found.st_size, found.st_blocks * 512, "content")
+        except ClaimError as error:
+            raise FlightError(f"{tree.path / name} can't be read: {error}") from error
+        return b"".join(bytes(piece) for piece in durable.pieces(fd, found.st_size))
 
 
 def _proved(there: Tree, name: str, image: bytes) -> Proved:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dappled import durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import parse_json, read_log
 from dappled.errors import counted
@@ -85,7 +86,7 @@ def read_telemetry(path: Path, report: Callable[[str], object] = lambda _: None)
     file. `report` gets a sentence for each such gap. Raises FlightError when the file can't be read.
     """
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=durable.without_waiting) as file:
             size = os.fstat(file.fileno()).st_size
             data = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) if size else None
     except OSError as error:
@@ -118,7 +119,7 @@ def summarise(path: Path, report: Callable[[str], object] = lambda _: None) -> T
     """Read a whole log and summarise it. Raises FlightError."""
     packets = sum(1 for _ in read_telemetry(path, report))
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=durable.without_waiting) as file:
             return TelemetrySummary(
                 packets, os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest()
             )

@@ -72,7 +72,7 @@ def offload(
         stack.enter_context(layout.work_lock(folder.path.parent, "offloads from", needed=prune))
         _refuse_unready(folder)
         if prune:
-            _finish_seal(folder, clock, key)
+            _finish_seal(folder, clock)
         source = stack.enter_context(Tree(folder.path))
         names = [name for name in source.walk() if _is_copied(name)]
         there = stack.enter_context(_open_copy(source, destination, same_device=same_device))
@@ -270,8 +270,9 @@ def _refuse_unready(folder: FlightFolder) -> None:
         raise FlightError(f"{folder.path} was offloaded to {facts[FACT]['destination']} and pruned already")
 
 
-def _finish_seal(folder: FlightFolder, clock: Clock, key: SealKey | None) -> None:
-    """Seal a flight again where a prune was cut short between announcing a seal and writing it. Raises FlightError."""
+def _finish_seal(folder: FlightFolder, clock: Clock) -> None:
+    """Seal a flight again where a prune was cut short between announcing a seal and writing it, unsigned: nobody knows
+    what was done in between. Raises FlightError."""
     with LedgerReader.open(folder.ledger) as ledger:
         count, missing = seals.announced(ledger.facts())
         reasons = [event.text for event in ledger.events() if event.kind == "opened again"]

@@ -10,11 +10,12 @@ import errno
 import os
 import shutil
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from dappled import durable
 from dappled.clock import Clock
@@ -28,6 +29,8 @@ from dappled.flight.records import Frame, Stray
 from dappled.flight.seal_key import SealKey
 
 _RESERVE = 4  # descriptors: a frame takes one at a time, and other threads may take what is given back
+
+T = TypeVar("T")
 
 
 class FileBytes(Protocol):
@@ -57,7 +60,8 @@ class Recorder:
     def __init__(self, folder: FlightFolder, ledger: Ledger) -> None:
         self._folder = folder
         self._ledger = ledger
-        self._reserve = [os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC) for _ in range(_RESERVE)]
+        self._reserve: list[int] = []
+        self._take_reserve()
 
     def close(self) -> None:
         """Give the reserve back. A second call does nothing."""
@@ -102,7 +106,10 @@ class Recorder:
     def record_stray(self, camera_name: str, blob: FileBytes, reason: str, *, arrived_utc_ns: int) -> Stray:
         """Make a file safe that belongs to no shot. `reason` is a sentence. Raises FlightError."""
         taken = {PurePosixPath(stray.name).stem for stray in self._ledger.strays()}
-        taken |= {path.stem for path in self._folder.frames.glob("stray-*")}  # one may have lost its row to a full disk
+        try:  # one may have lost its row to a full disk
+            taken |= {PurePosixPath(one).stem for one in self._with_reserve(partial(os.listdir, self._folder.frames))}
+        except OSError as error:
+            raise disk_error("list", self._folder.frames, error) from error
         number = next(n for n in range(len(taken) + 1) if f"stray-{n:06d}" not in taken)
         name = f"frames/stray-{number:06d}.{layout.extension(camera_name)}"
         sha256 = self._write(name, camera_name, blob)
@@ -122,20 +129,24 @@ class Recorder:
         if blob.size <= 0:
             raise FlightError(f"the camera's file {camera_name} is empty: nothing was recorded")
         try:
-            try:
-                return self._put(path, blob)
-            except OSError as error:
-                if error.errno not in (errno.EMFILE, errno.ENFILE) or not self._reserve:
-                    raise
-            self.close()
-            try:
-                return self._put(path, blob)
-            finally:
-                self._take_reserve()
+            return self._with_reserve(partial(self._put, path, blob))
         except OSError as error:
             raise disk_error(f"record {camera_name} as", path, error) from error
         except EOFError as error:
             raise FlightError(f"the camera's file {camera_name} ended early ({error}): it was not recorded") from error
+
+    def _with_reserve(self, work: Callable[[], T]) -> T:
+        """Do work that needs descriptors; once more with the reserve's where there were none. Raises what it raises."""
+        try:
+            return work()
+        except OSError as error:
+            if error.errno not in (errno.EMFILE, errno.ENFILE) or not self._reserve:
+                raise
+        self.close()
+        try:
+            return work()
+        finally:
+            self._take_reserve()
 
     def _put(self, path: Path, blob: FileBytes) -> str:
         return self._left_over(path, blob) if path.exists() else durable.copy_in(blob.fd, blob.size, path)
@@ -183,6 +194,7 @@ class Recording:
     _clock: Clock
     _key: SealKey | None
     _ended: threading.Event = field(default_factory=threading.Event)
+    _facts: threading.Lock = field(default_factory=threading.Lock)
 
     @property
     def closed(self) -> bool:
@@ -197,8 +209,10 @@ class Recording:
             self.index.put(IndexEntry(index, self.folder.name, None if frame is None else frame.name, row.state))
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
-        """Add to flight.toml what became known since the start, such as the camera's identity. Raises FlightError."""
-        provenance.write_facts(self.folder, self.ledger, {**layout.read_facts(self.folder), **facts})
+        """Add to flight.toml what became known since the start, such as the camera's identity. Any thread may; they
+        take turns. Raises FlightError."""
+        with self._facts:
+            provenance.write_facts(self.folder, self.ledger, {**layout.read_facts(self.folder), **facts})
 
     def note_inputs(self, folder: str) -> None:
         """Store the hashes of the files in this folder of the flight, which frames are decoded with: `flight check`

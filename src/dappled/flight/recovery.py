@@ -44,9 +44,10 @@ def recover(root: Path, index: ImageIndex, clock: Clock, key: SealKey | None) ->
             continue
         try:
             cut_short = not _closed(folder)
+            signs = key if key is not None and (cut_short or seals.may_sign(folder, key)) else None
             report += [f"flight {folder.name}: {text}" for text in recover_flight(folder, clock)]
             if not seals.is_sealed(folder):
-                seals.seal(folder, clock, "recovered", key)
+                seals.seal(folder, clock, "recovered", signs)
             report += index.take_in(folder, seal=True, cut_short=cut_short)
         except (DappledError, OSError) as error:
             report.append(f"flight {folder.name} could not be repaired: {error}")

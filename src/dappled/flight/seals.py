@@ -150,15 +150,26 @@ def _remove_parts(folder: FlightFolder) -> None:
         raise disk_error("remove what was left half-written in", folder.path, error) from error
 
 
+def may_sign(folder: FlightFolder, key: SealKey) -> bool:
+    """Whether a closed flight may be signed: it was never sealed, or this key signed all that is there. Raises
+    FlightError."""
+    with LedgerReader.open(folder.ledger) as ledger:
+        count, _ = announced(ledger.facts())
+    return (count == 0 and read(folder).last is None) or is_signed(folder, key)
+
+
 def is_signed(folder: FlightFolder, key: SealKey) -> bool:
     """Whether the newest seal is signed by this key, and covers all links of the chain and every file that the ledger
-    has no digest of. Raises FlightError."""
+    has no digest of, and whether each file that it covers is still there. Raises FlightError."""
     last = read(folder).last
     if last is None or last.key != key.name or not key.signed(last.signed_part(), last.mac or ""):
         return False
     with LedgerReader.open(folder.ledger) as ledger:
         head, recorded = ledger.last_link(), recorded_files(ledger)
     if head is None or (last.links, last.head) != (head.number, head.link):
+        return False
+    present = {path.relative_to(folder.path).as_posix() for path in sealed_paths(folder)}
+    if last.files.keys() - present - pruning.removed(folder).keys():
         return False
     try:
         return all(

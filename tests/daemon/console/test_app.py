@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import socket
 import threading
 import time
@@ -272,7 +273,12 @@ def test_a_fault_of_the_console_is_one_line_of_log(
     assert answer.status_code == 500
     assert answer.json() == {"error": "the console failed (ZeroDivisionError): see its log"}
     assert answer.headers["content-security-policy"]
-    (line,) = [record for record in caplog.records if record.levelname in ("WARNING", "ERROR")]
+
+    def told() -> list[logging.LogRecord]:
+        return [record for record in caplog.records if record.levelname in ("WARNING", "ERROR")]
+
+    eventually(lambda: bool(told()), "a line of log: it follows the answer")
+    (line,) = told()
     assert line.getMessage() == "GET '/api/state' failed: unexpected ZeroDivisionError: division by zero"
     assert line.exc_info is None
 

@@ -49,7 +49,7 @@ def record(
         stages=[stage.statistics()],
         shutter=ShutterStatistics(2, 0, 0, 2, 0, 2, None),
         links=[link, *more.pop("links", ())],
-        telemetry=Telemetry().statistics(),
+        telemetry=replace(Telemetry().statistics(), positions=more.pop("positions", 0)),
         publisher=PublisherStatistics({}, {}, 0, 0, 0),
         folder=folder,
         utc_known=more.pop("utc_known", True),
@@ -115,10 +115,14 @@ def test_a_folder_that_is_gone_is_unknown_not_zero(tmp_path: Path) -> None:
 def test_a_link_on_which_no_ground_station_is_yet_is_no_problem(tmp_path: Path) -> None:
     """As long as another link is heard; one that falls silent, or is refused, is a problem."""
     never = replace(LINK, url="udpin:127.0.0.1:2", last_heard_monotonic_ns=None)
-    found = record(tmp_path, links=[never])
+    found = record(tmp_path, links=[never], positions=5)
     assert (found["problems"], found["link"]["silent"]) == ([], 1)
-    (problem,) = record(tmp_path, links=[replace(never, last_heard_monotonic_ns=95 * S)])["problems"]
+    (problem,) = record(tmp_path, links=[replace(never, last_heard_monotonic_ns=95 * S)], positions=5)["problems"]
     assert "udpin:127.0.0.1:2: nothing was heard for 5 s" in problem
-    (problem,) = record(tmp_path, links=[replace(never, signing=SigningStatistics(0, 3, 1, 0, 7))])["problems"]
+    (problem,) = record(tmp_path, links=[replace(never, signing=SigningStatistics(0, 3, 1, 0, 7))], positions=5)[
+        "problems"
+    ]
     assert "3 forged" in problem
     assert len(record(tmp_path, link=never)["problems"]) == 1
+    silent = record(tmp_path, links=[never])["problems"]  # the autopilot's cable may be the silent one
+    assert any("udpin:127.0.0.1:2: nothing was heard for 5 s" in text for text in silent)

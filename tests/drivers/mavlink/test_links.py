@@ -175,11 +175,16 @@ def test_a_channel_that_is_opened_after_the_end_is_closed(monkeypatch: pytest.Mo
     far.close()
 
 
-def test_a_serial_device() -> None:
+def terminals() -> tuple[int, int]:
+    """Both ends of a pseudo terminal."""
     try:
-        near, far = pty.openpty()
+        return pty.openpty()
     except OSError as error:
         without(f"there are no pseudo terminals here ({error}): mount devpts at /dev/pts")
+
+
+def test_a_serial_device() -> None:
+    near, far = terminals()
     try:
         with Side(f"{os.ttyname(far)},57600") as side:
             packer = mavlink.MAVLink(None, srcSystem=3, srcComponent=1)
@@ -224,7 +229,7 @@ def test_a_device_or_an_address_that_is_not_there_yet_is_waited_for(url: str, wo
 
 def test_a_serial_device_that_comes_late_is_opened(tmp_path: Path) -> None:
     device = tmp_path / "ttyLate"
-    far, near = pty.openpty()
+    far, near = terminals()
     try:
         with Side(f"{device},57600") as side:
             assert side.links.statistics()[0].error is not None

@@ -79,9 +79,11 @@ class GroundClient:
 
     def find_camera(self, timeout_s: float = 10.0) -> tuple[int, int]:
         """(system id, component id) of the first camera whose heartbeat is heard. Raises GroundStationError."""
+        url, failed = self._links.statistics()[0].url, self._links.statistics()[0].error
+        if failed:  # a person waits: the link can't be opened now
+            raise GroundStationError(failed)
         with self._changed:
             if not self._changed.wait_for(lambda: self._camera is not None, timeout_s):
-                url = self._links.statistics()[0].url
                 raise GroundStationError(
                     f"no camera was heard on {url} for {timeout_s:g} s; is the daemon running there?"
                 )

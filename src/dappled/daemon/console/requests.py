@@ -57,6 +57,7 @@ class ConsoleRequests:
         if (known := self._done.get(number)) is not None:
             return {**known, "text": f"already {known['text']}"} if known["ok"] else known
         late = self._too_late(request)
+        self._done[number] = {"ok": False, "error": "it may have fired: see the flight's record", "index": None}
         answer = {"ok": False, "error": late, "index": None} if late else _decided(self._decide(request))
         self._done[number] = answer
         if len(self._done) > _REMEMBERED:

@@ -134,10 +134,12 @@ def _decoding(health: Mapping[str, Any]) -> Check:
 
 
 def _failing(decode: Mapping[str, Any]) -> Check | None:
-    """What is wrong where frames can't be decoded; None where they can. They are recorded in any case."""
+    """What is wrong where frames are in doubt or can't be decoded; None elsewhere. They are recorded in any case."""
     if decode.get("misfit"):
         return Check("Decoding", "no-go", f"frames will be kept, not decoded: {decode['misfit']}")
     failed, in_a_row = decode.get("failed", 0), decode.get("failed_in_a_row", 0)
+    if not failed and decode.get("doubt"):
+        return Check("Decoding", "caution", f"frames are decoded, in doubt: {decode['doubt']}")
     if in_a_row >= FAILING:
         text = f"the last {counted(in_a_row, 'frame')} could not be decoded, kept in the record: {decode['failure']}"
         return Check("Decoding", "no-go", text)

@@ -114,14 +114,15 @@ def record(
             "failed_in_a_row": decoding.failures.in_a_row,
             "failure": decoding.failures.reason,
             "misfit": decoding.misfit,
+            "doubt": decoding.failures.doubt,
         },
         "min_free_bytes": settings.record.min_free_mb * 1_000_000,
     }
 
 
 def _link_problem(link: LinkStatistics, *, heard: bool) -> str | None:
-    """What is wrong with a silent link. None for one on which nobody was heard yet, where another one is `heard`: no
-    ground station is there, nothing is lost, and the counters show it."""
+    """What is wrong with a silent link. None for one on which nobody was heard yet, where the vehicle is `heard` on
+    another: no ground station is there, nothing is lost, and the counters show it."""
     if link.error:
         return link.error
     if heard and link.last_heard_monotonic_ns is None and not _refused(link):
@@ -147,7 +148,7 @@ def _link(
         for link in links
         if link.error or monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS
     ]
-    heard = any(link.last_heard_monotonic_ns is not None for link in links)
+    heard = telemetry.positions > 0
     problems = [text for link in silent if (text := _link_problem(link, heard=heard))]
     facts = {
         "urls": len(links),

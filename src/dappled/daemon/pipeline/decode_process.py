@@ -126,7 +126,7 @@ class DecodeProcess:
         self._turn = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._channel: ProcessChannel | None = None
-        self._closed = False
+        self._closed, self._may_look = False, True
 
     def warm_up(self) -> None:
         """Start the worker now, so that the first frame doesn't wait for it. Raises DecodeProcessError for a recipe
@@ -149,11 +149,17 @@ class DecodeProcess:
         self, path: str, focal_length_mm: float | None, f_number: float | None, *, index: int, look: bool = False
     ) -> DecodedFrame:
         """See FrameDecoder."""
-        frame = {"path": path, "focal_length_mm": focal_length_mm, "f_number": f_number, "index": index, "look": look}
+        frame = {"path": path, "focal_length_mm": focal_length_mm, "f_number": f_number, "index": index}
         with self._turn:
-            decoded = _decoded(self._ask({"do": "decode", **frame}))
-            if decoded.decision is not None:  # a worker that takes over goes on by it
-                self._recipe = replace(self._recipe, decided=decoded.decision)
+            look = look and self._may_look
+            try:
+                decoded = _decoded(self._ask({"do": "decode", "look": look, **frame}))
+            except DecodeProcessError:
+                self._may_look = self._may_look and not (look and self._process is None)  # it may have died of a search
+                raise
+            if decoded.decision in (None, self._recipe.decided):
+                return replace(decoded, decision=None)
+            self._recipe = replace(self._recipe, decided=decoded.decision)  # a worker that takes over goes on by it
         return decoded
 
     def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> FrameDepth:

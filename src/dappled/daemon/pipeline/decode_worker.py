@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import logging
 import os
 import signal
 import socket
@@ -25,8 +26,10 @@ from dappled.decode.lightfield.light_field import slice_mosaic
 from dappled.drivers.camera import Blob
 from dappled.drivers.child_process import DECODER_GOES, ChannelMessage, end_with_parent, goes_first
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
+from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import sentence
 
+log = logging.getLogger(__name__)
 DEPTH_NICENESS = 14
 WorkerReply = tuple[Mapping[str, Any], tuple[int, ...]]
 
@@ -72,14 +75,12 @@ class DecodeWorker:
         in_force = self._decided if decided is not None and index >= decided.first else None
         done = (in_force or configured).decode(path, **known)
         ms = dict(done.ms)
-        decision = None
         if asked["look"] and self._looks and self._laws.wanted(done, index):
             began = time.perf_counter()
-            looked = Darkroom(replace(configured.recipe, try_laws=True))
-            decision = looked.decision(self._laws.keep(looked.decode(path, **known)), index)
-            if decision is not None:
+            decided = self._look(configured, path, known, index)
+            if decided is not None:
                 self._looks = False
-                self._decided = Darkroom(replace(configured.recipe, decided=decision))
+                self._decided = Darkroom(replace(configured.recipe, decided=decided))
                 done = self._decided.decode(path, **known)
             ms["laws"] = (time.perf_counter() - began) * 1e3
         field = done.light_field
@@ -106,9 +107,23 @@ class DecodeWorker:
             "seen": {**_seen(done), "doubts": doubts},
             "preview_size": list(size),
             "ms": ms,
-            "decision": None if decision is None else asdict(decision),
+            "decision": None if decided is None or index < decided.first else asdict(decided),
         }
         return facts, (body.fd, blob.fd)
+
+    def _look(self, configured: Darkroom, path: str, known: Mapping[str, Any], index: int) -> LawDecision | None:
+        """Search a frame near all laws; what it decides for the flight. A calibrated flight keeps to its calibration:
+        what is found elsewhere is a doubt. None also where the search fails: the frame is decoded already."""
+        self._laws.begin()
+        looker = Darkroom(replace(configured.recipe, try_laws=True))
+        calibrated = bool(configured.recipe.calibration)
+        try:
+            looked = looker.decode(path, **known)
+        except Exception as error:  # noqa: BLE001  # a search that fails must not cost a good frame
+            log.warning("frame %d was not searched near other laws: %s", index, sentence(error))
+            return None
+        self._laws.keep(looked, decides=not calibrated)
+        return None if calibrated else looker.decision(looked, index)
 
     def _preview(self, slices: Any, carriers: Any) -> tuple[bytes, tuple[int, int]]:
         step = max(1, round(max(slices.shape[1:]) * np.sqrt(2 * len(slices) - 1) / self._preview_px))
@@ -140,13 +155,15 @@ class LawLooks:
         blind = done.report.carriers_from in ("predicted", "calibrated")
         return in_order and told and blind and not self._settled and self._left > 0 and _lens(done) not in self._unseen
 
-    def keep(self, looked: DecodeResult) -> DecodeResult:
-        """Keep what a searched frame showed."""
+    def begin(self) -> None:
+        """Count a search, before it may fail."""
         self._left -= 1
-        self._settled = looked.search is not None and looked.search.found is not None
+
+    def keep(self, looked: DecodeResult, *, decides: bool) -> None:
+        """Keep what a searched frame showed: carriers that stand elsewhere, if that `decides`, or why none was seen."""
+        self._settled = decides and looked.search is not None and looked.search.found is not None
         if not self._settled:
             self._unseen[_lens(looked)] = looked.contradiction
-        return looked
 
     def judge(self, done: DecodeResult) -> tuple[int | None, list[str]]:
         """How many carriers a frame shows, None where none can be seen with its lens so; and what is in doubt."""

@@ -18,6 +18,7 @@ from dappled.daemon.pipeline.tagging import PoseSource, Tagging
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import Camera
+from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import sentence
 from dappled.flight import Tag
 from dappled.workers import Statistics, Worker
@@ -25,11 +26,13 @@ from dappled.workers import Statistics, Worker
 
 @dataclass(frozen=True, slots=True)
 class DecodeFailures:
-    """The frames that could not be decoded: all, those since the last one that could, and why the last could not."""
+    """The frames that could not be decoded: all, those since the last one that could, and why the last could not; and
+    what the last decoded one is in doubt about ("" where it is not)."""
 
     count: int = 0
     in_a_row: int = 0
     reason: str = ""
+    doubt: str = ""
 
 
 class Pipeline:
@@ -108,6 +111,7 @@ class Decoding:
         self._ends, self._decoder, self._publisher = ends, decoder, publisher
         self._preview_interval_s, self._last_preview_s = preview_interval_s, -1e9
         self.failures = DecodeFailures()
+        self._unrecorded: LawDecision | None = None
         self.worker: Worker[PendingShot] = Worker(
             "decode", self._work, capacity=capacity, on_failure=self._failed, on_drop=self._dropped
         )
@@ -133,10 +137,13 @@ class Decoding:
         decoded = self._decoder.decode(
             writer.path(frame), tag.focal_length_mm, tag.f_number, index=frame.index, look=True
         )
-        self.failures = replace(self.failures, in_a_row=0)
+        doubts = [*decoded.seen.get("doubts", ()), *([decoded.decision.sentence] if decoded.decision else [])]
+        self.failures = replace(self.failures, in_a_row=0, doubt=doubts[0] if doubts else "")
         pending.decoded = decoded
-        if decoded.decision is not None:
-            writer.law_decided(decoded.decision)
+        self._unrecorded = decoded.decision or self._unrecorded
+        if self._unrecorded is not None:  # tried again with the next frame where the disk refuses
+            writer.law_decided(self._unrecorded)
+            self._unrecorded = None
         writer.decoded(decoded.result(frame.index, (time.monotonic_ns() - began) / 1e6))
         pending.ms["decode"] = (time.monotonic_ns() - began) / 1e6
         began = time.monotonic_ns()
@@ -146,7 +153,7 @@ class Decoding:
 
     def _failed(self, pending: PendingShot, error: Exception) -> None:
         before = self.failures
-        self.failures = DecodeFailures(before.count + 1, before.in_a_row + 1, sentence(error))
+        self.failures = replace(before, count=before.count + 1, in_a_row=before.in_a_row + 1, reason=sentence(error))
         self._ends.leave(pending, "not decoded", sentence(error))
 
     def _dropped(self, pending: PendingShot) -> None:

@@ -36,6 +36,10 @@ _NO_CLIENT = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNABORTED, errno.EPROTO,
 """Errors of `accept` that are the client's and not the listening socket's: see accept(2)."""
 
 
+_FINAL = (errno.EADDRINUSE, errno.EACCES, errno.EPERM)
+"""What waiting does not mend: another program has the port, or this user may not open the device."""
+
+
 class LinkError(DappledError):
     """A link can't be opened: one sentence with the url and what to do. `may_come`: a device, an address or a peer is
     not there now, and waiting may mend it."""
@@ -134,7 +138,7 @@ def open_channel(address: Address) -> ByteChannel:
             return UdpIn(_bound(address, socket.SOCK_DGRAM))
         return UdpOut(address)
     except OSError as error:
-        raise LinkError(_sentence(address, error), may_come=error.errno != errno.EADDRINUSE) from error
+        raise LinkError(_sentence(address, error), may_come=error.errno not in _FINAL) from error
 
 
 def _sentence(address: Address, error: OSError) -> str:

@@ -225,12 +225,13 @@ class Darkroom:
                     light_field = replace(
                         light_field, views=coloured(light_field.views, light_field.grid, chroma, plane.shape)
                     )
+        dropped = isinstance(decoder, MaskDecoder) and decoder.calibration is None  # its metres don't hold then
         attributes = {
             **light_field.attributes,
             "camera": self.camera_name(raw.camera_model),
             "mask": self.recipe.mask,
             "decoded_from": "grey" if raw.cfa is None else "mosaic",
-            **(self._ranging if views else {}),
+            **(self._ranging if views and not dropped else {}),
         }
         made = DecodeResult(light_field, report, raw, ms, search, doubt, doubt_of(decoder))
         attributes["doubts"] = [words for words in (doubt, report.doubt, made.calibration_doubt) if words]

@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from dappled import durable
 from dappled.flight.chain import ChainLink
 from dappled.flight.errors import disk_error
 from dappled.flight.tables import TELEMETRY
@@ -19,7 +20,7 @@ def compare(path: Path, links: Mapping[int, ChainLink] | None) -> Iterator[str]:
     if not blocks:
         return
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=durable.without_waiting) as file:
             size = os.fstat(file.fileno()).st_size
             for link in blocks:
                 start, end = _range(link.key)
