@@ -69,19 +69,11 @@ def stream_endpoint(config: Path | None, service: Path = SERVICE_FOLDER) -> str:
 
 def is_listening(endpoint: str) -> bool:
     """Whether a daemon listens on an ipc endpoint; False for any other endpoint."""
-    if not endpoint.startswith("ipc://"):
-        return False
-    with socket.socket(socket.AF_UNIX) as probe:
-        probe.settimeout(1.0)
-        try:
-            probe.connect(endpoint.removeprefix("ipc://"))
-        except OSError:
-            return False
-    return True
+    return _listener(endpoint) is not None
 
 
-def stranger(endpoint: str) -> str | None:
-    """The user whose daemon listens on an ipc endpoint; None where it is this user's own, or can't be known."""
+def _listener(endpoint: str) -> int | None:
+    """The user id of who listens on an ipc endpoint; None where nobody does, and for any other endpoint."""
     if not endpoint.startswith("ipc://"):
         return None
     with socket.socket(socket.AF_UNIX) as probe:
@@ -92,7 +84,13 @@ def stranger(endpoint: str) -> str | None:
         except OSError:
             return None
     _, user, _ = struct.unpack("3i", facts)
-    if user == os.getuid():
+    return int(user)
+
+
+def stranger(endpoint: str) -> str | None:
+    """The user whose daemon listens on an ipc endpoint; None where it is this user's own, or can't be known."""
+    user = _listener(endpoint)
+    if user is None or user == os.getuid():
         return None
     try:
         return pwd.getpwuid(user).pw_name
