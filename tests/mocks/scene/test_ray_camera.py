@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,7 +68,9 @@ def board(cycles_per_px: float, disparity: float, shape: tuple[int, int] = (48, 
 )
 @pytest.mark.parametrize("order", [(0, 1), (1, 1), (1, -2)])
 @pytest.mark.parametrize("kappa", [0.5, 1.0])
-def test_a_stop_averages_an_order_by_its_own_transform(stop, expected, order, kappa) -> None:  # type: ignore[no-untyped-def]
+def test_a_stop_averages_an_order_by_its_own_transform(
+    stop: Any, expected: Callable[[tuple[float, float]], float], order: Order, kappa: float
+) -> None:
     camera = replace(CLEAN, stop=stop, blades=4, blade_turn_rad=0.0, points_per_view=8, level=0.1)
     camera = replace(camera, f_number=15.5 * 0.48 / kappa)
     kept = lens.modulation(FULL)[max(order, (-order[0], -order[1]))]
@@ -84,7 +89,7 @@ def test_a_round_stop_has_its_null_where_the_jinc_has() -> None:
 
 @pytest.mark.parametrize("pattern", ["full", "diagonal"])
 @pytest.mark.parametrize("harmonics", ["linear", "octave"])
-def test_a_film_makes_the_orders_of_its_picture(pattern, harmonics) -> None:  # type: ignore[no-untyped-def]
+def test_a_film_makes_the_orders_of_its_picture(pattern: Any, harmonics: Any) -> None:
     """Against the DFT of the drawn picture, scaled from black to clear."""
     mask = Mask(4.0, 3, pattern, harmonics)
     turns = np.arange(512) / 512
@@ -287,7 +292,9 @@ def test_what_no_camera_is_has_a_sentence() -> None:
         replace(CLEAN, print_scale=0.0)
 
 
-def test_shoot_writes_a_frame_with_the_imperfections_that_are_named(tmp_path, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_shoot_writes_a_frame_with_the_imperfections_that_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out, truth = tmp_path / "hard.dng", tmp_path / "truth.npz"
     words = [str(out), "--scale", "0.02", "--truth", str(truth), "--rays", "print_scale=1.003", "points_per_view=1"]
     assert shoot.main([*words, "stop=square", "moved_mm=0.016,0", "colours=yes", "film=no"]) == 0
