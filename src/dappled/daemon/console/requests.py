@@ -58,10 +58,10 @@ class ConsoleRequests:
             return {**known, "text": f"already {known['text']}"} if known["ok"] else known
         late = self._too_late(request)
         self._done[number] = {"ok": False, "error": "it may have fired: see the flight's record", "index": None}
-        answer = {"ok": False, "error": late, "index": None} if late else _decided(self._decide(request))
-        self._done[number] = answer
         if len(self._done) > _REMEMBERED:
             self._done.popitem(last=False)
+        answer = {"ok": False, "error": late, "index": None} if late else _decided(self._decide(request))
+        self._done[number] = answer
         return answer
 
     def _decide(self, request: Mapping[str, Any]) -> ShotDecision:
