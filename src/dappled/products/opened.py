@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -47,11 +48,11 @@ class NoFrameError(OpenError, IndexError, KeyError):
     __str__ = Exception.__str__  # KeyError's own would put the sentence in quotes
 
 
-class Refocusable:
+class Refocusable(ABC):
     """What a light field can be asked for, and a raw frame too: it is decoded for it."""
 
-    def _decoded(self) -> OpenedLightField:
-        raise NotImplementedError
+    @abstractmethod
+    def _decoded(self) -> OpenedLightField: ...
 
     @property
     def views(self) -> NDArray[np.float32]:
