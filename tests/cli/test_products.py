@@ -44,9 +44,10 @@ def test_views_as_one_picture(field: str, of: str, tmp_path: Path, capsys: pytes
     assert "5 × 5 views of 80 × 60 px" in capsys.readouterr().out
 
 
-def test_four_alphas_become_one_picture(field: str, tmp_path: Path) -> None:
-    words = ["refocus", field, "--alpha", "1", "0.8", "1.2", "2"]
+def test_four_alphas_become_one_picture(field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["refocus", field, "--alpha", "1", "0.98", "1.02", "1.04"]
     assert main([*words, "-o", str(tmp_path / "a.png")]) == 0
+    assert "alpha = 1.04 (+0.52 px/view)" in capsys.readouterr().out
     assert size(tmp_path / "a.png")[0] > 2 * 80
     assert main([*words, "--magnify", "-o", str(tmp_path / "a.npy")]) == 0
     assert np.load(tmp_path / "a.npy").shape == (4, 60, 80)
@@ -70,7 +71,7 @@ def test_metres_focus_where_the_board_is(field: str, tmp_path: Path) -> None:
 
 
 def test_fourier_tells_how_far_the_sum_is(field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["refocus", field, "--alpha", "0.7", "1", "--fourier", "-o", str(tmp_path / "a.png")]) == 0
+    assert main(["refocus", field, "--alpha", "1.03", "1", "--fourier", "-o", str(tmp_path / "a.png")]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [float(line.split("by ")[1].split(" dB")[0]) > 35 for line in lines[:2]] == [True, True]
 

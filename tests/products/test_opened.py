@@ -34,7 +34,8 @@ def test_a_light_field_is_opened_refocused_and_measured(path: Path) -> None:
     inner = (slice(6, -6), slice(6, -6))
     sharp, as_taken = found.refocus(disparity=DISPARITY), found.refocus()
     assert np.abs(sharp - middle)[inner].max() < np.abs(as_taken - middle)[inner].max() / 3
-    np.testing.assert_allclose(found.refocus(alpha=1 / (1 + DISPARITY)), sharp, atol=1e-5)
+    # 5 views of 0.1 mm pixels: 0.2 mm over an aperture of 6.757 mm, which is 1 − 1/α (Eq 28).
+    np.testing.assert_allclose(found.refocus(alpha=1 / (1 - 0.2 * 7.4 / 50)), sharp, atol=1e-5)
     np.testing.assert_allclose(found.refocus(disparity=DISPARITY, aperture=0.1), middle, atol=1e-6)
     depth = found.depth()
     assert np.nanmedian(depth.disparity) == pytest.approx(DISPARITY, abs=0.01)
@@ -109,6 +110,7 @@ def test_what_cannot_be_opened_is_told(tmp_path: Path, path: Path) -> None:
         (lambda: dappled.open(path, mask="nonsense"), "is decoded already: leave mask out"),
         (lambda: dappled.open(tmp_path / "empty"), "holds 0 pictures"),
         (lambda: opened.light_field(path).refocus(alpha=1, disparity=2), "give one of"),
+        (lambda: OpenedLightField(light_field(f_number=None)).refocus(alpha=1), "how wide its lens is"),
     ):
         with pytest.raises(OpenError if "pictures" not in words else DappledError, match=words):
             act()

@@ -258,7 +258,7 @@ def test_the_slider_s_alpha_is_the_command_s(chromium: Browser, daemon: Daemon, 
     page = opened(chromium, daemon, LAPTOP).page
     frame = shoot(page)
     page.wait_for_selector("#gl:not([hidden])")
-    disparities = (-0.4, 0.0, 1.0, 2.0)
+    disparities = (-0.4, 0.0, 1.0, 2.0)  # α about 0.97 to 1.17
     drawings, alphas = [], []
     for disparity in disparities:
         drawings.append(drawn(page, disparity))

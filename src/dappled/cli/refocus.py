@@ -21,7 +21,7 @@ Picture = NDArray[np.float32]
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "examples:\n  dappled refocus frame.zarr --alpha 1 0.8 1.2 2 -o four.png        # Fig 39\n"
+        "examples:\n  dappled refocus frame.zarr --alpha 1 0.98 1.02 1.04 -o four.png   # Fig 39\n"
         "  dappled refocus frame.zarr --distance 20 --focus inf -o at-20-m.png\n"
         "  dappled refocus frame.zarr --stack 0 0.6 9 --all-in-focus -o sharp.png\n"
         "Several planes become one picture with captions. .npy keeps the numbers: linear, 1.0 = sensor white."
@@ -29,7 +29,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     decode_arguments.add_field(parser)
     where = parser.add_argument_group("focus (one of them)").add_mutually_exclusive_group()
     where.add_argument("--alpha", nargs="+", type=float, metavar="A",
-                       help="Eq 29's α: 1 as taken, below 1 is nearer, above 1 farther")  # fmt: skip
+                       help="Eq 28's α, the film's distance from the lens: 1 as taken, above 1 is nearer, below 1\n"
+                       "farther; needs focal length, f-number and camera")  # fmt: skip
     where.add_argument("--disparity", nargs="+", type=float, metavar="D", help="disparities in px from view to view")
     where.add_argument(
         "--distance",
@@ -42,7 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--stack", nargs=3, type=float, metavar=("FROM", "TO", "N"), help="a focal stack at N disparities"
     )
     parser.add_argument("--magnify", action="store_true",
-                        help="with --alpha: follow Eq 29 exactly, so that the picture grows with α")  # fmt: skip
+                        help="with --alpha: follow Eq 28 exactly, so that the picture grows with α")  # fmt: skip
     parser.add_argument(
         "--aperture", type=float, metavar="D", help="diameter of a round synthetic aperture, as a share of the whole"
     )
@@ -101,13 +102,14 @@ def _check_mix(arguments: argparse.Namespace) -> None:
     if unused:
         raise OpenError(f"{chosen[0]} doesn't go with {', '.join(unused)}: leave one of them out")
     if arguments.magnify and not arguments.alpha:
-        raise OpenError("--magnify goes with --alpha: it is Eq 29's x/α")
+        raise OpenError("--magnify goes with --alpha: it is Eq 28's x/α")
 
 
 def _planes(found: OpenedLightField, arguments: argparse.Namespace) -> list[tuple[str, float]]:
     """(caption, disparity) of each plane that was asked for."""
     if arguments.alpha:
-        return [(f"alpha = {a:g}", found.disparity_of(alpha=a)) for a in arguments.alpha]
+        at = [(a, found.disparity_of(alpha=a)) for a in arguments.alpha]
+        return [(f"alpha = {a:g} ({d:+.3g} px/view)", d) for a, d in at]
     if arguments.distance:
         return [(f"{z:g} m", found.disparity_of(distance_m=z)) for z in arguments.distance]
     if arguments.stack:

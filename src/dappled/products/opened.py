@@ -1,7 +1,7 @@
 """`dappled.open`: open a light field, a raw frame or a flight from Python. `docs/api.md` says what is promised.
 
 with_views = dappled.open("frame.zarr")              # or a folder of n × n pictures
-sharp = with_views.refocus(alpha=0.8)                 # float32 (h, w) or (h, w, 3)
+sharp = with_views.refocus(alpha=1.02)                # float32 (h, w) or (h, w, 3)
 depth = with_views.depth(method="combined")           # .disparity, .sigma, .confidence
 frame = dappled.open("frame.cr2", mask="mask-2", calibration="calibration.toml")
 for frame in dappled.open("~/flights/20261121T101503Z-0a1b2c3d"): frame.views
@@ -68,7 +68,7 @@ class Refocusable(ABC):
         aperture: float | None = None,
         tilt: tuple[float, float] = (0.0, 0.0),
     ) -> NDArray[np.float32]:
-        """Return the picture focused at one α (Eq 29), disparity or distance; without one, as it was taken.
+        """Return the picture focused at one α (Eq 28), disparity or distance; without one, as it was taken.
 
         `aperture` is the diameter of a round synthetic aperture as a share of the whole; `tilt` the change of
         disparity over the picture's height and width. float32 (h, w) or (h, w, 3), NaN where no view sees.
@@ -156,16 +156,27 @@ class OpenedLightField(Refocusable):
     ) -> float:
         """Return the disparity that one of the three arguments names; 0 for none.
 
-        Raises DappledError for more than one, and for metres without a calibration.
+        α is Eq 28's: the film's distance from the lens as a share of the sensor's, above 1 for what is nearer.
+        Raises DappledError for more than one, for metres without a calibration, and for α of an unknown lens.
         """
         given = [value for value in (alpha, disparity, distance_m) if value is not None]
         if len(given) > 1:
             raise OpenError("give one of alpha, disparity and distance, not several")
         if alpha is not None:
-            return refocusing.disparity_of_alpha(alpha)
+            return refocusing.disparity_of_alpha(alpha, self._aperture_px(), self.stack)
         if distance_m is not None:
             return self.metres().disparity(distance_m, self.stack)
         return 0.0 if disparity is None else disparity
+
+    def _aperture_px(self) -> float:
+        """Return the lens' aperture in columns of the sensor. Raises OpenError where the lens is unknown."""
+        found = aperture_px(self.field.attributes)
+        if found is None:
+            raise OpenError(
+                f"{self.path or 'the light field'} doesn't say how wide its lens is (focal length, f-number, a camera "
+                "with a profile), and α needs that: give the disparity in pixels from view to view (--disparity)"
+            )
+        return found
 
     def metres(self) -> Ranging:
         """Return `ranging`. Raises DappledError with what to do where it is None."""
@@ -286,15 +297,30 @@ def light_field(path: str | Path, *, focus_m: float | None = None) -> OpenedLigh
 def lens_ranging(field: LightField, focus_m: float) -> Ranging | None:
     """Return distances by Eq 5, from a light field's focal length, f-number and camera; None without one of them."""
     known = field.attributes
-    length, stop, camera = known.get("focal_length_mm"), known.get("f_number"), known.get("camera")
-    if not (length and stop and camera and known.get("shape")) or known.get("lenslet_pitch_px"):
+    pixel_mm = _pixel_mm(known)
+    if pixel_mm is None or not (known.get("focal_length_mm") and known.get("f_number")):
+        return None
+    return Ranging.of_lens(float(known["focal_length_mm"]), float(known["f_number"]), pixel_mm, focus_m)
+
+
+def aperture_px(known: Mapping[str, Any]) -> float | None:
+    """Return the aperture f/N in columns of the sensor, from a light field's attributes; None where one is unknown."""
+    pixel_mm = _pixel_mm(known)
+    if pixel_mm is None or not (known.get("focal_length_mm") and known.get("f_number")):
+        return None
+    return float(known["focal_length_mm"]) / float(known["f_number"]) / pixel_mm
+
+
+def _pixel_mm(known: Mapping[str, Any]) -> float | None:
+    """Return the width of a column of the sensor; None under lenslets, and where no profile has the camera."""
+    if not (known.get("camera") and known.get("shape")) or known.get("lenslet_pitch_px"):
         return None
     try:
         rows, columns = known["shape"]
-        sensor = profiles.camera(str(camera)).sensor((int(rows), int(columns)))
+        sensor = profiles.camera(str(known["camera"])).sensor((int(rows), int(columns)))
     except DappledError:
-        return None  # no profile has this camera: relative depth only
-    return Ranging.of_lens(float(length), float(stop), math.hypot(*sensor.column_mm), focus_m)
+        return None
+    return math.hypot(*sensor.column_mm)
 
 
 def with_ranging(field: LightField, ranging: Ranging) -> LightField:

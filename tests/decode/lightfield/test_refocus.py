@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,29 +54,49 @@ def test_a_textured_scene_comes_into_focus_where_it_is() -> None:
         assert rms[d] < rms[other] / 5
 
 
-@pytest.mark.parametrize("alpha", [0.8, 1.0, 1.2, 2.0])
-def test_alpha_is_equation_29(alpha: float) -> None:
-    """E(x, y) = Σ L(u(1 − 1/α) + x/α, v(1 − 1/α) + y/α, u, v), counted as LFToolbox counts."""
-    stack, _ = paint([Board(0.3)], (64, 64), 3)
-    views = stack.views[::-1, ::-1]  # the further right a camera, the further left what is near
+@pytest.mark.parametrize(("object_m", "focus_m"), [(1.0, 2.0), (2.0, 2.0), (8.0, 2.0), (0.9, math.inf), (3.0, 1.2)])
+def test_alpha_is_the_film_s_distance_of_equation_28(object_m: float, focus_m: float) -> None:
+    """By the thin lens and similar triangles: an object is sharp on a film at v', the sensor lies at v, α = v'/v."""
+    f, aperture, pitch, view_px, n = 50.0, 6.25, 0.01, 8, 5
+    sensor, film = (1 / (1 / f - 1 / (1000 * metres)) for metres in (focus_m, object_m))
+    rays = np.array([-aperture / 2, aperture / 2])
+    on_sensor = rays + (0.0 - rays) * sensor / film  # from the lens to the image on the axis at `film`, cut at `sensor`
+    shift_px = float(np.ptp(on_sensor)) * math.copysign(1.0, film - sensor) / pitch
+    stack, _ = paint([Board(shift_px / (n * view_px))], (64, 64), n)
+    stack = replace(stack, sensor_px_per_disparity=float(n * view_px))
+    alpha = film / sensor
+    assert (alpha > 1) == (object_m < focus_m)
+    made = refocus.shift_and_add(stack, refocus.disparity_of_alpha(alpha, aperture / pitch, stack))
+    assert psnr(made, stack.middle()) > 42
+    if object_m != focus_m:  # the plane as far on the other side is not sharp
+        other = refocus.shift_and_add(stack, refocus.disparity_of_alpha(1 / alpha, aperture / pitch, stack))
+        assert psnr(other, stack.middle()) < psnr(made, stack.middle()) - 5
+
+
+@pytest.mark.parametrize("alpha", [0.9, 1.0, 1.15])
+def test_magnified_it_is_equation_28_itself(alpha: float) -> None:
+    """E(x, y) = mean of L(u(1 − 1/α) + x/α, v(1 − 1/α) + y/α, u, v), lengths in pixels of a view on the sensor."""
+    n, aperture = 3, 6.0  # px of a view
+    stack, _ = paint([Board(0.3)], (64, 64), n)
+    stack = replace(stack, sensor_px_per_disparity=float(n))  # one sensor pixel a pixel of a view
     y, x = np.mgrid[0:64, 0:64] - 31.5
     total = np.zeros((64, 64))
-    for v in (-1, 0, 1):
-        for u in (-1, 0, 1):
+    for row, v in enumerate(np.array([-1, 0, 1]) * aperture / n):
+        for column, u in enumerate(np.array([-1, 0, 1]) * aperture / n):
             at = [v * (1 - 1 / alpha) + y / alpha + 31.5, u * (1 - 1 / alpha) + x / alpha + 31.5]
-            total += ndimage.map_coordinates(views[v + 1, u + 1], at, order=5, mode="nearest")
-    same_size = refocus.shift_and_add(cameras(views), refocus.disparity_of_alpha(alpha))
-    made = refocus.magnified(same_size, alpha)
+            total += ndimage.map_coordinates(stack.views[row, column], at, order=5, mode="nearest")
+    made = refocus.magnified(refocus.shift_and_add(stack, refocus.disparity_of_alpha(alpha, aperture, stack)), alpha)
     known = np.isfinite(made)
-    assert known[INNER].mean() > (0.4 if alpha < 1 else 0.99)
+    assert known[INNER].mean() > (0.6 if alpha < 1 else 0.99)
     assert np.abs(made - total / 9)[INNER][known[INNER]].max() < 0.02
-    assert psnr(same_size, refocus.shift_and_add(stack, 1 / alpha - 1)) > 100
 
 
 @pytest.mark.parametrize("alpha", [0.0, -1.0, math.nan, math.inf])
 def test_an_alpha_that_is_no_plane_is_told(alpha: float) -> None:
     with pytest.raises(DecodeError, match="is not an image plane"):
-        refocus.disparity_of_alpha(alpha)
+        refocus.disparity_of_alpha(alpha, 100.0, replace(ramps(0.0), sensor_px_per_disparity=5.0))
+    with pytest.raises(DecodeError, match="views from a folder have no sensor"):
+        refocus.disparity_of_alpha(1.1, 100.0, ramps(0.0))
 
 
 def test_colours_are_refocused_each() -> None:

@@ -25,13 +25,15 @@ _UNKNOWN = 205
 @dataclass(frozen=True, slots=True)
 class Mosaic:
     """All views side by side, sRGB bytes on one scale. `tile` is the (height, width) of one, reduced by the whole
-    number `scale`; a disparity of `scale` moves a view by its step (of `row_steps`, `column_steps`) in tile pixels."""
+    number `scale`; a disparity of `scale` moves a view by its step (of `row_steps`, `column_steps`) in tile pixels.
+    `sensor_px_per_disparity` as that of the stack."""
 
     picture: Grey
     tile: tuple[int, int]
     scale: int
     row_steps: NDArray[np.float64]
     column_steps: NDArray[np.float64]
+    sensor_px_per_disparity: float | None = None
 
 
 def small(image: NDArray[np.floating], longest_side: int) -> NDArray[np.float32]:
@@ -107,7 +109,7 @@ def views_mosaic(stack: ViewStack) -> Mosaic:
             view = stack.views[row, column][: height * step, : width * step]
             mean = view.reshape(height, step, width, step).mean(axis=(1, 3))
             out[row * height : (row + 1) * height, column * width : (column + 1) * width] = encoded(mean / white)
-    return Mosaic(out, (height, width), step, stack.row_steps, stack.column_steps)
+    return Mosaic(out, (height, width), step, stack.row_steps, stack.column_steps, stack.sensor_px_per_disparity)
 
 
 def refocused(mosaic: Mosaic, disparity: float) -> Grey:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -80,7 +81,8 @@ class Studio:
         return pictures.shown(_stack(message)[0].real)
 
     def views(self, message: Message) -> tuple[dict[str, Any], bytes]:
-        """The mosaic of the views as JPEG, and its layout: size and place of each view, and the source of the phases.
+        """The mosaic of the views as JPEG, and its layout: size and place of each view, the source of the phases,
+        and the lens' aperture in disparities.
 
         Raises StudioError for a frame without views.
         """
@@ -93,6 +95,7 @@ class Studio:
                 "row_steps": np.round(made.row_steps, 6).tolist(),
                 "column_steps": np.round(made.column_steps, 6).tolist(),
                 "source": source,
+                "aperture": self._aperture(message.header, made),
             }
             return layout, pictures.jpeg(made.picture, 92)
 
@@ -141,6 +144,15 @@ class Studio:
             return pictures.views_mosaic(ViewStack.of(field)), str(field.attributes["views_from"])
 
         return self._once(message, "mosaic", make)
+
+    def _aperture(self, header: Mapping[str, Any], made: Mosaic) -> float | None:
+        """The lens' aperture as a disparity, for the α of Eq 28; None where lens or camera are unknown."""
+        try:
+            sensor = profiles.camera(header["camera"]).sensor(tuple(header["frame_shape"]))
+        except DappledError:
+            return None
+        length, stop, one = header["focal_length_mm"], header["f_number"], made.sensor_px_per_disparity
+        return length / stop / math.hypot(*sensor.column_mm) / one if length and stop and one else None
 
     def _light_field(self, message: Message) -> LightField:
         header = message.header

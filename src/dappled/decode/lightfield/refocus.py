@@ -1,8 +1,9 @@
 """Refocus by shift and add (Eq 28 and 29): on any α, disparity or plane, in focal stacks, for two eyes.
 
-Eq 29 sums L(u(1 − 1/α) + x/α, v(1 − 1/α) + y/α, u, v) over the views. u and v count views from the middle, x and y
-pixels of a view from the picture's middle, as in the thesis. α > 1 moves the focus into the background, α < 1 into
-the foreground; the plane in focus is that of disparity 1/α − 1.
+Eq 28 puts the film at α times its distance F from the lens: a ray from aperture point u to x on that film crosses
+the sensor at u(1 − 1/α) + x/α, all lengths in mm. Over the whole aperture A a point that is sharp on that film moves
+over the sensor by A(1 − 1/α). So α > 1 is nearer than the focus and α < 1 farther, and F itself is not needed. Pixels
+from view to view are called disparity here, never α: an α that counts views would depend on how many there are.
 """
 
 from __future__ import annotations
@@ -23,11 +24,17 @@ _SHARPNESS_BOX = 5  # px: the side of the box that sharpness is averaged over, t
 _LEAST_WEIGHT = 1e-6  # of all views: a pixel that less is seen of is unknown
 
 
-def disparity_of_alpha(alpha: float) -> float:
-    """The disparity 1/α − 1 that Eq 29 brings into focus. Raises DecodeError for an α that is not an image plane."""
+def disparity_of_alpha(alpha: float, aperture_px: float, stack: ViewStack) -> float:
+    """The disparity that a film at α times its distance has in focus (Eq 28): A(1 − 1/α) over the whole aperture.
+
+    `aperture_px` is the diameter A in columns of the sensor. Raises DecodeError for an α that is not an image plane,
+    and for views without a sensor.
+    """
     if not (math.isfinite(alpha) and alpha > 0):
         raise DecodeError(f"α = {alpha:g} is not an image plane: it must be above 0 (1 leaves the focus where it was)")
-    return 1 / alpha - 1
+    if stack.sensor_px_per_disparity is None:
+        raise DecodeError("views from a folder have no sensor, so they have no α: give --disparity")
+    return aperture_px * (1 - 1 / alpha) / stack.sensor_px_per_disparity
 
 
 def shift_and_add(

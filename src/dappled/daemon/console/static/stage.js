@@ -150,7 +150,8 @@ export class Stage {
 
   draw() {
     const disparity = Number($("disparity").value);
-    const alpha = disparity > -1 ? `, α ${fixed(1 / (1 + disparity), 2)}` : "";
+    const share = this.layout?.aperture ? disparity / this.layout.aperture : 1;   // Eq 28: 1 − 1/α of the aperture
+    const alpha = share < 1 ? `, α ${fixed(1 / (1 - share), 4)}` : "";
     $("disparity-text").textContent = `${disparity > 0 ? "+" : ""}${fixed(disparity, 2)} px${alpha}`;
     if (this.tab !== "refocus" || !this.layout) return;
     if (this.bitmap && this.refocus) this.refocus.draw(disparity);
