@@ -234,6 +234,10 @@ class MaskDecoder:
             "f_number": f_number,
             "mask_distance_mm": self._distance(focal_length_mm),
             "calibrated": self.calibration is not None,
+            "padded": list(spectrum.padded),
+            "level": spectrum.level,
+            "band": list(size),
+            "taper": self.taper,
             **known,
         }
         return light_field(slices, made, offsets, shape=plane.shape, report=report, facts=facts), report

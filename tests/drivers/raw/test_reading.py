@@ -5,6 +5,7 @@ import mmap
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,13 @@ def test_bytes_come_in_any_form(tmp_path: Path) -> None:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) as mapped:
         for source in (path, str(path), data, memoryview(data), mapped):
             np.testing.assert_array_equal(read(source).mosaic, values)
+
+
+def test_levels_are_plain_values_in_the_places_of_the_pattern() -> None:
+    raw = replace(read(dng(mosaic())), black=(1.0, 2.0, 3.0, 4.0), white=100.0)
+    assert raw.levels() == {"cfa": ["RG", "GB"], "black": [[1.0, 2.0], [4.0, 3.0]], "white_level": 100.0}
+    grey = replace(raw, cfa=None, colour_names=(), black=7.0)
+    assert grey.levels() == {"cfa": None, "black": [[7.0]], "white_level": 100.0}
 
 
 def png(values: NDArray[Any], **options: Any) -> bytes:

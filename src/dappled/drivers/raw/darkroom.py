@@ -231,6 +231,8 @@ class Darkroom:
             "camera": self.camera_name(raw.camera_model),
             "mask": self.recipe.mask,
             "decoded_from": "grey" if raw.cfa is None else "mosaic",
+            **raw.levels(),
+            "corrected_by": [name for name in ("dark", "white") if getattr(self.recipe, name)],
             **(self._ranging if views and not dropped else {}),
         }
         made = DecodeResult(light_field, report, raw, ms, search, doubt, doubt_of(decoder))

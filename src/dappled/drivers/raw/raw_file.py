@@ -94,6 +94,18 @@ class RawFile:
             **known,
         )
 
+    def levels(self) -> dict[str, Any]:
+        """Return what makes the mosaic linear, as plain values: colour pattern, black level of each place, white.
+
+        `cfa` holds the rows of the pattern in letters, as ["RG", "GB"], None for a single colour; `black` its levels in
+        the same rows, [[level]] for a single colour.
+        """
+        by_index = np.broadcast_to(np.asarray(self.black, dtype=np.float64), (max(1, len(self.colour_names)),))
+        if self.cfa is None:
+            return {"cfa": None, "black": [[float(by_index[0])]], "white_level": self.white}
+        rows = ["".join(self.colour_names[index] for index in row) for row in self.cfa.tolist()]
+        return {"cfa": rows, "black": by_index[self.cfa].tolist(), "white_level": self.white}
+
     def exposure_settings(self) -> ExposureSettings:
         """Return camera and exposure alone."""
         return ExposureSettings(
