@@ -160,7 +160,7 @@ def test_image_indices_go_on_after_a_prune(closed: Path, tmp_path: Path) -> None
 def test_a_second_prune_finds_nothing_to_do_and_proves_the_copy_again(closed: Path, tmp_path: Path) -> None:
     go(closed, tmp_path / "disk", prune=True)
     again = go(closed, tmp_path / "disk", prune=True)
-    assert (again.pruned, again.copied) == (0, 2)  # ledger and seals, which tell of the first prune
+    assert (again.pruned, again.copied) == (0, 0)
     assert check(closed).problems == check(again.destination).problems == ()
     flip(again.destination / "frames" / "000001.cr2", 7)
     with pytest.raises(FlightError, match=r"000001.cr2 differs from what the ledger says"):
@@ -264,7 +264,7 @@ def test_what_is_there_already_is_read_back_from_the_disk_too(
     for path in (copy, *copy.rglob("*"), tmp_path / "disk"):
         found = path.stat()
         assert (found.st_dev, found.st_ino) in synced, path
-    assert sorted(read) == sorted(path.name for path in copy.rglob("*") if path.is_file())
+    assert set(read) == {path.name for path in copy.rglob("*") if path.is_file()}
 
 
 def test_a_copy_that_can_be_read_from_memory_only_proves_nothing(

@@ -106,6 +106,14 @@ def _offloaded_before(place: Path) -> None:
     shutil.copytree(flight, place / "disk" / flight.name)
 
 
+def _worked_on_at_the_copy(place: Path) -> None:
+    """The copy is there already, and was geotagged there since."""
+    _offloaded_before(place)
+    (copy,) = layout.flights(place / "disk")
+    with seals.work(copy, clock(), "geotag", "geotags flights in", None):
+        geotags.write(copy.path, Mounting())
+
+
 def _offload(place: Path, say: Say) -> None:
     places.file_system = lambda fd: "ext4"
     for flight in flown(place):
@@ -267,6 +275,7 @@ def _recover(place: Path, say: Say) -> None:
 VERBS = {
     "offload": Verb(_to_offload, _offload, _offload_settled),
     "offload of what is there already": Verb(_offloaded_before, _offload, _offload_settled),
+    "offload after work at the copy": Verb(_worked_on_at_the_copy, _offload, _offload_settled),
     "pickup": Verb(_to_pick_up, _pick_up, _picked_up),
     "geotag": Verb(_to_tag, _geotag, _geotagged),
     "late tags": Verb(_untagged, _tag_late, _tagged_late),

@@ -10,7 +10,7 @@ import json
 import sqlite3
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -364,6 +364,15 @@ class Ledger(LedgerReader):
         """Store a value that holds for the whole flight; replaces an earlier one."""
         with self._transaction():
             self._fact(key, value)
+
+    def adopt(self, rows: Mapping[str, Iterable[Sequence[Column]]], text: str) -> None:
+        """Add rows of a later state of this ledger, by table, with the links that they have there; `text` says so."""
+        with self._transaction():
+            for table, some in rows.items():
+                for row in some:
+                    marks = ", ".join("?" * len(row))
+                    self._db.execute(f"INSERT OR REPLACE INTO {table} VALUES ({marks})", row)  # noqa: S608  our own names
+            self._event("brought home", text, None)
 
     def fold(self) -> None:
         """Fold the WAL into the file, which then stays as it is until the next row. Raises FlightError where another

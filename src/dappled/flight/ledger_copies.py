@@ -5,16 +5,21 @@ from __future__ import annotations
 import hashlib
 import os
 import sqlite3
+from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 
 from dappled import durable
 from dappled.bounds.claims import ClaimError, check_size
 from dappled.flight import seals
+from dappled.flight.chain import Column
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.pruning import Proved
+from dappled.flight.tables import KEYS
 from dappled.flight.trees import FileIdentity, Tree
 
+_TABLES = "SELECT name FROM sqlite_master WHERE type = 'table'"
 _GROWS = ("chain", "frames", "companions", "strays", "poses", "tags", "results", "events")
 """Tables whose rows are added and never changed. Of shots the state changes, of facts the value."""
 
@@ -25,9 +30,19 @@ def is_part(name: str) -> bool:
     return name in ("flight.sqlite", "flight.sqlite-wal", "flight.sqlite-shm", "seals.jsonl")
 
 
-def bring(source: Tree, there: Tree, name: str) -> tuple[bool, Proved]:
-    """Copy the ledger; (whether it was written, what the copy is). A copy that is an earlier state of the source's is
-    replaced, a later one stays: rows were added to it there.
+@dataclass(frozen=True, slots=True)
+class Brought:
+    """A ledger's copy: whether it was written, what it is now, and which rows it has that the source's lacks, by table:
+    work at the copy added them."""
+
+    written: bool
+    proved: Proved
+    later: Mapping[str, Sequence[Sequence[Column]]]
+
+
+def bring(source: Tree, there: Tree, name: str) -> Brought:
+    """Copy the ledger. A copy that is an earlier state of the source's is replaced, a later one stays: rows were added
+    to it there.
 
     Raises FlightError where each has rows that the other lacks, or a disk refuses.
     """
@@ -43,16 +58,13 @@ def bring(source: Tree, there: Tree, name: str) -> tuple[bool, Proved]:
                 f"{goal} is there already and is no copy of the ledger ({error}): move it away first"
             ) from error
         if theirs == image:
-            return False, _proved(there, name, image)
+            return Brought(False, _proved(there, name, image), {})
         if _within(image, theirs):
-            return False, _proved(there, name, theirs)
+            return Brought(False, _proved(there, name, theirs), _added(image, theirs))
         if not _within(theirs, image):
-            raise FlightError(
-                f"{goal} is there already and differs from {source.path / name}, and each holds what the other lacks: "
-                "move one away first"
-            )
+            raise _apart(source, there, name)
     there.write(name, [image])
-    return True, _proved(there, name, image)
+    return Brought(True, _proved(there, name, image), {})
 
 
 def bring_seals(source: Tree, there: Tree, name: str) -> tuple[bool, Proved] | None:
@@ -66,11 +78,16 @@ def bring_seals(source: Tree, there: Tree, name: str) -> tuple[bool, Proved] | N
     if theirs.startswith(ours):
         return False, _proved(there, name, theirs)
     if not ours.startswith(theirs):
-        raise FlightError(
-            f"{there.path / name} is there already and differs from {source.path / name}: move one away first"
-        )
+        raise _apart(source, there, name)
     there.write(name, [ours])
     return True, _proved(there, name, ours)
+
+
+def _apart(source: Tree, there: Tree, name: str) -> FlightError:
+    return FlightError(
+        f"{there.path / name} is there already and differs from {source.path / name}, and each holds what the other "
+        f"lacks: move {there.path} away, and offload again; where frames were removed here, copy them back first"
+    )
 
 
 class SealedStates:
@@ -128,10 +145,22 @@ def _opened(image: bytes) -> sqlite3.Connection:
 
 
 def _queries(ledger: sqlite3.Connection) -> list[str]:
-    tables = {row[0] for row in ledger.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    tables = {row[0] for row in ledger.execute(_TABLES)}
     whole = [f"SELECT * FROM {table}" for table in _GROWS if table in tables]  # noqa: S608  names of our own
     return [*whole, "SELECT idx, source, kind, sequence, wished_utc_ns FROM shots", "SELECT key FROM facts"]
 
 
-def _rows(ledger: sqlite3.Connection, query: str) -> set[tuple[object, ...]]:
+def _added(earlier: bytes, later: bytes) -> dict[str, list[tuple[Column, ...]]]:
+    """The rows of a later state of a ledger that the earlier one lacks or has otherwise, by table."""
+    with closing(_opened(earlier)) as one, closing(_opened(later)) as other:
+        known, tables = ({row[0] for row in db.execute(_TABLES)} for db in (one, other))
+        found = {}
+        for table in (name for name in (*KEYS, "chain") if name in tables):
+            query = f"SELECT * FROM {table}"  # noqa: S608  names of our own
+            before = _rows(one, query) if table in known else set()
+            found[table] = [row for row in other.execute(query) if row not in before]
+        return {table: rows for table, rows in found.items() if rows}
+
+
+def _rows(ledger: sqlite3.Connection, query: str) -> set[tuple[Column, ...]]:
     return set(ledger.execute(query))

@@ -10,15 +10,16 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 from dappled import durable
 from dappled.clock import Clock
-from dappled.flight import layout, ledger_copies, places, pruning, read_back, seals
+from dappled.flight import later_copy, layout, ledger_copies, places, pruning, read_back, seals
 from dappled.flight.checks import flight_check
 from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.later_copy import Added, Rows
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.ledger_copies import SealedStates
@@ -35,8 +36,9 @@ FACT = "offloaded"  # of flights that a version before 1.0 pruned
 @dataclass(frozen=True, slots=True)
 class Offloaded:
     """What was done. `copied` and `there_already` count files, `size` is their total in bytes; `pruned` counts the
-    files that were removed here. `file_system` is that of the copy, `read_back` how its files were read, and `doubts`
-    are sentences: what this copy can't prove."""
+    files that were removed here, `brought_home` the rows that work at the copy had added to its ledger and that are now
+    here too. `file_system` is that of the copy, `read_back` how its files were read, and `doubts` are sentences: what
+    this copy can't prove."""
 
     flight: str
     destination: Path
@@ -44,6 +46,7 @@ class Offloaded:
     there_already: int
     size: int
     pruned: int
+    brought_home: int
     file_system: str
     read_back: tuple[ReadBack, ...]
     doubts: tuple[str, ...]
@@ -105,28 +108,29 @@ class _Copying:
         states = SealedStates(self._source, self._there, self._folder.seals.name)
         for name in names:
             stands = self._there.stat(name) is not None
-            self._refuse_in_the_way(name, stands)
-            known = self._look(name, states) if stands and not anew else None
+            self._refuse_in_the_way(name)
+            known = self._look(name, states) if stands else None
+            if known is not None and anew and seals.never_changes(name):
+                self._refuse_different(name, known)
+                known = None
             if known is None:
                 known = self._copy(name)
                 fresh.add(name)
             manifest[name] = known
             progress(manifest[name].identity.size)
-        ledger = self._folder.ledger.name
-        written, manifest[ledger] = ledger_copies.bring(self._source, self._there, ledger)
-        fresh |= {ledger} if written else set()
-        seal_file = self._folder.seals.name
-        if (brought := ledger_copies.bring_seals(self._source, self._there, seal_file)) is not None:
-            written, manifest[seal_file] = brought
-            fresh |= {seal_file} if written else set()
+        later = self._bring_ledger(manifest, fresh)
         self._there.sync()
         self._there.sync_above()
         ways, copies = self._prove(manifest, fresh)
         rows = self._acknowledged()
         elsewhere = self._prove_removed(rows, manifest)
         self._check()
+        added = Added(later, self._prove_added(later, {**manifest, **rows}), states.copy_is_later)
+        elsewhere |= added.files
         _write_sums(self._there, {**manifest, **elsewhere})
         doubts = tuple(_doubts(self._there.path, self._system, ways))
+        size = sum(one.identity.size for one in manifest.values())
+        already = len(manifest) - len(fresh)
         pruned = 0
         if prune:
             if "page cache" in ways:
@@ -136,17 +140,64 @@ class _Copying:
                 for name, row in rows.items()
                 if name.startswith("frames/") and name in manifest and manifest[name].sha256 == row.sha256
             }
-            with seals.reopened(self._folder, clock, PRUNES, key) if sure else nullcontext():
-                pruned = pruning.remove(self._folder, self._source, self._there, sure, copies, clock)
-        size = sum(one.identity.size for one in manifest.values())
-        already = len(manifest) - len(fresh)
+            if sure:
+                self._write_down(manifest, copies, sure, added, clock=clock, key=key)
+                _write_sums(self._there, {**manifest, **elsewhere})
+                pruned = pruning.remove(self._source, self._there, sure, copies)
+            else:
+                self._source.remove_part(pruning.RECORD)  # of an attempt that was cut short
+        brought = added.count if pruned else 0
         return Offloaded(
-            self._folder.name, self._there.path, len(fresh), already, size, pruned, self._system, ways, doubts
+            self._folder.name, self._there.path, len(fresh), already, size, pruned, brought, self._system, ways, doubts
         )
 
-    def _refuse_in_the_way(self, name: str, stands: bool) -> None:
+    def _bring_ledger(self, manifest: dict[str, Proved], fresh: set[str]) -> Rows:
+        """Copy ledger and seals, add them to the manifest and, where they were written, to what is `fresh`. Returns the
+        rows that the copy's ledger has and ours lacks."""
+        ledger, seal_file = self._folder.ledger.name, self._folder.seals.name
+        for name in (ledger, seal_file):
+            self._refuse_in_the_way(name)
+        brought = ledger_copies.bring(self._source, self._there, ledger)
+        manifest[ledger] = brought.proved
+        fresh |= {ledger} if brought.written else set()
+        if (seal := ledger_copies.bring_seals(self._source, self._there, seal_file)) is not None:
+            written, manifest[seal_file] = seal
+            fresh |= {seal_file} if written else set()
+        return brought.later
+
+    def _write_down(
+        self,
+        manifest: dict[str, Proved],
+        copies: Mapping[str, FileIdentity | None],
+        sure: Mapping[str, Proved],
+        added: Added,
+        *,
+        clock: Clock,
+        key: SealKey | None,
+    ) -> None:
+        """Before anything is removed: bring home what was added at the copy, write down what will go, seal the flight
+        here, and bring the copy its ledger again, so that work there goes on from it. Raises FlightError."""
+        for name in (self._folder.ledger.name, self._folder.seals.name):
+            if pruning.copy_of(self._there, name) != copies.get(name):
+                raise FlightError(
+                    f"{self._there.path / name} changed while it was checked: nothing was removed; try again"
+                )
+        both = [self._folder, *([FlightFolder(self._there.path)] if added else [])]
+        signs = key if key is not None and all(seals.is_signed(one, key) for one in both) else None
+        if added:
+            added.bring_home(self._folder, self._source, self._there, manifest, clock)
+        known = {**manifest, **self._acknowledged()}
+        with seals.opened_again(self._folder, clock, PRUNES, signs):
+            pruning.note(self._folder, self._there.path, sure, added.files, clock)
+        if self._acknowledged().keys() <= known.keys():  # else a file came meanwhile: the next offload brings both
+            fresh: set[str] = set()
+            self._bring_ledger(manifest, fresh)
+            self._there.sync()
+            self._prove({name: manifest[name] for name in fresh}, fresh)
+
+    def _refuse_in_the_way(self, name: str) -> None:
         """Raise FlightError where something in the copy is the source's own file, or no file."""
-        if not stands:
+        if self._there.stat(name) is None or self._source.stat(name) is None:
             return
         with self._source.reading(name) as mine, self._there.reading(name) as other:
             same = os.path.sameopenfile(mine, other)
@@ -187,6 +238,13 @@ class _Copying:
             if theirs != sha256 and states.has(name, theirs):
                 return None
         return Proved(before, sha256)
+
+    def _refuse_different(self, name: str, known: Proved) -> None:
+        """Raise FlightError where the copy, as another machine gives it, is not what it should be."""
+        with self._there.reading(name) as fd:
+            if durable.hash_descriptor(fd, FileIdentity.of_fd(fd).size) != known.sha256:
+                goal, origin = self._there.path / name, self._source.path / name
+                raise FlightError(f"{goal} is there already and differs from {origin}: move it away first")
 
     def _refuse_changed(self, name: str, before: FileIdentity, after: FileIdentity) -> None:
         if before != after:
@@ -238,6 +296,23 @@ class _Copying:
             if sha256 != rows[name].sha256:
                 raise FlightError(f"{self._there.path / name} differs from what the ledger says: nothing was removed")
             proved[name] = Proved(FileIdentity.of(found), sha256)
+        return proved
+
+    def _prove_added(self, later: Rows, known: Mapping[str, object]) -> dict[str, Proved]:
+        """Read back the files that came to the copy alone (a pickup there). Raises FlightError where one isn't what the
+        ledger of the copy says."""
+        proved: dict[str, Proved] = {}
+        for row in (row for row in later_copy.files(later) if row.name not in known):
+            self._folder.file(row.name)  # confined
+            found = self._there.stat(row.name) if row.name.count("/") == 1 and row.name.startswith("frames/") else None
+            if found is None:
+                raise FlightError(f"the ledger of {self._there.path} names {row.name}, which is no frame there")
+            sha256, _ = self._read_back(row.name)
+            if sha256 != row.sha256:
+                raise FlightError(
+                    f"{self._there.path / row.name} differs from what the ledger there says: nothing was removed"
+                )
+            proved[row.name] = Proved(FileIdentity.of(found), sha256)
         return proved
 
     def _check(self) -> None:

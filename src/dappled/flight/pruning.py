@@ -71,23 +71,12 @@ def removed(folder: FlightFolder) -> dict[str, Removed]:
     return {row.name: row for row in rows}
 
 
-def remove(  # noqa: PLR0917  # the two trees, and what was proved of each
-    folder: FlightFolder,
-    source: Tree,
-    there: Tree,
-    sure: Mapping[str, Proved],
-    copies: Mapping[str, FileIdentity | None],
-    clock: Clock,
-) -> int:
-    """Remove files whose copies were read back from `there`; how many. Each must still be the file that was copied, and
-    its copy the one of `copies`, which was read back.
+def remove(source: Tree, there: Tree, sure: Mapping[str, Proved], copies: Mapping[str, FileIdentity | None]) -> int:
+    """Remove files that `note` has written down; how many. Each must still be the file that was copied, and its copy
+    the one of `copies`, which was read back from `there`.
 
     Raises FlightError where one isn't, a copy has vanished, or a disk refuses; the other files then stay.
     """
-    if not sure:
-        source.remove_part(RECORD)  # of an attempt that was cut short
-        return 0
-    _note(folder, there.path, sure, clock)
     for name, one in sure.items():
         with source.reading(name) as fd:
             _refuse_other(source, name, fd, one)
@@ -105,11 +94,15 @@ def remove(  # noqa: PLR0917  # the two trees, and what was proved of each
     return len(sure)
 
 
-def _note(folder: FlightFolder, there: Path, sure: Mapping[str, Proved], clock: Clock) -> None:
-    """Write down what will be removed: the ledger's event first: an older record has one of its own."""
+def note(
+    folder: FlightFolder, there: Path, sure: Mapping[str, Proved], elsewhere: Mapping[str, Proved], clock: Clock
+) -> None:
+    """Write down which files will be removed (`sure`), and which were never here (`elsewhere`), durably: first the
+    ledger's event; an older record has one of its own. Raises FlightError."""
     now = clock.utc_ns()
     rows = removed(folder) | {
-        name: Removed(name, one.identity.size, one.sha256, str(there), now) for name, one in sure.items()
+        name: Removed(name, one.identity.size, one.sha256, str(there), now)
+        for name, one in {**elsewhere, **sure}.items()
     }
     lines = [
         canonical({"name": row.name, "size": row.size, "sha256": row.sha256, "destination": row.destination,

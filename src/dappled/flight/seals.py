@@ -130,12 +130,20 @@ def reopened(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None =
         return
     signs = key if key is not None and is_signed(folder, key) else None
     _remove_parts(folder)
+    with opened_again(folder, clock, why, signs):
+        yield
+
+
+@contextmanager
+def opened_again(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None) -> Iterator[None]:
+    """Work on a closed flight as `reopened` does, where the caller has judged whether `key` may sign. Raises
+    FlightError."""
     with Ledger(folder.ledger, clock) as ledger:
         ledger.add_event("opened again", why)
     try:
         yield
     finally:
-        seal(folder, clock, why, signs)
+        seal(folder, clock, why, key)
 
 
 def _remove_parts(folder: FlightFolder) -> None:

@@ -1,0 +1,164 @@
+"""Work at a copy, a prune here, and the next offload, in any order: the two ledgers stay one."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from dappled.clock import RecordedClock
+from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Recording, layout, offload, places, seal_key, seals
+from dappled.flight.checks.flight_check import check
+from dappled.flight.later_copy import Added
+from dappled.flight.seal_key import SealKey
+from tests.flight.conftest import START_UTC_NS
+from tests.flight.makers import deliver, mavlink_2, request
+
+CLOCK = RecordedClock(START_UTC_NS)
+
+
+@pytest.fixture(autouse=True)
+def disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The temporary folder is believed to be on ext4, wherever it is."""
+    monkeypatch.setattr(places, "file_system", lambda fd: "ext4")
+
+
+@pytest.fixture
+def closed(flight: Recording) -> Path:
+    """Two frames, and a shot whose file is still on the card."""
+    for index in range(3):
+        request(flight, index)
+    for index in range(2):
+        deliver(flight, index, b"raw %d" % index * 1000)
+    flight.ledger.follows(2, "its file stays at the camera")
+    flight.telemetry.append(1, mavlink_2(b"a"))
+    flight.close()
+    return flight.folder.path
+
+
+def go(flight: Path, there: Path, *, prune: bool = False, key: SealKey | None = None) -> offload.Offloaded:
+    return offload.offload(flight, there, prune=prune, same_device=True, clock=CLOCK, key=key)
+
+
+def geotag(flight: Path, words: bytes, key: SealKey | None = None) -> None:
+    """What `dappled geotag` writes: sidecars, lists, and a seal."""
+    with seals.work(layout.open_folder(flight), CLOCK, "geotag", "geotags flights in", key):
+        (flight / "geotags").mkdir(exist_ok=True)
+        for name in ("frames/000000.cr2.xmp", "geotags/geo.txt"):
+            (flight / name).write_bytes(words)
+
+
+def pick_up(flight: Path) -> None:
+    """What `dappled flight pickup` writes."""
+    folder = layout.open_folder(flight)
+    with seals.work(folder, CLOCK, "pickup", "picks up files into", None):
+        (folder.frames / "000002.cr2").write_bytes(b"late")
+        late = hashlib.sha256(b"late").hexdigest()
+        with Ledger(folder.ledger, CLOCK) as ledger:
+            ledger.safe(Frame(2, "frames/000002.cr2", "A.CR2", 4, late, 1))
+
+
+def alike(flight: Path, copy: Path) -> bool:
+    """Whether ledger and seals are the same here and there."""
+    return all((flight / name).read_bytes() == (copy / name).read_bytes() for name in ("flight.sqlite", "seals.jsonl"))
+
+
+def test_work_at_the_copy_comes_home_with_a_prune(closed: Path, tmp_path: Path) -> None:
+    copy = go(closed, tmp_path / "disk").destination
+    geotag(copy, b"only there")
+    done = go(closed, tmp_path / "disk", prune=True)
+    assert (done.pruned, done.brought_home) == (2, 4)  # an event, a fact, and the link of each
+    assert (closed / "frames/000000.cr2.xmp").read_bytes() == (closed / "geotags/geo.txt").read_bytes() == b"only there"
+    assert alike(closed, copy)
+    assert check(copy).problems == check(closed).problems == ()
+    pick_up(closed)  # work here goes on from it
+    done = go(closed, tmp_path / "disk", prune=True)
+    assert (done.pruned, done.brought_home) == (1, 0)
+    assert sorted(os.listdir(copy / "frames")) == ["000000.cr2", "000000.cr2.xmp", "000001.cr2", "000002.cr2"]
+    assert check(copy).problems == check(closed).problems == ()
+
+
+def test_work_at_the_copy_after_a_prune_goes_on_from_it(closed: Path, tmp_path: Path) -> None:
+    """The usual order: frames are removed here, and then geotagged where they are."""
+    copy = go(closed, tmp_path / "disk", prune=True).destination
+    assert alike(closed, copy)
+    geotag(copy, b"there")
+    assert go(closed, tmp_path / "disk").copied == 0
+    assert go(closed, tmp_path / "disk", prune=True).pruned == 0
+    assert (copy / "geotags/geo.txt").read_bytes() == b"there"
+    assert check(copy).problems == check(closed).problems == ()
+
+
+def test_a_frame_that_came_to_the_copy_alone_is_known_here_to_be_there(closed: Path, tmp_path: Path) -> None:
+    copy = go(closed, tmp_path / "disk").destination
+    pick_up(copy)
+    assert go(closed, tmp_path / "disk", prune=True).pruned == 2
+    report = check(closed)
+    assert (report.problems, report.offloaded) == ((), 3)
+    with LedgerReader.open(closed / "flight.sqlite") as ledger:
+        assert [frame.index for frame in ledger.frames()] == [0, 1, 2]
+    (copy / "frames" / "000002.cr2").unlink()
+    with pytest.raises(FlightError, match=r"000002.cr2 was offloaded to .* and removed here, and .* lacks it"):
+        go(closed, tmp_path / "disk")
+
+
+@pytest.mark.parametrize("signs", [True, False])
+def test_a_prune_signs_what_the_key_signed_there(closed: Path, tmp_path: Path, signs: bool) -> None:
+    seal_key.make(tmp_path / "key")
+    key = seal_key.load(tmp_path / "key")
+    seals.seal(layout.open_folder(closed), CLOCK, "a test", key)
+    copy = go(closed, tmp_path / "disk").destination
+    geotag(copy, b"there", key if signs else None)
+    go(closed, tmp_path / "disk", prune=True, key=key)
+    assert check(closed, key).vouched == check(copy, key).vouched == ("signed" if signs else "not signed")
+
+
+def test_a_crash_while_work_comes_home_is_finished_by_the_next_call(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = go(closed, tmp_path / "disk").destination
+    geotag(copy, b"there")
+    for step in ("adopt", "add_event"):
+        with monkeypatch.context() as dying:
+            dying.setattr(Ledger, step, lambda *_: 1 / 0)
+            with pytest.raises(ZeroDivisionError):
+                go(closed, tmp_path / "disk", prune=True)
+        assert sorted(os.listdir(closed / "frames")) == ["000000.cr2", "000000.cr2.xmp", "000001.cr2"]
+    assert go(closed, tmp_path / "disk", prune=True).pruned == 2
+    assert alike(closed, copy)
+    assert check(copy).problems == check(closed).problems == ()
+
+
+def test_two_that_went_apart_are_refused_and_the_way_home_that_is_told_leads_there(
+    closed: Path, tmp_path: Path
+) -> None:
+    copy = go(closed, tmp_path / "disk", prune=True).destination
+    geotag(copy, b"there")
+    geotag(closed, b"here")
+    with pytest.raises(FlightError, match=r"move .* away, and offload again; .* copy them back first"):
+        go(closed, tmp_path / "disk", prune=True)
+    copy.rename(tmp_path / "away")
+    for path in (tmp_path / "away" / "frames").glob("*.cr2"):
+        shutil.copy(path, closed / "frames")
+    done = go(closed, tmp_path / "disk", prune=True)
+    assert done.pruned == 2
+    assert check(copy).problems == check(closed).problems == ()
+
+
+def test_nothing_was_added() -> None:
+    assert not Added({}, {}, seals=False)
+
+
+def test_a_different_frame_on_another_machine_is_not_written_over(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over a network a prune writes every file anew; what is there may be the better one."""
+    monkeypatch.setattr(places, "file_system", lambda fd: "nfs4")
+    copy = go(closed, tmp_path / "disk").destination
+    (closed / "frames" / "000000.cr2").write_bytes(b"rotten")
+    with pytest.raises(FlightError, match=r"000000.cr2 is there already and differs from"):
+        go(closed, tmp_path / "disk", prune=True)
+    assert (copy / "frames" / "000000.cr2").read_bytes() == b"raw 0" * 1000
