@@ -55,8 +55,8 @@ faults: setup ## run every camera fault against the daemon in 20 rounds; ROUNDS=
 	@for round in $$(seq $(or $(ROUNDS),20)); do echo "== round $$round"; \
 	  $(BIN)/pytest -q -p no:cacheprovider -m "" tests/system/test_camera_faults.py || exit 1; done
 
-bench: setup ## run the benchmarks behind the performance figures
-	@for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
+bench: setup ## run the benchmarks, print one table with the limits, write docs/performance.md; REPEATS=n
+	@$(BIN)/python benchmarks/table.py --page --repeats $(or $(REPEATS),1)
 
 lock: setup ## resolve the locks anew from pyproject.toml: everything, the peers of tests, and what flies
 	@uv=$$(command -v uv || echo .tools/bin/uv); $$uv pip compile -q --universal --python-version 3.11 --generate-hashes \

@@ -25,6 +25,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import tomli_w
+from limits import show
 
 from dappled.config import profiles
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
@@ -157,7 +158,6 @@ def main() -> None:
                 ways["pool of 2"].append(timed(fresh, lambda some: workers.in_processes(some, batch.make, 2), 4))
                 ways["dask of 2"].append(timed(fresh, lambda some: workers.on_cluster(some, batch.make, url), 4))
     one, two, cluster = (ways[way] for way in ways)
-    each = {way: statistics.median(t[0] for t in runs) / arguments.frames for way, runs in ways.items()}
     peak = {way: max(t[2] for t in runs) for way, runs in ways.items()}
     result = {
         "frames": arguments.frames,
@@ -171,13 +171,7 @@ def main() -> None:
         "cpu_seconds_per_frame": {way: min(t[3] for t in runs) for way, runs in ways.items()},
         "peak_mb_per_worker": peak,
     }
-    if arguments.json:
-        print(json.dumps(result, indent=1))
-        return
-    for way in ways:
-        print(f"{way}: {each[way]:.2f} s a frame, {peak[way]:.0f} MB")
-    print(f"two workers are {result['two_workers_over_one']:.2f} × as fast as one (wanted: 1.7)")
-    print(f"dask takes {result['dask_over_pool']:.2f} × the pool's time (wanted: at most 1.15)")
+    show("batch", result, as_json=arguments.json)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import math
 import os
 import statistics
@@ -26,6 +25,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+from limits import show
 
 from dappled import durable
 from dappled.clock import SystemClock
@@ -209,21 +210,7 @@ def main() -> None:
             "stall": stall(),
             "trigger": trigger(arguments.shots),
         }
-    if arguments.json:
-        print(json.dumps(told, indent=2))
-        return
-    file, fired = told["file"], told["trigger"]
-    print(f"load before: {told['load']:.2f}; niceness {told['niceness']} (the service has -5)")
-    print(
-        f"17.6 MB from the body to safe: {file['body_to_safe_mb_s']:.0f} MB/s; a plain copy with fsync "
-        f"{file['plain_copy_mb_s']:.0f} MB/s; ratio {file['ratio']:.2f} (at least 0.6)"
-    )
-    print(f"memory of the driver's process for it: {file['memory_per_file_size']:.2f} × the file (at most 3)")
-    print(
-        f"fire to trigger call, cores loaded: median {fired['median_ms']:.2f} ms, p99 {fired['p99_ms']:.2f} ms "
-        f"(at most 5), worst {fired['worst_ms']:.2f} ms of {fired['shots']}"
-    )
-    print(f"longest stall beside a silent body: {told['stall']['longest_ms']:.1f} ms (at most 50)")
+    show("camera", told, as_json=arguments.json)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ where only this program was late to read it.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import socket
@@ -28,6 +27,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import tomli_w
+from limits import show
 
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
@@ -37,14 +37,6 @@ from dappled.mocks.simulation import Simulation, World, free_port
 
 SO_TIMESTAMPNS = 35
 RATE_HZ = 200
-LIMITS = {
-    "ack_ms_decoding_p99": 20.0,
-    "ack_ms_decoding_max": 50.0,
-    "ack_ms_camera_hung_p99": 20.0,
-    "ack_ms_camera_hung_max": 50.0,
-    "request_to_trigger_call_ms_p99": 10.0,
-    "cpu_share_at_1000_per_s": 0.25,
-}
 
 
 def main() -> None:
@@ -57,12 +49,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="dpl-") as folder:
         figures |= idle_share(Path(folder) / "share", wanted.seconds)
         figures |= under_load(Path(folder) / "load", wanted.seconds, wanted.nice)
-    if wanted.json:
-        print(json.dumps(figures))
-    else:
-        for name, value in figures.items():
-            limit = f"   (at most {LIMITS[name]:g})" if name in LIMITS else ""
-            print(f"{name:44} {value:10.3f}{limit}")
+    show("mavlink", figures, as_json=wanted.json)
 
 
 def idle_share(folder: Path, seconds: float) -> dict[str, float]:

@@ -13,7 +13,6 @@ predicted from its neighbours.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import random
 import statistics
@@ -21,6 +20,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path as File
 from typing import TypeVar
+
+from limits import show
 
 from dappled.daemon.navigation import BodyLatency, CameraClock, ExposureTime, Telemetry, navigation
 from dappled.daemon.navigation.clocks import exposure_from_camera, mid_exposure
@@ -71,11 +72,7 @@ def main() -> None:
     figures = (
         leave_one_out(arguments.log, arguments.stride) if arguments.log else measure(arguments.frames, arguments.seed)
     )
-    if arguments.json:
-        print(json.dumps(figures))
-        return
-    for name, row in figures.items():
-        print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in row.items()))
+    show("pose", figures, as_json=arguments.json)
 
 
 def measure(frames: int, seed: int) -> dict[str, dict[str, float]]:

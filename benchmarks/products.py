@@ -7,7 +7,6 @@ what all threads together took, which a busy machine changes less.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -17,6 +16,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the painted scenes are the tests' own
 
+from limits import show
 from tests.decode.scenes import boards, paint
 
 from dappled.decode.depth import DepthMap, estimate, evidence
@@ -34,8 +34,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=ROUNDS, help=f"measurements each (default: {ROUNDS})")
     parser.add_argument("--workers", type=int, default=WORKERS, help=f"threads (default: {WORKERS})")
     arguments = parser.parse_args()
-    found = figures(arguments.rounds, arguments.workers)
-    print(json.dumps(found, indent=2) if arguments.json else "\n".join(f"{k:42} {v:.4g}" for k, v in found.items()))
+    show("products", figures(arguments.rounds, arguments.workers), as_json=arguments.json)
 
 
 def figures(rounds: int, workers: int) -> dict[str, float]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import multiprocessing
 import os
 import signal
@@ -26,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from limits import show
 from numpy.typing import NDArray
 
 from dappled.clock import TimeOfDayClock
@@ -40,14 +40,6 @@ HUNG = 3
 RAW_BYTES = 17_000_000
 DEADLINE_S = 60.0
 SPAWN = multiprocessing.get_context("spawn")
-LIMITS = {  # what is wanted of those figures that are a promise
-    "ipc_over_memcpy": "at least 0.4",
-    "record_crowd_over_alone": "at most 1.05",
-    "shot_note_crowd_over_alone": "at most 1.05",
-    "most_frames_kept_for_the_hung": "at most 4",
-    "safe_to_received_less_decode_median_ms": "at most 15",
-    "frames_of_a_subscriber_started_again": "1",
-}
 UNIT_NICENESS = -5  # systemd/dappled.service
 
 
@@ -65,11 +57,7 @@ def main() -> None:
             **hung(root, arguments.rounds),
             **latency(root, arguments.frames),
         }
-    if arguments.json:
-        print(json.dumps(figures))
-    else:
-        for name, value in figures.items():
-            print(f"{name:44} {value:10.3f}{f'   wanted: {LIMITS[name]}' if name in LIMITS else ''}")
+    show("publish", figures, as_json=arguments.json)
 
 
 def stack(seed: int) -> NDArray[np.complex64]:

@@ -7,7 +7,6 @@ python benchmarks/record.py --sustained 300 [--json] [--directory DIR]      4 fr
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
 import tempfile
@@ -18,6 +17,7 @@ from functools import partial
 from pathlib import Path
 
 import sustained
+from limits import show
 
 from dappled.clock import TimeOfDayClock
 from dappled.drivers.camera import Blob
@@ -40,11 +40,7 @@ def main() -> None:
             figures = sustained.measure(Path(folder), arguments.sustained, 4.0, 11_000_000, decode_s=2.0)
         else:
             figures = measure(Path(folder), arguments.megabytes * 1_000_000, arguments.rounds, arguments.pause)
-    if arguments.json:
-        print(json.dumps(figures))
-    else:
-        for name, value in figures.items():
-            print(f"{name:32} {value:10.3f}")
+    show("sustained" if arguments.sustained else "record", figures, as_json=arguments.json)
 
 
 def measure(root: Path, size: int, rounds: int, pause_s: float) -> dict[str, float]:

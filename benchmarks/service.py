@@ -11,7 +11,6 @@ the daemon and its children: shared pages count once.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
 import signal
@@ -25,6 +24,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import tomli_w
+from limits import show
 
 from dappled.config import settings as configuration
 from dappled.mocks.simulation import Simulation, World
@@ -50,11 +50,7 @@ def main() -> int:
             told |= measure("with_camera_and_link", full, folder, wanted.seconds)
     for where in ("alone", "with_camera_and_link"):
         told[f"{where}_ready_of_import"] = told[f"{where}_ready_s"] / told["imports_s"]
-    if wanted.json:
-        print(json.dumps(told, indent=1))
-    else:
-        for key, value in told.items():
-            print(f"{key:40} {value:9.3f}")
+    show("service", told, as_json=wanted.json)
     return 0
 
 

@@ -10,7 +10,6 @@ compared.
 from __future__ import annotations
 
 import argparse
-import json
 import mmap
 import os
 import queue
@@ -24,6 +23,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # sink and poses are the tests' own
 
+from limits import show
 from tests.daemon.fakes import FlightSink, NoPoses
 
 from dappled.clock import SystemClock
@@ -115,11 +115,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=wanted.directory) as folder:
         size = round(wanted.megabytes * 1e6)
         figures = measure(Path(folder), wanted.seconds, wanted.rate, size, decode_s=wanted.decode_s)
-    if wanted.json:
-        print(json.dumps(figures))
-    else:
-        for name, value in figures.items():
-            print(f"{name:32} {value:12.3f}")
+    show("sustained", figures, as_json=wanted.json)
 
 
 def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: float) -> dict[str, float]:

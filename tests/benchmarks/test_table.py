@@ -1,0 +1,101 @@
+"""The benchmarks' table: a limit can be missed, a figure can be missing, and both end 1."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+sys.path.insert(0, str(FOLDER))  # they are programs, not a package
+
+from limits import Limit, flat, read_limits  # noqa: E402  # once their folder is known
+from table import Row, measured, page  # noqa: E402  # the same
+
+
+def limit(at_most: float | None = None, at_least: float | None = None, noise: float = 0.1) -> Limit:
+    return Limit("decode", "ratio", "a ratio", "SciPy", at_most, at_least, noise)
+
+
+@pytest.mark.parametrize(
+    ("asked", "value", "spread", "verdict"),
+    [
+        (limit(at_most=1.5), 1.49, 0.0, "ok"),
+        (limit(at_most=1.5), 1.60, 0.0, "within noise"),
+        (limit(at_most=1.5), 1.70, 0.0, "missed"),
+        (limit(at_most=1.5), 1.70, 0.3, "within noise"),
+        (limit(at_least=20.0), 17.0, 0.0, "missed"),
+        (limit(at_least=20.0), 19.0, 0.0, "within noise"),
+        (limit(at_least=0.8, at_most=1.2), 0.5, 0.0, "missed"),
+        (limit(at_least=0.8, at_most=1.2), 1.0, 0.0, "ok"),
+        (limit(at_most=0.0, noise=0.0), 1.0, 0.0, "missed"),
+        (limit(), 7.0, 0.0, ""),
+    ],
+)
+def test_a_limit_is_missed_beyond_its_noise(asked: Limit, value: float, spread: float, verdict: str) -> None:
+    assert Row(asked, value, spread, None).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("asked", "value", "words", "worse"),
+    [
+        (limit(at_most=1.5), 1.30, "+30%", True),
+        (limit(at_most=1.5), 0.70, "-30%", False),
+        (limit(at_least=0.1), 0.70, "-30%", True),
+        (limit(at_most=1.5), 1.05, "same", False),
+    ],
+)
+def test_a_change_counts_beyond_the_noise(asked: Limit, value: float, words: str, worse: bool) -> None:
+    row = Row(asked, value, 0.0, 1.0)
+    assert (row.changed, row.worse) == (words, worse)
+
+
+def test_median_spread_and_what_no_run_gave() -> None:
+    other = Limit("decode", "gone", "", "", None, None, 0.1)
+    rows, missing = measured([limit(), other], {"decode": [{"ratio": 1.0}, {"ratio": 1.4}, {"ratio": 1.1}]}, {})
+    assert [row.value for row in rows] == [1.1]
+    assert [row.spread for row in rows] == pytest.approx([0.2])
+    assert missing == ["decode.gone"]
+
+
+def test_nested_figures_by_their_path() -> None:
+    assert dict(flat({"a": {"b": 1, "c": {"d": 2.5}}, "word": "x"})) == {"a.b": 1.0, "a.c.d": 2.5}
+
+
+def test_every_limit_names_a_benchmark_and_every_ratio_its_anchor() -> None:
+    for one in read_limits():
+        assert (FOLDER / f"{one.benchmark}.py").is_file(), one.name
+        assert one.anchor or "_over_" not in one.figure, one.name
+
+
+def test_the_page_marks_what_is_missed() -> None:
+    on: dict[str, str | int | float] = {"model": "m", "cores": 2, "python": "3", "date": "d", "load_before": 0}
+    text = page(
+        [Row(limit(at_most=1.5), 1.7, 0.0, None)],
+        on,
+        1,
+    )
+    assert "| a ratio | SciPy | 1.7 |  | at most 1.5 | **missed** |  |" in text
+
+
+def test_a_benchmark_that_fails_ends_1(tmp_path: Path) -> None:
+    """The programs copied beside one that fails: as somebody would run it."""
+    for name in ("limits.py", "table.py"):
+        (tmp_path / name).write_text((FOLDER / name).read_text(encoding="utf-8"), encoding="utf-8")
+    (tmp_path / "limits.toml").write_text(
+        '[good.ratio]\ntext = "r"\nat_most = 2\nnoise = 0.1\n[bad.ratio]\ntext = "b"\nnoise = 0.1\n', encoding="utf-8"
+    )
+    (tmp_path / "good.py").write_text("print('{\"ratio\": 3}')", encoding="utf-8")
+    (tmp_path / "bad.py").write_text("raise SystemExit('no camera was heard')", encoding="utf-8")
+    out = tmp_path / "out.json"
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "table.py"), "--out", str(out)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert "bad: no camera was heard" in done.stderr
+    assert "bad.ratio was not measured" in done.stderr
+    assert "good.ratio is 3, asked is at most 2" in done.stderr
+    assert json.loads(out.read_text(encoding="utf-8"))["figures"] == {"good.ratio": 3.0}
