@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,8 @@ from dappled.decode.geometry import camera_pose
 from dappled.errors import DappledError, counted
 from dappled.flight import layout, seals
 from dappled.flight.seal_key import SealKey
-from dappled.products.geotags import geotags
+from dappled.products.geotags import geotags, marks
+from dappled.products.geotags.marks import Marked
 from dappled.products.maps import earth
 from dappled.products.maps.earth import EarthError, Geoid
 from dappled.products.mounting import Mounting
@@ -28,13 +28,20 @@ from dappled.products.mounting import Mounting
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "example: dappled geotag ~/flights/20261121T101503Z-0a1b2c3d\n"
+        "examples:\n"
+        "  dappled geotag ~/flights/20261121T101503Z-0a1b2c3d\n"
+        "  dappled geotag FLIGHT --pos rover_events.pos --lever-arm 0.05 0 0.12\n"
         "Writes name.ext.xmp beside each frame, and in geotags/\n"
         "geo.txt (OpenDroneMap), pix4d.csv and track.geojson.\n"
         "The frames themselves are not changed."
     )
     parser.add_argument("flight", type=Path, metavar="FLIGHT", help="flight folder")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="write everything into this folder instead")
+    parser.add_argument(
+        "--pos", type=Path, metavar="FILE",
+        help="positions of the camera's marks after PPK (*_events.pos of RTKLIB or Emlid Studio), in place of the "
+        "autopilot's",
+    )  # fmt: skip
     parser.add_argument("--lightroom", action="store_true", help="name sidecars name.xmp instead of name.ext.xmp")
     parser.add_argument("--force", action="store_true", help="replace sidecars that another program wrote")
     parser.add_argument(
@@ -65,6 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     key = sealing.key_of(arguments.config)
     tagged_late = _tag_late(arguments.flight, key)
     mounting, geoid = _mounting(arguments, facts), _geoid(arguments.geoid)
+    marked = marks.find(arguments.flight, arguments.pos, geoid) if arguments.pos else None
     folder = layout.open_folder(arguments.flight)
     clock = TimeOfDayClock()
     into_flight = arguments.output is None
@@ -73,11 +81,13 @@ def run(arguments: argparse.Namespace) -> int:
             arguments.flight,
             mounting,
             geoid=geoid,
+            marked=marked,
             output=arguments.output,
             replace_extension=arguments.lightroom,
             force=arguments.force,
         )
-    found = dict(_copies(arguments.flight, arguments.copies, mounting, geoid)) if arguments.copies else {}
+    made = geotags.copies(arguments.flight, arguments.copies, mounting, geoid, marked) if arguments.copies else ()
+    found = dict(tqdm(made, unit="frame", disable=None, delay=1.0, leave=False))
     copied = [str(path) for path in found.values() if isinstance(path, Path)]
     without_copy = {name: reason for name, reason in found.items() if isinstance(reason, str)}
     if arguments.json:
@@ -92,6 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
                     "copies": copied,
                     "without_copy": without_copy,
                     "geoid": geoid.name if geoid else None,
+                    "marks": _marks_json(marked) if marked else None,
                 },
                 indent=2,
             )
@@ -102,6 +113,8 @@ def run(arguments: argparse.Namespace) -> int:
             words
             + (f", {len(copied)} {'copy' if len(copied) == 1 else 'copies'} with EXIF" if arguments.copies else "")
         )
+    for text in _of_marks(marked) if marked else ():
+        print(text, file=sys.stderr)
     for name in written.without_position:
         print(f"no position is known for {name}", file=sys.stderr)
     for name in written.without_tag:
@@ -124,9 +137,27 @@ def _tag_late(flight: Path, key: SealKey | None) -> list[int]:
     return added
 
 
-def _copies(flight: Path, folder: Path, mounting: Mounting, geoid: Geoid | None) -> Iterable[tuple[str, Path | str]]:
-    made = geotags.copies(flight, folder, mounting, geoid)
-    return tqdm(made, unit="frame", disable=None, delay=1.0, leave=False)
+def _of_marks(marked: Marked) -> list[str]:
+    """Sentences about the matching of marks and frames."""
+    times = f"times agree within {1e3 * marked.spread_s:.1f} ms after {1e3 * marked.offset_s:+.1f} ms"
+    lines = [f"{counted(len(marked.marks), 'frame')} placed by a mark; {times}"]
+    if marked.shift_m:
+        north, east, up = marked.shift_m
+        lines.append(f"marks less autopilot (median): {north:+.2f} m north, {east:+.2f} m east, {up:+.2f} m up")
+    lost = [f"frame {index} has no mark: it keeps the autopilot's position" for index in marked.lost]
+    return [*lines, *lost, *marked.extra, *(f"in doubt: {text}" for text in marked.doubts)]
+
+
+def _marks_json(marked: Marked) -> dict[str, Any]:
+    return {
+        "placed": sorted(marked.marks),
+        "lost": list(marked.lost),
+        "extra": list(marked.extra),
+        "doubts": list(marked.doubts),
+        "offset_s": marked.offset_s,
+        "spread_s": marked.spread_s,
+        "shift_m": None if marked.shift_m is None else dict(zip(("north", "east", "up"), marked.shift_m, strict=True)),
+    }
 
 
 def _mounting(arguments: argparse.Namespace, facts: dict[str, Any]) -> Mounting:

@@ -36,15 +36,15 @@ class Pose:
 
     `attitude` is the unit quaternion (w, x, y, z) from body (forward, right, down) to north-east-down. Sigmas are one
     standard deviation; `position_sigma_m` is horizontal, as a distance. `source` says where the pose comes
-    from: "interpolated", "nearest" (no sample on one side) or "none". `age_ms` is the time from
-    mid-exposure to the nearest position sample. `telemetry_packets` is how many packets of telemetry.tlog were
-    used: a replay stops there too. `gimbal_attitude` is that of a gimbal's head (forward, right, down) to
-    north-east-down, where one reports it; `gimbal_source` names its message. Covariances: the position's in
-    north-east-down, the attitude's in body axes (forward, right, down); an uncertain time adds to them along the
-    motion.
+    from: "interpolated", "nearest" (no sample on one side), "none", or, on the ground only, "mark" (the position is
+    that of a GNSS mark after PPK). `age_ms` is the time from mid-exposure to the nearest position sample.
+    `telemetry_packets` is how many packets of telemetry.tlog were used: a replay stops there too. `gimbal_attitude` is
+    that of a gimbal's head (forward, right, down) to north-east-down, where one reports it; `gimbal_source` names its
+    message. Covariances: the position's in north-east-down, the attitude's in body axes (forward, right, down); an
+    uncertain time adds to them along the motion.
     """
 
-    source: Literal["interpolated", "nearest", "none"]
+    source: Literal["interpolated", "nearest", "none", "mark"]
     utc_ns: int
     boot_us: int | None
     latitude_rad: float | None

@@ -17,6 +17,7 @@ from dappled.decode.geometry.camera_pose import CameraPose
 from dappled.flight import FlightError, Frame, LedgerReader, Tag, disk_error, layout
 from dappled.products.geotags import exif_gps, sidecars
 from dappled.products.geotags.exif_gps import ExifError
+from dappled.products.geotags.marks import Marked
 from dappled.products.maps.earth import Geoid
 from dappled.products.mounting import Mounting
 
@@ -47,20 +48,23 @@ class Written:
     without_tag: tuple[str, ...]
 
 
-def read(flight: Path, mounting: Mounting, geoid: Geoid | None = None) -> tuple[list[Placed], list[str]]:
-    """A flight's tagged frames in order, and the names of frames without a tag. Raises FlightError and EarthError."""
+def read(
+    flight: Path, mounting: Mounting, geoid: Geoid | None = None, marked: Marked | None = None
+) -> tuple[list[Placed], list[str]]:
+    """A flight's tagged frames in order, and the names of frames without a tag. Where a frame has a mark, its time and
+    position are the mark's. Raises FlightError and EarthError."""
     with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
         tags, frames, correction_ns = ledger.tags(), ledger.frames(), ledger.utc_correction_ns()
-    placed = [
-        Placed(
-            frame,
-            tag,
-            _camera(tag.pose, mounting, geoid),
-            None if correction_ns is None else tag.utc_ns + correction_ns,
-        )
-        for frame in frames
-        if (tag := tags.get(frame.index)) is not None
-    ]
+    placed = []
+    for frame in frames:
+        tag = tags.get(frame.index)
+        if tag is None:
+            continue
+        utc_ns = None if correction_ns is None else tag.utc_ns + correction_ns
+        if marked is not None and frame.index in marked.marks:
+            tag = marked.tag(tag, geoid)
+            utc_ns = tag.utc_ns
+        placed.append(Placed(frame, tag, _camera(tag.pose, mounting, geoid), utc_ns))
     return placed, [frame.name for frame in frames if frame.index not in tags]
 
 
@@ -69,13 +73,14 @@ def write(
     mounting: Mounting,
     *,
     geoid: Geoid | None = None,
+    marked: Marked | None = None,
     output: Path | None = None,
     replace_extension: bool = False,
     force: bool = False,
 ) -> Written:
     """Write sidecars beside the frames, and geo.txt, pix4d.csv and track.geojson into `<flight>/geotags/`; or all of
     them into `output`. Raises FlightError, SidecarError and EarthError."""
-    placed, without_tag = read(flight, mounting, geoid)
+    placed, without_tag = read(flight, mounting, geoid, marked)
     inside = layout.FlightFolder(flight)
     forms: dict[str, Callable[[Sequence[Placed]], str]] = {
         "geo.txt": odm,
@@ -98,7 +103,7 @@ def write(
 
 
 def copies(
-    flight: Path, folder: Path, mounting: Mounting, geoid: Geoid | None = None
+    flight: Path, folder: Path, mounting: Mounting, geoid: Geoid | None = None, marked: Marked | None = None
 ) -> Iterator[tuple[str, Path | str]]:
     """Copy the placed frames to `folder`, with positions in EXIF; yields (frame, its copy or why there is none).
 
@@ -106,7 +111,7 @@ def copies(
     """
     if folder.resolve().is_relative_to(flight.resolve()):
         raise FlightError(f"cannot write copies into the flight itself ({folder}): give another folder")
-    placed, without_tag = read(flight, mounting, geoid)
+    placed, without_tag = read(flight, mounting, geoid, marked)
     originals = [layout.FlightFolder(flight).file(one.frame.name) for one in placed]
     _make(folder)
     for one, original in zip(placed, originals, strict=True):
