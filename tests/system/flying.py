@@ -62,14 +62,14 @@ class Flying:
     def until_ready(self) -> None:
         eventually(lambda: self.camera == "ready", f"camera ready: {self.problems}")
 
-    def request(self) -> ShotDecision:
+    def request(self, *, happened: bool = False) -> ShotDecision:
         self._requests += 1
-        return self.service.request(CaptureRequest("test", "console", self._requests))
+        return self.service.request(CaptureRequest("test", "console", self._requests, happened=happened))
 
-    def shoot(self) -> PendingShot:
-        """One shot to its end."""
+    def shoot(self, *, happened: bool = False) -> PendingShot:
+        """One shot to its end. `happened`: something else has fired the camera."""
         self.until_ready()
-        decision = self.request()
+        decision = self.request(happened=happened)
         assert decision.outcome == "shot", decision.reason
         eventually(lambda: any(one.shot.index == decision.index for one in self.shots), f"shot {decision.index}")
         return next(one for one in self.shots if one.shot.index == decision.index)

@@ -235,7 +235,7 @@ def test_files_are_picked_up_over_ptp_after_landing(here: Path, capfd: pytest.Ca
         with other_hand(body) as press, flying(outside(here, body, "later")) as daemon:
             flight = daemon.service.folder
             for number in range(3):
-                daemon.shoot()
+                daemon.shoot(happened=True)
                 press(number)
         assert main(["flight", "pickup", str(flight), "--from", body.port, "--json"]) == 0
     told = json.loads(capfd.readouterr().out)
@@ -260,7 +260,7 @@ def test_files_are_picked_up_over_ptp_in_flight(here: Path) -> None:
         body.fault("clear")
         with other_hand(body) as press:
             for number in range(3):
-                daemon.shoot()
+                daemon.shoot(happened=True)
                 press(number)
         with LedgerReader.open(daemon.service.folder / "flight.sqlite") as ledger:
             eventually(lambda: len(ledger.tags()) == 3, "all frames recorded and tagged")

@@ -31,7 +31,8 @@ class CameraSettings:
     )
     shutter: str = setting(
         "",
-        "Shutter of fujifilm and folder: gpio:CHIP:LINE, servo:OUTPUT:PRESSED:RELEASED, relay:NUMBER, autopilot",
+        "Shutter of fujifilm and folder: gpio:CHIP:LINE, servo:OUTPUT:PRESSED:RELEASED, relay:NUMBER, autopilot, "
+        "outside",
     )
     pickup: str = setting(
         "", "Where fujifilm and folder get the files from: later, storage, a libgphoto2 port, or a folder"
@@ -47,6 +48,11 @@ class CameraSettings:
     file_timeout_s: float = setting(
         30.0, "A shot fails when its file has not come after this time", unit="s", low=1, high=3600
     )
+
+    @property
+    def fired_outside(self) -> bool:
+        """Whether something else fires the camera: it can't be fired from here, and is told of exposures instead."""
+        return self.shutter == "outside" or (self.driver == "folder" and not self.shutter)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +78,23 @@ class MavlinkSettings:
         choices=("refuse", "listen", "allow"),
     )
     feedback_is_shot: bool = setting(
-        False, "The autopilot fires the camera by wire, and each of its CAMERA_FEEDBACK messages is a shot"
+        False,
+        "The autopilot fires the camera by wire, and each of its CAMERA_FEEDBACK messages is a shot; "
+        'always so with camera.shutter = "outside"',
     )
+    autopilot_camera: int = setting(
+        0,
+        "Which camera of the autopilot this one is: 1 for CAM1, 2 for CAM2 …; 0: by component_id (100 is CAM1)",
+        low=0,
+        high=9,
+    )
+
+    @property
+    def cam_idx(self) -> int:
+        """The camera's number in CAMERA_FEEDBACK, from 0."""
+        if self.autopilot_camera:
+            return self.autopilot_camera - 1
+        return self.component_id - 100 if 100 <= self.component_id <= 105 else 0
 
 
 @dataclass(frozen=True, slots=True)

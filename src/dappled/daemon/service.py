@@ -176,7 +176,11 @@ class Service:
             handover=self._after,
         )
         self._shutter = Shutter(
-            self._control, clock, next_index=recording.next_index, capacity=settings.camera.max_pending
+            self._control,
+            clock,
+            next_index=recording.next_index,
+            capacity=settings.camera.max_pending,
+            fires=not settings.camera.fired_outside,
         )
         autopilot = OwnAutopilot(sender, clock)
         if isinstance(camera, UsesAutopilot):
@@ -190,6 +194,7 @@ class Service:
             model=self._control,
             earlier=IndexedOutcomes(recording.index),
             feedback_is_shot=settings.mavlink.feedback_is_shot,
+            cam_idx=settings.mavlink.cam_idx,
         )
         self._decoder = None if recipe is None else DecodeProcess(recipe, clock=clock)
         self._depth = None

@@ -50,7 +50,13 @@ class Rig:
     """A component whose links are a list."""
 
     def __init__(
-        self, *, feedback_is_shot: bool = False, capacity: int = 8, earlier: EarlierOutcomes | None = None
+        self,
+        *,
+        feedback_is_shot: bool = False,
+        capacity: int = 8,
+        earlier: EarlierOutcomes | None = None,
+        cam_idx: int = 0,
+        fires: bool = True,
     ) -> None:
         self.body = Body()
         self.decode = "on"
@@ -62,7 +68,7 @@ class Rig:
         self.well, self.critical = True, False
         self.clock = RecordedClock(10**18, 10**18 - 10**9)
         self.sink = FakeSink()
-        self.shutter = Shutter(self.sink, self.clock, next_index=5, capacity=capacity)
+        self.shutter = Shutter(self.sink, self.clock, next_index=5, capacity=capacity, fires=fires)
         parameters = Parameters(self.body, (self,))
         self.autopilot = OwnAutopilot(self, self.clock)
         self.component = Component(
@@ -74,6 +80,7 @@ class Rig:
             model=self,
             earlier=earlier or NothingEarlier(),
             feedback_is_shot=feedback_is_shot,
+            cam_idx=cam_idx,
         )
 
     @property
@@ -457,7 +464,7 @@ def test_an_unsigned_heartbeat_does_not_decide_whose_camera_this_is(late_s: floa
 def test_feedback_is_a_shot_only_where_the_autopilot_fires(counts: bool) -> None:
     rig = Rig(feedback_is_shot=counts)
     rig.tick(4)
-    feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+    feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 0, 7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
     rig.hear(feedback, AUTOPILOT)
     rig.hear(feedback, (9, 1))  # somebody else's autopilot
     assert rig.fired == ([5] if counts else [])
@@ -468,7 +475,7 @@ def test_the_echo_of_an_order_is_no_wish_and_the_next_trigger_is_one() -> None:
     rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), AUTOPILOT)
     rig.tick(4)
     fire = mavlink.MAVLink_command_long_message(0, 0, mavlink.MAV_CMD_DO_DIGICAM_CONTROL, 0, 0, 0, 0, 0, 1, 0, 0)
-    feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+    feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 0, 7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
     for turn in range(2):
         assert rig.autopilot.command(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1)) is None
         rig.clock.advance(0.05)

@@ -50,6 +50,18 @@ def test_what_is_far_off_or_of_two_minds_is_not_taken() -> None:
     assert clocks.choose_feedback([event(55)], ExposureTime(EXPECTED.utc_ns, 10 * MS, "given"), CLOCK) is None
 
 
+@pytest.mark.parametrize("latency_ms", [-25, 0, 25])
+def test_at_five_a_second_a_lost_contact_is_not_replaced_by_the_next_shots(latency_ms: int) -> None:
+    """The default latency, 60 ± 30 ms: the next shot's contact is 200 ms after the one that was lost."""
+    expected = mid_exposure(START_NS + 10**9, BodyLatency(60.0, 30.0, "latency"), 0.002)
+    before, after = event(60 - 200), event(260 + latency_ms, 1)
+    assert clocks.choose_feedback([before, after], expected, CLOCK) is None
+    own = event(60 + latency_ms, 2)
+    assert clocks.choose_feedback([before, own, after], expected, CLOCK) == own
+    doubled = event(60 + latency_ms, 3)
+    assert clocks.choose_feedback([before, own, doubled, after], expected, CLOCK) == own
+
+
 def made(message: MavlinkMessage, component: int = 1) -> MavlinkMessage:
     message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=component))
     return message

@@ -12,7 +12,7 @@ from dappled.clock import Clock
 from dappled.daemon.camera_protocol.camera_status import ZOOM, CameraStatus
 from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
-from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
+from dappled.daemon.pipeline.shutter import CANNOT_FIRE, ShotDecision, Shutter
 from dappled.drivers.camera import CameraError
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
@@ -76,6 +76,9 @@ class CommandAnswer:
     result: int
     then: tuple[MavlinkMessage, ...] = ()
     words: str | None = None
+
+
+_NOT_OURS = CommandAnswer(DENIED)  # a broadcast to a camera that something else fires: it is left alone, unanswered
 
 
 class MessageIntervals:
@@ -142,6 +145,8 @@ class CameraCommands:
         return command.name == mavlink.MAV_CMD_DO_DIGICAM_CONTROL and command.integer(5) == 1
 
     def _start_capture(self, command: Command) -> CommandAnswer:
+        if command.broadcast and not self._shutter.fires:
+            return _NOT_OURS
         count = command.integer(3, 1)
         request = CaptureRequest(
             command.source, "IMAGE_START_CAPTURE", command.integer(4), command.confirmation, command.link
@@ -157,6 +162,8 @@ class CameraCommands:
     def _digicam_control(self, command: Command) -> CommandAnswer:
         if command.integer(5) != 1:
             return CommandAnswer(ACCEPTED if command.broadcast else UNSUPPORTED)
+        if command.broadcast and not self._shutter.fires:
+            return _NOT_OURS
         request = CaptureRequest(
             command.source,
             "DO_DIGICAM_CONTROL",
@@ -310,7 +317,8 @@ _COMMANDS: dict[int, Callable[[CameraCommands, Command], CommandAnswer]] = {
 
 
 def _decided(decision: ShotDecision) -> CommandAnswer:
-    """The answer to a capture request. ACCEPTED means that the shot will be attempted."""
+    """The answer to a capture request. ACCEPTED means that the shot will be attempted, DENIED that none ever will."""
     if decision.accepted:
         return CommandAnswer(ACCEPTED)
-    return CommandAnswer(REJECTED, words=f"no photo: {decision.reason}")
+    result = DENIED if decision.reason == CANNOT_FIRE else REJECTED
+    return CommandAnswer(result, words=f"no photo: {decision.reason}")

@@ -37,7 +37,7 @@ _OLD_IMAGES_A_TICK = 2
 class Component:
     """One camera on all links.
 
-    `feedback_is_shot`: the autopilot fires the camera, and each of its CAMERA_FEEDBACK is a shot.
+    `feedback_is_shot`: the autopilot fires the camera, and each CAMERA_FEEDBACK about its camera `cam_idx` is a shot.
     """
 
     def __init__(
@@ -51,10 +51,13 @@ class Component:
         model: CameraModel,
         earlier: EarlierOutcomes,
         feedback_is_shot: bool = False,
+        cam_idx: int = 0,
     ) -> None:
         self._links, self._autopilot, self._identity = links, autopilot, autopilot.identity
         self._shutter, self._clock = shutter, clock
-        self._model, self._earlier, self._feedback_is_shot = model, earlier, feedback_is_shot
+        self._model, self._earlier = model, earlier
+        self._feedback_is_shot, self._cam_idx = feedback_is_shot or not shutter.fires, cam_idx
+        self._last_feedback = 0
         self._status = CameraStatus(model, shutter, parameters, clock, component_id=links.component_id)
         self._intervals = MessageIntervals()
         self._commands = CameraCommands(shutter, clock, self._status, parameters, self._intervals)
@@ -142,19 +145,39 @@ class Component:
         name = message.get_type()
         if message.get_srcSystem() != self._identity.system_id or self._is_duplicate(packet):
             return
-        if name == "CAMERA_FEEDBACK" and not self._feedback_is_shot:
+        if name == "CAMERA_FEEDBACK" and not (self._feedback_is_shot and self._is_trigger(message)):
             return  # the hot shoe's time of a known shot: telemetry uses it
         if self._autopilot.is_echo(packet, name):
             return
         source = f"mavlink:{message.get_srcSystem()}/{message.get_srcComponent()}"
         sequence = message.seq if name == "CAMERA_TRIGGER" else message.img_idx
         request = CaptureRequest(
-            source, name, sequence, 0, packet.link, acknowledged=False, time_us=int(message.time_usec)
+            source,
+            name,
+            sequence,
+            0,
+            packet.link,
+            acknowledged=False,
+            time_us=int(message.time_usec),
+            happened=name == "CAMERA_FEEDBACK" or not self._shutter.fires,
         )
         decision = self._shutter.request(request)
         if not decision.accepted:
             self.say(f"no photo: {decision.reason}")
             self.state_changed()
+
+    def _is_trigger(self, feedback: MavlinkMessage) -> bool:
+        """Whether a CAMERA_FEEDBACK reports a trigger of our camera.
+
+        ArduPilot sends one for each of its cameras at every trigger of one. The others repeat their last trigger, or
+        have neither time nor number. Without satellites it has no time, and then a new number shows a trigger.
+        """
+        if feedback.cam_idx != self._cam_idx:
+            return False
+        known, self._last_feedback = self._last_feedback, feedback.img_idx
+        if feedback.time_usec == 0:
+            return bool(feedback.img_idx not in (0, known))
+        return not self._autopilot.is_stale(feedback.time_usec)
 
     def _parameter(self, packet: Packet) -> None:
         message = packet.message

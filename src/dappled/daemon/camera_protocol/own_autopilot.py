@@ -11,6 +11,9 @@ from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
 
 TIMESYNC_NS = 200_000_000
 STREAMS_NS = 5 * 10**9
+STALE_US = 5_000_000  # a slow radio is seconds behind
+EPOCH_US = 10**15  # 2001: a time above is UTC, one below counts since boot
+_WRAP_US = 2**32
 STREAMS = (  # message, interval in microseconds
     (mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 20_000),
     (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, 20_000),
@@ -119,6 +122,32 @@ class AutopilotRequests:
                     )
 
 
+class AutopilotNow:
+    """What the autopilot's clocks show now, to `STALE_US`: the last times it sent, plus what has passed since."""
+
+    def __init__(self) -> None:
+        self._boot: tuple[int, int] | None = None  # its microseconds, our nanoseconds
+        self._utc: tuple[int, int] | None = None
+
+    def heard(self, message: MavlinkMessage, now_ns: int) -> None:
+        """Take a message of the autopilot. Times are monotonic."""
+        boot_ms = getattr(message, "time_boot_ms", 0)
+        if boot_ms > 0:
+            self._boot = boot_ms * 1000, now_ns
+        if message.get_type() == "SYSTEM_TIME" and message.time_unix_usec >= EPOCH_US:
+            self._utc = int(message.time_unix_usec), now_ns
+
+    def is_stale(self, time_us: int, now_ns: int) -> bool:
+        """See `OwnAutopilot.is_stale`."""
+        shown = self._utc if time_us >= EPOCH_US else self._boot
+        if shown is None:
+            return False
+        age_us = shown[0] + (now_ns - shown[1]) // 1000 - time_us
+        if time_us < _WRAP_US:
+            age_us = (age_us + _WRAP_US // 2) % _WRAP_US - _WRAP_US // 2
+        return abs(age_us) > STALE_US
+
+
 class OwnAutopilot:
     """The autopilot of the system that the camera belongs to, on the link that it was last heard on."""
 
@@ -127,10 +156,18 @@ class OwnAutopilot:
         self.identity = SystemIdentity(links.system_id, clock.monotonic_ns())
         self._commands = AutopilotCommands()
         self._requests = AutopilotRequests()
+        self._now = AutopilotNow()
 
     def heard(self, message: MavlinkMessage) -> None:
-        """Count a message of its system."""
+        """Take a message of its system."""
         self._requests.heard(message.get_msgId())
+        if message.get_srcComponent() == 1:
+            self._now.heard(message, self._clock.monotonic_ns())
+
+    def is_stale(self, time_us: int) -> bool:
+        """Whether a time of the autopilot's, in microseconds since boot (perhaps of 32 bits) or of UTC, is not about
+        now: more than `STALE_US` ago, or ahead. False where its clock is not known yet."""
+        return self._now.is_stale(time_us, self._clock.monotonic_ns())
 
     def ask(self) -> None:
         """Send what is due by now: requests for the time, and for streams that arrive too slowly."""

@@ -8,6 +8,9 @@ Hot-shoe feedback is CAMERA_FEEDBACK (ArduPilot: boot time with a feedback pin, 
 boot time). Both are also sent for the mere command to fire, without a contact in the hot shoe. Such a message is
 recognised by its time: it is not after our own trigger call, and nothing exposes before that.
 
+Where the autopilot fires the body, its message comes before we know of the shot. Such a shot has the time of the
+message that created it (`TriggerMessage`). No other message is considered, and no call of ours is compared with it.
+
 Where this machine's UTC can't be believed, the autopilot's satellites give the correction (`UtcLearner`). Stamps
 already written stay as they are; the correction is recorded beside them.
 """
@@ -44,8 +47,10 @@ _UTC_AGREES_NS = 10**9  # clocks that differ by less are not reported
 _TIMEX_BYTES = 512  # more than any kernel's struct timex
 _UNSEEN_NS = 10**9  # how late a trigger call may be, where not even the file's arrival bounds it
 _REACH_SIGMAS = 4
-_REACH_NS = 50_000_000
+_REACH_NS = 10_000_000  # with the default 30 ms in all 130 ms: at 5 Hz the next shot's contact is farther away
 _AFTER_CALL_NS = 3_000_000
+_OWN_NS = 2_500_000_000  # a message that a slow link repeats is the same until then
+_WRAP_US = 2**32
 _CAMERA_SHOTS_KEPT = 256
 _CAMERA_SHOTS_LEAST = 3
 _PRIOR = np.diag([0.0, 1 / (DRIFT_SIGMA * 1e9) ** 2])  # of level (ns) and slope (ns/s)
@@ -61,11 +66,25 @@ class BodyLatency:
     mean_ms: float
     sigma_ms: float
     source: str
+    fired_outside: bool = False  # something else fires the body: the time counts from its trigger, not from our call
 
     @classmethod
     def of(cls, settings: CameraSettings) -> Self:
         """As configured."""
-        return cls(settings.latency_ms, settings.latency_sigma_ms, LATENCY_SOURCE)
+        return cls(settings.latency_ms, settings.latency_sigma_ms, LATENCY_SOURCE, settings.fired_outside)
+
+
+@dataclass(frozen=True, slots=True)
+class TriggerMessage:
+    """The autopilot's message that created a shot: its type and number, when it was heard, and the body's latency.
+
+    The latency counts only where the message has the time of the command, not of the contact (`Feedback.contact`).
+    """
+
+    kind: str
+    number: int
+    heard_utc_ns: int
+    latency: BodyLatency
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +92,7 @@ class ExposureTime:
     """Mid-exposure in UTC with its 1 σ, and where it comes from.
 
     `half_ns` is half the exposure as far as known. `called_utc_ns` is when the trigger call was made: nothing exposes
-    before it; None where that is unknown.
+    before it; None where that is unknown. `trigger` is the message whose time the shot owns, where there is one.
     """
 
     utc_ns: int
@@ -81,6 +100,16 @@ class ExposureTime:
     source: str
     half_ns: int = 0
     called_utc_ns: int | None = None
+    trigger: TriggerMessage | None = None
+
+
+def owned(exposure: ExposureTime, shot: Shot, latency: BodyLatency) -> ExposureTime:
+    """The expected exposure with the autopilot's message that created the shot, where that message is about it."""
+    cause = shot.cause
+    kinds = ("CAMERA_FEEDBACK", "CAMERA_TRIGGER") if latency.fired_outside else ("CAMERA_FEEDBACK",)
+    if cause.kind not in kinds or cause.sequence is None:
+        return exposure
+    return replace(exposure, trigger=TriggerMessage(cause.kind, cause.sequence, shot.wished_utc_ns, latency))
 
 
 def called_utc_ns(shot: Shot, called_monotonic_ns: int) -> int:
@@ -213,20 +242,34 @@ def from_arrivals(arrivals: Sequence[tuple[int, int]]) -> BootClock | None:
 
 @dataclass(frozen=True, slots=True)
 class Feedback:
-    """One message: the contact's time since boot. `number` is its packet's in the log."""
+    """One message: its time since boot. `number` is its packet's in the log, `image` the autopilot's number of it.
+
+    `contact`: it is the time of a contact in the hot shoe. False: it may be that of the command to fire.
+    """
 
     number: int
     stamp_ns: int
     boot_ns: int
     kind: str
+    image: int = 0
+    contact: bool = True
 
 
-def feedback_boot_ns(message: MavlinkMessage, unix_minus_boot_ns: int | None) -> int | None:
-    """When the contact closed, in time since boot; None for a GPS time before SYSTEM_TIME has given the offset."""
+def feedback_boot_ns(message: MavlinkMessage, unix_minus_boot_ns: int | None, now_boot_ns: int) -> int | None:
+    """The message's time since boot. None for 0, which is no time, and for a GPS time before SYSTEM_TIME has given the
+    offset.
+
+    ArduPilot counts the microseconds of its feedback pin in 32 bits, which wrap every 71.6 minutes: the time next to
+    `now_boot_ns` is meant.
+    """
     time_us = int(message.time_usec)
-    if time_us < EPOCH_US:
-        return time_us * 1000 if time_us > 0 else None
-    return None if unix_minus_boot_ns is None else time_us * 1000 - unix_minus_boot_ns
+    if time_us <= 0:
+        return None
+    if time_us >= EPOCH_US:
+        return None if unix_minus_boot_ns is None else time_us * 1000 - unix_minus_boot_ns
+    if message.get_type() == "CAMERA_FEEDBACK" and time_us < _WRAP_US:
+        time_us += max(0, round((now_boot_ns // 1000 - time_us) / _WRAP_US)) * _WRAP_US
+    return time_us * 1000
 
 
 def reach_ns(exposure: ExposureTime) -> int:
@@ -237,7 +280,7 @@ def reach_ns(exposure: ExposureTime) -> int:
 def choose_feedback(events: Sequence[Feedback], exposure: ExposureTime, clock: BootClock) -> Feedback | None:
     """Choose the event of this exposure; None where there is none.
 
-    It is the one nearest to when the exposure was expected to begin, within 4 σ + 50 ms of that (σ of the body and of
+    It is the one nearest to when the exposure was expected to begin, within 4 σ + 10 ms of that (σ of the body and of
     the clocks), and after the trigger call. None also where two are so near that either may be it (half the nearer
     one's distance + 5 ms): a wrong time would be worse than a wide one.
     """
@@ -258,6 +301,36 @@ def choose_feedback(events: Sequence[Feedback], exposure: ExposureTime, clock: B
     if any(distance <= doubtful_ns and event.boot_ns != near[0][2].boot_ns for distance, _, event in near[1:]):
         return None
     return near[0][2]
+
+
+def own_feedback(events: Sequence[Feedback], trigger: TriggerMessage) -> Feedback | None:
+    """The message that created a shot, among those of the log; None where it had no time that can be used."""
+    mine = [
+        (abs(event.stamp_ns - trigger.heard_utc_ns), event.number, event)
+        for event in events
+        if (event.kind, event.image) == (trigger.kind, trigger.number)
+    ]
+    distance_ns, _, event = min(mine, default=(_OWN_NS, 0, None))
+    return event if distance_ns < _OWN_NS else None
+
+
+def by_trigger(
+    exposure: ExposureTime, trigger: TriggerMessage, event: Feedback, clock: BootClock
+) -> tuple[ExposureTime, int, int]:
+    """The exposure by the message that created its shot: the exposure, mid-exposure in time since boot, and 1 σ of the
+    latter alone. The body's latency is added where the message is no contact."""
+    if event.contact:
+        return *refine(exposure, event, clock), CONTACT_SIGMA_NS
+    start_boot_ns = event.boot_ns + round(trigger.latency.mean_ms * 1e6)
+    own_ns = round(trigger.latency.sigma_ms * 1e6)
+    middle_boot_ns = start_boot_ns + exposure.half_ns
+    better = replace(
+        exposure,
+        utc_ns=clock.utc_ns(middle_boot_ns),
+        sigma_ns=round(math.hypot(own_ns, clock.sigma_ns)),
+        source=f"autopilot's trigger ({event.kind}) + body latency",
+    )
+    return better, middle_boot_ns, own_ns
 
 
 def refine(exposure: ExposureTime, event: Feedback, clock: BootClock) -> tuple[ExposureTime, int]:

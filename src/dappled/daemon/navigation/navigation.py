@@ -21,7 +21,9 @@ from dappled.daemon.navigation.clocks import (
     ExposureTime,
     UtcCorrection,
     UtcLearner,
+    by_trigger,
     choose_feedback,
+    own_feedback,
     reach_ns,
     refine,
 )
@@ -72,19 +74,24 @@ class Telemetry:
     """Telemetry of one vehicle: the one given to `follow`; until then the first autopilot (component 1) heard.
 
     `vehicles` are (packet number, system id) in order, as a recorded flight followed them. `component_id` is our own
-    (see AutopilotTime). `attitude_sigma_rad` is how well the autopilot knows its attitude, where it doesn't say; 0 is
-    not known. All methods may be called from any thread.
+    (see AutopilotTime), `cam_idx` our camera's number in CAMERA_FEEDBACK. `attitude_sigma_rad` is how well the
+    autopilot knows its attitude, where it doesn't say; 0 is not known. All methods may be called from any thread.
     """
 
     def __init__(
-        self, *, vehicles: Sequence[tuple[int, int]] = (), component_id: int = 100, attitude_sigma_rad: float = 0.0
+        self,
+        *,
+        vehicles: Sequence[tuple[int, int]] = (),
+        component_id: int = 100,
+        cam_idx: int = 0,
+        attitude_sigma_rad: float = 0.0,
     ) -> None:
         self._turns = deque(vehicles)
-        self._component_id, self._attitude_sigma_rad = component_id, attitude_sigma_rad
+        self._component_id, self._cam_idx, self._attitude_sigma_rad = component_id, cam_idx, attitude_sigma_rad
         self._lock = threading.Lock()
         self._packets = self._prune_at = 0
         self._counts = Counts()
-        self._history = VehicleHistory(None, component_id, self._counts)
+        self._history = VehicleHistory(None, component_id, self._counts, cam_idx=cam_idx)
 
     def feed(self, number: int, stamp_us: int, message: MavlinkMessage) -> None:
         """Take one packet. Numbers must rise. Messages that are not used only count."""
@@ -92,7 +99,7 @@ class Telemetry:
             while self._turns and self._turns[0][0] <= number:
                 _, system_id = self._turns.popleft()
                 if system_id != self._history.system_id:
-                    self._history = VehicleHistory(system_id, self._component_id, self._counts)
+                    self._history = VehicleHistory(system_id, self._component_id, self._counts, cam_idx=self._cam_idx)
             self._packets = number + 1
             if message.get_type() not in USED_MESSAGES:
                 return
@@ -139,7 +146,8 @@ class Telemetry:
     def locate(self, exposure: ExposureTime, *, upto_packet: int | None = None) -> tuple[ExposureTime, Pose]:
         """When and where a frame was exposed, from the packets below `upto_packet` (all so far).
 
-        Where the autopilot saw the hot shoe close, its time replaces the expected one (see `clocks.choose_feedback`).
+        Where the autopilot saw the hot shoe close, its time replaces the expected one (see `clocks.choose_feedback`);
+        a shot that the autopilot's message created has that message's time, and no other's.
         That time is on the autopilot's own clock, as the poses are: the error between the machines' clocks doesn't
         count.
         """
@@ -147,11 +155,18 @@ class Telemetry:
             limit = self._packets if upto_packet is None else upto_packet
             clock = self._history.clock(limit)
             events = self._history.feedbacks(limit)
-        event = None if clock is None else choose_feedback(events, exposure, clock)
+        trigger = exposure.trigger
+        event = None
+        if clock is not None:
+            event = own_feedback(events, trigger) if trigger else choose_feedback(events, exposure, clock)
         if clock is None or event is None:
             return exposure, self.pose_at(exposure.utc_ns, exposure.sigma_ns, upto_packet=limit)
-        better, boot_ns = refine(exposure, event, clock)
-        return better, self.pose_at(better.utc_ns, CONTACT_SIGMA_NS, upto_packet=limit, boot_ns=boot_ns)
+        sigma_ns = CONTACT_SIGMA_NS
+        if trigger:
+            better, boot_ns, sigma_ns = by_trigger(exposure, trigger, event, clock)
+        else:
+            better, boot_ns = refine(exposure, event, clock)
+        return better, self.pose_at(better.utc_ns, sigma_ns, upto_packet=limit, boot_ns=boot_ns)
 
     def pose_at(
         self, utc_ns: int, utc_sigma_ns: float, *, upto_packet: int | None = None, boot_ns: int | None = None
@@ -212,7 +227,9 @@ class Navigation:
         self._settings, self._clock, self._recording = settings, clock, recording
         self._never = threading.Event()
         self.telemetry = Telemetry(
-            component_id=now.mavlink.component_id, attitude_sigma_rad=math.radians(now.pose.attitude_sigma_deg)
+            component_id=now.mavlink.component_id,
+            cam_idx=now.mavlink.cam_idx,
+            attitude_sigma_rad=math.radians(now.pose.attitude_sigma_deg),
         )
         self.utc = UtcLearner(recording, known=utc_known)
         self._vehicles: list[tuple[int, int]] = []

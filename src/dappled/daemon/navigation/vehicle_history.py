@@ -250,11 +250,11 @@ class VehicleHistory:
     """Samples of position, attitude, receiver, gimbal and hot shoe of one vehicle.
 
     `system_id` is the vehicle's: None for the first autopilot (component 1) that is heard. `component_id` is our own
-    (see AutopilotTime). Not thread-safe.
+    (see AutopilotTime), `cam_idx` our camera's number at the autopilot. Not thread-safe.
     """
 
-    def __init__(self, system_id: int | None, component_id: int, counts: Counts) -> None:
-        self.system_id, self.counts = system_id, counts
+    def __init__(self, system_id: int | None, component_id: int, counts: Counts, *, cam_idx: int = 0) -> None:
+        self.system_id, self.counts, self._cam_idx = system_id, counts, cam_idx
         self.time = AutopilotTime(component_id)
         self.gimbals = Gimbals()
         self._positions: list[PositionSample] = []
@@ -339,13 +339,17 @@ class VehicleHistory:
         self.time.timesync(number, stamp_ns, message, from_autopilot=self._ours(message))
 
     def _feedback(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
-        if not self._ours(message):
+        """ArduPilot reports every camera at each trigger of one: only our camera's message counts."""
+        by_pin = message.get_type() == "CAMERA_FEEDBACK"
+        if not self._ours(message) or (by_pin and message.cam_idx != self._cam_idx):
             return
-        boot_ns, now_ns = feedback_boot_ns(message, self.time.unix_minus_boot_ns), self.time.now_boot_ns
+        now_ns = self.time.now_boot_ns
+        boot_ns = None if now_ns is None else feedback_boot_ns(message, self.time.unix_minus_boot_ns, now_ns)
         if boot_ns is None or now_ns is None or abs(boot_ns - now_ns) > NEAREST_NS:
             return
         self.counts.feedbacks += 1
-        _keep(self._feedbacks, Feedback(number, stamp_ns, boot_ns, message.get_type()))
+        image, contact = (message.img_idx, message.time_usec < EPOCH_US) if by_pin else (message.seq, False)
+        _keep(self._feedbacks, Feedback(number, stamp_ns, boot_ns, message.get_type(), image, contact))
 
     def _ours(self, message: MavlinkMessage) -> bool:
         if message.get_srcComponent() != 1:

@@ -64,6 +64,7 @@ class CaptureRequest:
     acknowledged: bool = True
     series: tuple[float, ...] | None = None
     time_us: int = 0  # the sender's own time of it; 0: the kind has none
+    happened: bool = False  # it reports an exposure: that can't be refused
 
 
 @dataclass(slots=True)

@@ -18,6 +18,7 @@ from dappled.workers import Loop
 __all__ = ["CaptureRequest", "ShotDecision", "Shutter", "ShutterStatistics"]
 
 log = logging.getLogger(__name__)
+CANNOT_FIRE = 'this camera can\'t be fired from here: something else fires it (camera.shutter = "outside")'
 _IDLE_S = 60.0
 _SHORTEST_S = 0.05
 _AGAIN_S = 1.0
@@ -86,12 +87,14 @@ class ShotSink(Protocol):
 class Shutter:
     """Turn capture requests into shots.
 
-    `next_index`: the image index of the next shot. At most `capacity` shots may be pending (fired, not yet settled).
+    `next_index`: the image index of the next shot. At most `capacity` shots may be pending (fired, not yet settled);
+    an exposure that has happened is taken in any case. `fires`: False where something else fires the camera, so that
+    only exposures that have happened are shots.
     All methods may be called from any thread, and return within a millisecond as long as those of `sink` do.
     """
 
-    def __init__(self, sink: ShotSink, clock: Clock, *, next_index: int, capacity: int = 8) -> None:
-        self._sink, self._clock = sink, clock
+    def __init__(self, sink: ShotSink, clock: Clock, *, next_index: int, capacity: int = 8, fires: bool = True) -> None:
+        self._sink, self._clock, self.fires = sink, clock, fires
         self._next_index = next_index
         self._capacity = capacity
         self._lock = threading.Lock()
@@ -222,7 +225,7 @@ class Shutter:
             known = self._recent.same(request, now_ns)
             if known is not None:
                 return ShotDecision("duplicate", index=known)
-        reason = self._why_not()
+        reason = self._why_not(happened=request.happened)
         if reason is None:
             shot = Shot(
                 self._next_index, Cause(request.source, request.kind, request.sequence), self._clock.utc_ns(), now_ns
@@ -253,9 +256,13 @@ class Shutter:
             self._sink.refused(one)
         return ShotDecision("refused", reason=reason)
 
-    def _why_not(self) -> str | None:
+    def _why_not(self, *, happened: bool) -> str | None:
         if self._stopped:
             return "the daemon is stopping"
+        if happened:
+            return None
+        if not self.fires:
+            return CANNOT_FIRE
         if len(self._pending) >= self._capacity:
             return f"{counted(len(self._pending), 'shot')} waiting for the camera already"
         return self._sink.obstacle()

@@ -153,7 +153,8 @@ class Tagging:
             return FrameSettings()
 
     def _expected(self, pending: PendingShot, settings: FrameSettings) -> ExposureTime:
-        """When the frame was exposed, as far as trigger call and file say.
+        """When the frame was exposed, as far as trigger call and file say. See `clocks.owned` for a shot that the
+        autopilot's message created.
 
         By the trigger call and the body's latency; by the camera's own clock, where the driver did not report when it
         fired; else by the request.
@@ -161,7 +162,9 @@ class Tagging:
         shot = pending.shot
         if pending.fired is not None:
             called_utc_ns = clocks.called_utc_ns(shot, pending.fired.called_monotonic_ns)
-            return clocks.mid_exposure(called_utc_ns, self._latency, settings.exposure_s)
+            return clocks.owned(
+                clocks.mid_exposure(called_utc_ns, self._latency, settings.exposure_s), shot, self._latency
+            )
         shown = clocks.camera_time(settings.taken)
         by_camera = shown and clocks.exposure_from_camera(self._camera_clock, *shown, settings.exposure_s)
         if by_camera:

@@ -159,6 +159,7 @@ def bring(
             assert row is not None
             facts_of = _settings(folder.file(frame.name))
             exposure = clocks.mid_exposure(_called_utc_ns(row), latency, facts_of.exposure_s)
+            exposure = clocks.owned(exposure, row.shot, latency)
             exposure, pose = telemetry.pose(number, exposure)
             camera = camera_name(names.get("camera", "auto"), facts_of.model)
             ledger.add_tag(tagging.tag(frame, exposure, facts_of, camera=camera, mask=names.get("mask", ""), pose=pose))

@@ -140,11 +140,14 @@ class RecordedTelemetry:
         wait_s: float,
         vehicles: Sequence[tuple[int, int]] = (),
         component_id: int = 100,
+        cam_idx: int = 0,
         attitude_sigma_rad: float = 0.0,
     ) -> None:
-        """`vehicles`, `component_id` and `attitude_sigma_rad` are those that the recording daemon had."""
+        """`vehicles`, `component_id`, `cam_idx` and `attitude_sigma_rad` are those that the recording daemon had."""
         self._horizons, self._wait_ns = horizons, round(wait_s * 1e9)
-        self._telemetry = Telemetry(vehicles=vehicles, component_id=component_id, attitude_sigma_rad=attitude_sigma_rad)
+        self._telemetry = Telemetry(
+            vehicles=vehicles, component_id=component_id, cam_idx=cam_idx, attitude_sigma_rad=attitude_sigma_rad
+        )
         self._packets = _packets(path) if path else iter(())
         self._fed = 0
 
@@ -159,6 +162,7 @@ class RecordedTelemetry:
             wait_s=settings.pose.wait_ms / 1e3,
             vehicles=vehicles,
             component_id=settings.mavlink.component_id,
+            cam_idx=settings.mavlink.cam_idx,
             attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
         )
 

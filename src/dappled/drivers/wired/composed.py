@@ -24,11 +24,11 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.drivers.wired.file_watch import FileWatch
-from dappled.drivers.wired.shutter_line import CommandSender, ShutterLine, UsesAutopilot
+from dappled.drivers.wired.shutter_line import CommandSender, OutsideLine, ShutterLine, UsesAutopilot
 from dappled.drivers.wired.sources import FileSource
 from dappled.workers import Loop
 
-_WAITING = 64
+_WAITING = 256  # at 5 Hz with files that come after 30 s, 150 shots wait
 _PRESSED = "the shutter stays pressed"
 _FIRST_LOOK_S = 2.0
 _END_S = 0.8
@@ -220,7 +220,8 @@ class ComposedCamera(PlainCamera):
             self._shot_fired.set()
         if self._settings.follows is not None:
             self._end(shot, Deferred(shot, self._settings.follows, self._clock.monotonic_ns()))
-        self._stopping.wait(self._settings.hold_s)
+        if not isinstance(self._line, OutsideLine):
+            self._stopping.wait(self._settings.hold_s)
         problem = self._tried(self._line.let_go)
         if not problem:
             self._rest()

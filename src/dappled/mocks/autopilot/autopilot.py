@@ -23,6 +23,7 @@ from pathlib import Path
 from dappled.clock import SystemClock
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, MavlinkMessage, Packet, mavlink
 from dappled.mocks.autopilot.path import FlightPath, TruePose
+from dappled.mocks.autopilot.personality import PERSONALITIES, CameraPort, CameraTriggers
 from dappled.workers import Loop
 
 RATES_HZ: dict[int, float] = {
@@ -34,6 +35,7 @@ RATES_HZ: dict[int, float] = {
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
 }
 _FASTEST_HZ = 100.0
+_LATENCY_NS = 60_000_000  # from a trigger over a wire to the contact
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +94,10 @@ def flight(path: FlightPath, boot: BootTime, start_s: float, stop_s: float) -> I
 
 @dataclass(slots=True)
 class Flyer:
-    """The running autopilot: sends what is due, answers TIMESYNC and message interval requests, delays telemetry."""
+    """The running autopilot: sends what is due, answers TIMESYNC and message interval requests, delays telemetry.
+
+    `cameras` are those that it triggers itself, on command; none: it leaves these commands to cameras.
+    """
 
     path: FlightPath
     start_monotonic_ns: int
@@ -100,10 +105,12 @@ class Flyer:
     send: Callable[[MavlinkMessage], object]
     jitter_s: float = 0.0
     system_id: int = 1
+    cameras: CameraTriggers | None = None
     due_ns: dict[int, int] = field(default_factory=dict)
     interval_ns: dict[int, int] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
     delayed: deque[tuple[int, MavlinkMessage]] = field(default_factory=deque)
+    contacts: deque[int] = field(default_factory=deque)
     random: random.Random = field(default_factory=lambda: random.Random(0))  # noqa: S311 (a simulation)
 
     def __post_init__(self) -> None:
@@ -127,6 +134,14 @@ class Flyer:
             if pose is None:
                 pose = self.path.pose((now_ns - self.start_monotonic_ns) / 1e9)
             self._later(telemetry_message(number, pose, self.boot_ns(now_ns), time.time_ns() // 1000), now_ns)
+        if self.cameras is not None:
+            with self.lock:
+                triggered = self.cameras.due(self.boot_ns(now_ns) // 1000, time.time_ns() // 1000)
+            self._triggered(triggered, now_ns)
+        while self.contacts and self.contacts[0] <= now_ns:
+            assert self.cameras is not None
+            for message in self.cameras.contact(self.boot_ns(self.contacts.popleft()) // 1000):
+                self.send(message)
         while self.delayed and self.delayed[0][0] <= now_ns:
             self.send(self.delayed.popleft()[1])
         with self.lock:
@@ -146,6 +161,11 @@ class Flyer:
         if message.get_type() == "TIMESYNC" and message.tc1 == 0:
             self.send(mavlink.MAVLink_timesync_message(self.boot_ns(time.monotonic_ns()), message.ts1))
         if message.get_type() == "COMMAND_LONG" and message.target_system in (0, self.system_id):
+            if self.cameras is not None:
+                now_ns = time.monotonic_ns()
+                with self.lock:
+                    triggered = self.cameras.command(message, self.boot_ns(now_ns) // 1000, time.time_ns() // 1000)
+                self._triggered(triggered, now_ns)
             if message.command != mavlink.MAV_CMD_SET_MESSAGE_INTERVAL or message.target_component not in (0, 1):
                 return
             result = self._set_interval(message.param1, message.param2)
@@ -160,6 +180,13 @@ class Flyer:
         with self.lock:
             self.interval_ns[int(number)] = max(round(interval_us * 1e3), round(1e9 / _FASTEST_HZ))
         return int(mavlink.MAV_RESULT_ACCEPTED)
+
+    def _triggered(self, messages: list[MavlinkMessage], now_ns: int) -> None:
+        """Send what a trigger makes it send; the hot shoe of the first camera closes a little later."""
+        for message in messages:
+            self.send(message)
+        if messages and self.cameras is not None and self.cameras.cameras[0].pin:
+            self.contacts.append(now_ns + _LATENCY_NS)
 
     def _later(self, message: MavlinkMessage, now_ns: int) -> None:
         if self.jitter_s <= 0 and not self.delayed:
@@ -236,12 +263,21 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--system-id", type=int, default=1)
     parser.add_argument("--jitter", type=float, default=0.0, help="seconds that telemetry may be late")
     parser.add_argument("--booted", type=float, default=BootTime().offset_s, help="seconds before the flight began")
+    parser.add_argument("--personality", choices=PERSONALITIES, default="ardupilot", help="whose messages it sends")
+    parser.add_argument(
+        "--camera",
+        action="append",
+        type=CameraPort.of,
+        default=[],
+        help="a camera that it triggers on command: mavlink, broadcast or wire, and :pin for a wired hot shoe",
+    )
     parser.add_argument("--with-parent", action="store_true", help="end when standard input is closed")
     wanted = parser.parse_args(arguments)
     start_ns = time.monotonic_ns() if wanted.start_monotonic_ns is None else wanted.start_monotonic_ns
     links = MavlinkLinks([wanted.url], system_id=wanted.system_id, component_id=1, clock=SystemClock())
     boot = BootTime(wanted.booted)
-    flyer = Flyer(FlightPath(wanted.seed), start_ns, boot, links.sender.send, wanted.jitter, wanted.system_id)
+    cameras = CameraTriggers(wanted.personality, tuple(wanted.camera), wanted.system_id) if wanted.camera else None
+    flyer = Flyer(FlightPath(wanted.seed), start_ns, boot, links.sender.send, wanted.jitter, wanted.system_id, cameras)
     try:
         links.start(flyer)
     except LinkError as error:
