@@ -22,6 +22,8 @@ UNUSED = {
     "__getattr__": "Python calls it, for the public names that are loaded when they are asked for",
     "__dir__": "Python calls it, for `dir(dappled)`",
     "collect": "prometheus_client calls it",
+    "get_reader": "napari calls it, by the manifest napari.json",
+    "plot": "of what `dappled.open` returns: notebooks call it",
 }
 
 # Fields that nothing in src reads by name, and why they stay.

@@ -1,10 +1,18 @@
 from __future__ import annotations
 
+import base64
+import io
+import re
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib import pyplot
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
 from PIL import Image
 
 import dappled
@@ -146,3 +154,74 @@ def test_a_light_field_shows_itself_in_a_line(path: Path) -> None:
     )
     bare = opened.OpenedLightField(light_field(doubts=["the mask moved"], focal_length_mm=None, camera=None))
     assert repr(bare) == "<light field 5 × 5 views of 60 × 80 px, 3 slices, f/7.4, 1 doubt>"
+
+
+def test_a_kind_is_asked_for_and_checked(path: Path) -> None:
+    assert dappled.open(path, kind="light field").refocus().shape == (60, 80)
+    with pytest.raises(OpenError, match="is a light field, not a flight: open it with kind='light field'"):
+        dappled.open(path, kind="flight")
+    with pytest.raises(OpenError, match="there is no kind 'film': choose light field, frame, flight"):
+        dappled.open(path, kind="film")  # type: ignore[call-overload]  # mypy refuses it too
+
+
+def test_a_notebook_shows_a_picture_and_the_doubts() -> None:
+    found = OpenedLightField(light_field(doubts=["the mask <moved>"]))
+    shown = found._repr_html_()
+    assert "5 × 5 views of 60 × 80 px" in shown
+    assert "doubt: the mask &lt;moved&gt;" in shown
+    (data,) = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', shown)
+    with Image.open(io.BytesIO(base64.b64decode(data))) as picture:
+        assert picture.size == (80, 60)
+        shown_px, middle = np.asarray(picture, dtype=float), found.views[2, 2]
+    assert np.corrcoef(shown_px.ravel(), middle.ravel())[0, 1] > 0.95
+    bare = replace(light_field(), views=np.zeros((0, 0, 60, 80), np.float32), view_offsets=np.zeros((0, 0, 2)))
+    assert "data:image/jpeg" in OpenedLightField(bare)._repr_html_()  # the mean, from slices alone
+
+
+def pixels(axes: Axes) -> NDArray[Any]:
+    """Of the image that was drawn last, NaN where masked."""
+    return np.asarray(np.ma.filled(np.ma.asarray(axes.images[-1].get_array()), np.nan))
+
+
+def test_views_slices_spectrum_and_depth_are_drawn(path: Path) -> None:
+    found = opened.light_field(path)
+    views = found.plot()
+    assert views.get_title() == "5 × 5 views"
+    assert pixels(views).shape == (300, 400)
+    assert found.plot("slices").get_title() == "3 slices and their conjugates"
+    spectrum = found.plot("spectrum")
+    assert spectrum.get_xlim() == (-0.5, 0.5)
+    ends = sorted(tuple(round(float(x), 3) for x in image.get_extent()) for image in spectrum.images)
+    assert (0.05, 0.15, 0.05, -0.05) in ends  # carrier (0, 1) at 0.1 cycles/pixel; a band is 1/10 wide
+    assert (-0.15, -0.05, 0.05, -0.05) in ends
+    made = found.depth("contrast")
+    drawn = found.plot("depth", depth=made, axes=views)
+    assert drawn is views
+    assert "contrast, " in drawn.get_title()
+    np.testing.assert_array_equal(pixels(drawn), made.disparity)
+    pyplot.close("all")
+
+
+def test_what_cannot_be_drawn_is_told(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = opened.light_field(path)
+    with pytest.raises(OpenError, match="'picture' can't be drawn: choose views, slices, spectrum or depth"):
+        found.plot("picture")  # type: ignore[arg-type]  # mypy refuses it too
+    none = replace(light_field(), slices=np.zeros((0, 60, 80), np.complex64), carriers=np.zeros((0, 4)))
+    with pytest.raises(DappledError, match="has no slices"):
+        OpenedLightField(none).plot("slices")
+    with pytest.raises(DappledError, match="has no slices"):
+        OpenedLightField(none).plot("spectrum")
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    with pytest.raises(DappledError, match=r"matplotlib"):
+        found.plot()
+
+
+def test_a_frame_is_shown_without_being_decoded_and_drawn_with_its_own_spectrum(tmp_path: Path) -> None:
+    (tmp_path / "frame.dng").write_bytes(reference_camera(1, scale=0.5, scene="white").expose(0.0, 0).file)
+    frame = dappled.open(tmp_path / "frame.dng", kind="frame", mask="reference-5x5")
+    assert repr(frame) == "<frame frame.dng, reference-5x5>"
+    assert "img" not in frame._repr_html_()
+    drawn = frame.plot("spectrum")
+    assert pixels(drawn).shape[2] == 3  # in colour: boxes on a grey spectrum
+    assert "img" in frame._repr_html_()
+    pyplot.close("all")

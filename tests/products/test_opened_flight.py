@@ -26,6 +26,8 @@ def test_a_flight_is_its_frames(flown: Flown) -> None:
     flight = dappled.open(flown.folder, **{k: v for k, v in asdict(flown.recipe).items() if v})
     assert isinstance(flight, OpenedFlight)
     assert len(flight) == 1
+    assert repr(flight) == f"<flight {flown.folder.name}: 1 safe frame, reference-5x5>"
+    assert "<td>50 mm, f/" in flight._repr_html_()
     (frame,) = flight
     assert frame.index is not None
     assert flight[frame.index].path == frame.path

@@ -1,6 +1,6 @@
 """`dappled.open`: open a light field, a raw frame or a flight from Python. `docs/api.md` says what is promised.
 
-with_views = dappled.open("frame.zarr")              # or a folder of n × n pictures
+with_views = dappled.open("frame.zarr", kind="light field")  # or a folder of n × n pictures
 sharp = with_views.refocus(alpha=1.02)                # float32 (h, w) or (h, w, 3)
 depth = with_views.depth(method="combined")           # .disparity, .sigma, .confidence
 frame = dappled.open("frame.cr2", mask="mask-2", calibration="calibration.toml")
@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +31,16 @@ from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield import refocus as refocusing
 from dappled.decode.lightfield.refocus import FocalPlane, StereoPair, eyes
 from dappled.drivers.raw.darkroom import Darkroom, Recipe, of_flight
-from dappled.errors import DappledError
+from dappled.errors import DappledError, counted
 from dappled.flight import Tag, flight_report, layout
+from dappled.products import figures, summaries
 from dappled.products.exports import light_files, view_folders
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 _LIGHT_FIELDS = (".zarr", ".npz", ".h5")
+_SHOWN = 10  # frames of a flight in its table
 
 
 class OpenError(DappledError):
@@ -85,6 +90,33 @@ class Refocusable(ABC):
         one = self._decoded()
         return depths.estimate(one.evidence, method, between=between, window=window, workers=one.workers)
 
+    def plot(
+        self,
+        what: Literal["views", "slices", "spectrum", "depth"] = "views",
+        *,
+        depth: DepthMap | None = None,
+        axes: Axes | None = None,
+    ) -> Axes:
+        """Draw the views, slices, spectrum or depth with matplotlib, into `axes` or a new figure; returns the axes.
+
+        The spectrum is the frame's where there is one, else that of the slices' bands. `depth` is the map to draw, by
+        default `self.depth()`; in metres where they are known. Raises DappledError for another word, for what the light
+        field lacks, and without matplotlib.
+        """
+        one = self._decoded()
+        if what == "depth":
+            made = self.depth() if depth is None else depth
+            if one.ranging is None:
+                return figures.depth(made.disparity, "disparity, px/view", made.method, axes)
+            return figures.depth(one.distances(made).distance_m, "distance, m", made.method, axes)
+        drawn = {"views": figures.views, "slices": figures.slices, "spectrum": self._draw_spectrum}.get(what)
+        if drawn is None:
+            raise OpenError(f"{what!r} can't be drawn: choose views, slices, spectrum or depth")
+        return drawn(one.field, axes)
+
+    def _draw_spectrum(self, field: LightField, axes: Axes | None) -> Axes:
+        return figures.bands(field, axes)
+
 
 @dataclass(frozen=True, repr=False)
 class OpenedLightField(Refocusable):
@@ -111,6 +143,14 @@ class OpenedLightField(Refocusable):
         words = [f"{size}, {slices} slices", *(str(one) for one in taken if one)]
         words += [f"{len(doubts)} doubt{'s' * (len(doubts) > 1)}"] if doubts else []
         return f"<light field {'' if self.path is None else self.path.name + ': '}{', '.join(words)}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the line, the middle view (without views, the mean), and the doubts."""
+        picture: NDArray[np.float32] | None = np.abs(self.slices[0]) if len(self.slices) else None
+        with contextlib.suppress(DecodeError):
+            picture = self.stack.middle()
+        doubts = (f"doubt: {one}" for one in self.attributes.get("doubts") or ())
+        return summaries.block(repr(self), None if picture is None else figures.bright(picture), doubts)
 
     @property
     def slices(self) -> NDArray[np.complex64]:
@@ -201,7 +241,7 @@ class OpenedLightField(Refocusable):
         light_files.save(Path(path), self.field, overwrite=overwrite)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class OpenedFrame(Refocusable):
     """A raw frame, decoded once, by `light_field`. `tag` says when and where it was taken; None outside a flight."""
 
@@ -221,8 +261,22 @@ class OpenedFrame(Refocusable):
     def _decoded(self) -> OpenedLightField:
         return self.light_field
 
+    def __repr__(self) -> str:
+        """One line: which frame, and what its tag says."""
+        number = "" if self.index is None else f"{self.index}, "
+        return f"<frame {number}{', '.join([self.path.name, self.darkroom.recipe.mask, *_lens(self.tag)])}>"
 
-@dataclass(frozen=True)
+    def _repr_html_(self) -> str:
+        """For notebooks: the line, and the light field once the frame is decoded; showing a frame decodes nothing."""
+        made = self.__dict__.get("light_field")
+        return summaries.block(repr(self), None) + ("" if made is None else made._repr_html_())
+
+    def _draw_spectrum(self, field: LightField, axes: Axes | None) -> Axes:
+        plane = self.darkroom.plane(self.darkroom.read(self.path))
+        return figures.spectrum(plane, field, axes)
+
+
+@dataclass(frozen=True, repr=False)
 class OpenedFlight:
     """A recorded flight: the sequence of its safe frames, each decoded by the flight's recipe when it is used."""
 
@@ -230,6 +284,18 @@ class OpenedFlight:
     record: flight_report.FlightContents
     darkroom: Darkroom | None
     focus_m: float | None = None
+
+    def __repr__(self) -> str:
+        """One line: which flight, how many safe frames."""
+        mask = "no mask" if self.darkroom is None else self.darkroom.recipe.mask
+        return f"<flight {self.path.name}: {counted(len(self), 'safe frame')}, {mask}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the line, and a table of the first frames."""
+        safe = [(line.frame, line.tag) for line in self.record.lines if line.frame is not None]
+        rows = [(str(frame.index), frame.name, ", ".join(_lens(tag))) for frame, tag in safe[:_SHOWN]]
+        more = [("…", f"{len(safe) - _SHOWN} more", "")] if len(safe) > _SHOWN else []
+        return summaries.table(repr(self), ("index", "file", "lens"), [*rows, *more])
 
     def __len__(self) -> int:
         return sum(line.frame is not None for line in self.record.lines)
@@ -258,15 +324,48 @@ class OpenedFlight:
 
 
 Opened = OpenedLightField | OpenedFrame | OpenedFlight
+_KINDS: Mapping[str, type[Opened]] = {
+    "light field": OpenedLightField, "frame": OpenedFrame, "flight": OpenedFlight,
+}  # fmt: skip
 
 
-def open(path: str | Path, *, focus_m: float | None = None, **recipe: Any) -> Opened:
+@overload
+def open(
+    path: str | Path, *, kind: Literal["light field"], focus_m: float | None = None, **recipe: Any
+) -> OpenedLightField: ...
+
+
+@overload
+def open(path: str | Path, *, kind: Literal["frame"], focus_m: float | None = None, **recipe: Any) -> OpenedFrame: ...
+
+
+@overload
+def open(path: str | Path, *, kind: Literal["flight"], focus_m: float | None = None, **recipe: Any) -> OpenedFlight: ...
+
+
+@overload
+def open(path: str | Path, *, kind: None = None, focus_m: float | None = None, **recipe: Any) -> Opened: ...
+
+
+def open(path: str | Path, *, kind: str | None = None, focus_m: float | None = None, **recipe: Any) -> Opened:
     """Open a light field (.zarr, .npz, .h5, or a folder of n × n pictures), a flight, or a raw frame.
 
+    `kind` says which of them is expected, so that the result has one type: "light field", "frame" or "flight".
     `focus_m` is the distance at which the lens was focused (inf: infinity). `recipe` says how frames are decoded:
     `camera`, `mask`, `law`, `calibration`, `white`, `dark`, `colour` … as in `Recipe`; in a flight these replace values
-    of its own recipe. Raises DappledError, also for a recipe with a light field, which is decoded already.
+    of its own recipe. Raises DappledError, also where the path is of another kind, and for a recipe with a light field,
+    which is decoded already.
     """
+    if kind is not None and kind not in _KINDS:
+        raise OpenError(f"there is no kind {kind!r}: choose {', '.join(_KINDS)}, or leave it out")
+    made = _open(path, focus_m, recipe)
+    if kind is not None and not isinstance(made, _KINDS[kind]):
+        actual = next(word for word, one in _KINDS.items() if isinstance(made, one))
+        raise OpenError(f"{path} is a {actual}, not a {kind}: open it with kind={actual!r}, or name another path")
+    return made
+
+
+def _open(path: str | Path, focus_m: float | None, recipe: Mapping[str, Any]) -> Opened:
     found = Path(path).expanduser()
     if not found.exists():
         raise OpenError(f"{found} does not exist; check the path")
@@ -326,6 +425,13 @@ def _pixel_mm(known: Mapping[str, Any]) -> float | None:
 def with_ranging(field: LightField, ranging: Ranging) -> LightField:
     """Return the light field with `ranging` among its attributes."""
     return replace(field, attributes={**field.attributes, RANGING: ranging.to_dict()})
+
+
+def _lens(tag: Tag | None) -> list[str]:
+    """Focal length and f-number in words, as far as they are known."""
+    length, stop = (None, None) if tag is None else (tag.focal_length_mm, tag.f_number)
+    words = None if length is None else f"{length:g} mm", None if stop is None else f"f/{stop:g}"
+    return [one for one in words if one is not None]
 
 
 def _refuse(recipe: Mapping[str, Any], path: Path) -> None:
