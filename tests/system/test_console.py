@@ -331,6 +331,80 @@ def test_a_phone_shows_go_or_no_go_first_and_fits(chromium: Browser, daemon: Dae
     assert watched.wrong == []
 
 
+SIZES = [(390, 844), (844, 390), (1024, 600), (1440, 900)]
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_the_first_screen_has_verdict_shutter_instruments_and_picture(
+    chromium: Browser, daemon: Daemon, width: int, height: int
+) -> None:
+    phone = min(width, height) < 500
+    watched = opened(chromium, daemon, {"width": width, "height": height}, is_mobile=phone, has_touch=phone)
+    page = watched.page
+    frame = shoot(page)
+    page.wait_for_selector("#gl:not([hidden])")
+    until(page, f"document.querySelector('#which').textContent === 'frame {frame}'")
+    until(page, "document.querySelector('#instruments .histogram svg') !== null")
+    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+    page.screenshot(path=SCREENSHOTS / f"first-screen-{width}x{height}.png")
+    assert page.evaluate("window.scrollY") == 0
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    boxes = {name: page.locator(f"#{name}").bounding_box() for name in ("verdict", "shoot", "instruments", "gl")}
+    floor = boxes["shoot"]["y"] if width < 700 and boxes["shoot"] else height  # the button lies over the page there
+    for name, box in boxes.items():
+        assert box is not None, name
+        below = box["y"] + box["height"]
+        assert (below <= height) if name == "shoot" else (below <= floor), (name, box)
+    assert boxes["gl"] is not None
+    assert boxes["gl"]["height"] >= 0.4 * min(width, height), "the picture is there to be looked at"
+    told = page.inner_text("#instruments")
+    assert "unknown" not in told, told
+    assert re.search(r"ISO\s*\d+", told), told
+    assert re.search(r"shutter\s*1/\d+ s", told), told
+    assert re.search(r"stop\s*f/[\d.]+", told), told
+    assert re.search(r"battery\s*\d+ ?%", told), told
+    assert re.search(r"GNSS\s*RTK fixed, \d+ sat", told), told
+    assert re.search(r"frames left\s*[1-9]", told), told
+    assert re.search(r"[\d.]+\s% clipped", told), told
+    small = page.evaluate(
+        """[...document.querySelectorAll('button, select, input:not([type=checkbox]), label.follow')]
+            .filter((one) => one.offsetParent !== null)
+            .map((one) => [one.id || one.textContent, one.getBoundingClientRect()])
+            .filter(([, box]) => box.width < 44 || box.height < 44)
+            .map(([name, box]) => `${name} ${box.width} ${box.height}`)"""
+    )
+    assert small == [], "a thumb misses these"
+    assert watched.wrong == []
+
+
+def test_a_setting_is_set_and_what_the_body_says_is_shown(chromium: Browser, daemon: Daemon) -> None:
+    watched = opened(chromium, daemon, LAPTOP)
+    page = watched.page
+    page.wait_for_selector("#set-CAM_ISO:not([disabled])")
+    before = page.input_value("#set-CAM_ISO")
+    offered = page.evaluate("[...document.querySelector('#set-CAM_ISO').options].map((one) => one.value)")
+    other = next(value for value in offered if value != before)
+    for value in (other, before):
+        page.select_option("#set-CAM_ISO", value)
+        until(page, f"document.querySelector('#outcome').textContent === 'ISO is {value}'")
+        until(page, f"/ISO\\s*{value}/.test(document.querySelector('#instruments').textContent)")
+    assert page.locator("#set-CAM_BATTERY").is_hidden()  # it can only be read
+    page.on("dialog", lambda dialog: dialog.dismiss())
+    mask = page.input_value("#set-LF_MASK")
+    page.select_option("#set-LF_MASK", "mask-1")  # another flight would begin: the page asks first
+    assert page.input_value("#set-LF_MASK") == mask
+    assert watched.wrong == []
+
+
+def test_before_the_first_frame_what_is_not_known_is_unknown(chromium: Browser, tmp_path: Path, sockets: Path) -> None:
+    with flown(tmp_path, sockets) as daemon:
+        page = opened(chromium, daemon, PHONE, is_mobile=True, has_touch=True).page
+        told = page.inner_text("#instruments")
+        assert re.search(r"frames left\s*unknown", told), told
+        assert re.search(r"histogram\s*unknown", told), told
+        assert not re.search(r"\b0\b", told), told
+
+
 def test_without_webgl_the_vehicle_makes_the_picture(daemon: Daemon, chromium: Browser) -> None:
     without = "HTMLCanvasElement.prototype.getContext = (of => function (kind, ...more) {"
     without += (

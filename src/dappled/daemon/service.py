@@ -123,7 +123,7 @@ class Service:
             self._build(camera, names, recipe)
             if listener:  # before the publisher, so that it ends after it: the pages are told how the flight ended
                 self.console_url = listener.url
-                requests = ConsoleRequests(self._shutter, self._logbook, self._clock)
+                requests = ConsoleRequests(self._shutter, self._parameters, self._logbook, self._clock)
                 self._console = console_process.start(
                     listener, settings, stack, recipe=recipe, requests=requests, clock=self._clock
                 )
@@ -185,12 +185,13 @@ class Service:
         autopilot = OwnAutopilot(sender, clock)
         if isinstance(camera, UsesAutopilot):
             camera.use_autopilot(autopilot.command)
+        self._parameters = self._settable(camera, names, decodes=recipe is not None)
         self._component = Component(
             sender,
             autopilot,
             self._shutter,
             clock,
-            self._parameters(camera, names, decodes=recipe is not None),
+            self._parameters,
             model=self._control,
             earlier=IndexedOutcomes(recording.index),
             feedback_is_shot=settings.mavlink.feedback_is_shot,
@@ -238,7 +239,7 @@ class Service:
         self._vital: tuple[HasThreads, ...] = (self._pipeline, self._links, self._shutter, *driver)
         self._tasks = self._periodic_tasks()
 
-    def _parameters(self, camera: Camera, names: Names, *, decodes: bool) -> Parameters:
+    def _settable(self, camera: Camera, names: Names, *, decodes: bool) -> Parameters:
         """What a ground station may set: the body's settings, decoding in flight, the next flight's mask and law."""
         decoding = DecodingParameter(self._shots, self._writer, decodes=decodes)
         recipe = RecipeParameters(names, self._after, self._settings, self._shutter, self._writer)
@@ -366,6 +367,8 @@ class Service:
             utc_known=navigation.utc.known,
             dead_threads=[name for part in (*self._vital, *viewers) for name in part.dead_threads()],
             doubts=[text for text in (*doubts, *(task.problem for task in self._tasks)) if text],
+            parameters=[asdict(one) for one in self._parameters.all()],
+            frame_bytes=self._events.frame_bytes,
         )
 
     # what others may look at, and ask for

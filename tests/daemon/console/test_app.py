@@ -56,7 +56,8 @@ def slices(index: int) -> tuple[dict[str, Any], bytes]:
     header = {
         **facts, "focal_length_mm": 50.0, "f_number": None, "carriers": [[0, 0, 0.0, 0.0], [0, 1, 0.0, 0.2]],
         "carriers_from": "predicted", "carriers_found": 0, "grid": [[46.3, 0.0, 0.0], [0.0, 46.1, 0.0]],
-        "frame_shape": [1388, 1844], "mosaic": True, "noise_rms": 0.01, "predicted": [], "slices_sha256": "0" * 64,
+        "frame_shape": [1388, 1844], "mosaic": True, "noise_rms": 0.01, "predicted": [], "histogram": [1 / 64] * 64,
+        "clipped_share": 0.0, "slices_sha256": "0" * 64,
         "arrays": [wire.describe_array("slices", STACK, "1")],
     }  # fmt: skip
     return header, STACK.tobytes()
@@ -162,7 +163,16 @@ def test_the_page_and_its_parts_are_served_under_strict_rules(rig: Rig) -> None:
         assert "<title>dappled</title>" in page.text
         assert "default-src 'none'" in page.headers["content-security-policy"]
         assert page.headers["cache-control"] == "no-store"
-        for part in ("main.js", "stage.js", "refocus.js", "map.js", "format.js", "console.css", "icon.svg"):
+        for part in (
+            "main.js",
+            "settings.js",
+            "stage.js",
+            "refocus.js",
+            "map.js",
+            "format.js",
+            "console.css",
+            "icon.svg",
+        ):
             assert client.get(f"/static/{part}").status_code == 200
         assert client.get("/static/../app.py").status_code == 404
         assert "http" not in page.text.replace("http-equiv", "")  # nothing from elsewhere
@@ -173,11 +183,15 @@ def test_a_wish_goes_to_the_daemon_with_its_number(rig: Rig) -> None:
     assert rig.post("/api/shoot", {"sequence": 7, **clock}).json() == {"ok": True, "text": "shot 0", "lines": []}
     assert rig.post("/api/interval", {"sequence": 8, "interval_s": 2.5, "count": 3, **clock}).status_code == 200
     assert rig.post("/api/interval/stop", {}).status_code == 200
+    assert rig.post("/api/interval/stop", clock).status_code == 200
+    assert rig.post("/api/setting", {"sequence": 9, "name": "CAM_ISO", "value": "200", **clock}).status_code == 200
     asked = [{key: value for key, value in one.items() if key != "number"} for one in rig.asked]
     assert asked == [
         {"do": "shoot", "sequence": 7, **clock},
         {"do": "interval", "sequence": 8, "interval_s": 2.5, "count": 3, **clock},
         {"do": "stop interval"},
+        {"do": "stop interval", **clock},
+        {"do": "set", "sequence": 9, "name": "CAM_ISO", "value": "200", **clock},
     ]
 
 
@@ -198,6 +212,10 @@ def test_a_refusal_comes_with_its_sentence(rig: Rig) -> None:
         ("/api/shoot", {"sequence": 1, "token": "x" * 41}, 422),
         ("/api/outcome", {"sequence": 1, "elapsed_ms": 1.5}, 422),
         ("/api/shoot", [1], 422),
+        ("/api/interval/stop", {"token": 5}, 422),
+        ("/api/setting", {"sequence": 1, "name": "CAM_ISO"}, 422),
+        ("/api/setting", {"sequence": 1, "name": "CAM_ISO", "value": 200}, 422),
+        ("/api/setting", {"sequence": 1, "name": "CAM_ISO", "value": "x" * 201}, 422),
         ("/api/interval", {"sequence": 1, "interval_s": -1, "count": 1}, 422),
         ("/api/interval", {"sequence": 1, "interval_s": "2", "count": 1}, 422),
         ("/api/interval", {"sequence": 1, "interval_s": 2, "count": 1.5}, 422),

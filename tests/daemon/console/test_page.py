@@ -45,7 +45,7 @@ def test_every_text_stands_out_from_its_ground(scheme: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["index.html", "main.js", "stage.js", "refocus.js", "map.js", "format.js", "console.css"]
+    "name", ["index.html", "main.js", "settings.js", "stage.js", "refocus.js", "map.js", "format.js", "console.css"]
 )
 def test_nothing_comes_from_elsewhere(name: str) -> None:
     addresses = re.findall(r"(?:https?:)?//[a-z0-9.-]+\.[a-z]{2,}[^\s\"']*", text(name))

@@ -11,9 +11,11 @@ from typing import Any
 import pytest
 
 from dappled.clock import RecordedClock, SystemClock
+from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.console.requests import DEADLINE_MS, HEARD_MS, ConsoleRequests, token
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.pipeline.shutter import Shutter
+from dappled.drivers.camera import PlainCamera, Setting, SettingName
 from tests.daemon.fakes import FakeSink, Rig, rig
 
 MS = 10**6
@@ -28,7 +30,21 @@ def pipeline(tmp_path: Path) -> Iterator[Rig]:
 
 
 def asked(shutter: Shutter) -> ConsoleRequests:
-    return ConsoleRequests(shutter, Logbook(RecordedClock(7)), SystemClock())
+    return ConsoleRequests(shutter, Parameters(Body()), Logbook(RecordedClock(7)), SystemClock())
+
+
+class Body(PlainCamera):
+    """A camera with an ISO that can be set, and a battery that can be read."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: list[tuple[str, str]] = []
+
+    def settings(self) -> tuple[Setting, ...]:
+        return Setting("iso", "100", ("100", "200")), Setting("battery", "50%")
+
+    def change(self, name: SettingName, value: str) -> None:
+        self.asked.append((name, value))
 
 
 def do(requests: ConsoleRequests, **request: Any) -> dict[str, Any]:
@@ -73,7 +89,7 @@ def test_the_log_is_told_from_a_number_on(pipeline: Rig) -> None:
     logbook = Logbook(RecordedClock(7))
     logbook.add("one")
     logbook.add("two", "warning")
-    requests = ConsoleRequests(pipeline.shutter, logbook, SystemClock())
+    requests = ConsoleRequests(pipeline.shutter, Parameters(Body()), logbook, SystemClock())
     assert requests.answer({"do": "log", "after": 1})["lines"] == [
         {"number": 2, "utc_ns": 7, "level": "warning", "text": "two"}
     ]
@@ -86,7 +102,8 @@ class Late:
     def __init__(self) -> None:
         self.clock = RecordedClock(1000 * MS)
         self.sink = FakeSink()
-        self.requests = ConsoleRequests(Shutter(self.sink, self.clock, next_index=0), Logbook(self.clock), self.clock)
+        self.body, self.shutter = Body(), Shutter(self.sink, self.clock, next_index=0)
+        self.requests = ConsoleRequests(self.shutter, Parameters(self.body), Logbook(self.clock), self.clock)
         self.token = token(self.requests.run, self.clock.monotonic_ns())
 
     def at(self, ms: int, **request: Any) -> dict[str, Any]:
@@ -129,3 +146,52 @@ def test_what_became_of_a_request_can_be_asked() -> None:
     assert not one.at(9000, sequence=2, elapsed_ms=100, do="shoot")["ok"]
     assert one.at(9000, sequence=1, elapsed_ms=0, do="outcome", token="0000-1")["state"] == "known"  # noqa: S106  # it opens nothing
     assert one.at(9000, sequence=3, elapsed_ms=0, do="outcome", token="0000-1")["state"] == "restarted"  # noqa: S106  # as above
+
+
+def test_a_stop_that_a_link_held_back_leaves_alone_what_was_begun_since() -> None:
+    one = Late()
+    one.at(0, sequence=1, do="interval", interval_s=60, count=0)
+    assert one.at(63_000, elapsed_ms=500, do="stop interval")["text"] == "the interval is stopped"  # never too late
+    assert one.at(64_000, elapsed_ms=64_000, do="stop interval")["text"] == "no interval was running"
+    one.token = token(one.requests.run, one.clock.monotonic_ns())
+    assert one.at(70_000, sequence=2, do="interval", interval_s=60, count=0, elapsed_ms=6000)["ok"]
+    held = one.at(80_000, elapsed_ms=5000, do="stop interval")
+    assert (held["ok"], "press it again" in held["error"]) == (False, True)
+    assert one.shutter.statistics().interval_s == 60
+    other = one.at(80_000, token="0000-1", do="stop interval")  # noqa: S106  # it opens nothing
+    assert other["text"] == "no interval of then is running: the daemon was started again since"
+    assert one.shutter.statistics().interval_s == 60
+    assert one.at(80_000, elapsed_ms=16_000, do="stop interval")["text"] == "the interval is stopped"
+
+
+def test_a_stop_right_after_the_start_that_the_page_has_seen_is_meant_for_it() -> None:
+    one = Late()
+    one.at(0, sequence=1, do="interval", interval_s=60, count=0)
+    assert one.at(0, elapsed_ms=0, do="stop interval")["text"] == "the interval is stopped"
+
+
+def test_a_setting_is_asked_of_the_camera_once_and_never_late() -> None:
+    one = Late()
+    asked = {"do": "set", "name": "CAM_ISO", "value": "200", "sequence": 1}
+    assert one.at(100, **asked) == {"ok": True, "text": "the camera was asked for 200"}
+    assert one.at(200, **asked)["ok"]
+    assert one.body.asked == [("iso", "200")]
+    assert one.at(63_000, **{**asked, "sequence": 2})["error"].startswith(
+        "nothing was set: the request came 63 s after"
+    )
+    assert one.body.asked == [("iso", "200")]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("CAM_ISO", "6400", "it takes 100, 200"),
+        ("CAM_BATTERY", "100%", "can't be changed"),
+        ("CAM_X", "1", "no setting CAM_X"),
+    ],
+)
+def test_a_setting_that_can_t_be_is_refused_in_words(name: str, value: str, words: str) -> None:
+    one = Late()
+    answer = one.at(0, do="set", name=name, value=value, sequence=1)
+    assert (answer["ok"], words in answer["error"]) == (False, True), answer
+    assert one.body.asked == []

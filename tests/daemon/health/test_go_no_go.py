@@ -26,6 +26,7 @@ WELL: dict[str, Any] = {
     "vehicle": VEHICLE,
     "decode": DECODE,
     "min_free_bytes": 5 * 10**8,
+    "frame_bytes": 17e6,
 }
 
 
@@ -36,7 +37,7 @@ def found(name: str, **changes: Any) -> Check:
 
 
 def test_all_is_well() -> None:
-    checks = go_no_go.checks(WELL, frame_bytes=17e6)
+    checks = go_no_go.checks(WELL)
     assert [one.state for one in checks] == ["go"] * 7
     assert go_no_go.verdict(checks) == "go"
     assert [one.text for one in checks if one.name == "Disk"] == ["50.0 GB free, room for 2\u202f911 frames"]
@@ -53,7 +54,10 @@ def test_all_is_well() -> None:
         ("Disk", "no-go", "can't be read", {"disk": {"free_bytes": None}}),
         ("Disk", "no-go", "shots are refused", {"disk": {"free_bytes": 4 * 10**8}}),
         ("Disk", "no-go", "only 3 more files", {"disk": {"free_bytes": 50 * 10**9, "free_files": 3}}),
-        ("Disk", "caution", "room for about 25 frames", {"disk": {"free_bytes": 10**9}}),
+        ("Disk", "caution", "room for 25 frames", {"disk": {"free_bytes": 10**9}, "frame_bytes": 20e6}),
+        ("Disk", "caution", "room for 1 frame", {"disk": {"free_bytes": 53 * 10**7}, "frame_bytes": 20e6}),
+        ("Disk", "caution", "unknown before the first", {"disk": {"free_bytes": 10**9}, "frame_bytes": None}),
+        ("Disk", "go", "unknown before the first", {"frame_bytes": None}),
         ("Autopilot", "caution", "no link is configured", {"link": {"urls": 0, "packets": 0}}),
         ("Autopilot", "go", "1 of 2 links silent", {"link": LINK | {"silent": 1}}),
         ("Autopilot", "no-go", "silent", {"link": LINK | {"silent": 2}, "vehicle": VEHICLE | {"age_ms": 9e3}}),
@@ -90,3 +94,10 @@ def test_the_worst_decides() -> None:
     go, caution, bad = (Check("x", state, "") for state in ("go", "caution", "no-go"))
     assert go_no_go.verdict([go, caution]) == "caution"
     assert go_no_go.verdict([caution, bad, go]) == "no-go"
+
+
+def test_frames_left_are_counted_by_measured_sizes_or_unknown() -> None:
+    assert go_no_go.frames_left(WELL) == 2911
+    assert go_no_go.frames_left(WELL | {"frame_bytes": None}) is None
+    assert go_no_go.frames_left(WELL | {"disk": {"free_bytes": None}}) is None
+    assert go_no_go.frames_left(WELL | {"disk": {"free_bytes": 10**8}}) == 0  # a full disk is no unknown

@@ -17,6 +17,7 @@ from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.stream.publisher import PublisherStatistics
+from dappled.decode.geometry import Gnss, Pose
 from dappled.drivers.camera import BodyState
 from dappled.drivers.mavlink import LinkStatistics, SigningStatistics
 from dappled.workers import Worker
@@ -56,6 +57,7 @@ def record(
         dead_threads=more.pop("dead", ()),
         doubts=more.pop("doubts", ()),
         decoding=more.pop("decoding", None),
+        **more,
     )
 
 
@@ -64,6 +66,19 @@ def test_well(tmp_path: Path) -> None:
     assert found["problems"] == []
     envelope = {"schema": "dappled/health", "version": 1, "flight": "f", "seq": 0, "dropped": 0}
     jsonschema.validate({**envelope, **found}, schema("health"))
+
+
+def test_instruments_are_in_the_record_and_what_is_not_known_is_null(tmp_path: Path) -> None:
+    unknown = record(tmp_path)
+    assert (unknown["gnss"], unknown["frame_bytes"], unknown["settings"]) == (None, None, [])
+    iso = {"name": "CAM_ISO", "title": "ISO", "value": "100", "choices": ("100", "200")}
+    receiver = Gnss(3, 11, None, None, None, None, None, age_ms=200.0)
+    without_a_place = Pose("none", 0, None, None, None, None, None, None, None, None, None, None, 0)
+    found = record(tmp_path, vehicle=replace(without_a_place, gnss=receiver), frame_bytes=17e6, parameters=[iso])
+    assert (found["gnss"], found["vehicle"]) == ({"fix_type": 3, "satellites": 11}, None)
+    assert (found["frame_bytes"], found["settings"]) == (17e6, [iso])
+    old = record(tmp_path, vehicle=replace(without_a_place, gnss=replace(receiver, age_ms=9000.0)))
+    assert old["gnss"] is None
 
 
 @pytest.mark.parametrize(

@@ -175,7 +175,8 @@ def test_an_endless_interval_ends_when_told_and_late_ticks_are_not_bunched() -> 
     rig.shutter.serve()
     rig.shutter.serve()
     assert len(rig.fired()) == 6
-    assert rig.shutter.stop_interval()
+    assert rig.shutter.stop_interval() == "stopped"
+    assert rig.shutter.stop_interval() == "none ran"
     rig.tick(3)
     assert len(rig.fired()) == 6
 
@@ -207,9 +208,9 @@ def test_an_interval_that_was_stopped_starts_again_at_once_unless_another_stoppe
     for again in ("shot", "shot"):
         assert start(rig, 2.0) == again
         rig.clock.advance(0.3)
-        assert rig.shutter.stop_interval(PILOT)
+        assert rig.shutter.stop_interval(PILOT) == "stopped"
     assert start(rig, 2.0) == "shot"
-    assert rig.shutter.stop_interval(VEHICLE)
+    assert rig.shutter.stop_interval(VEHICLE) == "stopped"
     assert start(rig, 2.0) == "duplicate"  # a retry that was under way must not undo the stop
     assert rig.shutter.statistics().interval_s is None
 

@@ -36,7 +36,7 @@ _DISPARITY_PX = 8.0
 _FRAME_DIGITS = 10
 _MAP_PX, _GLOBE_BOUNDS_PX, _GLOBE_PICTURE_PX = 320, 320, 1024
 _LOG_EVERY_S = 0.7
-_TOKEN_CHARACTERS = 40
+_TOKEN_CHARACTERS, _SETTING_CHARACTERS = 40, 200
 _STATIC = Path(str(resources.files("dappled.daemon.console") / "static"))
 
 
@@ -63,6 +63,7 @@ class ConsoleApp:
             Route("/api/interval", self._interval, methods=["POST"]),
             Route("/api/outcome", self._outcome, methods=["POST"]),
             Route("/api/interval/stop", self._stop_interval, methods=["POST"]),
+            Route("/api/setting", self._set, methods=["POST"]),
             Route("/api/frames/{frame}/{name}", self._frame_picture),
             Route("/api/map", self._map),
             Route("/metrics", self._metrics),
@@ -159,8 +160,15 @@ class ConsoleApp:
         return await self._do({"do": "interval", **_numbered(body), "interval_s": seconds, "count": count})
 
     async def _stop_interval(self, request: Request) -> Response:
-        await _body(request)
-        return await self._do({"do": "stop interval"})
+        body = await _body(request)
+        return await self._do({"do": "stop interval", **(_pressed(body) if "token" in body else {})})
+
+    async def _set(self, request: Request) -> Response:
+        body = await _body(request)
+        name, value = (body.get(key) for key in ("name", "value"))
+        if not (isinstance(name, str) and isinstance(value, str) and max(len(name), len(value)) <= _SETTING_CHARACTERS):
+            raise StudioError("name and value must be texts: a setting, and one of its choices")
+        return await self._do({"do": "set", **_numbered(body), "name": name, "value": value})
 
     async def _do(self, question: Mapping[str, Any]) -> Response:
         answer = await self._ask(question)
@@ -271,11 +279,15 @@ def _whole(body: Mapping[str, Any], name: str, low: int, high: int) -> int:
 
 def _numbered(body: Mapping[str, Any]) -> dict[str, Any]:
     """A request's number, and when it was made by the daemon's clock: see `requests`."""
+    return {"sequence": _whole(body, "sequence", 0, 2**31), **_pressed(body)}
+
+
+def _pressed(body: Mapping[str, Any]) -> dict[str, Any]:
+    """When a button was pressed by the daemon's clock: see `requests`."""
     token = body.get("token", "")
     if not isinstance(token, str) or len(token) > _TOKEN_CHARACTERS:
         raise StudioError("token must be the one that came with the last state")
-    elapsed_ms = _whole(body, "elapsed_ms", 0, 2**31) if "elapsed_ms" in body else 0
-    return {"sequence": _whole(body, "sequence", 0, 2**31), "token": token, "elapsed_ms": elapsed_ms}
+    return {"token": token, "elapsed_ms": _whole(body, "elapsed_ms", 0, 2**31) if "elapsed_ms" in body else 0}
 
 
 def _frame(request: Request) -> int:

@@ -141,7 +141,6 @@ class Feed:
         self._stacks: OrderedDict[int, Message] = OrderedDict()
         self._asked: dict[int, asyncio.Future[Message]] = {}
         self._stream: AsyncSubscriber | None = None
-        self._bytes = self._sized = 0
         self.path: deque[tuple[float, float]] = deque(maxlen=PATH)  # (longitude, latitude) of the vehicle
 
     async def run(self) -> None:
@@ -187,22 +186,18 @@ class Feed:
             return max(self._stacks)
         return next(reversed(self.frames), None)
 
-    @property
-    def frame_bytes(self) -> float | None:
-        """The mean size of a frame on disk so far."""
-        return self._bytes / self._sized if self._sized else None
-
     def state(self) -> Event:
         """The newest health record as an event, with its checks."""
         health = self.health
         if health is None:
             return {"is": "state", "health": None, "checks": [], "verdict": None, "token": self._token()}
-        checks = go_no_go.checks(health, frame_bytes=self.frame_bytes)
+        checks = go_no_go.checks(health)
         return {
             "is": "state",
             "health": health,
             "checks": [{"name": one.name, "state": one.state, "text": one.text} for one in checks],
             "verdict": go_no_go.verdict(checks),
+            "frames_left": go_no_go.frames_left(health),
             "token": self._token(),
         }
 
@@ -267,8 +262,6 @@ class Feed:
         self.frames[index] = FeedState(header, corners=self._studio.corners(header))
         while len(self.frames) > FRAMES:
             self.frames.popitem(last=False)
-        self._bytes += header["size"]
-        self._sized += 1
         self.hub.send(self.frame_event(index))
 
     def _slices(self, message: Message) -> None:
@@ -321,6 +314,8 @@ def _facts(message: Message) -> dict[str, Any]:
                 "frame_shape",
                 "predicted",
                 "law",
+                "histogram",
+                "clipped_share",
             )
         },
     }

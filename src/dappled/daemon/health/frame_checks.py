@@ -12,6 +12,7 @@ from dappled.config import profiles
 from dappled.daemon.health.go_no_go import Check
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
+from dappled.drivers.raw.exposure import exposure
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
 
@@ -51,9 +52,8 @@ def _focal_length(raw: RawFile) -> Check:
 
 
 def _exposure(raw: RawFile) -> Check:
-    black = float(np.mean(raw.black))
-    share = (raw.mosaic.astype(np.float32) - black) / (raw.white - black)
-    clipped, mean = float(np.mean(share >= 0.99)), float(np.mean(share))
+    exposed = exposure(raw, every=1)
+    clipped, mean = exposed.clipped_share, exposed.mean_share
     measured = {"clipped_share": clipped, "mean_share": mean}
     if clipped > CLIPPED_SHARE:
         text = f"{clipped:.1%} of the pixels are white: expose less (clipped carriers can't be restored)"

@@ -12,7 +12,8 @@ from dappled.flight.layout import disk_shortage
 State = Literal["go", "caution", "no-go"]
 _SURE_M, _SLOW_CLOCK_MS, _FRESH_MS = 5.0, 50.0, 3000.0
 FAILING = 3  # so many frames in a row that can't be decoded are no accident
-_FRAME_BYTES = 20e6  # until a flight has shown its own
+_FRAME_BYTES = 20e6  # of a large one: whether little room is left before a flight has shown its own
+_FRAMES = ("frames", "frame")
 _EARLIEST_UTC_NS = 1_700_000_000 * 10**9  # a machine with a date before 2023 has no clock
 
 
@@ -42,11 +43,11 @@ def next_step(checks: Sequence[Check]) -> str:
     return next((one.todo for one in checks if one.state == "no-go" and one.todo), "")
 
 
-def checks(health: Mapping[str, Any], *, frame_bytes: float | None = None) -> list[Check]:
-    """The checks of one health record. `frame_bytes`: mean size of this flight's frames, None before the first."""
+def checks(health: Mapping[str, Any]) -> list[Check]:
+    """The checks of one health record."""
     return [
         _camera(health["camera"]),
-        _disk(health, frame_bytes or _FRAME_BYTES, known=frame_bytes is not None),
+        _disk(health),
         _link(health),
         _position(health.get("vehicle")),
         _clock(health),
@@ -64,15 +65,27 @@ def _camera(camera: Mapping[str, Any]) -> Check:
     return Check("Camera", "no-go", f"{state}: {reason}" if reason else state)
 
 
-def _disk(health: Mapping[str, Any], frame_bytes: float, *, known: bool) -> Check:
+def frames_left(health: Mapping[str, Any]) -> int | None:
+    """How many more frames the disk takes, by the sizes of this flight's; None where either is unknown."""
+    free, each = health["disk"]["free_bytes"], health.get("frame_bytes")
+    return None if free is None or not each else _room(health, each)
+
+
+def _room(health: Mapping[str, Any], frame_bytes: float) -> int:
+    return max(0, int((health["disk"]["free_bytes"] - (health.get("min_free_bytes") or 0)) / frame_bytes))
+
+
+def _disk(health: Mapping[str, Any]) -> Check:
     free, least = health["disk"]["free_bytes"], health.get("min_free_bytes") or 0
     if free is None:
         return Check("Disk", "no-go", "the flight's folder can't be read")
-    frames = max(0, int((free - least) / frame_bytes))
+    known = frames_left(health)
+    frames = _room(health, _FRAME_BYTES) if known is None else known
     count = f"{frames:,}".replace(",", "\u202f")  # a thin space that doesn't break
-    text = (
-        f"{free / 1e9:.1f} GB free, room for {'' if known else 'about '}{count} {'frame' if frames == 1 else 'frames'}"
+    room = (
+        "room for frames: unknown before the first" if known is None else f"room for {count} frame{'s'[: frames != 1]}"
     )
+    text = f"{free / 1e9:.1f} GB free, {room}"
     short = disk_shortage(free, health["disk"].get("free_files"), least // 1_000_000)
     if short is not None:
         return Check("Disk", "no-go", f"{short}; shots are refused")

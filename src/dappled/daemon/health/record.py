@@ -23,6 +23,7 @@ from dappled.flight import FlightError, layout
 from dappled.workers import Statistics
 
 SILENT_NS = 5 * 10**9
+_RECEIVER_MS = 5000.0
 _NO_LINK = "no MAVLink link is configured: frames are tagged without poses"
 _NO_MASK = "no mask is configured: frames are kept, not decoded (set mask.profile)"
 _NO_UTC = "UTC is not known yet: all time stamps will be corrected when the autopilot gets it from its satellites"
@@ -67,10 +68,13 @@ def record(
     utc_known: bool = True,
     dead_threads: Sequence[str] = (),
     doubts: Sequence[str] = (),
+    parameters: Sequence[Mapping[str, Any]] = (),
+    frame_bytes: float | None = None,
 ) -> dict[str, Any]:
     """The header of a `health` message. Its `problems` are sentences, none when all is well.
 
-    `doubts` are further problems, found by other parts. `dead_threads` have ended without being asked to.
+    `doubts` are further problems, found by other parts. `dead_threads` have ended without being asked to. `parameters`
+    are the settings of body and decoder; `frame_bytes` is the mean size of this flight's frames, None before the first.
     """
     decoding = decoding or DecodingState()
     link, silences = _link(settings, links, telemetry, monotonic_ns, began_monotonic_ns)
@@ -105,6 +109,7 @@ def record(
         "interval_s": shutter.interval_s,
         "interval": _interval(shutter),
         "clock": None if clock is None else {"source": clock.source, "sigma_ms": clock.sigma_ns / 1e6},
+        "gnss": None if vehicle is None else _receiver(vehicle),
         "vehicle": None if vehicle is None or vehicle.latitude_rad is None else _place(vehicle),
         "decode": {
             "mask": settings.mask.profile,
@@ -117,6 +122,8 @@ def record(
             "doubt": decoding.failures.doubt,
         },
         "min_free_bytes": settings.record.min_free_mb * 1_000_000,
+        "frame_bytes": frame_bytes,
+        "settings": list(parameters),
     }
 
 
@@ -235,6 +242,14 @@ def _place(pose: Pose) -> dict[str, float | None]:
         "position_sigma_m": pose.position_sigma_m,
         "age_ms": pose.age_ms,
     }
+
+
+def _receiver(vehicle: Pose) -> dict[str, Any] | None:
+    """The satellite receiver's last report; None where there is none, or it is old."""
+    gnss = vehicle.gnss
+    if gnss is None or gnss.age_ms > _RECEIVER_MS:
+        return None
+    return {"fix_type": gnss.fix_type, "satellites": gnss.satellites}
 
 
 def line(health: Mapping[str, Any]) -> str:

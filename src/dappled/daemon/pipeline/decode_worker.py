@@ -26,6 +26,7 @@ from dappled.decode.lightfield.light_field import slice_mosaic
 from dappled.drivers.camera import Blob
 from dappled.drivers.child_process import DECODER_GOES, ChannelMessage, end_with_parent, goes_first
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
+from dappled.drivers.raw.exposure import exposure
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import sentence
 
@@ -225,11 +226,14 @@ def _seen(done: DecodeResult) -> dict[str, Any]:
         }
         for c, m in pairs
     ]
+    exposed = exposure(done.raw)
     return {
         "frame_shape": done.light_field.attributes["shape"],
         "mosaic": done.raw.cfa is not None,
         "noise_rms": report.noise_rms,
         "predicted": carriers,
+        "histogram": [round(one, 5) for one in exposed.histogram],
+        "clipped_share": round(exposed.clipped_share, 6),
     }
 
 

@@ -22,6 +22,7 @@ CANNOT_FIRE = 'this camera can\'t be fired from here: something else fires it (c
 _IDLE_S = 60.0
 _SHORTEST_S = 0.05
 _AGAIN_S = 1.0
+IntervalEnd = Literal["stopped", "none ran", "began later"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +66,7 @@ class _Interval:
     left: int | None
     due_ns: int
     command: CaptureRequest
+    began_ns: int
     taken: int = 1
 
 
@@ -146,17 +148,24 @@ class Shutter:
                 step_ns = round(max(interval_s, _SHORTEST_S if interval_s > 0 else 0.0) * 1e9)
                 left = None if count == 0 else count - 1
                 self._end_interval(request.source)
-                self._interval = _Interval(request.source, step_ns, left, self._clock.monotonic_ns() + step_ns, request)
+                now_ns = self._clock.monotonic_ns()
+                self._interval = _Interval(request.source, step_ns, left, now_ns + step_ns, request, now_ns)
                 self._wake.set()
         return decision
 
-    def stop_interval(self, source: str | None = None) -> bool:
+    def stop_interval(self, source: str | None = None, *, asked_ns: int | None = None) -> IntervalEnd:
         """End a running interval, from any source; the same command from the same `source` then starts it again.
-        False where none ran."""
+
+        `asked_ns` is when the stop was asked for (monotonic; None: now). An interval that began later goes on: a stop
+        that a link held back is not meant for it.
+        """
         with self._lock:
-            ran = self._interval is not None
+            if self._interval is None:
+                return "none ran"
+            if asked_ns is not None and self._interval.began_ns > asked_ns:
+                return "began later"
             self._end_interval(source)
-        return ran
+        return "stopped"
 
     def settled(self, index: int, ok: bool) -> None:
         """A shot's outcome is known: its frame is safe, or there will be none. A second call for a shot is ignored."""

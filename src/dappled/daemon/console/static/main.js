@@ -1,12 +1,14 @@
 // Show the daemon's events on the page. All state is here; the other modules draw.
-import { dash, element, fixed, mark, rows, utc } from "./format.js";
+import { dash, element, fixed, mark, rows, svg, utc } from "./format.js";
 import { FieldMap } from "./map.js";
+import { Settings } from "./settings.js";
 import { Stage } from "./stage.js";
 
 const $ = (id) => document.getElementById(id);
 const STALE_MS = 3500, DEADLINE_MS = 2000, AGAIN_MS = 1000;
 const stage = new Stage();
 const map = new FieldMap($("map"));
+const settings = new Settings($("settings"), (name, value) => fire("/api/setting", { name, value }), (text, state) => tell(text, state));
 const frames = new Map();   // index → frame event
 let token = null, tokenAt = 0;   // the daemon's clock, and when it was heard
 let chosen = null, heardAt = 0, utcAt = null, connected = false, ended = null, flight = null, lastLine = 0;
@@ -29,7 +31,7 @@ function began(start) {
   $("flight").textContent = [start.flight, start.camera, start.mask || "no mask"].join("  ·  ");
 }
 
-function showState({ health, checks, verdict }) {
+function showState({ health, checks, verdict, frames_left: framesLeft = null }) {
   heardAt = performance.now();
   utcAt = health.utc_ns;
   if (flight && health.flight && health.flight !== flight) location.reload();
@@ -41,6 +43,8 @@ function showState({ health, checks, verdict }) {
   interval = health.interval ?? null;
   showInterval();
   map.setVehicle(health.vehicle);
+  showInstruments(health, framesLeft);
+  settings.show(health.settings ?? []);
   const place = health.vehicle;
   $("map-text").textContent = place
     ? `${fixed(place.latitude_deg, 6)}°, ${fixed(place.longitude_deg, 6)}°  ·  ${fixed(place.height_above_home_m, 1, "m")} up  ·  ${fixed(place.speed_m_s, 1, "m/s")}`
@@ -67,7 +71,41 @@ function showVerdict(verdict, checks) {
   $("verdict").dataset.state = verdict;
   $("verdict-word").textContent = verdict === "no-go" ? "No-go" : "Go";
   const names = (list) => list.map((one) => one.name.toLowerCase()).join(", ");
-  $("verdict-text").textContent = verdict === "no-go" ? names(bad) : verdict === "caution" ? `with caution: ${names(cautions)}` : `all ${checks.length} checks pass`;
+  $("verdict-text").textContent = verdict === "no-go" ? (bad.length === 1 ? `${names(bad)}: ${bad[0].text}` : names(bad)) : verdict === "caution" ? `with caution: ${names(cautions)}` : `all ${checks.length} checks pass`;
+}
+
+// What a photographer looks at, of the body as it is now; what is not known is "unknown", and never 0.
+function showInstruments(health, framesLeft) {
+  const body = Object.fromEntries((health.settings ?? []).map((one) => [one.name, one.value]));
+  const cell = (name, value, known = true) => element("div", { "data-known": String(known) }, element("dt", {}, name), element("dd", {}, known ? value : "unknown"));
+  const of = (name, setting, text = (value) => value) => cell(name, body[setting] ? text(body[setting]) : "", Boolean(body[setting]));
+  const fix = health.gnss;
+  $("instruments").replaceChildren(
+    of("ISO", "CAM_ISO"),
+    of("shutter", "CAM_SHUTTERSPD", (value) => (/^[\d/.]+$/.test(value) ? `${value} s` : value)),
+    of("stop", "CAM_APERTURE", (value) => (/^[\d.]+$/.test(value) ? `f/${value}` : value)),
+    of("battery", "CAM_BATTERY"),
+    cell("GNSS", fix ? fixWords(fix) : "", Boolean(fix)),
+    cell("frames left", framesLeft === null ? "" : framesLeft.toLocaleString("en").replaceAll(",", "\u202f"), framesLeft !== null),
+    histogramCell(),
+  );
+}
+
+const FIXES = ["no GNSS", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed", "static", "PPP"];
+function fixWords({ fix_type: type, satellites }) {
+  const word = FIXES[type] ?? `fix ${type}`;
+  return satellites === null ? word : `${word}, ${satellites} sat.`;
+}
+
+// The histogram of the frame that is shown, and how much of it is clipped.
+function histogramCell() {
+  const { histogram, clipped_share: clipped } = frames.get(chosen)?.slices ?? {};
+  if (!histogram) return element("div", { "data-known": "false", class: "histogram" }, element("dt", {}, "histogram"), element("dd", {}, "unknown"));
+  const highest = Math.max(...histogram.slice(1, -1), 1e-9), n = histogram.length;
+  const bars = histogram.map((share, at) => `M${at + 0.5} 24V${(24 - 24 * Math.min(1, share / highest)).toFixed(2)}`).join("");
+  const drawn = svg("svg", { viewBox: `0 0 ${n} 24`, preserveAspectRatio: "none", role: "img", "aria-label": "histogram of the frame, black to white" }, svg("path", { d: bars, stroke: "currentColor", "stroke-width": 1 }));
+  const text = clipped > 0 && clipped < 0.0005 ? "< 0.1 % clipped" : `${fixed(100 * clipped, 1)} % clipped`;
+  return element("div", { class: "histogram", "data-known": "true", "data-clipped": clipped > 0.01 ? "much" : null }, element("dt", {}, drawn), element("dd", {}, text));
 }
 
 function showCounters(health) {
@@ -117,6 +155,7 @@ function choose(index) {
   for (const one of $("strip").children) one.setAttribute("aria-selected", String(Number(one.dataset.frame) === index));
   map.select(index);
   showFacts(frame);
+  document.querySelector("#instruments .histogram")?.replaceWith(histogramCell());
   stage.set(frame);
 }
 
@@ -170,6 +209,7 @@ function tick() {
   const able = token !== null && !stale && !sending && !unconfirmed;
   $("shoot").disabled = !able;
   $("interval-go").disabled = !able || Boolean(interval);
+  settings.enable(able);
   $("interval-stop").disabled = Boolean(ended) || stopping || !(interval || lost);
 }
 
@@ -195,21 +235,24 @@ function tell(text, state = "") {
 
 const tellAnswer = (answer) => tell(answer.ok ? answer.text : answer.error ?? "refused", answer.ok ? "" : "bad");
 
-// A request that may fire is sent once, with the daemon's clock: it refuses what comes later than two seconds.
+// A request that may fire, or set something, is sent once, with the daemon's clock: it refuses what comes later than two seconds.
 async function fire(path, body) {
   sequence = (sequence + 1) % 2 ** 31;
   const request = { sequence, token, elapsed_ms: Math.round(performance.now() - tokenAt), ...body };
   sending = true;
   tell("sending…", "busy");
   tick();
+  let answer = null;
   try {
-    tellAnswer(await post(path, request));
+    answer = await post(path, request);
+    tellAnswer(answer);
   } catch {
     keep(request);
   }
   sending = false;
   tick();
   if (unconfirmed) settle();
+  return Boolean(answer?.ok);
 }
 
 // A request without an answer. It outlives a reload of the page: the question is still open then.
@@ -250,13 +293,15 @@ $("interval").addEventListener("submit", (event) => {
   fire("/api/interval", { interval_s: seconds, count });
 });
 // To stop is safe at any time: it is sent until the daemon has confirmed it.
+// It carries when it was pressed, so that one that comes late does not end an interval that was begun since.
 $("interval-stop").addEventListener("click", async () => {
+  const pressed = { token: token ?? "", elapsed_ms: Math.round(performance.now() - tokenAt) };
   stopping = true;
   tell("stopping…", "busy");
   tick();
   for (;;) {
     try {
-      const answer = await post("/api/interval/stop", {});
+      const answer = await post("/api/interval/stop", pressed);
       tellAnswer(answer);
       if (answer.ok) interval = null;
       break;
