@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from dappled.clock import RecordedClock, SystemClock
 from dappled.daemon.navigation import BodyLatency, ExposureTime
@@ -34,6 +35,7 @@ from dappled.drivers.camera import (
     StateChanged,
     check_change,
 )
+from dappled.drivers.raw.recipe import LawDecision
 from dappled.flight import Shot, recording
 from dappled.refusals import Refusals
 
@@ -123,6 +125,8 @@ class FakeDecoder:
         self.gate = threading.Event()
         self.gate.set()
         self.seen: list[str] = []
+        self.seen_facts: dict[str, Any] = {}
+        self.decision: LawDecision | None = None
 
     def decode(
         self, path: str, focal_length_mm: float | None, f_number: float | None, *, index: int, look: bool = False
@@ -134,7 +138,10 @@ class FakeDecoder:
         body = mmap.mmap(-1, 16)
         arrays = [{"name": "slices", "dtype": "<c8", "shape": [1, 1, 2], "unit": "1"}]
         unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
-        return DecodedFrame(body, "0" * 64, arrays, [[0.0] * 4], "calibrated", 1, 1, "geometric", unit, b"", (0, 0))
+        decision, self.decision = self.decision, None
+        where = ("calibrated", 1, 1, "geometric", unit)
+        facts = {"seen": self.seen_facts, "decision": decision}
+        return DecodedFrame(body, "0" * 64, arrays, [[0.0] * 4], *where, b"", (0, 0), **facts)
 
 
 @dataclass

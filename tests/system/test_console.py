@@ -156,7 +156,10 @@ def until(page: Page, condition: str) -> None:
     """Wait for a JavaScript condition. (Playwright's own way needs eval, which the page's rules forbid.)"""
     deadline = time.monotonic() + DEADLINE_MS / 1e3
     while not page.evaluate(condition):
-        assert time.monotonic() < deadline, f"never: {condition}; the page says {page.inner_text('#verdict')!r}"
+        said = (
+            f"{page.inner_text('#verdict')!r}, {page.inner_text('#outcome')!r}" if time.monotonic() > deadline else ""
+        )
+        assert not said, f"never: {condition}; the page says {said}"
         page.wait_for_timeout(30)
 
 

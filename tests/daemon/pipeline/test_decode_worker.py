@@ -13,6 +13,7 @@ from dappled.daemon.pipeline.decode_worker import DecodeWorker, nearest
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.decode.depth.ranging import Ranging
 from dappled.drivers.child_process import ChannelMessage
+from dappled.drivers.raw import darkroom
 from dappled.drivers.raw.recipe import LawDecision, Recipe
 from dappled.products.opened import with_ranging
 from tests.cli.test_thesis_camera import PROFILE, QUARTER, dng_of
@@ -93,3 +94,21 @@ def test_carriers_that_must_be_seen_and_are_not_are_a_doubt_about_every_frame(
     assert "laws" in first["ms"]
     assert "laws" not in second["ms"]
     assert "laws" not in ask(worker_of(flown[0]), bare, 0, look=False)["ms"]
+
+
+def test_a_search_that_fails_costs_no_frame_and_is_a_doubt_until_carriers_are_seen(
+    flown: tuple[Recipe, list[Path]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise ValueError("singular matrix")
+
+    recipe, frames = flown
+    worker = worker_of(recipe)
+    with monkeypatch.context() as patched:
+        patched.setattr(darkroom, "search_frame", fail)
+        for index in (1, 2):
+            found = ask(worker, frames[1], index)
+            assert (found["law"], found["decision"]) == ("fd", None)
+            assert "the search near other laws failed: " in found["seen"]["doubts"][0]
+            assert "singular matrix" in found["seen"]["doubts"][0]
+            assert len(found["sha256"]) == 64

@@ -8,19 +8,29 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from dappled.daemon.navigation import clocks
+from dappled.config.settings import DecodeSettings, MaskSettings, Settings
+from dappled.daemon.health import go_no_go
+from dappled.daemon.health import record as health
+from dappled.daemon.health.go_no_go import Check
+from dappled.daemon.health.record import DecodingState
+from dappled.daemon.navigation import Telemetry, clocks
 from dappled.daemon.pipeline import capture
 from dappled.daemon.pipeline.pipeline import DecodeFailures
+from dappled.daemon.stream import wire
+from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.drivers.camera import Blob, CameraError, CameraEvent, Companion, Deferred
-from dappled.flight import ShotState, flight_report
+from dappled.drivers.raw import darkroom
+from dappled.drivers.raw.recipe import LawDecision, of_flight
+from dappled.flight import FlightError, Recording, ShotState, flight_report, layout
 from dappled.flight.checks import flight_check
-from tests.daemon.fakes import FakeCamera, arrival, eventually, failed, fired, good, rig
+from tests.daemon.fakes import FakeCamera, Rig, arrival, eventually, failed, fired, good, rig
 
 
 def states(flight: Path) -> dict[int, ShotState]:
@@ -389,3 +399,79 @@ def jpeg_at(focal_length_mm: float, taken: str = "") -> bytes:
     file = io.BytesIO()
     Image.new("L", (64, 48)).save(file, "JPEG", exif=exif)
     return file.getvalue()
+
+
+DOUBT = darkroom.OTHER_LATTICE
+
+
+def judged(one: Rig) -> Check:
+    """The check of decoding, as a person sees it."""
+    record = health.record(
+        Settings(mask=MaskSettings("mask-1"), decode=DecodeSettings(calibration="c.toml")),
+        utc_ns=1,
+        monotonic_ns=1,
+        began_monotonic_ns=0,
+        shots=one.pending,
+        stages=one.pipeline.statistics(),
+        shutter=one.shutter.statistics(),
+        links=(),
+        telemetry=Telemetry().statistics(),
+        publisher=PublisherStatistics({}, {}, 0, 0, 0),
+        folder=one.flight.folder.path,
+        decoding=DecodingState(True, one.pipeline.decode_failures),
+    )
+    (found,) = [check for check in go_no_go.checks(record) if check.name == "Decoding"]
+    return found
+
+
+def test_a_doubt_about_a_calibrated_flight_is_in_ledger_wire_and_go_no_go(tmp_path: Path) -> None:
+    """As where the mask was moved after its calibration: the frames show its carriers elsewhere."""
+    with rig(tmp_path) as one:
+        assert one.decoder is not None
+        one.decoder.seen_facts = {"doubts": [DOUBT]}
+        one.request(1)
+        pending = one.ended(0)
+        row = one.flight.ledger.result(0)
+        assert row is not None
+        assert row.details["doubts"] == [DOUBT]
+        assert pending.tag is not None
+        assert pending.decoded is not None
+        assert wire.slices_header(pending.tag, pending.decoded)["doubts"] == [DOUBT]
+        check = judged(one)
+        assert (check.state, DOUBT in check.text) == ("caution", True)
+        one.decoder.seen_facts = {"doubts": []}
+        one.request(2)
+        one.ended(1)
+        assert judged(one).state == "go"
+
+
+def test_a_law_that_a_full_disk_refuses_is_written_down_with_the_next_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decision = LawDecision("fd", (1.0, 0.0, 0.0, 1.0), 0, "decoded by the law fd from frame 0 on")
+    with rig(tmp_path) as one:
+        assert one.decoder is not None
+        one.decoder.decision = decision
+        add, refused = Recording.add_facts, []
+
+        def full(recording: Recording, facts: dict[str, Any]) -> None:
+            if len(refused) < 2:
+                refused.append(facts)
+                raise FlightError("flight.toml can't be written: no space left on device")
+            add(recording, facts)
+
+        monkeypatch.setattr(Recording, "add_facts", full)
+        for number in (1, 2, 3):
+            one.request(number)
+            one.ended(number - 1)
+        assert [one.flight.ledger.result(index) is not None for index in (0, 1, 2)] == [False, False, True]
+        events = one.events()
+        assert sum(text.startswith("not decoded: ") and "no space left" in text for text in events) == 2
+        assert events.count(f"law: {decision.sentence}") == 1
+        check = judged(one)
+        assert (check.state, "no space left" in check.text) == ("caution", True)
+    facts = layout.read_facts(one.flight.folder)
+    made = of_flight(one.flight.folder.path, {**facts, "settings": {"mask": {"profile": "mask-2"}}}, {})
+    assert made is not None
+    assert made.decided == decision
+    assert [line.row.state for line in flight_report.show(one.flight.folder.path).lines] == ["safe"] * 3

@@ -78,7 +78,7 @@ class DecodeWorker:
         ms = dict(done.ms)
         if asked["look"] and self._looks and self._laws.wanted(done, index):
             began = time.perf_counter()
-            decided = self._look(configured, path, known, index)
+            decided = self._look(configured, path, known, index, done)
             if decided is not None:
                 self._looks = False
                 self._decided = Darkroom(replace(configured.recipe, decided=decided))
@@ -112,15 +112,19 @@ class DecodeWorker:
         }
         return facts, (body.fd, blob.fd)
 
-    def _look(self, configured: Darkroom, path: str, known: Mapping[str, Any], index: int) -> LawDecision | None:
+    def _look(
+        self, configured: Darkroom, path: str, known: Mapping[str, Any], index: int, done: DecodeResult
+    ) -> LawDecision | None:
         """Search a frame near all laws; what it decides for the flight. A calibrated flight keeps to its calibration:
-        what is found elsewhere is a doubt. None also where the search fails: the frame is decoded already."""
+        what is found elsewhere is a doubt. None also where the search fails: the frame is decoded already (`done`), and
+        in doubt."""
         self._laws.begin()
         looker = Darkroom(replace(configured.recipe, try_laws=True))
         calibrated = bool(configured.recipe.calibration)
         try:
             looked = looker.decode(path, **known)
         except Exception as error:  # noqa: BLE001  # a search that fails must not cost a good frame
+            self._laws.fail(done, sentence(error))
             log.warning("frame %d was not searched near other laws: %s", index, sentence(error))
             return None
         self._laws.keep(looked, decides=not calibrated)
@@ -165,6 +169,10 @@ class LawLooks:
         self._settled = decides and looked.search is not None and looked.search.found is not None
         if not self._settled:
             self._unseen[_lens(looked)] = looked.contradiction
+
+    def fail(self, done: DecodeResult, why: str) -> None:
+        """Keep that the search of a frame failed: whether its carriers stand elsewhere is not known."""
+        self._unseen[_lens(done)] = f"no carriers where predicted, and the search near other laws failed: {why}"
 
     def judge(self, done: DecodeResult) -> tuple[int | None, list[str]]:
         """How many carriers a frame shows, None where none can be seen with its lens so; and what is in doubt."""
