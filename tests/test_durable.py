@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,18 @@ def test_a_source_that_ends_early_leaves_nothing(tmp_path: Path) -> None:
     with held(b"abc", size=4) as blob, pytest.raises(EOFError, match="only 3 of 4 bytes"):
         durable.copy_in(blob.fd, blob.size, tmp_path / "a")
     assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("planted", [os.mkfifo, lambda part: os.link(part.with_name("victim"), part)])
+def test_what_stands_under_the_temporary_name_is_neither_waited_for_nor_written_to(
+    tmp_path: Path, planted: Callable[[Path], None]
+) -> None:
+    (tmp_path / "victim").write_bytes(b"somebody's")
+    planted(tmp_path / ".a.part")
+    durable.write_file(tmp_path / "a", b"ours")
+    assert sorted(os.listdir(tmp_path)) == ["a", "victim"]
+    assert ((tmp_path / "a").read_bytes(), (tmp_path / "victim").read_bytes()) == (b"ours", b"somebody's")
 
 
 @pytest.mark.parametrize("call", ["sendfile", "fsync", "replace"])

@@ -135,7 +135,7 @@ def pieces(fd: int, size: int) -> Iterator[memoryview]:
 def _put(path: Path, fill: Callable[[int], None], mode: int = 0o644) -> None:
     part = temporary(path)
     try:
-        fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _NOFOLLOW | _CLOEXEC, mode)
+        fd = _new(part, mode)
         try:
             fill(fd)
             os.fsync(fd)
@@ -147,3 +147,14 @@ def _put(path: Path, fill: Callable[[int], None], mode: int = 0o644) -> None:
         with contextlib.suppress(OSError):
             os.unlink(part)
         raise
+
+
+def _new(part: Path, mode: int) -> int:
+    """Make a temporary file and open it; what an earlier attempt left, or somebody put there, is removed first: a pipe
+    would be waited for, a file that has a second name be changed under that too."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NOFOLLOW | _CLOEXEC
+    try:
+        return os.open(part, flags, mode)
+    except FileExistsError:
+        os.unlink(part)
+        return os.open(part, flags, mode)

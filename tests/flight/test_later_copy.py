@@ -1,4 +1,4 @@
-"""Work at a copy, a prune here, and the next offload, in any order: the two ledgers stay one."""
+"""Work at a copy, a prune here, and the next offload, in any order and at once: the two ledgers stay one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,22 @@ from pathlib import Path
 import pytest
 
 from dappled.clock import RecordedClock
-from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Recording, layout, offload, places, seal_key, seals
+from dappled.flight import (
+    FlightError,
+    FlightsLock,
+    Frame,
+    Ledger,
+    LedgerReader,
+    Recording,
+    layout,
+    ledger_copies,
+    offload,
+    places,
+    recording,
+    seal_key,
+    seals,
+)
+from dappled.flight.checks import flight_check
 from dappled.flight.checks.flight_check import check
 from dappled.flight.later_copy import Added
 from dappled.flight.seal_key import SealKey
@@ -162,3 +177,69 @@ def test_a_different_frame_on_another_machine_is_not_written_over(
     with pytest.raises(FlightError, match=r"000000.cr2 is there already and differs from"):
         go(closed, tmp_path / "disk", prune=True)
     assert (copy / "frames" / "000000.cr2").read_bytes() == b"raw 0" * 1000
+
+
+def test_nobody_works_at_the_destination_meanwhile(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Work there would remove files that are half-written as left over from a crash."""
+    there = tmp_path / "disk"
+    go(closed, there)
+    said = []
+
+    def meanwhile(path: Path) -> object:
+        try:
+            geotag(path, b"at once")
+        except FlightError as error:
+            said.append(str(error))
+        return check(path)
+
+    monkeypatch.setattr(flight_check, "check", meanwhile)
+    go(closed, there)
+    assert [f"offloads into {there}; wait until it has ended" in text for text in said] == [True]
+    with FlightsLock(there, "geotags flights in"), pytest.raises(FlightError, match="geotags flights in"):
+        go(closed, there)
+
+
+def test_an_offload_that_was_cut_short_is_left_to_itself(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Somebody records at the destination, or works on the copy, before the offload is called again."""
+    there = tmp_path / "disk"
+    with monkeypatch.context() as dying:
+        dying.setattr(ledger_copies, "bring", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            go(closed, there)
+    copy = there / closed.name
+    before = sorted(path.name for path in copy.rglob("*"))
+    begun = recording.begin(there, CLOCK)
+    begun.close()
+    assert any(f"{copy} is the copy of an offload that was cut short" in text for text in begun.recovered)
+    assert sorted(path.name for path in copy.rglob("*")) == before
+    assert any("an offload to this folder was cut short: run it again" in text for text in check(copy).problems)
+    assert go(closed, there, prune=True).pruned == 2
+    assert check(copy).problems == check(closed).problems == ()
+
+
+def test_work_waits_for_the_rest_of_a_copy(closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = tmp_path / "disk"
+    copy = go(closed, there).destination
+    pick_up(closed)
+    with monkeypatch.context() as dying:
+        dying.setattr(ledger_copies, "bring", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            go(closed, there)
+    with pytest.raises(FlightError, match="run that offload again first"):
+        geotag(copy, b"too early")
+    assert go(closed, there, prune=True).pruned == 3
+    geotag(copy, b"in time")
+    assert check(copy).problems == ()
+
+
+@pytest.mark.timeout(30)
+def test_a_pipe_at_the_destination_is_not_waited_for(closed: Path, tmp_path: Path) -> None:
+    copy = go(closed, tmp_path / "disk", prune=True).destination
+    (copy / "frames/000000.cr2").unlink()
+    os.mkfifo(copy / "frames/000000.cr2")
+    with pytest.raises(FlightError, match=r"000000.cr2"):
+        go(closed, tmp_path / "disk")

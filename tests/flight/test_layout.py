@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,8 +12,31 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.flight import FlightError, layout
+from dappled.confined import OutsideError
+from dappled.flight import FlightError, FlightsLock, layout
 from tests.flight.conftest import START_UTC_NS
+
+
+@pytest.mark.parametrize("link", [os.symlink, os.link])
+def test_a_file_that_was_linked_to_where_the_lock_belongs_is_not_written_to(
+    tmp_path: Path, link: Callable[[Path, Path], None]
+) -> None:
+    """A stick that somebody else prepared."""
+    victim = tmp_path / "victim.txt"
+    victim.write_text("somebody's file")
+    link(victim, tmp_path / ".lock")
+    with pytest.raises(FlightError, match=r"\.lock"):
+        FlightsLock(tmp_path)
+    assert victim.read_text() == "somebody's file"
+
+
+@pytest.mark.parametrize("name", ["flight.sqlite-wal", "flight.sqlite-shm", "flight.sqlite-journal", "seals.jsonl"])
+def test_a_link_that_sqlite_would_follow_is_refused(tmp_path: Path, name: str) -> None:
+    folder = layout.create(tmp_path, None)
+    (tmp_path / "victim.txt").write_text("somebody's file")
+    (folder.path / name).symlink_to(tmp_path / "victim.txt")
+    with pytest.raises(OutsideError, match=f"{name} is a link"):
+        layout.open_folder(folder.path)
 
 
 def test_a_new_flight_is_named_by_utc_and_holds_its_facts(flights: Path) -> None:

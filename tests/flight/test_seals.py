@@ -435,7 +435,12 @@ def unsigned_seal(folder: FlightFolder) -> None:
     seals.seal(folder, LATER, "geotag")
 
 
-@pytest.mark.parametrize("attack", [added_row, changed_sidecar, missing_sidecar, unsigned_seal])
+def unused_bytes(folder: FlightFolder) -> None:
+    """A change of the ledger's bytes that changes no row."""
+    vacuum(folder)
+
+
+@pytest.mark.parametrize("attack", [added_row, changed_sidecar, missing_sidecar, unsigned_seal, unused_bytes])
 def test_later_work_does_not_sign_what_somebody_else_did_before_it(
     flights: Path, tmp_path: Path, attack: Callable[[FlightFolder], None]
 ) -> None:
@@ -449,6 +454,21 @@ def test_later_work_does_not_sign_what_somebody_else_did_before_it(
     report = check(folder.path, key)
     assert report.vouched == "not signed"
     assert f"signed with key {key.name} up to seal 2, then not signed" in report.verdict
+
+
+@pytest.mark.parametrize(
+    ("attack", "names"), [(unused_bytes, "flight.sqlite"), (changed_sidecar, "frames/000000.cr2.xmp")]
+)
+def test_what_was_changed_between_two_works_stays_known(
+    sealed: FlightFolder, attack: Callable[[FlightFolder], None], names: str
+) -> None:
+    """Without a key too: the next seal covers what is there, and the ledger tells that something else made it."""
+    attack(sealed)
+    with seals.reopened(sealed, LATER, "late tags"):
+        pass
+    report = check(sealed.path)
+    assert report.problems == ()
+    assert report.notes == (f"changed, added or removed by something else after seal 2: {names}",)
 
 
 @pytest.mark.parametrize("name", ["shots.jsonl", "seals.jsonl", "offloaded.jsonl"])

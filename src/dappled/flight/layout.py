@@ -11,6 +11,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -27,10 +28,14 @@ from dappled.flight.errors import FlightError, disk_error
 _FLIGHT_NAME = re.compile(r"(\d{8}T\d{6}Z|boot[0-9a-f]{8})-[0-9a-f]{8}")
 _FRAME_NAME = re.compile(r"(\d{6,})\.([a-z0-9]{1,8})")
 _LOCK = ".lock"
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+UNFINISHED = ".offload.part"  # in the copy of a flight, while files of it are missing or its ledger lacks some
 SIDECAR = ".xmp"  # written beside frames by later work; in no row of the ledger
 FEWEST_FILES = 16  # a frame, its companion, temporary files, for each of the shots that may be under way
 JOURNAL_BYTES = 1_000_000  # journal, ledger and telemetry of some seconds
 RECORDS = "records into"  # what the daemon does in a flights folder
+_NO_LOCKS = frozenset((errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS))
+_WITHOUT_LOCK = _NO_LOCKS | {errno.EACCES, errno.EPERM, errno.EROFS}
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
@@ -76,9 +81,12 @@ class FlightFolder:
         return confined.path(self.path, name, f"the ledger {self.ledger}")
 
     def refuse_links(self) -> None:
-        """Raise OutsideError where one of the flight's own files, or the folder of frames, is a link."""
-        for own in (self.settings, self.ledger, self.journal, self.telemetry, self.frames):
-            confined.path(self.path, own.name, f"the flight {self.path}")
+        """Raise OutsideError where one of the flight's own files, one that SQLite has beside the ledger, or the folder
+        of frames is a link."""
+        beside = (self.ledger.name + suffix for suffix in ("-wal", "-shm", "-journal"))
+        own = (self.settings, self.ledger, self.journal, self.telemetry, self.frames, self.seals)
+        for name in (*(path.name for path in own), *beside):
+            confined.path(self.path, name, f"the flight {self.path}")
 
 
 def extension(camera_name: str) -> str:
@@ -264,11 +272,12 @@ class FlightsLock:
         path = root / _LOCK
         try:
             durable.make_folder(root)
-            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | _NO_LINK, 0o644)
         except OSError as error:
             raise disk_error("make the lock", path, error) from error
         try:
             file_lock.lock(self._fd)
+            _refuse_shared(self._fd, path)
             os.ftruncate(self._fd, 0)
             os.pwrite(self._fd, f"{os.getpid()} {doing}\n".encode(), 0)
         except BlockingIOError as error:
@@ -285,6 +294,9 @@ class FlightsLock:
         except OSError as error:
             os.close(self._fd)
             raise disk_error("take the lock", path, error) from error
+        except FlightError:
+            os.close(self._fd)
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -296,14 +308,29 @@ class FlightsLock:
         os.close(self._fd)
 
 
+def _refuse_shared(fd: int, path: Path) -> None:
+    """Raise FlightError where what should be the lock is another file under a second name, or no file: it is written
+    to."""
+    found = os.fstat(fd)
+    if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+        raise FlightError(f"{path} is not the lock of a flights folder, but another file: remove it")
+
+
+def refuse_unfinished(folder: FlightFolder) -> None:
+    """Raise FlightError for the copy of a flight to which an offload was cut short."""
+    if (folder.path / UNFINISHED).is_file():
+        raise FlightError(f"{folder.path} is the copy of an offload that was cut short: run that offload again first")
+
+
 def work_lock(root: Path, doing: str, *, needed: bool = False) -> AbstractContextManager[object]:
     """The lock of a flights folder for work on its closed flights. Where this user can't make it there and no other
-    process holds it, the work goes without, unless it is `needed`. Raises FlightError."""
+    process holds it, or the file system has no locks, the work goes without, unless it is `needed`. Raises
+    FlightError."""
     try:
         return FlightsLock(root, doing)
     except FlightError as error:
         why = error.__cause__.errno if isinstance(error.__cause__, OSError) else None
-        if needed or why not in (errno.EACCES, errno.EPERM, errno.EROFS) or is_locked(root):
+        if needed or why not in _WITHOUT_LOCK or (why not in _NO_LOCKS and is_locked(root)):
             raise
         return nullcontext()
 
@@ -312,7 +339,7 @@ def is_locked(root: Path) -> bool:
     """Whether some process records into `root` now. Raises FlightError when the lock can't be read."""
     path = root / _LOCK
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        fd = os.open(path, os.O_RDONLY | _NO_LINK)
     except FileNotFoundError:
         return False
     except OSError as error:

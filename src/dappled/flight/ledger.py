@@ -124,6 +124,9 @@ class LedgerReader(Database):
         """Open a ledger for reading. Raises FlightError."""
         if not path.is_file():
             raise FlightError(f"there is no ledger at {path}; give a flight folder that dappled recorded")
+        journal = path.with_name(path.name + "-journal")
+        if journal.is_file() and journal.stat().st_size:
+            raise FlightError(f"{journal} stands beside the ledger, and SQLite would change it by that: move it away")
         try:
             # Not mode=ro: when such a connection is the last one, it leaves -wal and -shm behind. We change nothing.
             reader = cls(path, uri=f"{path.absolute().as_uri()}?mode=rw")

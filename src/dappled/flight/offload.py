@@ -78,7 +78,7 @@ def offload(
             _finish_seal(folder, clock)
         source = stack.enter_context(Tree(folder.path))
         names = [name for name in source.walk() if _is_copied(name)]
-        there = stack.enter_context(_open_copy(source, destination, same_device=same_device))
+        there = _open_copy(stack, source, destination, same_device=same_device)
         system = places.file_system(there.folders[""])
         if prune:
             _refuse_unprovable(there, system, same_device=same_device)
@@ -114,12 +114,14 @@ class _Copying:
                 self._refuse_different(name, known)
                 known = None
             if known is None:
+                self._mark()
                 known = self._copy(name)
                 fresh.add(name)
             manifest[name] = known
             progress(manifest[name].identity.size)
         later = self._bring_ledger(manifest, fresh)
         self._there.sync()
+        self._unmark()
         self._there.sync_above()
         ways, copies = self._prove(manifest, fresh)
         rows = self._acknowledged()
@@ -206,6 +208,17 @@ class _Copying:
                 f"{self._there.path / name} is the same file as {self._source.path / name} under another name: nothing "
                 "was removed; give a folder on another disk"
             )
+
+    def _mark(self) -> None:
+        """Mark the copy as unfinished, durably: a daemon that records there would repair it, and work there be lost."""
+        if self._there.stat(layout.UNFINISHED) is None:
+            self._there.write(layout.UNFINISHED, [f"offloaded from {self._source.path}\n".encode()])
+            self._there.sync()
+
+    def _unmark(self) -> None:
+        if self._there.stat(layout.UNFINISHED) is not None:
+            self._there.unlink(layout.UNFINISHED)
+            self._there.sync()
 
     def _copy(self, name: str) -> Proved:
         """Copy a file; the hash is that of the bytes which were written."""
@@ -357,10 +370,12 @@ def _finish_seal(folder: FlightFolder, clock: Clock) -> None:
         seals.seal(folder, clock, PRUNES)
 
 
-def _open_copy(source: Tree, destination: Path, *, same_device: bool) -> Tree:
-    """Open the flight's folder at the destination with all folders of the source, made where they are missing.
+def _open_copy(stack: ExitStack, source: Tree, destination: Path, *, same_device: bool) -> Tree:
+    """Open the flight's folder at the destination with all folders of the source, made where they are missing, and hold
+    the lock of the destination: work on the flights there would take half-written files for its own. `stack` closes
+    both.
 
-    Raises FlightError where one of them is the source's, before anything is written.
+    Raises FlightError where one of them is the source's, before anything is written, and where others work there.
     """
     top = destination.resolve()
     existing = next(path for path in (top, *top.parents) if path.is_dir())
@@ -373,17 +388,14 @@ def _open_copy(source: Tree, destination: Path, *, same_device: bool) -> Tree:
     with Tree(top) as parent:
         places.refuse_same_place(source, parent, same_device=same_device)
         parent.enter(source.path.name, make=True)
-    there = Tree(top / source.path.name)
-    try:
+    there = stack.enter_context(Tree(top / source.path.name))
+    places.refuse_same_place(source, there, same_device=same_device)
+    stack.enter_context(layout.work_lock(top, "offloads into"))
+    for name in sorted(source.folders):
+        there.enter(name, make=True)
         places.refuse_same_place(source, there, same_device=same_device)
-        for name in sorted(source.folders):
-            there.enter(name, make=True)
-            places.refuse_same_place(source, there, same_device=same_device)
-        there.enter("frames", make=True)  # also of a flight without a frame
-        places.refuse_reexport(source, there)
-    except BaseException:
-        there.close()
-        raise
+    there.enter("frames", make=True)  # also of a flight without a frame
+    places.refuse_reexport(source, there)
     return there
 
 

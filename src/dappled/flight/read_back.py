@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import mmap
 import os
+import stat
 from typing import Literal
 
 from dappled import durable
@@ -21,8 +22,10 @@ _REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
 
 def hash_on_disk(name: str, folder: int) -> tuple[str, ReadBack]:
     """fsync a file in an open folder and return its SHA-256 (hex), and how it was read. Raises OSError."""
-    fd = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
+    fd = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder)
     try:
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
+            raise OSError(errno.ENOTSUP, "it is no file")  # a pipe would be waited for
         os.fsync(fd)
         os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
         size = os.fstat(fd).st_size

@@ -43,6 +43,7 @@ def recover(root: Path, index: ImageIndex, clock: Clock, key: SealKey | None) ->
         if folder.name in sealed:
             continue
         try:
+            layout.refuse_unfinished(folder)
             cut_short = not _closed(folder)
             signs = key if key is not None and (cut_short or seals.may_sign(folder, key)) else None
             report += [f"flight {folder.name}: {text}" for text in recover_flight(folder, clock)]

@@ -26,6 +26,8 @@ from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.seal_key import SealKey
 
 FACT = "seals"  # {"count": seals announced, "missing": those that were never written}
+CHANGED = "changed in between"  # an event: what later work found that was not as the seal before it covers it
+_NAMED = 5
 _BESIDE_LEDGER = ("-wal", "-shm")
 _MOST_SEALS = 100_000
 _MAC = "mac"
@@ -129,7 +131,6 @@ def reopened(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None =
         yield
         return
     signs = key if key is not None and is_signed(folder, key) else None
-    _remove_parts(folder)
     with opened_again(folder, clock, why, signs):
         yield
 
@@ -138,8 +139,13 @@ def reopened(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None =
 def opened_again(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None) -> Iterator[None]:
     """Work on a closed flight as `reopened` does, where the caller has judged whether `key` may sign. Raises
     FlightError."""
+    _remove_parts(folder)
+    last, changed = read(folder).last, changed_since(folder)
     with Ledger(folder.ledger, clock) as ledger:
         ledger.add_event("opened again", why)
+        if last is not None and changed:
+            names = ", ".join(changed[:_NAMED]) + (f" and {len(changed) - _NAMED} more" if changed[_NAMED:] else "")
+            ledger.add_event(CHANGED, f"changed, added or removed by something else after seal {last.seal}: {names}")
     try:
         yield
     finally:
@@ -147,7 +153,9 @@ def opened_again(folder: FlightFolder, clock: Clock, why: str, key: SealKey | No
 
 
 def _remove_parts(folder: FlightFolder) -> None:
-    """Remove what earlier work left half-written when it was killed. Raises FlightError."""
+    """Remove what earlier work left half-written when it was killed. Raises FlightError, also where the flight is the
+    copy of an offload that was cut short: that one goes on."""
+    layout.refuse_unfinished(folder)
     try:
         for root, _, names in os.walk(folder.path, onerror=_raise):
             for name in names:
@@ -167,26 +175,40 @@ def may_sign(folder: FlightFolder, key: SealKey) -> bool:
 
 
 def is_signed(folder: FlightFolder, key: SealKey) -> bool:
-    """Whether the newest seal is signed by this key, and covers all links of the chain and every file that the ledger
-    has no digest of, and whether each file that it covers is still there. Raises FlightError."""
+    """Whether the newest seal is signed by this key and covers all links of the chain, and nothing that it covers was
+    changed since. Raises FlightError."""
     last = read(folder).last
     if last is None or last.key != key.name or not key.signed(last.signed_part(), last.mac or ""):
         return False
+    return is_sealed(folder) and not changed_since(folder)
+
+
+def changed_since(folder: FlightFolder) -> list[str]:
+    """The files that something other than dappled changed since the newest seal, by name: also the ledger, down to the
+    bytes that no row uses. None where rows were written since, or there is no seal: then the files may be newer too.
+
+    Frames and telemetry are compared with the ledger by `flight check`, and with its digests here only by their names.
+    Raises FlightError.
+    """
+    last = read(folder).last
+    if last is None or not is_sealed(folder):
+        return []
     with LedgerReader.open(folder.ledger) as ledger:
-        head, recorded = ledger.last_link(), recorded_files(ledger)
-    if head is None or (last.links, last.head) != (head.number, head.link):
-        return False
-    present = {path.relative_to(folder.path).as_posix() for path in sealed_paths(folder)}
-    if last.files.keys() - present - pruning.removed(folder).keys():
-        return False
+        recorded = recorded_files(ledger)
+    present = {path.relative_to(folder.path).as_posix(): path for path in sealed_paths(folder)}
+    wal = folder.ledger.with_name(folder.ledger.name + "-wal")
+    found = {*(last.files.keys() - present.keys() - pruning.removed(folder).keys())}
     try:
-        return all(
-            last.files.get(name) == (path.stat().st_size, durable.hash_file(path))
-            for name, path in ((path.relative_to(folder.path).as_posix(), path) for path in sealed_paths(folder))
-            if name not in recorded and path != folder.ledger
-        )
+        if wal.is_file() and wal.stat().st_size:
+            found.add(folder.ledger.name)
+        found |= {
+            name
+            for name, path in present.items()
+            if name not in recorded and last.files.get(name) != (path.stat().st_size, durable.hash_file(path))
+        }
     except OSError as error:
         raise disk_error("read the files of", folder.path, error) from error
+    return sorted(found)
 
 
 def is_sealed(folder: FlightFolder) -> bool:

@@ -38,6 +38,8 @@ def look(folder: FlightFolder) -> PlaceFindings:
     for entry, name in _entries(folder.path):
         if entry.is_symlink():
             unknown.append((name, f"{name} is a link, which dappled never makes; it was not followed"))
+        elif name == layout.UNFINISHED:
+            unknown.append((name, "an offload to this folder was cut short: run it again"))
         elif durable.is_temporary(entry.name) and Path(name).parent.as_posix() != folder.frames.name:
             half_written.append((name, f"{name} is a half-written file"))
         elif entry.is_dir():

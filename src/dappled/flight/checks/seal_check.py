@@ -63,6 +63,7 @@ def compare(
     problems = [*file.problems, *_numbers(file.seals, links or {}, facts), *_heads(file.seals, links or {}, facts)]
     problems += [*_signatures(file.seals, key), *_rewritten(file.seals)]
     notes = [f"seal {number} was never written: its work was interrupted" for number in seals.announced(facts)[1]]
+    notes += [event.text for event in ledger.events() if event.kind == seals.CHANGED]
     last = file.last
     if last is None:
         vouched: Vouched = "no chain" if links is None else "not sealed"
