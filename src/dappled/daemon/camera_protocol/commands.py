@@ -20,6 +20,7 @@ ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
 DENIED = mavlink.MAV_RESULT_DENIED
 UNSUPPORTED = mavlink.MAV_RESULT_UNSUPPORTED
 REJECTED = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 OLD_IMAGES = 256
 SHORTEST_NS = 100_000_000  # 10 Hz: nothing here changes faster
 LONGEST_US = 3.6e9
@@ -62,6 +63,11 @@ class Command:
     def integer(self, place: int, default: int = 0) -> int:
         """Parameter 1 to 7 as an integer; the default where it is not finite."""
         return round(self.number(place, float(default)))
+
+    @property
+    def of_autopilot(self) -> bool:
+        """Whether an autopilot sent it."""
+        return self.component == AUTOPILOT
 
     @property
     def source(self) -> str:
@@ -149,7 +155,13 @@ class CameraCommands:
             return _NOT_OURS
         count = command.integer(3, 1)
         request = CaptureRequest(
-            command.source, "IMAGE_START_CAPTURE", command.integer(4), command.confirmation, command.link
+            command.source,
+            "IMAGE_START_CAPTURE",
+            command.integer(4),
+            command.confirmation,
+            command.link,
+            broadcast=command.broadcast,
+            autopilot=command.of_autopilot,
         )
         if count == 1:
             return _decided(self._shutter.request(request))
@@ -171,6 +183,8 @@ class CameraCommands:
             command.confirmation,
             command.link,
             acknowledged=not command.broadcast,
+            broadcast=command.broadcast,
+            autopilot=command.of_autopilot,
         )
         return _decided(self._shutter.request(request))
 

@@ -159,6 +159,7 @@ class Component:
             packet.link,
             acknowledged=False,
             time_us=int(message.time_usec),
+            autopilot=True,
             happened=name == "CAMERA_FEEDBACK" or not self._shutter.fires,
         )
         decision = self._shutter.request(request)

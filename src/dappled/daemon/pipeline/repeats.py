@@ -13,11 +13,16 @@
 4. Echo. An autopilot that we command to fire the camera (a servo, a relay, its own trigger) reports that:
    CAMERA_TRIGGER, CAMERA_FEEDBACK, or the command for cameras. One message of each kind on each link within 2 s of our
    command is its echo and not a request, else every shot would ask for the next (`AutopilotCommands`).
-
 5. Same instant. CAMERA_TRIGGER and CAMERA_FEEDBACK carry the autopilot's time in microseconds. One of the same source
    with the same time (not 0) and number as one of the last 256 is that trigger, however late it comes: delayed on a
    link, or replayed by somebody (`RecentRequests`). Commands carry no time, and their numbers start again with their
    sender, so a command that comes again after the windows above can't be told from a new one.
+
+6. Forwarded. A ground station's capture request to all components also reaches the autopilot, which executes it: its
+   version follows, from another sender, with another number and often as another command. An autopilot's request within
+   0.25 s of a ground station's broadcast, or the other way round, is that broadcast. Each message of one side is paired
+   with one message of the other, the oldest first (`ForwardedRequests`). An autopilot's own trigger within 0.25 s of a
+   broadcast is therefore joined with it; no body here takes two photographs within 0.25 s. For intervals see `Shutter`.
 
 A series (an interval, a step of the zoom) is a different request than a single shot and than a series with other
 numbers: only a retry with the same numbers is the same, and nothing else belongs to its first shot.
@@ -40,6 +45,8 @@ RETRY_LIMIT_NS = 2_400_000_000
 CONFIRMED_RETRY_NS = 10 * 10**9
 TRIGGER_NS = 300_000_000
 ECHO_NS = 2 * 10**9
+FORWARDED_NS = 250_000_000
+_UNPAIRED_KEPT = 64
 _PACKETS_KEPT = 1024
 _REQUESTS_KEPT = 256
 _COMMANDS_KEPT = 32
@@ -65,6 +72,8 @@ class CaptureRequest:
     series: tuple[float, ...] | None = None
     time_us: int = 0  # the sender's own time of it; 0: the kind has none
     happened: bool = False  # it reports an exposure: that can't be refused
+    broadcast: bool = False  # to all components: the autopilot may execute it too
+    autopilot: bool = False  # an autopilot sent it
 
 
 @dataclass(slots=True)
@@ -150,6 +159,38 @@ class RecentRequests:
             if all(sequence == request.sequence for (kind, _), sequence in known.parts.items() if kind == request.kind):
                 return known
         return None
+
+
+@dataclass(frozen=True, slots=True)
+class _Unpaired:
+    at_ns: int
+    autopilot: bool
+    index: int
+
+
+class ForwardedRequests:
+    """Ground stations' broadcasts and autopilots' requests of the last 0.25 s (at most 64) that have no partner yet."""
+
+    def __init__(self) -> None:
+        self._unpaired: deque[_Unpaired] = deque(maxlen=_UNPAIRED_KEPT)
+
+    def partner(self, request: CaptureRequest, now_ns: int) -> int | None:
+        """The image index of the shot that the other side's message got; None where there is none. It has its partner
+        then. Times are monotonic."""
+        if not (request.autopilot or request.broadcast):
+            return None
+        while self._unpaired and now_ns - self._unpaired[0].at_ns > FORWARDED_NS:
+            self._unpaired.popleft()
+        for one in self._unpaired:
+            if one.autopilot != request.autopilot:
+                self._unpaired.remove(one)
+                return one.index
+        return None
+
+    def add(self, request: CaptureRequest, now_ns: int, index: int) -> None:
+        """A request that belongs to shot `index` may have a partner that comes later."""
+        if request.autopilot or request.broadcast:
+            self._unpaired.append(_Unpaired(now_ns, request.autopilot, index))
 
 
 class PacketDedup:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 from dappled.clock import Clock
-from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
+from dappled.daemon.pipeline.repeats import FORWARDED_NS, CaptureRequest, ForwardedRequests, RecentRequests
 from dappled.errors import counted, report
 from dappled.flight import Cause, FlightError, Shot
 from dappled.refusals import RefusalLog, Refusals
@@ -68,6 +68,13 @@ class _Interval:
     command: CaptureRequest
     began_ns: int
     taken: int = 1
+    driven: bool = False  # the autopilot runs the same interval, and sets its pace
+
+    def took(self) -> None:
+        """One more shot of it was taken or missed."""
+        self.taken += 1
+        if self.left is not None:
+            self.left -= 1
 
 
 class ShotSink(Protocol):
@@ -100,7 +107,7 @@ class Shutter:
         self._next_index = next_index
         self._capacity = capacity
         self._lock = threading.Lock()
-        self._recent = RecentRequests()
+        self._recent, self._forwarded = RecentRequests(), ForwardedRequests()
         self._refusals = RefusalLog(log, clock)
         self._pending: set[int] = set()
         self._interval: _Interval | None = None
@@ -137,19 +144,26 @@ class Shutter:
         Takes the place of a running interval, unless it is a retry of the command that started it; ends at `count`
         shots taken or missed, or at `stop_interval`. A shot that can't be taken when it is due is counted as refused,
         and not made up for.
+
+        An autopilot that heard the same broadcast runs the interval as well, and requests each shot. From its first
+        request on these are the interval's shots; one that is 0.25 s late is taken without it. That holds for intervals
+        of 0.5 s and more.
         """
         if not (math.isfinite(interval_s) and 0 <= interval_s <= 86400) or count < 0:
             with self._lock:
                 return self._refuse(request, "an interval must be 0 to 86400 s, and a count 0 or more")
         request = replace(request, series=(interval_s, float(count)))
         with self._lock:
-            decision = self._judge(request)
-            if decision.outcome == "shot" and count != 1:
+            if (known := self._recent.same(request, self._clock.monotonic_ns())) is not None:
+                return ShotDecision("duplicate", index=known)
+            decision = self._judge(request)  # a duplicate of the autopilot's first request begins the interval as well
+            if decision.accepted and count != 1:
                 step_ns = round(max(interval_s, _SHORTEST_S if interval_s > 0 else 0.0) * 1e9)
                 left = None if count == 0 else count - 1
                 self._end_interval(request.source)
-                now_ns = self._clock.monotonic_ns()
-                self._interval = _Interval(request.source, step_ns, left, now_ns + step_ns, request, now_ns)
+                now_ns, driven = self._clock.monotonic_ns(), decision.outcome == "duplicate"
+                due_ns = now_ns + step_ns + (FORWARDED_NS if driven else 0)
+                self._interval = _Interval(request.source, step_ns, left, due_ns, request, now_ns, driven=driven)
                 self._wake.set()
         return decision
 
@@ -192,10 +206,16 @@ class Shutter:
             if interval is None or (interval.interval_ns == 0 and self._pending):
                 return _IDLE_S
             if now_ns >= interval.due_ns:
-                decision = self._judge(CaptureRequest(interval.source, "interval", interval.taken, acknowledged=False))
-                interval.taken += 1
-                if interval.left is not None:
-                    interval.left -= 1
+                decision = self._judge(
+                    CaptureRequest(
+                        interval.source,
+                        "interval",
+                        interval.taken,
+                        acknowledged=False,
+                        broadcast=interval.command.broadcast,
+                    )
+                )
+                interval.took()
                 if interval.left == 0:
                     self._interval = interval = None
                 elif interval.interval_ns:
@@ -233,7 +253,14 @@ class Shutter:
         if request.kind != "interval":
             known = self._recent.same(request, now_ns)
             if known is not None:
+                if not request.autopilot:
+                    self._forwarded.add(request, now_ns, known)  # the autopilot executes a broadcast's retry as well
                 return ShotDecision("duplicate", index=known)
+        if (partner := self._forwarded.partner(request, now_ns)) is not None:
+            if request.kind != "interval":
+                self._recent.add(request, now_ns, partner)
+            self._follow_autopilot(request, now_ns, new=False)
+            return ShotDecision("duplicate", index=partner)
         reason = self._why_not(happened=request.happened)
         if reason is None:
             shot = Shot(
@@ -250,6 +277,8 @@ class Shutter:
         self._pending.add(shot.index)
         if request.kind != "interval":
             self._recent.add(request, now_ns, shot.index)
+        self._forwarded.add(request, now_ns, shot.index)
+        self._follow_autopilot(request, now_ns, new=True)
         try:
             self._sink.fire(shot)
         except Exception:
@@ -258,6 +287,22 @@ class Shutter:
             self._failed += 1
             raise
         return ShotDecision("shot", index=shot.index)
+
+    def _follow_autopilot(self, request: CaptureRequest, now_ns: int, *, new: bool) -> None:
+        """Where the autopilot runs the interval as well: it sets the pace, and its `new` request is the next shot."""
+        interval = self._interval
+        if interval is None or not interval.command.broadcast or not request.autopilot:
+            return
+        if interval.interval_ns < 2 * FORWARDED_NS:
+            return
+        interval.driven = interval.driven or not new
+        if not interval.driven:
+            return
+        if new:
+            interval.took()
+        if interval.left == 0:
+            self._interval = None
+        interval.due_ns = now_ns + interval.interval_ns + FORWARDED_NS
 
     def _refuse(self, request: CaptureRequest, reason: str) -> ShotDecision:
         self._refused += 1
