@@ -6,7 +6,8 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
@@ -17,19 +18,27 @@ from dappled.errors import DappledError, counted
 from dappled.flight import layout
 from dappled.products.batch import batch, workers
 from dappled.products.batch.batch import KINDS, Job, Manifest
+from dappled.products.geotags import geotags, marks
+from dappled.products.geotags.geotags import Placed
+from dappled.products.handover import photo_files
+from dappled.products.maps import earth
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n"
         "  dappled batch ~/flights/20261121T* -o products\n"
+        "  dappled batch FLIGHT --as photos -o products --pos rover_events.pos\n"
         "  dappled batch FLIGHT --as npz cog -o products --scheduler tcp://10.0.0.5:8786\n"
         "Continues where it was stopped. A bad frame is reported and does not stop the others."
     )
     parser.add_argument("flights", nargs="+", type=Path, metavar="FLIGHT", help="flight folders")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the results")
     parser.add_argument("--as", dest="kinds", nargs="+", choices=tuple(KINDS), default=["npz"],
-                        help="per frame: a light field (npz, zarr, h5) or a map (cog, kmz); default: npz")  # fmt: skip
+                        help="per frame: a light field (npz, zarr, h5; default: npz), a map (cog, kmz), or pictures\n"
+                        "with position (photos: 16-bit TIFF and JPEG, and geo.txt for OpenDroneMap)")  # fmt: skip
+    parser.add_argument("--pos", type=Path, metavar="FILE",
+                        help="marks after PPK, as for dappled geotag; one FLIGHT only")  # fmt: skip
     parser.add_argument("--workers", type=whole, default=os.cpu_count() or 1, metavar="N",
                         help="number of processes (default: one per core)")  # fmt: skip
     parser.add_argument(
@@ -40,11 +49,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    if arguments.pos and len(arguments.flights) > 1:
+        raise DappledError(f"--pos {arguments.pos} holds the marks of one flight: give one FLIGHT")
     jobs: list[Job] = []
     refused = 0
+    lists: list[Callable[[Manifest], None]] = []
     for flight in _different(arguments.flights):
         try:
-            jobs += _planned(flight, arguments)
+            planned, placed = _planned(flight, arguments)
+            jobs += planned
+            lists.append(partial(_lists, placed=placed, jobs=planned))
         except DappledError as error:  # go on with the other flights
             refused += 1
             named = str(error) if str(flight) in str(error) else f"{flight}: {error}"
@@ -69,6 +83,8 @@ def run(arguments: argparse.Namespace) -> int:
                 if arguments.json:
                     said = {"flight": done.flight, "frame": done.frame, "error": done.error, "seconds": done.seconds}
                     print(json.dumps({**said, "files": [one.name for one in done.outputs]}))
+        for write in lists if "photos" in arguments.kinds else ():
+            write(manifest)
     if not jobs:
         raise DappledError("these flights hold no frames")
     if not arguments.json:
@@ -88,10 +104,26 @@ def _different(flights: Sequence[Path]) -> list[Path]:
     return list(named.values())
 
 
-def _planned(flight: Path, arguments: argparse.Namespace) -> list[Job]:
-    """The jobs of one flight. Raises DappledError."""
+def _planned(flight: Path, arguments: argparse.Namespace) -> tuple[list[Job], list[Placed]]:
+    """The jobs of one flight, and where its frames were taken. Raises DappledError."""
     folder = layout.open_folder(flight)
     facts = layout.read_facts(folder)
     recipe = georeference.recipe(folder.path, facts, arguments)
     options = georeference.options(facts, arguments)
-    return batch.plan(folder.path, recipe, options, arguments.kinds, arguments.output)
+    marked = geoid = None
+    if arguments.pos:
+        geoid = earth.geoid(arguments.geoid)
+        marked = marks.find(folder.path, arguments.pos, geoid)
+        for text in marks.sentences(marked):
+            print(text, file=sys.stderr)
+    placed, _ = geotags.read(folder.path, options.mounting, geoid, marked)
+    by_index = {one.frame.index: one for one in placed}
+    return batch.plan(folder.path, recipe, options, arguments.kinds, arguments.output, placed=by_index), placed
+
+
+def _lists(manifest: Manifest, placed: Sequence[Placed], jobs: Sequence[Job]) -> None:
+    """Write geo.txt beside the pictures of a flight that are there."""
+    there = {job.frame.index for job in jobs if manifest.holds(job.key)}
+    if there:
+        folder = manifest.path.parent / Path(jobs[0].flight).name / "photos"
+        photo_files.write_lists(folder, [one for one in placed if one.frame.index in there])

@@ -113,7 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
             words
             + (f", {len(copied)} {'copy' if len(copied) == 1 else 'copies'} with EXIF" if arguments.copies else "")
         )
-    for text in _of_marks(marked) if marked else ():
+    for text in marks.sentences(marked) if marked else ():
         print(text, file=sys.stderr)
     for name in written.without_position:
         print(f"no position is known for {name}", file=sys.stderr)
@@ -135,17 +135,6 @@ def _tag_late(flight: Path, key: SealKey | None) -> list[int]:
     if added:
         print(f"tagged {counted(len(added), 'frame')} that the recording had left without a tag", file=sys.stderr)
     return added
-
-
-def _of_marks(marked: Marked) -> list[str]:
-    """Sentences about the matching of marks and frames."""
-    times = f"times agree within {1e3 * marked.spread_s:.1f} ms after {1e3 * marked.offset_s:+.1f} ms"
-    lines = [f"{counted(len(marked.marks), 'frame')} placed by a mark; {times}"]
-    if marked.shift_m:
-        north, east, up = marked.shift_m
-        lines.append(f"marks less autopilot (median): {north:+.2f} m north, {east:+.2f} m east, {up:+.2f} m up")
-    lost = [f"frame {index} has no mark: it keeps the autopilot's position" for index in marked.lost]
-    return [*lines, *lost, *marked.extra, *(f"in doubt: {text}" for text in marked.doubts)]
 
 
 def _marks_json(marked: Marked) -> dict[str, Any]:

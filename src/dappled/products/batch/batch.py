@@ -13,10 +13,11 @@ import json
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 from dappled import __version__, confined, durable, file_lock
@@ -25,13 +26,16 @@ from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError, sentence
 from dappled.flight import Frame, Tag, canonical
 from dappled.products.exports import light_files
+from dappled.products.geotags.geotags import Placed
+from dappled.products.handover import photo_files
 from dappled.products.maps import cog, georeference, map_files, photographs
 from dappled.products.maps.earth import Projection, utm
 from dappled.products.maps.georeference import Options
 from dappled.products.maps.photographs import Station
 
-KINDS = {"npz": ".npz", "zarr": ".zarr", "h5": ".h5", "cog": ".tif", "kmz": ".kmz"}
+KINDS = {"npz": ".npz", "zarr": ".zarr", "h5": ".h5", "cog": ".tif", "kmz": ".kmz", "photos": ""}
 MAPS = ("cog", "kmz")
+PLACED = (*MAPS, "photos")  # what needs a full pose
 MANIFEST = "manifest.jsonl"
 _LINE_BYTES = 1 << 20  # of a manifest
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # mallopt(3)
@@ -40,7 +44,8 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # mallopt(3)
 @dataclass(frozen=True, slots=True)
 class Job:
     """One frame and all that is to be made of it. `station` is None where its position isn't known, for the reason
-    `why`; `level_m` is the height of flat ground. `key` is a hash of everything that the outcome depends on."""
+    `why`; `level_m` is the height of flat ground. `key` is a hash of everything that the outcome depends on.
+    `utc_ns` is mid-exposure, corrected; None where UTC was never known."""
 
     flight: str
     frame: Frame
@@ -53,6 +58,7 @@ class Job:
     kinds: tuple[str, ...]
     output: str
     key: str
+    utc_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +84,17 @@ class Done:
     peak_mb: float
 
 
-def plan(flight: Path, recipe: Recipe, options: Options, kinds: Sequence[str], output: Path) -> list[Job]:
-    """The jobs of one flight. Raises DappledError where the flight or the recipe can't be read."""
+def plan(
+    flight: Path,
+    recipe: Recipe,
+    options: Options,
+    kinds: Sequence[str],
+    output: Path,
+    *,
+    placed: Mapping[int, Placed] = MappingProxyType({}),
+) -> list[Job]:
+    """The jobs of one flight. `placed`: tags and times by image index, in place of the ledger's. Raises DappledError
+    where the flight or the recipe can't be read."""
     for kind in kinds:
         if kind not in KINDS:
             raise DappledError(f"a batch makes {', '.join(KINDS)}, not {kind}")
@@ -88,6 +103,7 @@ def plan(flight: Path, recipe: Recipe, options: Options, kinds: Sequence[str], o
     if options.terrain is not None:
         options = replace(options, terrain=options.terrain.absolute())
     frames, tags = photographs.recorded(flight)
+    tags |= {index: one.tag for index, one in placed.items()}
     if options.frames is not None:
         frames = [frame for frame in frames if frame.index in options.frames]
     stations: dict[int, Station] = {}
@@ -100,6 +116,7 @@ def plan(flight: Path, recipe: Recipe, options: Options, kinds: Sequence[str], o
     level = None
     if set(kinds) & set(MAPS) and stations:
         level = georeference.level_of(list(stations.values()), options)
+    if set(kinds) & set(PLACED) and stations:
         first = next(iter(stations.values())).camera
         options = replace(options, crs=options.crs or utm(first.latitude_deg, first.longitude_deg))
     common = {
@@ -113,13 +130,14 @@ def plan(flight: Path, recipe: Recipe, options: Options, kinds: Sequence[str], o
     jobs = []
     for frame in frames:
         tag = tags.get(frame.index)
-        said = {**common, "flight": flight.name, "name": frame.name, "frame": frame.sha256,
+        utc_ns = placed[frame.index].utc_ns if frame.index in placed else None
+        said = {**common, "flight": flight.name, "name": frame.name, "frame": frame.sha256, "utc_ns": utc_ns,
                 "tag": None if tag is None else asdict(tag)}  # fmt: skip
         key = hashlib.sha256(canonical(said)).hexdigest()
         jobs.append(
             Job(
                 str(flight.absolute()), frame, tag, stations.get(frame.index), reasons.get(frame.index, ""), level,
-                recipe, options, tuple(kinds), str(output.absolute()), key,
+                recipe, options, tuple(kinds), str(output.absolute()), key, utc_ns,
             )
         )  # fmt: skip
     return jobs
@@ -146,9 +164,9 @@ def _made(job: Job) -> list[BatchOutput]:
     folder = Path(job.output) / flight.name
     durable.make_folder(folder)
     beside = folder / Path(job.frame.name).stem
-    fields = [kind for kind in job.kinds if kind not in MAPS]
+    fields = [kind for kind in job.kinds if kind not in PLACED]
     drawn = [kind for kind in job.kinds if kind in MAPS]
-    if drawn and job.station is None:
+    if set(job.kinds) & set(PLACED) and job.station is None:
         raise DappledError(job.why)
     darkroom = _darkroom(job.recipe)
     made = georeference.decode(darkroom, flight, job.frame, job.tag, job.options)
@@ -159,6 +177,15 @@ def _made(job: Job) -> list[BatchOutput]:
         field = replace(made.light_field, attributes={**made.light_field.attributes, **pose})
         light_files.save(path, field, overwrite=True)
         outputs.append(_output(path, job))
+    if "photos" in job.kinds:
+        assert job.station is not None
+        assert job.options.crs is not None
+        one = georeference.place(job.station, made, darkroom, _projection(job.options.crs), job.options)
+        for form, data in photo_files.encoded(one, job.station, job.utc_ns).items():
+            path = folder / "photos" / form / (beside.name + photo_files.SUFFIXES[form])
+            durable.make_folder(path.parent)
+            durable.write_file(path, data)
+            outputs.append(_output(path, job))
     if drawn:
         assert job.station is not None
         assert job.level_m is not None

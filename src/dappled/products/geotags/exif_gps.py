@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -17,13 +18,16 @@ from dappled.errors import DappledError
 
 _GPS_IFD = 0x8825
 _BYTE, _ASCII, _LONG, _RATIONAL = 1, 2, 4, 5
+Entry = tuple[int, int, int, bytes]
+"""Tag, type, count and value (in the file's byte order) of a directory."""
 _RAF = b"FUJIFILMCCD-RAW"
 _RAF_JPEG = 84
 _EXIF = b"Exif\0\0"
 _PNG = b"\x89PNG\r\n\x1a\n"
 _SOI, _APP0, _APP1, _SOS = 0xD8, 0xE0, 0xE1, 0xDA
 _SEGMENT = 0xFFFF
-_EMPTY = b"II*\0" + struct.pack("<IHI", 8, 0, 0)
+EMPTY = b"II*\0" + struct.pack("<IHI", 8, 0, 0)
+"""A TIFF without an entry, little endian."""
 
 
 class ExifError(DappledError):
@@ -71,20 +75,30 @@ def tagged(data: bytes, where: Place) -> bytes:
 
 def _tiff(data: bytes, where: Place) -> bytes:
     order = "<" if data[:2] == b"II" else ">"
+    return with_directory(data, _GPS_IFD, _entries(order, where))
+
+
+def with_directory(data: bytes, tag: int, inner: Sequence[Entry], first_too: Sequence[Entry] = ()) -> bytes:
+    """A TIFF whose first directory has these entries besides its own, and points to a further directory by `tag`.
+
+    Both are appended, sorted by their tags. Raises struct.error and IndexError for a damaged TIFF."""
+    order = "<" if data[:2] == b"II" else ">"
     (first,) = struct.unpack_from(order + "I", data, 4)
     (count,) = struct.unpack_from(order + "H", data, first)
     body = data[first + 2 : first + 2 + 12 * count + 4]
     if len(body) != 12 * count + 4:
         raise IndexError("its first directory is cut off")
     entries = [body[12 * i : 12 * i + 12] for i in range(count)]
-    kept = [entry for entry in entries if struct.unpack_from(order + "H", entry)[0] != _GPS_IFD]
+    new = {tag, *(entry[0] for entry in first_too)}
+    kept = [entry for entry in entries if struct.unpack_from(order + "H", entry)[0] not in new]
     data += b"\0" * (len(data) % 2)
-    gps = _directory(order, len(data), _entries(order, where))
-    pointer = struct.pack(order + "HHII", _GPS_IFD, _LONG, 1, len(data))
-    kept = sorted([*kept, pointer], key=lambda entry: int(struct.unpack_from(order + "H", entry)[0]))
-    start = len(data) + len(gps)
+    pointer = struct.pack(order + "HHII", tag, _LONG, 1, len(data))
+    data += _directory(order, len(data), sorted(inner))
+    rows, values = _rows(order, len(data), first_too)
+    data += values
+    kept = sorted([*kept, *rows, pointer], key=lambda entry: int(struct.unpack_from(order + "H", entry)[0]))
     directory = struct.pack(order + "H", len(kept)) + b"".join(kept) + body[-4:]
-    return data[:4] + struct.pack(order + "I", start) + data[8:] + gps + directory
+    return data[:4] + struct.pack(order + "I", len(data)) + data[8:] + directory
 
 
 def _jpeg(data: bytes, where: Place) -> bytes:
@@ -97,7 +111,7 @@ def _jpeg(data: bytes, where: Place) -> bytes:
         at += 2 + length
         if insert == 2 and data[3] == _APP0:
             insert = at
-    return data[:insert] + _segment(_tiff(_EMPTY, where)) + data[insert:]
+    return data[:insert] + _segment(_tiff(EMPTY, where)) + data[insert:]
 
 
 def _png(data: bytes, where: Place) -> bytes:
@@ -111,7 +125,7 @@ def _png(data: bytes, where: Place) -> bytes:
         raise ExifError("the PNG is cut short: no position can be written into a copy")
     pixels, _ = first[b"IDAT"]
     start, end = first.get(b"eXIf", (pixels, pixels))
-    present = data[start + 8 : end - 4] if start < end else _EMPTY
+    present = data[start + 8 : end - 4] if start < end else EMPTY
     return data[:start] + _chunk(_tiff(present, where)) + data[end:]
 
 
@@ -125,22 +139,26 @@ def _segment(tiff: bytes) -> bytes:
     return struct.pack(">BBH", 0xFF, _APP1, len(tiff) + 8) + _EXIF + tiff
 
 
-def _directory(order: str, start: int, entries: list[tuple[int, int, int, bytes]]) -> bytes:
+def _directory(order: str, start: int, entries: Sequence[Entry]) -> bytes:
     """An image file directory for the offset `start`, followed by its longer values."""
-    values = b""
-    behind = start + 2 + 12 * len(entries) + 4
-    rows = b""
+    rows, values = _rows(order, start + 2 + 12 * len(entries) + 4, entries)
+    return struct.pack(order + "H", len(entries)) + b"".join(rows) + bytes(4) + values
+
+
+def _rows(order: str, behind: int, entries: Sequence[Entry]) -> tuple[list[bytes], bytes]:
+    """The entries' rows, and their longer values, which begin at the offset `behind`."""
+    rows, values = [], b""
     for tag, kind, count, value in entries:
         if len(value) <= 4:
             field = value.ljust(4, b"\0")
         else:
             field = struct.pack(order + "I", behind + len(values))
             values += value + b"\0" * (len(value) % 2)
-        rows += struct.pack(order + "HHI", tag, kind, count) + field
-    return struct.pack(order + "H", len(entries)) + rows + bytes(4) + values
+        rows.append(struct.pack(order + "HHI", tag, kind, count) + field)
+    return rows, values
 
 
-def _entries(order: str, where: Place) -> list[tuple[int, int, int, bytes]]:
+def _entries(order: str, where: Place) -> list[Entry]:
     """(tag, type, count, value) in the order of their tags (EXIF 2.3, GPS attributes)."""
 
     def ratios(*parts: tuple[int, int]) -> bytes:
@@ -155,7 +173,7 @@ def _entries(order: str, where: Place) -> list[tuple[int, int, int, bytes]]:
         coded = words.encode("ascii") + b"\0"
         return len(coded), coded
 
-    entries: list[tuple[int, int, int, bytes]] = [
+    entries: list[Entry] = [
         (0x00, _BYTE, 4, bytes((2, 3, 0, 0))),
         (0x01, _ASCII, 2, b"S\0" if where.latitude_deg < 0 else b"N\0"),
         (0x02, _RATIONAL, 3, angle(where.latitude_deg)),
@@ -179,4 +197,4 @@ def _entries(order: str, where: Place) -> list[tuple[int, int, int, bytes]]:
         entries.append((0x11, _RATIONAL, 1, ratios((round(where.direction_deg * 100) % 36000, 100))))
     if where.error_m is not None:
         entries.append((0x1F, _RATIONAL, 1, ratios((round(where.error_m * 1000), 1000))))
-    return sorted(entries)
+    return entries

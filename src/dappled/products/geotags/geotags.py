@@ -159,17 +159,19 @@ def _write(path: Path, data: bytes) -> None:
         raise disk_error("write", path, error) from error
 
 
-def odm(placed: Sequence[Placed]) -> str:
+def odm(placed: Sequence[Placed], suffix: str | None = None) -> str:
     """OpenDroneMap's geo.txt: EPSG:4326, then `name x y z [yaw pitch roll [hacc [vacc]]]`.
 
-    Fields are positional: a line ends before the first unknown one. z is above mean sea level.
+    Fields are positional: a line ends before the first unknown one. z is above mean sea level. `suffix` replaces
+    that of the frames' names, for pictures made of them.
     """
     lines = ["EPSG:4326"]
     for one in placed:
         if one.camera is None:
             continue
         camera, sigma = one.camera, one.tag.pose.position_sigma_m
-        words = [one.file_name, f"{camera.longitude_deg:.9f}", f"{camera.latitude_deg:.9f}"]
+        name = one.file_name if suffix is None else PurePosixPath(one.file_name).stem + suffix
+        words = [name, f"{camera.longitude_deg:.9f}", f"{camera.latitude_deg:.9f}"]
         words.append(f"{camera.altitude_msl_m:.3f}")
         if camera.pix4d:
             words += [f"{angle:.4f}" for angle in _ypr(camera)]

@@ -106,6 +106,17 @@ def find(flight: Path, path: Path, geoid: Geoid | None) -> Marked:
     )
 
 
+def sentences(marked: Marked) -> list[str]:
+    """What a person should know of the matching of marks and frames."""
+    times = f"times agree within {1e3 * marked.spread_s:.1f} ms after {1e3 * marked.offset_s:+.1f} ms"
+    lines = [f"{counted(len(marked.marks), 'frame')} placed by a mark; {times}"]
+    if marked.shift_m:
+        north, east, up = marked.shift_m
+        lines.append(f"marks less autopilot (median): {north:+.2f} m north, {east:+.2f} m east, {up:+.2f} m up")
+    lost = [f"frame {index} has no mark: it keeps the autopilot's position" for index in marked.lost]
+    return [*lines, *lost, *marked.extra, *(f"in doubt: {text}" for text in marked.doubts)]
+
+
 def _window_s(tags: Iterable[Tag]) -> float:
     """How much the times of true pairs differ: by the error of each shot's time."""
     sigma_s = max(tag.utc_sigma_ns for tag in tags) / 1e9

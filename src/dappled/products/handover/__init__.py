@@ -1,0 +1,1 @@
+"""Write a flight as pictures and poses for the programs that make models of them."""

@@ -1,0 +1,133 @@
+"""Encode a frame's picture as 16-bit TIFF and as JPEG, with place, time, lens and exposure in EXIF and XMP."""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import tifffile
+from PIL import Image
+
+from dappled import __version__, durable
+from dappled.decode.array_types import Floats, Singles
+from dappled.flight import Tag
+from dappled.products.geotags import exif_gps, geotags, sidecars
+from dappled.products.geotags.exif_gps import Entry
+from dappled.products.geotags.geotags import Placed
+from dappled.products.maps.photographs import Photograph, Station
+
+SUFFIXES = {"tiff": ".tif", "jpeg": ".jpg"}
+_QUALITY = 95
+_EXIF_IFD = 0x8769
+_ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED = 2, 3, 4, 5, 7
+_XMP_TAG = 700
+_XMP_HEAD = b"http://ns.adobe.com/xap/1.0/\0"
+_FILM_MM = 36.0
+_FIRST_OF_JPEG: list[Entry] = [
+    (0x011A, _RATIONAL, 1, struct.pack("<II", 72, 1)),
+    (0x011B, _RATIONAL, 1, struct.pack("<II", 72, 1)),
+    (0x0128, _SHORT, 1, struct.pack("<H", 2)),
+    (0x0213, _SHORT, 1, struct.pack("<H", 1)),
+]
+
+
+def gain_of(image: Singles) -> float:
+    """The gain that brings the brightest hundredth of a picture to 0.9 of white."""
+    level = float(np.nanpercentile(image, 99))
+    return 0.9 / level if level > 0 else 1.0
+
+
+def encoded(one: Photograph, station: Station, utc_ns: int | None) -> dict[str, bytes]:
+    """The files by kind, "tiff" and "jpeg": the picture in sRGB's curve, its brightest hundredth at 0.9 of white.
+
+    `utc_ns` is mid-exposure, corrected; None where UTC was never known.
+    """
+    shown = _srgb(one.image * gain_of(one.image))
+    xmp = sidecars.text(station.tag, station.camera, utc_ns).encode()
+    first, inner = _settings(one, station.tag, utc_ns)
+    gnss = station.tag.pose.gnss
+    where = replace(
+        exif_gps.place(station.camera, utc_ns, station.tag.pose.position_sigma_m),
+        dop=gnss.hdop if gnss else None,
+        satellites=gnss.satellites if gnss else None,
+    )
+    buffer = io.BytesIO()
+    tifffile.imwrite(
+        buffer,
+        np.round(shown * 65535).astype(np.uint16),
+        byteorder="<",
+        photometric="rgb" if shown.ndim == 3 else "minisblack",
+        metadata=None,
+        software=False,
+        extratags=[(_XMP_TAG, 1, len(xmp), xmp, True)],
+    )
+    tiff = exif_gps.tagged(exif_gps.with_directory(buffer.getvalue(), _EXIF_IFD, inner, first), where)
+    buffer = io.BytesIO()
+    settings = exif_gps.with_directory(exif_gps.EMPTY, _EXIF_IFD, inner, [*first, *_FIRST_OF_JPEG])
+    eight = Image.fromarray(np.round(shown * 255).astype(np.uint8))
+    eight.save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=b"Exif\0\0" + settings)
+    jpeg = exif_gps.tagged(buffer.getvalue(), where)
+    packet = _XMP_HEAD + xmp
+    jpeg = jpeg[:2] + struct.pack(">BBH", 0xFF, 0xE1, len(packet) + 2) + packet + jpeg[2:]
+    return {"tiff": tiff, "jpeg": jpeg}
+
+
+def write_lists(folder: Path, placed: Sequence[Placed]) -> None:
+    """Write geo.txt beside the pictures of each kind, which names them. Raises OSError."""
+    for form, suffix in SUFFIXES.items():
+        durable.write_file(folder / form / "geo.txt", geotags.odm(placed, suffix).encode())
+
+
+def _srgb(image: Singles) -> Floats:
+    """Linear values in sRGB's curve (IEC 61966-2-1), within 0 and 1; unknown ones are black."""
+    linear = np.clip(np.nan_to_num(image.astype(np.float64)), 0.0, 1.0)
+    return np.asarray(np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
+
+
+def _settings(one: Photograph, tag: Tag, utc_ns: int | None) -> tuple[list[Entry], list[Entry]]:
+    """Entries of the first directory and of EXIF 2.31's, little endian; unknown ones are left out."""
+    first = [_text(0x010F, "dappled"), _text(0x0110, tag.camera), _text(0x0131, f"dappled {__version__}")]
+    rows, columns = one.eye.shape
+    inner: list[Entry] = [
+        (0x9000, _UNDEFINED, 4, b"0231"),
+        (0x9101, _UNDEFINED, 4, bytes((1, 2, 3, 0))),
+        (0xA000, _UNDEFINED, 4, b"0100"),
+        (0xA001, _SHORT, 1, struct.pack("<H", 1)),  # sRGB
+        (0xA002, _LONG, 1, struct.pack("<I", columns)),
+        (0xA003, _LONG, 1, struct.pack("<I", rows)),
+    ]
+    if utc_ns is not None:
+        taken = datetime.fromtimestamp(utc_ns // 10**9, UTC).strftime("%Y:%m:%d %H:%M:%S")
+        fraction = f"{utc_ns % 10**9 // 1000:06d}"
+        first.append(_text(0x0132, taken))
+        inner += [_text(0x9003, taken), _text(0x9004, taken), _text(0x9011, "+00:00"), _text(0x9291, fraction)]
+    if tag.exposure_s:
+        inner.append(_ratio(0x829A, round(tag.exposure_s * 1e6), 10**6))
+    if tag.f_number:
+        inner.append(_ratio(0x829D, round(tag.f_number * 100), 100))
+    if tag.iso:
+        inner.append((0x8827, _SHORT, 1, struct.pack("<H", min(65535, round(tag.iso)))))
+    if tag.focal_length_mm:
+        per_mm = [float(np.linalg.norm(one.eye.matrix[:2, axis])) / tag.focal_length_mm for axis in (0, 1)]
+        inner += [
+            _ratio(0x920A, round(tag.focal_length_mm * 1000), 1000),
+            _ratio(0xA20E, round(per_mm[0] * 10 * 10**4), 10**4),  # pixels of this picture in a centimetre of the chip
+            _ratio(0xA20F, round(per_mm[1] * 10 * 10**4), 10**4),
+            (0xA210, _SHORT, 1, struct.pack("<H", 3)),
+            (0xA405, _SHORT, 1, struct.pack("<H", round(_FILM_MM * tag.focal_length_mm * per_mm[0] / columns))),
+        ]
+    return first, inner
+
+
+def _text(tag: int, words: str) -> Entry:
+    coded = words.encode("ascii", "replace") + b"\0"
+    return tag, _ASCII, len(coded), coded
+
+
+def _ratio(tag: int, above: int, below: int) -> Entry:
+    return tag, _RATIONAL, 1, struct.pack("<II", above, below)
