@@ -30,6 +30,8 @@ def read_npy(file: IO[bytes], stored: int, what: str) -> NDArray[Any]:
 def read_npz(path: Path, names: Collection[str]) -> dict[str, NDArray[Any]]:
     """Read these arrays of an NPZ file. Raises ClaimError, KeyError where one is missing, and what zipfile raises."""
     with zipfile.ZipFile(path) as archive:
+        if missing := {f"{name}.npy" for name in names}.difference(archive.namelist()):
+            raise KeyError(min(missing).removesuffix(".npy"))  # zipfile's own error has a sentence of its own
         members = {name: archive.getinfo(f"{name}.npy") for name in names}
         claimed = 0
         for name, member in members.items():

@@ -18,6 +18,7 @@ from dappled.daemon.replay import late_tags
 from dappled.decode.geometry import camera_pose
 from dappled.errors import DappledError, counted
 from dappled.flight import layout, seals
+from dappled.flight.layout import LockHeldError
 from dappled.flight.seal_key import SealKey
 from dappled.products.geotags import geotags, marks
 from dappled.products.geotags.marks import Marked
@@ -70,12 +71,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     facts = layout.read_facts(layout.open_folder(arguments.flight))
     key = sealing.key_of(arguments.config)
-    tagged_late = _tag_late(arguments.flight, key)
+    into_flight = arguments.output is None
+    tagged_late = _tag_late(arguments.flight, key, into_flight=into_flight)
     mounting, geoid = _mounting(arguments, facts), _geoid(arguments.geoid)
     marked = marks.find(arguments.flight, arguments.pos, geoid) if arguments.pos else None
     folder = layout.open_folder(arguments.flight)
     clock = TimeOfDayClock()
-    into_flight = arguments.output is None
     with seals.work(folder, clock, "geotag", "geotags flights in", key) if into_flight else nullcontext():
         written = geotags.write(
             arguments.flight,
@@ -125,11 +126,14 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _tag_late(flight: Path, key: SealKey | None) -> list[int]:
-    """Tag the frames that a crash left untagged. If that fails, print why, and go on with the others."""
+def _tag_late(flight: Path, key: SealKey | None, *, into_flight: bool) -> list[int]:
+    """Tag the frames that a crash left untagged. If that fails, print why, and go on with the others. Raises
+    LockHeldError, which no sidecar could be written under either."""
     try:
         added = late_tags.add_missing(flight, TimeOfDayClock(), key)
     except DappledError as error:
+        if into_flight and isinstance(error, LockHeldError):
+            raise
         print(f"frames without a tag stay without one: {error}", file=sys.stderr)
         return []
     if added:

@@ -258,6 +258,10 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, os.PathLike) else value
 
 
+class LockHeldError(FlightError):
+    """Another process holds the lock of a flights folder."""
+
+
 class FlightsLock:
     """The lock (flock) of the one process that writes in a flights folder: the daemon, or work on its closed flights.
 
@@ -288,7 +292,7 @@ class FlightsLock:
             if records:
                 other = "set record.directory to another folder" if doing == RECORDS else "work on a copy of the flight"
                 what = f"stop it, or {other}"
-            raise FlightError(
+            raise LockHeldError(
                 f"another dappled (process {holder or 'unknown'}) {does or RECORDS} {root}; {what}"
             ) from error
         except OSError as error:

@@ -26,6 +26,7 @@ from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.seal_key import SealKey
 
 FACT = "seals"  # {"count": seals announced, "missing": those that were never written}
+BY_OWNER = "signed by its owner"  # why a seal was made that `flight seal` adds
 CHANGED = "changed in between"  # an event: what later work found that was not as the seal before it covers it
 _NAMED = 5
 _BESIDE_LEDGER = ("-wal", "-shm")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 
 from dappled.cli import main
 from dappled.clock import RecordedClock
-from dappled.flight import Recording, Result, recording, seal_key
+from dappled.flight import Recording, Result, layout, recording, seal_key, seals
 from tests.flight.makers import deliver, flip, request, tag
 
 START_UTC_NS = 1_795_256_103_000_000_000  # 2026-11-21T10:15:03Z
@@ -192,3 +193,40 @@ def test_offload_says_what_it_did(closed: Path, tmp_path: Path, capsys: pytest.C
     assert (told["copied"], told["there_already"], told["pruned"]) == (0, count, 0)
     assert main(["flight", "offload", str(disk), str(closed)]) == 1
     assert "insist with --same-device" in capsys.readouterr().err
+
+
+def test_a_flight_is_signed_later_by_its_owner(
+    closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seal_key.make(tmp_path / "key")
+    name = seal_key.load(tmp_path / "key").name
+    words = ["seal", str(closed), "--key", str(tmp_path / "key")]
+    for _ in range(2):  # the second call has nothing to do
+        note, verdict = lines(words, capsys)
+        assert note.startswith("note:  seal 2 was signed later, by hand (flight seal)")
+        assert f"intact, sealed with key {name}" in verdict
+    (closed / "notes.txt").write_bytes(b"windy")  # a file of somebody's own is no fault, and not signed along
+    assert lines(["check", str(closed), "--key", str(tmp_path / "key")], capsys)[-1] == verdict
+    seals.seal(layout.open_folder(closed), RecordedClock(START_UTC_NS), "work without the key")
+    assert (
+        "up to seal 2, then not signed" in lines(["check", str(closed), "--key", str(tmp_path / "key")], capsys, 1)[-1]
+    )
+    assert f"intact, sealed with key {name}" in lines(words, capsys)[-1]
+
+
+def test_what_is_not_intact_or_not_closed_is_not_signed(
+    flights: Path, closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seal_key.make(tmp_path / "key")
+    before = (closed / "seals.jsonl").read_bytes()
+    flip(closed / "frames" / "000000.cr2", 1000)
+    assert main(["flight", "seal", str(closed), "--key", str(tmp_path / "key")]) == 1
+    assert "is not intact (frames/000000.cr2 was changed: its SHA-256 is not the ledger's)" in capsys.readouterr().err
+    assert (closed / "seals.jsonl").read_bytes() == before
+    assert main(["flight", "seal", str(closed)]) == 2
+    assert "no key is named to sign with: give --key FILE" in capsys.readouterr().err
+    still = fly(flights)
+    copy = shutil.copytree(still.folder.path, tmp_path / "killed" / still.folder.name)
+    still.close()
+    assert main(["flight", "seal", str(copy), "--key", str(tmp_path / "key")]) == 1
+    assert "was never closed, and can't be sealed: the next `dappled run` closes it" in capsys.readouterr().err

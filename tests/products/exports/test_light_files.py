@@ -99,6 +99,12 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, kind: str, mon
     assert os.listdir(tmp_path) == [path.name]
 
 
+def test_an_npz_that_lacks_an_array_is_refused_by_its_name(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", views=np.zeros(2))
+    with pytest.raises(LightFileError, match=r"a.npz is not a light field: it lacks 'attributes'$"):
+        load(tmp_path / "a.npz")
+
+
 def test_others_can_read_zarr_and_npz(tmp_path: Path) -> None:
     field = light_field()
     save(tmp_path / "a.zarr", field)

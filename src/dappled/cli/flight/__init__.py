@@ -1,4 +1,4 @@
-"""`dappled flight list|show|check|report|offload|pickup`: work with recorded flights."""
+"""`dappled flight list|show|check|report|seal|offload|pickup`: work with recorded flights."""
 
 from __future__ import annotations
 
@@ -19,10 +19,16 @@ from dappled.cli.flight import pickup
 from dappled.clock import SystemClock
 from dappled.config import settings
 from dappled.errors import counted
-from dappled.flight import FlightError, flight_report, index, layout, offload, seal_key
+from dappled.flight import FlightError, flight_report, index, layout, offload, owner_seal, seal_key
 from dappled.flight.checks import flight_check
 
 _FLIGHT = "~/flights/20261121T101503Z-0a1b2c3d"
+
+
+class NoKeyError(FlightError):
+    """A flight was to be signed, and no key was named."""
+
+    exit_code = 2
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -38,6 +44,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "report",
         "count which requests became frames; exits 1 if the counts don't agree or there was no shot",
         "dappled flight report",
+    )
+    signing = actions.add(
+        "seal",
+        "check a flight and sign it as it stands; exits 1 if it is not intact",
+        f"dappled flight seal {_FLIGHT} --key ~/seal.key",
     )
     away = actions.add(
         "offload",
@@ -59,7 +70,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="insist that this key signed the seals (default: record.seal_key, if any)",
     )
-    for one in (show, intact, report, away, bring):
+    signing.add_argument(
+        "--key", type=Path, metavar="FILE", help="the key that signs (default: record.seal_key); see dappled keys seal"
+    )
+    for one in (show, intact, report, signing, away, bring):
         one.add_argument(
             "flight", nargs="?", type=Path, metavar="FLIGHT", help="flight folder (default: the last with shots)"
         )
@@ -76,6 +90,8 @@ def run(arguments: argparse.Namespace) -> int:
         return pickup.run(flight, arguments)
     if arguments.action == "offload":
         return _offload(flight, arguments)
+    if arguments.action == "seal":
+        return _seal(flight, arguments.config, arguments.key, arguments.json)
     if arguments.action == "check":
         return _check(flight, arguments.config, arguments.key, arguments.json)
     return {"show": _show, "report": _report}[arguments.action](flight, arguments.json)
@@ -126,6 +142,16 @@ def _check(flight: Path, config: Path | None, key: Path | None, as_json: bool) -
     found = flight_check.check(flight, sealing.key_of(config) if key is None else seal_key.load(key))
     _said({**_plain(found), "intact": found.intact}, flight_lines.of_check(found), as_json)
     return 0 if found.intact and (key is None or found.vouched == "signed") else 1
+
+
+def _seal(flight: Path, config: Path | None, file: Path | None, as_json: bool) -> int:
+    key = sealing.key_of(config) if file is None else seal_key.load(file)
+    if key is None:
+        raise NoKeyError(
+            "no key is named to sign with: give --key FILE, or record.seal_key in --config; dappled keys seal makes one"
+        )
+    found = owner_seal.sign(flight, SystemClock(), key)
+    return _said({**_plain(found), "intact": found.intact}, flight_lines.of_check(found), as_json)
 
 
 def _report(flight: Path, as_json: bool) -> int:

@@ -63,6 +63,12 @@ def compare(
     problems = [*file.problems, *_numbers(file.seals, links or {}, facts), *_heads(file.seals, links or {}, facts)]
     problems += [*_signatures(file.seals, key), *_rewritten(file.seals)]
     notes = [f"seal {number} was never written: its work was interrupted" for number in seals.announced(facts)[1]]
+    notes += [
+        f"seal {number} was signed later, by hand (flight seal): what stands in the flight since an earlier time, key "
+        f"{seal.key} vouches for from then on"
+        for number, seal in file.seals.items()
+        if seal.why == seals.BY_OWNER
+    ]
     notes += [event.text for event in ledger.events() if event.kind == seals.CHANGED]
     last = file.last
     if last is None:
