@@ -6,6 +6,13 @@ import argparse
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
+from pathlib import Path
+
+from dappled.errors import DappledError
+
+
+class OutputExistsError(DappledError):
+    """What is to be written is there already; one sentence."""
 
 
 def whole(text: str) -> int:
@@ -44,6 +51,20 @@ def _number(text: str) -> float | None:
         return float(text)
     except ValueError:
         return None
+
+
+def add_overwrite(parser: argparse.ArgumentParser) -> None:
+    """Add --overwrite, for verbs that write what the user named: see `refuse_existing`."""
+    parser.add_argument("--overwrite", action="store_true", help="replace what is there under that name")
+
+
+def refuse_existing(arguments: argparse.Namespace, *outputs: Path) -> None:
+    """Refuse to replace an output. Call it before the work is done. Raises OutputExistsError."""
+    if arguments.overwrite:
+        return
+    for path in outputs:
+        if path.is_symlink() or path.exists():
+            raise OutputExistsError(f"{path} exists already: choose another name, or --overwrite replaces it")
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  dappled batch FLIGHT --as npz cog -o products --scheduler tcp://10.0.0.5:8786\n"
         "Continues where it was stopped. A bad frame is reported and does not stop the others."
     )
-    parser.add_argument("flights", nargs="+", type=Path, metavar="FLIGHT", help="flight folders")
+    parser.add_argument("flights", nargs="+", type=Path, metavar="FLIGHT",
+                        help="flight folders, or a folder of flights")  # fmt: skip
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the results")
     parser.add_argument("--as", dest="kinds", nargs="+", choices=tuple(KINDS), default=["npz"],
                         help="per frame: a light field (npz, zarr, h5; default: npz), a map (cog, kmz), or pictures\n"
@@ -49,12 +50,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    if arguments.pos and len(arguments.flights) > 1:
+    flights = _different(_flights(arguments.flights))
+    if arguments.pos and len(flights) > 1:
         raise DappledError(f"--pos {arguments.pos} holds the marks of one flight: give one FLIGHT")
     jobs: list[Job] = []
     refused = 0
     lists: list[Callable[[Manifest], None]] = []
-    for flight in _different(arguments.flights):
+    for flight in flights:
         try:
             planned, placed = _planned(flight, arguments)
             jobs += planned
@@ -90,6 +92,15 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.json:
         print(f"{counted(len(todo) - bad, 'frame')} made, {len(jobs) - len(todo)} already there, {bad} failed")
     return 1 if bad or refused else 0
+
+
+def _flights(given: Sequence[Path]) -> list[Path]:
+    """The flights that were named, and those in folders of flights that were."""
+    found: list[Path] = []
+    for path in given:
+        inside = [] if (path / "flight.toml").exists() or not path.is_dir() else layout.flights(path)
+        found += [one.path for one in inside] or [path]
+    return found
 
 
 def _different(flights: Sequence[Path]) -> list[Path]:

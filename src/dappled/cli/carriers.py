@@ -14,6 +14,7 @@ from typing import Any
 from PIL import Image
 
 from dappled.cli import decode_arguments
+from dappled.cli.arguments import add_overwrite, refuse_existing
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
 from dappled.decode.calibration.law_search import LawSearch
@@ -44,6 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--shape", type=int, nargs=2, metavar=("H", "W"), help="only predict, for frames of this size")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the spectrum with its boxes")
+    add_overwrite(parser)
     parser.add_argument(
         "--look", choices=LOOKS, help="what the picture shows (default: magnitude; with --around: phase)"
     )
@@ -87,6 +89,8 @@ class Table:
 
 def run(arguments: argparse.Namespace) -> int:
     plane = None
+    if arguments.picture:
+        refuse_existing(arguments, arguments.picture)
     if arguments.frames is None:
         table = _predicted(arguments)
     else:

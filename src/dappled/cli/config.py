@@ -23,6 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     actions = Actions.of(parser)
     check = actions.add("check", "check a settings file", "dappled config check /etc/dappled/dappled.toml")
     check.add_argument("file", type=Path, metavar="FILE", help="settings file")
+    check.add_argument("--json", action="store_true", help="print JSON")
     show = actions.add(
         "show", "show every setting with its value, unit and meaning", "dappled config show > dappled.toml"
     )
@@ -37,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
         return _profiles(arguments.json)
     if arguments.action == "check":
         settings_check.checked(settings.examine_file(arguments.file), by_this_user=False)
-        print(f"{arguments.file}: good")
+        print(json.dumps({"file": str(arguments.file), "good": True}) if arguments.json else f"{arguments.file}: good")
         return 0
     loaded = settings.load(arguments.file)
     if arguments.json:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from dappled.cli import decode_arguments
+from dappled.cli.arguments import add_overwrite
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.errors import DappledError, counted
 from dappled.products.exports import light_files
@@ -29,12 +32,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="share of each band with a soft edge, 0 to 1: less ringing, less detail")  # fmt: skip
     parser.add_argument("--anyway", action="store_true",
                         help="write the light field although carriers that must be visible are not")  # fmt: skip
-    parser.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
+    add_overwrite(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON object per frame")
 
 
 def run(arguments: argparse.Namespace) -> int:
     darkroom = Darkroom(decode_arguments.recipe(arguments))
     darkroom.check()
+    arguments.frames = decode_arguments.frames(arguments.frames)
     single = len(arguments.frames) == 1 and arguments.output.suffix
     if not single:
         _refuse_same_names(arguments.frames, arguments.output)
@@ -47,12 +52,14 @@ def run(arguments: argparse.Namespace) -> int:
             if not arguments.anyway:
                 _refuse_contradicted(frame, made)
             light_files.save(target, made.light_field, overwrite=arguments.overwrite)
-            print(f"{target}: {summary(made)}")
+            print(json.dumps(_facts(target, made)) if arguments.json else f"{target}: {summary(made)}")
         except DappledError as error:
             if single:
                 raise
             bad += 1
             print(f"dappled decode: {error}", file=sys.stderr)
+            if arguments.json:
+                print(json.dumps({"frame": str(frame), "error": str(error)}))
     if bad:
         print(f"{bad} of {counted(len(arguments.frames), 'frame')} could not be decoded", file=sys.stderr)
     return 1 if bad else 0
@@ -73,6 +80,22 @@ def _refuse_contradicted(frame: Path, made: DecodeResult) -> None:
     """Carriers that must be visible and are not: slices cut at the prediction would hold nothing."""
     if made.contradiction:
         raise DappledError(f"{frame}: {made.contradiction}; --anyway decodes it at the prediction")
+
+
+def _facts(target: Path, made: DecodeResult) -> dict[str, Any]:
+    """What the line of a frame says, for a program."""
+    field = made.light_field
+    return {
+        "file": str(target),
+        "slices": list(field.slices.shape),
+        "views": list(field.views.shape[:2]),
+        "carriers_found": made.carriers_found if made.observable else None,
+        "carriers_predicted": made.carriers_predicted,
+        "carriers_from": made.report.carriers_from,
+        "law": field.attributes["law"],
+        "doubts": field.attributes["doubts"],
+        "contradiction": made.contradiction,
+    }
 
 
 def summary(made: DecodeResult) -> str:

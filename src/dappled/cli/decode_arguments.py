@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from dappled.cli.arguments import metres
@@ -10,15 +11,41 @@ from dappled.decode.depth import RANGING, Ranging
 from dappled.decode.optics import LAWS
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Recipe
+from dappled.errors import DappledError
 from dappled.products import opened
 from dappled.products.opened import OpenedLightField
+
+FRAME_SUFFIXES = (".arw", ".cr2", ".dng", ".lfp", ".lfr", ".nef", ".npy", ".png", ".raf", ".tif", ".tiff")
 
 
 def add_frames(parser: argparse.ArgumentParser, count: str) -> None:
     """Add the frames, as positional arguments."""
     parser.add_argument(
-        "frames", nargs=count, type=Path, metavar="FRAME", help="frame: RAF, CR2, DNG, LFP, TIFF, PNG or NPY"
+        "frames",
+        nargs=count,
+        type=Path,
+        metavar="FRAME",
+        help="frame: RAF, CR2, DNG, LFP, TIFF, PNG or NPY; or a folder of frames, or a flight",
     )
+
+
+def frames(given: Sequence[Path]) -> list[Path]:
+    """The frames that were named, and those in the folders that were: of a flight, those in its record.
+
+    Raises DappledError for a folder without frames.
+    """
+    found: list[Path] = []
+    for path in given:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        folder = path / "frames" if (path / "frames").is_dir() else path
+        inside = sorted(one for one in folder.iterdir() if one.suffix.lower() in FRAME_SUFFIXES and one.is_file())
+        if not inside:
+            kinds = ", ".join(FRAME_SUFFIXES)
+            raise DappledError(f"{folder} holds no frame ({kinds}): name frames, a folder of frames, or a flight")
+        found += inside
+    return found
 
 
 def add_law(parser: argparse.ArgumentParser) -> None:

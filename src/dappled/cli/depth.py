@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.cli import decode_arguments
+from dappled.cli.arguments import add_overwrite, refuse_existing
 from dappled.decode import DecodeError
 from dappled.decode.depth import DepthMap, DistanceMap
 from dappled.decode.depth import estimate as depths
@@ -50,10 +51,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frame", type=int, metavar="N", help="number of this frame in the flight")
     parser.add_argument("--crs", default="", metavar="EPSG:N", help="projection of the points (default: the UTM zone)")
     parser.add_argument("-o", "--output", nargs="+", type=Path, default=[], metavar="OUT", help="files to write")
+    add_overwrite(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
+    refuse_existing(arguments, *arguments.output)
     found = decode_arguments.opened_field(arguments)
     between = None if arguments.between is None else (arguments.between[0], arguments.between[1])
     made = found.depth(arguments.method, between=between, window=arguments.window)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
 from dappled.cli import decode_arguments
+from dappled.cli.arguments import add_overwrite, refuse_existing
 from dappled.products.exports import exports, light_files
 from dappled.products.opened import OpenedLightField
 
@@ -35,11 +37,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="quilt: the disparity that appears in the plane of the screen",
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="file or folder to write")
+    add_overwrite(parser)
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
+    refuse_existing(arguments, arguments.output)
     found = decode_arguments.opened_field(arguments)
-    print(write(found, arguments.kind, arguments.output, arguments))
+    written = write(found, arguments.kind, arguments.output, arguments)
+    print(json.dumps({"file": str(written), "as": arguments.kind}) if arguments.json else written)
     return 0
 
 
@@ -61,5 +67,5 @@ def write(found: OpenedLightField, kind: str, path: Path, arguments: argparse.Na
         case _:
             if path.suffix != f".{kind}":
                 raise exports.ExportError(f"{path}: --as {kind} writes a .{kind} file; give it that ending")
-            light_files.save(path, found.field)
+            light_files.save(path, found.field, overwrite=arguments.overwrite)
     return path

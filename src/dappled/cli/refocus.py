@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.cli import decode_arguments
-from dappled.cli.arguments import metres
+from dappled.cli.arguments import add_overwrite, metres, refuse_existing
 from dappled.decode.lightfield.fourier_refocus import Spectrum4D, difference
 from dappled.decode.lightfield.refocus import all_in_focus, anaglyph, focal_stack, magnified, side_by_side
 from dappled.products.exports import prints
@@ -61,10 +61,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fourier", action="store_true",
                         help="refocus by a slice of the 4D spectrum (Ng), and compare with shift and add")  # fmt: skip
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=".png, .jpg, .tif or .npy")
+    add_overwrite(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     _check_mix(arguments)
+    refuse_existing(arguments, arguments.output, *([arguments.index] if arguments.index else []))
     found = decode_arguments.opened_field(arguments)
     planes = _planes(found, arguments)
     if arguments.all_in_focus or arguments.index:

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 from dappled.cli.arguments import seconds, whole
+from dappled.cli.waiting import waiting_for
 from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
 
 
@@ -32,7 +33,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     with GroundClient(arguments.url, key_file=arguments.key) as client:
-        client.find_camera(arguments.timeout)
+        with waiting_for(f"a camera on {arguments.url}"):
+            client.find_camera(arguments.timeout)
         outcomes = client.capture(
             arguments.count,
             arguments.interval,

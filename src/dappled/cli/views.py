@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
 import numpy as np
 
 from dappled.cli import decode_arguments
+from dappled.cli.arguments import add_overwrite, refuse_existing
 from dappled.decode.depth.evidence import of_light_field
 from dappled.decode.depth.stereo import shifts_from_middle
 from dappled.decode.lightfield import ViewStack
@@ -28,36 +30,48 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="views (default), slices at their carriers, or shifts: how far each view has\n"
                         "moved from the middle; slice-shifts: the same for slices, as the thesis tried")  # fmt: skip
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="picture to write")
+    add_overwrite(parser)
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
+    refuse_existing(arguments, arguments.output)
     found = decode_arguments.opened_field(arguments)
-    made = {"views": _views, "slices": _slices, "shifts": _shifts, "slice-shifts": _slice_shifts}[arguments.of](found)
+    made, note = {"views": _views, "slices": _slices, "shifts": _shifts, "slice-shifts": _slice_shifts}[arguments.of](
+        found
+    )
     prints.save(arguments.output, _small(made))
     count_v, count_u = found.views.shape[:2]
+    if arguments.json:
+        facts = {"file": str(arguments.output), "of": arguments.of, "views": list(found.views.shape[:4])}
+        print(json.dumps({**facts, **({"note": note} if note else {})}))
+        return 0
+    if note:
+        print(note)
     print(f"{count_v} × {count_u} views of {found.views.shape[3]} × {found.views.shape[2]} px; {arguments.output}")
     return 0
 
 
-def _views(found: OpenedLightField) -> prints.Bytes:
+def _views(found: OpenedLightField) -> tuple[prints.Bytes, str]:
+    """The picture, and what its colours mean."""
     stack = found.stack
     white = prints.white_of([stack.views])
     pictures = [prints.toned(view, white) for line in stack.views for view in line]
-    return prints.mosaic(pictures, columns=stack.views.shape[1])
+    return prints.mosaic(pictures, columns=stack.views.shape[1]), ""
 
 
-def _slices(found: OpenedLightField) -> prints.Bytes:
+def _slices(found: OpenedLightField) -> tuple[prints.Bytes, str]:
     if len(found.slices) == 0:
         raise OpenError(f"{found.path} was stored as views and has no slices")
-    return slice_mosaic(found.slices, found.field.carriers, longest_side=_LONGEST)
+    return slice_mosaic(found.slices, found.field.carriers, longest_side=_LONGEST), ""
 
 
-def _shifts(found: OpenedLightField) -> prints.Bytes:
+def _shifts(found: OpenedLightField) -> tuple[prints.Bytes, str]:
     # Wiener weights shrink the parallax of noisy views, so measure on views without them.
     return _coloured(shifts_from_middle(of_light_field(found.field).stack))
 
 
-def _slice_shifts(found: OpenedLightField) -> prints.Bytes:
+def _slice_shifts(found: OpenedLightField) -> tuple[prints.Bytes, str]:
     if len(found.slices) == 0:
         raise OpenError(f"{found.path} was stored as views and has no slices")
     stack = found.stack
@@ -73,11 +87,11 @@ def _slice_shifts(found: OpenedLightField) -> prints.Bytes:
     return _coloured(shifts_from_middle(ViewStack(images, steps * stack.row_steps[-1] / reach, steps)))
 
 
-def _coloured(shifts: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> prints.Bytes:
+def _coloured(shifts: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> tuple[prints.Bytes, str]:
     low, high = (float(x) for x in np.quantile(shifts, [0.01, 0.99]))
     pictures = [prints.coloured(shift, low, high) for line in shifts for shift in line]
-    print(f"dark {low:.2f} px, bright {high:.2f} px from the middle view")
-    return prints.mosaic(pictures, columns=shifts.shape[1])
+    note = f"dark {low:.2f} px, bright {high:.2f} px from the middle view"
+    return prints.mosaic(pictures, columns=shifts.shape[1]), note
 
 
 def _small(picture: prints.Bytes) -> prints.Bytes:

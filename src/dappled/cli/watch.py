@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+from contextlib import ExitStack
 from pathlib import Path
 
 from dappled.cli.arguments import seconds, whole
 from dappled.cli.status import stream_endpoint
+from dappled.cli.waiting import waiting_for
 from dappled.clock import SystemClock
 from dappled.daemon.stream import watch
 from dappled.daemon.stream.curve import ClientKeys, KeyFileError, load_own, load_public
@@ -27,6 +29,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="ZeroMQ endpoint of the stream (default: the daemon's on this machine)",
     )
     parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="the daemon's settings file, which names the endpoint"
+    )
+    parser.add_argument(
         "--ask", metavar="ENDPOINT", help="endpoint that answers requests (default: the one beside an ipc stream)"
     )
     parser.add_argument("--save", type=Path, metavar="DIR", help="save each frame's header, slices and mosaic here")
@@ -39,7 +44,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    endpoint = arguments.endpoint or stream_endpoint(None)
+    endpoint = arguments.endpoint or stream_endpoint(arguments.config)
     ask = arguments.ask or (f"{endpoint}.ask" if endpoint.startswith("ipc://") else "")
     if bool(arguments.keys) != bool(arguments.server_key):
         raise KeyFileError("--keys and --server-key go together: your own secret key, and the vehicle's public one")
@@ -47,10 +52,16 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.save:
         arguments.save.mkdir(parents=True, exist_ok=True)
     reuse_large_blocks()
-    with Subscriber(endpoint, ask, from_start=arguments.from_start, keys=keys) as subscriber:
+    with Subscriber(endpoint, ask, from_start=arguments.from_start, keys=keys) as subscriber, ExitStack() as silence:
+        silence.enter_context(waiting_for(f"a daemon on {endpoint}"))
+
+        def received(message: Message) -> None:
+            silence.close()
+            _show(message, arguments.json)
+
         seen = watch.watch(
             subscriber,
-            received=lambda message: _show(message, arguments.json),
+            received=received,
             new_frame=lambda message: watch.save(message, arguments.save) if arguments.save else None,
             count=arguments.count,
             silence_s=arguments.timeout,

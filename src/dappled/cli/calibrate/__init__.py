@@ -11,6 +11,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from dappled.cli import decode_arguments
+from dappled.cli.arguments import add_overwrite, refuse_existing
 from dappled.cli.calibrate import lens, target
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
@@ -34,11 +35,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="calibration to write: FILE.toml and FILE.npz"
     )
+    add_overwrite(parser)
     parser.add_argument("--anyway", action="store_true", help="write a calibration that no law explains, too")
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
+    refuse_existing(arguments, arguments.output)
+    arguments.frames = decode_arguments.frames(arguments.frames)
     if arguments.lens:
         arguments.mask = arguments.mask or ""
         return lens.run(

@@ -12,7 +12,7 @@ from dappled.config import profiles
 from dappled.daemon.health.go_no_go import Check
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
-from dappled.drivers.raw.exposure import exposure
+from dappled.drivers.raw.raw_file import exposure
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
 

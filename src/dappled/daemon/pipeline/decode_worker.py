@@ -26,7 +26,7 @@ from dappled.decode.lightfield.light_field import slice_mosaic
 from dappled.drivers.camera import Blob
 from dappled.drivers.child_process import DECODER_GOES, ChannelMessage, end_with_parent, goes_first
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
-from dappled.drivers.raw.exposure import exposure
+from dappled.drivers.raw.raw_file import exposure
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import sentence
 

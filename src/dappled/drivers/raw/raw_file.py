@@ -1,4 +1,4 @@
-"""A frame as its file gives it: the sensor's values, and camera and exposure settings from EXIF.
+"""A frame as its file gives it: the sensor's values and how they are exposed, camera and exposure settings from EXIF.
 
 EXIF is read from TIFF-like raws, RAF, JPEG, PNG and TIFF. Zero, infinite and negative values mean "unknown" there, and
 are None here.
@@ -24,6 +24,9 @@ from dappled.bounds.pictures import open_picture
 RawSource = Path | str | bytes | memoryview | mmap.mmap
 Values = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.float64]
 
+WHITE_SHARE = 0.99  # of white: a pixel of so much light is clipped
+STEPS = 64
+_EVERY = 5  # odd, so that the colours of a mosaic take turns
 _EXIF_IFD = 0x8769
 _MAKE, _MODEL, _DATETIME = 0x010F, 0x0110, 0x0132
 _EXPOSURE, _F_NUMBER, _ISO, _TAKEN, _SUBSECONDS, _FOCAL = 0x829A, 0x829D, 0x8827, 0x9003, 0x9291, 0x920A
@@ -118,6 +121,26 @@ class RawFile:
             self.taken,
             self.focal_sigma_mm,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """`histogram`: shares of the pixels in STEPS equal steps of the square root of the linear value, black to white.
+    `clipped_share` of them are white; `mean_share` is the mean as a share of white."""
+
+    histogram: tuple[float, ...]
+    clipped_share: float
+    mean_share: float
+
+
+def exposure(raw: RawFile, every: int = _EVERY) -> Exposure:
+    """Measure one pixel of `every` × `every`."""
+    black = float(np.mean(raw.black))
+    values = raw.mosaic[::every, ::every].astype(np.float32)
+    share = (values - black) / (raw.white - black)
+    counts, _ = np.histogram(np.sqrt(np.clip(share, 0, 1)), STEPS, (0, 1))
+    shares = tuple(float(one) for one in counts / share.size)
+    return Exposure(shares, float(np.mean(share >= WHITE_SHARE)), float(np.mean(share)))
 
 
 def read_exif(file: BinaryIO) -> ExposureSettings:

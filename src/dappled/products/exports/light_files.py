@@ -55,7 +55,7 @@ def save(path: Path, field: LightField, *, overwrite: bool = False) -> None:
     _fits(path, arrays)
     attributes = _json(path, field.attributes)
     if path.exists() and not overwrite:
-        raise LightFileError(f"{path} exists already; choose another name, or allow it to be overwritten")
+        raise LightFileError(f"{path} exists already: choose another name, or --overwrite replaces it (overwrite=True)")
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         write(part, arrays, attributes)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dappled.drivers.raw.exposure import STEPS, exposure
-from dappled.drivers.raw.raw_file import ExposureSettings, RawFile
+from dappled.drivers.raw.raw_file import STEPS, ExposureSettings, RawFile, exposure
 
 WHITE, BLACK = 4095, 128
 
