@@ -40,6 +40,8 @@ VERBS: dict[str, tuple[str, str]] = {
     "georeference": ("georeference", "make maps of a flight: KMZ overlay, GeoTIFF, footprints, terrain"),
     "batch": ("batch", "process whole flights frame by frame, on all cores or a Dask cluster"),
     "config": ("config", "check or show settings"),
+    "init": ("init", "write a settings file: finds what is plugged in, and asks"),
+    "completion": ("completion", "print a completion script for bash, zsh or fish"),
     "profiles": ("config", "list the shipped camera and mask profiles"),
 }
 

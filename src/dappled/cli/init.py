@@ -1,0 +1,166 @@
+"""`dappled init`: write a settings file from what is plugged in and a few questions, and check it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from dappled.cli.arguments import add_overwrite, refuse_existing
+from dappled.config import profiles, settings
+from dappled.config.settings import RecordSettings
+from dappled.daemon import settings_check
+from dappled.drivers import usb_bus
+from dappled.drivers.usb_bus import UsbBody
+from dappled.errors import DappledError
+
+ANY, NONE = "auto", "none"
+FLIGHTS = RecordSettings().directory
+_SERIAL = ("ttyACM*", "ttyUSB*", "ttyAMA0", "serial0", "ttyTHS1")
+_BAUD = {"ttyACM": ",115200", "ttyUSB": ",57600"}  # USB of an autopilot; a telemetry radio
+_WIRED_BAUD = ",921600"
+_DEFAULT_LINK = "udpin:0.0.0.0:14550"
+
+
+class InitError(DappledError):
+    """There is nobody to ask; one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """One setting that is asked for: its flag, its words, what is proposed, and what else there is to choose from."""
+
+    flag: str
+    words: str
+    proposed: str
+    choices: Sequence[str] = ()
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "examples:\n  dappled init dappled.toml\n"
+        "  dappled init dappled.toml --body canon-eos-450d --mask mask-2 --link /dev/ttyAMA0,921600 --folder ~/flights"
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help="settings file to write")
+    parser.add_argument("--body", metavar="P", help="camera profile or TOML file, or auto: the one that fits the body")
+    parser.add_argument("--mask", metavar="P", help="mask profile or TOML file, or none")
+    parser.add_argument("--link", metavar="URL", help="the autopilot's link, such as /dev/ttyAMA0,921600, or none")
+    parser.add_argument("--folder", metavar="DIR", help="folder for flights")
+    add_overwrite(parser)
+    parser.add_argument("--json", action="store_true", help="print JSON; asks nothing")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    refuse_existing(arguments, arguments.file)
+    asks = sys.stdin.isatty() and sys.stderr.isatty() and not arguments.json
+    given = {"--body": arguments.body, "--mask": arguments.mask, "--link": arguments.link, "--folder": arguments.folder}
+    found = bodies()
+    if asks:
+        print(f"on the bus: {', '.join(_named(body) for body in found) or 'no camera'}", file=sys.stderr)
+    answers: dict[str, str] = {}
+    for question in questions(found, serial_devices()):
+        answer = given[question.flag]
+        if answer is None:
+            answer = ask(question, input) if asks else question.proposed
+        if not answer:
+            raise InitError(f"nobody is there to ask: give {question.flag} ({question.words})")
+        answers[question.flag] = answer
+    text = settings_text(answers)
+    write(arguments.file, text)
+    if arguments.json:
+        print(json.dumps({"file": str(arguments.file), "settings": tables(answers)}))
+    else:
+        print(text, end="")
+        print(f"{arguments.file}: good; next: dappled doctor --config {arguments.file}", file=sys.stderr)
+    return 0
+
+
+def questions(found: Sequence[UsbBody], serial: Sequence[str]) -> list[Question]:
+    """What is asked, with what is proposed by what is plugged in; "" where nothing can be proposed."""
+    cameras, masks = profiles.shipped("cameras"), profiles.shipped("masks")
+    fits = [profile.name for body in found if (profile := profiles.camera_for_model(body.name)) is not None]
+    fujifilm = [body for body in found if not body.fires and body.vendor == usb_bus.FUJIFILM]
+    body = fits[0] if fits else "fujifilm-s5200" if fujifilm else ANY
+    link = serial[0] if serial else _DEFAULT_LINK
+    return [
+        Question("--body", "which camera body", body, [ANY, *cameras]),
+        Question("--mask", "which mask is in it", "", [NONE, *masks]),
+        Question("--link", "where the autopilot is", link, [*serial, _DEFAULT_LINK, NONE]),
+        Question("--folder", "where flights are kept (~ is the home of the user who runs the daemon)", FLIGHTS),
+    ]
+
+
+def ask(question: Question, answer: Callable[[str], str]) -> str:
+    """The person's answer, or what was proposed for an empty one. Asks again where there is neither."""
+    if question.choices:
+        print(f"  {', '.join(question.choices)}", file=sys.stderr)
+    proposed = f" [{question.proposed}]" if question.proposed else ""
+    while True:
+        print(f"{question.words}{proposed}: ", end="", file=sys.stderr, flush=True)
+        try:
+            said = answer("").strip()
+        except EOFError:
+            said = ""
+            if not question.proposed:
+                raise InitError(f"there was no answer: give {question.flag}") from None
+        if said or question.proposed:
+            return said or question.proposed
+
+
+def tables(answers: dict[str, str]) -> dict[str, dict[str, Any]]:
+    """The settings file's tables. Only what differs from the built-in settings stands in it."""
+    body, mask, link = answers["--body"], answers["--mask"], answers["--link"]
+    found: dict[str, dict[str, Any]] = {}
+    if body != ANY:
+        found["camera"] = {"profile": body}
+    if mask != NONE:
+        found["mask"] = {"profile": mask}
+    found["mavlink"] = {"url": [] if link == NONE else [link]}
+    if answers["--folder"] != FLIGHTS:
+        found["record"] = {"directory": answers["--folder"]}
+    return found
+
+
+def settings_text(answers: dict[str, str]) -> str:
+    """The settings file."""
+    return f"# Written by dappled init; all settings: dappled config show\n{tomli_w.dumps(tables(answers))}"
+
+
+def write(file: Path, text: str) -> None:
+    """Write the file if `config check` finds it good. Raises ConfigError, and writes nothing, if not."""
+    part = file.with_name(f".{file.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        try:
+            settings_check.checked(settings.examine_file(part), by_this_user=False)
+        except DappledError as error:
+            raise type(error)(str(error).replace(str(part), str(file))) from None
+        part.replace(file)
+    except OSError as error:
+        raise InitError(f"{file} can't be written: {error.strerror}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def bodies() -> list[UsbBody]:
+    """The cameras on the bus; none where it can't be read."""
+    try:
+        return usb_bus.bodies()
+    except DappledError:
+        return []
+
+
+def serial_devices(dev: Path = Path("/dev")) -> list[str]:
+    """Serial devices at which an autopilot may be, with the usual speed of each."""
+    found = [path.name for pattern in _SERIAL for path in sorted(dev.glob(pattern))]
+    return [f"{dev / name}{_BAUD.get(name.rstrip('0123456789'), _WIRED_BAUD)}" for name in dict.fromkeys(found)]
+
+
+def _named(body: UsbBody) -> str:
+    return f"{body.maker} {body.name}".strip() + f" at {body.port}"
