@@ -113,7 +113,7 @@ def test_a_full_disk_leaves_the_depth_map_of_before(
     (tmp_path / name).write_bytes(b"of before")
     monkeypatch.setattr("dappled.products.exports.exports.write_pfm", torn)
     monkeypatch.setattr("numpy.savez_compressed", torn)
-    assert main(["depth", field, "--between", "0", "1", "-o", str(tmp_path / name)]) == 1
+    assert main(["depth", field, "--between", "0", "1", "-o", str(tmp_path / name), "--overwrite"]) == 1
     assert "can't be written: No space left on device" in capsys.readouterr().err
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [(name, b"of before")]
 

@@ -79,7 +79,7 @@ def test_tables_law_and_pair_of_files(
             assert carrier["offset"] == pytest.approx(offset.tolist(), abs=1e-9)
             assert carrier["distance"] == pytest.approx(float(np.hypot(*offset)), abs=1e-9)
     assert calibration_files.load(tmp_path / "c.npz") == calibration_files.load(tmp_path / "c.toml")
-    assert main([*words, "-o", str(tmp_path / "c.toml")]) == 0
+    assert main([*words, "-o", str(tmp_path / "c.toml"), "--overwrite"]) == 0
     text = capsys.readouterr().out
     assert "expected" in text
     assert "distance" in text
@@ -111,7 +111,7 @@ def test_frames_of_the_other_law_choose_it_unless_one_is_asked_for(
     told = json.loads(capsys.readouterr().out)
     assert told["law"] == "fd"
     assert "fd explains" in told["verdict"]
-    assert main([*words, "--law", "geometric"]) == 0
+    assert main([*words, "--law", "geometric", "--overwrite"]) == 0
     assert calibration_files.load(tmp_path / "c.toml").law == "geometric"
 
 
@@ -164,7 +164,7 @@ def test_a_dark_frame_is_taken_off_and_one_of_another_size_is_refused(
     assert main([*words, "--dark", str(tmp_path / "dark.npy"), "-o", str(tmp_path / "c.toml")]) == 0
     np.save(tmp_path / "dark.npy", dark[:600])
     capsys.readouterr()
-    assert main([*words, "--dark", str(tmp_path / "dark.npy"), "-o", str(tmp_path / "c.toml")]) == 1
+    assert main([*words, "--dark", str(tmp_path / "dark.npy"), "-o", str(tmp_path / "c.toml"), "--overwrite"]) == 1
     told = capsys.readouterr().err
     assert "dark frame" in told
     assert "600×922" in told
