@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -139,9 +139,8 @@ class FakeDecoder:
         arrays = [{"name": "slices", "dtype": "<c8", "shape": [1, 1, 2], "unit": "1"}]
         unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
         decision, self.decision = self.decision, None
-        where = ("calibrated", 1, 1, "geometric", unit)
-        facts = {"seen": self.seen_facts, "decision": decision}
-        return DecodedFrame(body, "0" * 64, arrays, [[0.0] * 4], *where, b"", (0, 0), **facts)
+        made = DecodedFrame(body, "0" * 64, arrays, [[0.0] * 4], "calibrated", 1, 1, "geometric", unit, b"", (0, 0))
+        return replace(made, seen=self.seen_facts, decision=decision)
 
 
 @dataclass

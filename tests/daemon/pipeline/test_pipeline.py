@@ -452,7 +452,8 @@ def test_a_law_that_a_full_disk_refuses_is_written_down_with_the_next_frame(
     with rig(tmp_path) as one:
         assert one.decoder is not None
         one.decoder.decision = decision
-        add, refused = Recording.add_facts, []
+        add = Recording.add_facts
+        refused: list[dict[str, Any]] = []
 
         def full(recording: Recording, facts: dict[str, Any]) -> None:
             if len(refused) < 2:
