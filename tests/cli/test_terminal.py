@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import socket
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, frame_line
+from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, frame_line, waiting_for
 from dappled.clock import RecordedClock
 from dappled.daemon.health import systemd
 from dappled.daemon.pipeline.capture import PendingShot
@@ -124,3 +125,15 @@ def test_in_the_journal_a_frame_can_be_asked_for(tmp_path: Path, capsys: pytest.
     assert asked == {"FRAME": "42", "STATE": "failed", "PROBLEM": "it hangs"}
     assert frame["PRIORITY"] == "4"
     assert told["camera ready"]["DAPPLED_CAMERA"] == "ready"
+
+
+def test_silence_is_explained_and_an_answer_in_time_is_not(capsys: pytest.CaptureFixture[str]) -> None:
+    with waiting_for("a camera on udpout:127.0.0.1:1", silence_s=0.0):
+        until = time.monotonic() + 20
+        said = ""
+        while not said and time.monotonic() < until:
+            said = capsys.readouterr().err
+    assert said == "waiting for a camera on udpout:127.0.0.1:1\n"
+    with waiting_for("nothing", silence_s=600):
+        pass
+    assert capsys.readouterr().err == ""

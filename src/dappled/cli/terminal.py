@@ -11,7 +11,8 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any, Protocol
@@ -24,16 +25,34 @@ from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.stream import wire
 from dappled.drivers.camera import StateChanged
 from dappled.errors import counted
-from dappled.workers import Worker
+from dappled.workers import Loop, Worker
 
 log = logging.getLogger("dappled.run")
 _PROBLEMS_EVERY_NS = 10**9
+SILENCE_S = 2.0
 
 
 class Say(Protocol):
     """Prints a line; `fields` are the fields of the journal's record."""
 
     def __call__(self, text: str, level: int = ..., **fields: object) -> None: ...
+
+
+@contextmanager
+def waiting_for(what: str, silence_s: float = SILENCE_S) -> Iterator[None]:
+    """Context that prints "waiting for WHAT" on standard error if it takes longer than `silence_s`."""
+    over = threading.Event()
+
+    def wait() -> None:
+        if not over.wait(silence_s):
+            print(f"waiting for {what}", file=sys.stderr, flush=True)
+
+    loop = Loop("waiting", wait, over)
+    loop.start()
+    try:
+        yield
+    finally:
+        loop.stop(1.0)
 
 
 def remark(text: str, level: int = logging.INFO, **fields: object) -> None:

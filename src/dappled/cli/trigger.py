@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from dappled.cli.arguments import seconds, whole
-from dappled.cli.waiting import waiting_for
+from dappled.cli.terminal import waiting_for
 from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dappled.cli.arguments import seconds, whole
 from dappled.cli.status import stream_endpoint
-from dappled.cli.waiting import waiting_for
+from dappled.cli.terminal import waiting_for
 from dappled.clock import SystemClock
 from dappled.daemon.stream import watch
 from dappled.daemon.stream.curve import ClientKeys, KeyFileError, load_own, load_public
