@@ -34,6 +34,7 @@ from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
 from dappled.mocks.autopilot.path import FlightPath
 
 START_NS = 1_790_000_000 * 10**9
+EXACT_RAD = 1e-6  # the simulated autopilot's attitude has no error of its own
 SPEED_M_S = 15.0
 TURN_RAD_S = math.radians(30)
 LATENCY_S, JITTER_S = 0.020, 0.010
@@ -82,7 +83,7 @@ def measure(frames: int, seed: int) -> dict[str, dict[str, float]]:
     taken = [_take(WARM_UP_S + EVERY_S * number, rng) for number in range(frames)]
     packets = sorted(_packets(path, taken, rng), key=lambda packet: packet[0])
     found: dict[str, list[tuple[Taken, ExposureTime, Pose]]] = {"hot_shoe": [], "body_latency": [], "camera_clock": []}
-    with_shoe, without = Telemetry(), Telemetry()
+    with_shoe, without = Telemetry(attitude_sigma_rad=EXACT_RAD), Telemetry(attitude_sigma_rad=EXACT_RAD)
     camera, told = CameraClock(), 0
     for number, (stamp_ns, message) in enumerate(packets):
         with_shoe.feed(number, stamp_ns // 1000, message)

@@ -123,7 +123,7 @@ class PoseSettings:
     )
     attitude_sigma_deg: float = setting(
         0.0,
-        "Standard deviation of the attitude where the autopilot sends none; 0: not known",
+        "Standard deviation of the attitude where the autopilot sends none; 0: not known, as is then that of each pose",
         unit="°",
         low=0,
         high=90,

@@ -37,7 +37,7 @@ from dappled.daemon.health.record import DecodingState
 from dappled.daemon.health.status_text import Alarms
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import BodyLatency, Navigation
-from dappled.daemon.navigation.clocks import utc_known
+from dappled.daemon.navigation.machine_clock import utc_known
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.capture import Observer, PendingShots
 from dappled.daemon.pipeline.decode_process import DecodeProcess
@@ -348,7 +348,13 @@ class Service:
             self._answers,
             *(part for part in (self._depth, self._console) if part is not None),
         ]
-        doubts = (self._component.doubt(), navigation.utc.doubt(), self._events.doubt, self._control.shortage)
+        doubts = (
+            self._component.doubt(),
+            navigation.utc.doubt(),
+            navigation.telemetry.clock_problem(self._clock.utc_ns()),
+            self._events.doubt,
+            self._control.shortage,
+        )
         return health.record(
             self._settings.now,
             utc_ns=self._clock.utc_ns(),

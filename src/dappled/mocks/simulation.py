@@ -41,6 +41,9 @@ class World:
     truth: Path | None = None
 
 
+_ATTITUDE_SIGMA_DEG = 0.01  # the simulated autopilot knows its attitude; only its messages are rounded
+
+
 class Simulation:
     """The simulated surroundings of one daemon. Use as a context manager around it."""
 
@@ -93,6 +96,7 @@ class Simulation:
             ),
             mask=replace(given.mask, profile=MASK),
             mavlink=replace(given.mavlink, url=links, keys=_keys(given)),
+            pose=replace(given.pose, attitude_sigma_deg=given.pose.attitude_sigma_deg or _ATTITUDE_SIGMA_DEG),
             decode=replace(given.decode, calibration=str(calibration), white="", dark=""),
         )
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from dappled.daemon.navigation import Telemetry, UtcCorrection, clocks
-from dappled.daemon.navigation.clocks import FLOOR_NS, UtcLearner
+from dappled.daemon.navigation import Telemetry, UtcCorrection, machine_clock
+from dappled.daemon.navigation.clocks import UtcLearner
+from dappled.daemon.navigation.machine_clock import FLOOR_NS
 from dappled.drivers.mavlink import mavlink
 from dappled.errors import DappledError
 from dappled.mocks.autopilot.autopilot import BootTime, flight
@@ -47,30 +48,30 @@ def test_a_board_without_a_clock_knows_utc_only_from_the_network(
     tmp_path: Path, board: bool, clock: bool, synchronised: bool, knows: bool
 ) -> None:
     root = machine(tmp_path, board=board, clock=clock)
-    assert clocks.machine_knows_utc(NOW_NS, synchronised=lambda: synchronised, root=root) is knows
+    assert machine_clock.machine_knows_utc(NOW_NS, synchronised=lambda: synchronised, root=root) is knows
 
 
 def test_where_the_kernel_may_not_be_asked_timesyncd_s_mark_tells(tmp_path: Path) -> None:
     root = machine(tmp_path, board=True, clock=False)
     mark = root / "run/systemd/timesync/synchronized"
     mark.parent.mkdir(parents=True)
-    assert not clocks.machine_knows_utc(NOW_NS, synchronised=lambda: False, root=root)
+    assert not machine_clock.machine_knows_utc(NOW_NS, synchronised=lambda: False, root=root)
     mark.touch()
-    assert clocks.machine_knows_utc(NOW_NS, synchronised=lambda: False, root=root)
+    assert machine_clock.machine_knows_utc(NOW_NS, synchronised=lambda: False, root=root)
 
 
 def test_a_clock_that_was_never_set_is_not_believed(tmp_path: Path) -> None:
-    assert not clocks.machine_knows_utc(FLOOR_NS - 1, synchronised=lambda: True, root=tmp_path)
-    assert not clocks.utc_known("auto", 10**18)
+    assert not machine_clock.machine_knows_utc(FLOOR_NS - 1, synchronised=lambda: True, root=tmp_path)
+    assert not machine_clock.utc_known("auto", 10**18)
 
 
 def test_a_person_may_say_so() -> None:
-    assert clocks.utc_known("system", 0)
-    assert not clocks.utc_known("autopilot", NOW_NS)
+    assert machine_clock.utc_known("system", 0)
+    assert not machine_clock.utc_known("autopilot", NOW_NS)
 
 
 def test_the_kernel_can_be_asked() -> None:
-    assert clocks.kernel_synchronised() in (True, False)
+    assert machine_clock.kernel_synchronised() in (True, False)
 
 
 def test_the_first_word_is_noted_and_then_only_much_better_ones() -> None:

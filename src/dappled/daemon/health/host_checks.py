@@ -15,7 +15,7 @@ from pathlib import Path
 from dappled.config.settings import Settings
 from dappled.daemon.health import resources
 from dappled.daemon.health.go_no_go import Check
-from dappled.daemon.navigation.clocks import kernel_synchronised
+from dappled.daemon.navigation.machine_clock import kernel_synchronised
 from dappled.drivers import usb_bus
 from dappled.drivers.camera import CameraError, StateChanged
 from dappled.drivers.registry import open_camera

@@ -17,20 +17,17 @@ already written stay as they are; the correction is recorded beside them.
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Literal, Protocol, Self
 
 import numpy as np
 
 from dappled.config.settings import CameraSettings
 from dappled.decode.array_types import Floats
-from dappled.drivers.mavlink import MavlinkMessage
 from dappled.flight import Shot
 
 log = logging.getLogger(__name__)
@@ -41,21 +38,22 @@ CAMERA_SOURCE = "camera clock (EXIF)"
 CONTACT_SIGMA_NS = 1_000_000  # interrupt and contact bounce; the best bodies were measured at 0.56 ms
 EPOCH_US = 10**15  # 2001; no autopilot has been running for that long
 DRIFT_SIGMA = 50e-6  # crystals of autopilots: some tens of ppm between two machines
-FLOOR_NS = 1_735_689_600 * 10**9  # 2025: a clock that shows less has never been set
 _UTC_BETTER = 2
 _UTC_AGREES_NS = 10**9  # clocks that differ by less are not reported
-_TIMEX_BYTES = 512  # more than any kernel's struct timex
 _UNSEEN_NS = 10**9  # how late a trigger call may be, where not even the file's arrival bounds it
 _REACH_SIGMAS = 4
 _REACH_NS = 10_000_000  # with the default 30 ms in all 130 ms: at 5 Hz the next shot's contact is farther away
 _AFTER_CALL_NS = 3_000_000
 _OWN_NS = 2_500_000_000  # a message that a slow link repeats is the same until then
-_WRAP_US = 2**32
 _CAMERA_SHOTS_KEPT = 256
 _CAMERA_SHOTS_LEAST = 3
 _PRIOR = np.diag([0.0, 1 / (DRIFT_SIGMA * 1e9) ** 2])  # of level (ns) and slope (ns/s)
 _TIMESYNC_FLOOR_NS = 50_000.0
 _TIMESYNC_ASYMMETRY = 0.05  # share of the least round trip by which the two ways may differ; not observable
+_STEADY = 600e-6
+_STEP_LOOK_NS = 10 * 10**9
+_STEP_FLOOR_NS = 500_000
+_RECENT_NS = 5 * 10**9
 _ARRIVAL_FLOOR_NS = 5e6  # the shortest way through radio, UART and scheduler; not observable from one side
 
 
@@ -169,13 +167,17 @@ class TimesyncAnswer:
 
 @dataclass(frozen=True, slots=True)
 class BootClock:
-    """UTC = boot time + offset + drift × (boot time − reference). Sigma is one standard deviation of UTC."""
+    """UTC = boot time + offset + drift × (boot time − reference). Sigma is one standard deviation of UTC.
+
+    `doubt`: a sentence where the clock stepped near the time that it is used for.
+    """
 
     source: Literal["timesync", "arrival"]
     reference_boot_ns: int
     offset_ns: int
     drift: float
     sigma_ns: float
+    doubt: str = ""
 
     def utc_ns(self, boot_ns: int) -> int:
         """UTC at a boot time."""
@@ -219,6 +221,30 @@ def from_timesync(answers: Sequence[TimesyncAnswer]) -> BootClock | None:
     )
 
 
+def from_few(answers: Sequence[TimesyncAnswer]) -> BootClock:
+    """The clock by the quickest of one or two answers, without a slope: it is wrong by at most half its round trip."""
+    best = min(answers, key=lambda answer: answer.delay_ns)
+    sigma_ns = math.hypot(best.delay_ns / 2 / math.sqrt(3), _TIMESYNC_FLOOR_NS)
+    return BootClock("timesync", best.boot_ns, best.offset_ns, 0.0, sigma_ns)
+
+
+def step_ns(answers: Sequence[TimesyncAnswer], new: TimesyncAnswer) -> int | None:
+    """By how much UTC − boot time has changed since the last of `answers`, where a steady clock can't give `new`; else
+    None.
+
+    An answer is wrong by at most half its round trip, so two differ by at most half of both, plus what crystals and
+    a machine clock under correction (0.06 %) can drift in between. Answers of the last ten seconds count.
+    """
+    for old in reversed(answers):
+        apart_ns = new.stamp_ns - old.stamp_ns
+        if apart_ns > _STEP_LOOK_NS:
+            break
+        most_ns = (old.delay_ns + new.delay_ns) / 2 + _STEADY * apart_ns + _STEP_FLOOR_NS
+        if abs(new.offset_ns - old.offset_ns) > most_ns:
+            return new.offset_ns - answers[-1].offset_ns
+    return None
+
+
 def _line(x: Floats, y: Floats, weight: Floats) -> tuple[Floats, Floats, Floats]:
     """Weighted least squares with the prior: (level, slope), the inverse of the normal matrix, the residuals."""
     sides = np.stack([np.ones_like(x), x])
@@ -231,13 +257,17 @@ def from_arrivals(arrivals: Sequence[tuple[int, int]]) -> BootClock | None:
     """Take the least of (arrival − boot time) over `arrivals`, pairs (boot_ns, received_utc_ns); None from none.
 
     It is late by the delay of the quickest packet, which can't be observed: sigma allows 5 ms for it, and a tenth of
-    the median excess.
+    the median excess; and all of what the quickest packet of the last five seconds came later: the autopilot's clock
+    may have lost that much.
     """
     if not arrivals:
         return None
     offsets = sorted(received - boot for boot, received in arrivals)
+    since_ns = max(received for _, received in arrivals) - _RECENT_NS
+    later_ns = min(received - boot for boot, received in arrivals if received >= since_ns) - offsets[0]
     median_excess = offsets[len(offsets) // 2] - offsets[0]
-    return BootClock("arrival", arrivals[-1][0], offsets[0], 0.0, math.hypot(_ARRIVAL_FLOOR_NS, 0.1 * median_excess))
+    sigma_ns = math.hypot(_ARRIVAL_FLOOR_NS, 0.1 * median_excess, later_ns)
+    return BootClock("arrival", arrivals[-1][0], offsets[0], 0.0, sigma_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,23 +283,6 @@ class Feedback:
     kind: str
     image: int = 0
     contact: bool = True
-
-
-def feedback_boot_ns(message: MavlinkMessage, unix_minus_boot_ns: int | None, now_boot_ns: int) -> int | None:
-    """The message's time since boot. None for 0, which is no time, and for a GPS time before SYSTEM_TIME has given the
-    offset.
-
-    ArduPilot counts the microseconds of its feedback pin in 32 bits, which wrap every 71.6 minutes: the time next to
-    `now_boot_ns` is meant.
-    """
-    time_us = int(message.time_usec)
-    if time_us <= 0:
-        return None
-    if time_us >= EPOCH_US:
-        return None if unix_minus_boot_ns is None else time_us * 1000 - unix_minus_boot_ns
-    if message.get_type() == "CAMERA_FEEDBACK" and time_us < _WRAP_US:
-        time_us += max(0, round((now_boot_ns // 1000 - time_us) / _WRAP_US)) * _WRAP_US
-    return time_us * 1000
 
 
 def reach_ns(exposure: ExposureTime) -> int:
@@ -422,36 +435,6 @@ class UtcNotes(Protocol):
     """Where a correction is recorded; see `flight.recording.Recording`."""
 
     def learn_utc(self, correction_ns: int, sigma_ns: int, source: str) -> None: ...
-
-
-def machine_knows_utc(utc_ns: int, *, synchronised: Callable[[], bool] | None = None, root: Path = Path("/")) -> bool:
-    """Whether the machine's time of day can be believed: it was set, and is kept by the network, by a hardware clock
-    that runs while the machine is off, or by a host.
-
-    A single-board computer without these shows the time of its last shutdown. A systemd service with `ProtectClock=`
-    may not ask the kernel, so systemd-timesyncd's mark counts as well.
-    """
-    if utc_ns < FLOOR_NS:
-        return False
-    if (synchronised or kernel_synchronised)() or (root / "run/systemd/timesync/synchronized").exists():
-        return True
-    board = (root / "proc/device-tree/model").exists()
-    return not board or any((root / "sys/class/rtc").glob("rtc*"))
-
-
-def kernel_synchronised() -> bool:
-    """Whether the kernel's clock is synchronised (adjtimex(2)); False where the kernel can't be asked."""
-    try:
-        adjtimex = ctypes.CDLL(None, use_errno=True).adjtimex
-    except (OSError, AttributeError):
-        return False
-    timex = ctypes.create_string_buffer(_TIMEX_BYTES)  # modes = 0: only read
-    return int(adjtimex(timex)) in range(5)  # 5 is TIME_ERROR: not synchronised; -1 an error
-
-
-def utc_known(setting: str, utc_ns: int) -> bool:
-    """Whether UTC is known by the setting `record.utc`: system, autopilot (only once it reports UTC), or auto."""
-    return setting == "system" or (setting == "auto" and machine_knows_utc(utc_ns))
 
 
 class UtcLearner:

@@ -52,6 +52,7 @@ AHEAD_NS = 10**9  # a body's latency and half an exposure; an exposure further a
 _VEHICLES = "vehicles"  # the ledger's fact: [number of the first packet, system id] of each vehicle followed
 _HINT_NS = 50_000_000  # a new fit while one frame waits changes the clock by less
 _PRUNE_EVERY = 256
+_STEP_SHOWN_NS = 60 * 10**9
 _LOOK_S = 0.005
 # A single-frequency receiver under open sky, where it reports a dilution only; GPS_FIX_TYPE → metres for each unit.
 METRES_PER_DOP = {2: 2.5, 3: 2.5, 4: 1.0, 5: 0.3, 6: 0.02, 7: 0.02, 8: 0.05}
@@ -125,14 +126,19 @@ class Telemetry:
     def bracketed(self, utc_ns: int) -> bool:
         """Whether samples from after this instant have arrived: waiting longer would not improve its pose.
 
-        Attitude counts only if some arrived in the last five seconds.
+        Attitude counts only if some arrived in the last five seconds. Where the autopilot answers TIMESYNC, so has an
+        answer: one that arrives later may show that its clock has stepped before.
         """
         with self._lock:
+            if self._history.time.is_past(utc_ns):
+                return True
             hint = self._history.time.last_fit(self._packets)
             if hint is not None and not self._history.reached(hint.boot_ns(utc_ns) - _HINT_NS):
                 return False  # far from it: no new fit for every packet that arrives while a frame waits
             clock = self._history.clock(self._packets)
-            return clock is not None and self._history.reached(clock.boot_ns(utc_ns))
+            if clock is None or self._history.time.awaits_answer(utc_ns):
+                return False
+            return self._history.reached(clock.boot_ns(utc_ns))
 
     def settled(self, exposure: ExposureTime) -> bool:
         """Whether waiting longer would not improve this exposure's pose.
@@ -153,20 +159,22 @@ class Telemetry:
         """
         with self._lock:
             limit = self._packets if upto_packet is None else upto_packet
-            clock = self._history.clock(limit)
-            events = self._history.feedbacks(limit)
+            clock = self._history.clock(limit, exposure.utc_ns)
+            events = self._history.feedbacks(limit, exposure.utc_ns)
         trigger = exposure.trigger
         event = None
         if clock is not None:
             event = own_feedback(events, trigger) if trigger else choose_feedback(events, exposure, clock)
         if clock is None or event is None:
-            return exposure, self.pose_at(exposure.utc_ns, exposure.sigma_ns, upto_packet=limit)
+            pose = self.pose_at(exposure.utc_ns, exposure.sigma_ns, upto_packet=limit)
+            return _in_doubt(exposure, clock), pose
         sigma_ns = CONTACT_SIGMA_NS
         if trigger:
             better, boot_ns, sigma_ns = by_trigger(exposure, trigger, event, clock)
         else:
             better, boot_ns = refine(exposure, event, clock)
-        return better, self.pose_at(better.utc_ns, sigma_ns, upto_packet=limit, boot_ns=boot_ns)
+        pose = self.pose_at(better.utc_ns, sigma_ns, upto_packet=limit, boot_ns=boot_ns)
+        return _in_doubt(better, clock), pose
 
     def pose_at(
         self, utc_ns: int, utc_sigma_ns: float, *, upto_packet: int | None = None, boot_ns: int | None = None
@@ -181,15 +189,25 @@ class Telemetry:
         """
         with self._lock:
             limit = self._packets if upto_packet is None else upto_packet
-            clock = self._history.clock(limit)
+            clock = self._history.clock(limit, utc_ns)
             if clock is None:
                 return unknown_pose(utc_ns, limit)
             if boot_ns is None:
                 boot_ns, sigma_ns = clock.boot_ns(utc_ns), (utc_sigma_ns**2 + clock.sigma_ns**2) ** 0.5
             else:
                 sigma_ns = utc_sigma_ns
-            at = self._history.around(utc_ns, boot_ns, sigma_ns, limit)
+            at = self._history.around(utc_ns, boot_ns, sigma_ns, limit, placed=not clock.doubt)
         return pose_around(at, packets=limit, attitude_sigma_rad=self._attitude_sigma_rad)
+
+    def clock_problem(self, utc_ns: int) -> str | None:
+        """A sentence where the autopilot's clock has stepped in the last minute."""
+        with self._lock:
+            last, unsteady = self._history.time.last_step(), self._history.time.is_unsteady()
+        if last is None or last.step_ns is None or utc_ns - last.since_ns > _STEP_SHOWN_NS:
+            return None
+        if unsteady:
+            return "the autopilot's clock does not run steadily: poses are in doubt"
+        return f"the autopilot's clock stepped by {last.step_ns / 1e9:+.3f} s: poses next to that are in doubt"
 
     def utc_correction(self) -> UtcCorrection | None:
         """This machine's UTC against that of the autopilot's satellites; None while either is unknown."""
@@ -292,7 +310,7 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) ->
     Position: cubic Hermite with the reported velocities. Attitude and gimbal: slerp. With one sample only, that one,
     marked "nearest". Sigmas: time (exposure and clocks) × speed and × turn rate, with the age of a single sample; the
     uncertainty of the interpolation; the receiver's accuracy (without one the position's sigmas are None); the
-    attitude's own, as the autopilot reports it, else `attitude_sigma_rad`.
+    attitude's own, as the autopilot reports it, else `attitude_sigma_rad` (without either the attitude's are None).
     """
     sigma_s = math.hypot(at.sigma_ns, HALF_MS_NS / math.sqrt(3)) / 1e9
     attitude, attitude_sigma, attitude_covariance = _attitude(at, sigma_s, attitude_sigma_rad)
@@ -322,7 +340,7 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) ->
         covariance = _symmetric(found.velocity_ned_m_s, blur_s, (across, across, upright_m**2 + upright_doubt_m**2))
     return replace(
         made,
-        source="interpolated" if len(at.positions) == 2 and len(at.attitudes) != 1 else "nearest",
+        source="interpolated" if at.placed and len(at.positions) == 2 and len(at.attitudes) != 1 else "nearest",
         latitude_rad=found.latitude_rad,
         longitude_rad=found.longitude_rad,
         altitude_msl_m=found.altitude_msl_m,
@@ -335,6 +353,13 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) ->
         position_covariance_m2=covariance,
         age_ms=age_s * 1e3,
     )
+
+
+def _in_doubt(exposure: ExposureTime, clock: BootClock | None) -> ExposureTime:
+    """The exposure with the doubt of the clock that places it."""
+    if clock is None or not clock.doubt:
+        return exposure
+    return replace(exposure, source=f"{exposure.source}; in doubt: {clock.doubt}")
 
 
 def unknown_pose(utc_ns: int, packets: int) -> Pose:
@@ -398,6 +423,8 @@ def _attitude(at: Around, sigma_s: float, own_rad: float) -> tuple[Quaternion | 
         return None, None, None
     found, doubt = attitude_at(samples, at.boot_ns)
     reported_rad = max((sample.sigma_rad for sample in samples if sample.sigma_rad is not None), default=own_rad)
+    if reported_rad <= 0:
+        return found, None, None  # the error of the interpolation alone says nothing about the autopilot's own
     rates = max((s.rates_rad_s for s in samples if s.rates_rad_s is not None), key=norm, default=None)
     if len(samples) == 1:
         sigma_s = math.hypot(sigma_s, abs(samples[0].boot_ns - at.boot_ns) / 1e9)

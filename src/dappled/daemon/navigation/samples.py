@@ -1,13 +1,17 @@
-"""Turn single telemetry messages into samples of position, attitude, receiver and gimbal.
+"""Turn telemetry messages into samples of position, attitude, receiver and gimbal, and find samples in a history.
 
-A message without a value gives None.
+A message without a value gives None. A history is a list of samples in the order of their packets.
 """
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
+from dappled.daemon.navigation.clocks import EPOCH_US
 from dappled.decode.geometry import Gnss, Quaternion, Vector3, from_euler, normalised
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
@@ -16,6 +20,30 @@ GIMBAL_COMPONENTS = frozenset({1, 154, 171, 172, 173, 174, 175})  # an autopilot
 _EARTH = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
 _VEHICLE = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
 _LOCK = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK
+_WRAP_US = 2**32
+NEAREST_NS = 10 * 10**9
+MOST_SAMPLES = 2**16  # of one kind: three minutes at 360 Hz, more than any autopilot sends
+
+
+class Numbered(Protocol):
+    """Something from one packet of the telemetry log: its running number, and when it arrived."""
+
+    @property
+    def number(self) -> int: ...
+
+    @property
+    def stamp_ns(self) -> int: ...
+
+
+class Sample(Numbered, Protocol):
+    """Something that also has the vehicle's own time."""
+
+    @property
+    def boot_ns(self) -> int: ...
+
+
+N = TypeVar("N", bound=Numbered)
+S = TypeVar("S", bound=Sample)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,3 +177,63 @@ def gimbal(number: int, stamp_ns: int, message: MavlinkMessage, epoch: int = 0) 
 def _scaled(value: int, unknown: int, parts: int) -> float | None:
     """A field in parts of its unit; 0 and the highest value stand for unknown."""
     return value / parts if 0 < value < unknown else None
+
+
+def feedback_boot_ns(message: MavlinkMessage, unix_minus_boot_ns: int | None, now_boot_ns: int) -> int | None:
+    """The message's time since boot. None for 0, which is no time, and for a GPS time before SYSTEM_TIME has given the
+    offset.
+
+    ArduPilot counts the microseconds of its feedback pin in 32 bits, which wrap every 71.6 minutes: the time next to
+    `now_boot_ns` is meant.
+    """
+    time_us = int(message.time_usec)
+    if time_us <= 0:
+        return None
+    if time_us >= EPOCH_US:
+        return None if unix_minus_boot_ns is None else time_us * 1000 - unix_minus_boot_ns
+    if message.get_type() == "CAMERA_FEEDBACK" and time_us < _WRAP_US:
+        time_us += max(0, round((now_boot_ns // 1000 - time_us) / _WRAP_US)) * _WRAP_US
+    return time_us * 1000
+
+
+def between(history: Sequence[N], first: int, limit: int) -> Sequence[N]:
+    """Those of the packets first <= number < limit."""
+    return history[_place(history, first) : _place(history, limit)]
+
+
+def _place(history: Sequence[Numbered], number: int) -> int:
+    """Where packet `number` would stand."""
+    return bisect_left(history, number, key=lambda sample: sample.number)
+
+
+def last(history: Sequence[N], window_ns: int) -> Sequence[N]:
+    """Those that arrived in the last `window_ns` before the last one."""
+    if not history:
+        return history
+    since = history[-1].stamp_ns - window_ns
+    return history[bisect_left(history, since, key=lambda sample: sample.stamp_ns) :]
+
+
+def around(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[S, ...]:
+    """The two samples around an instant, not more than `gap_ns` apart; or the nearest one, if it is near enough; or
+    none. `boot_ns` of the history must rise."""
+    at = bisect_left(history, boot_ns, key=lambda sample: sample.boot_ns)
+    sides = tuple(history[max(0, at - 1) : at + 1])
+    if len(sides) == 2 and sides[1].boot_ns - sides[0].boot_ns <= gap_ns:
+        return sides
+    nearest = min(sides, key=lambda sample: abs(sample.boot_ns - boot_ns), default=None)
+    if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS:
+        return ()
+    return (nearest,)
+
+
+def keep(history: list[N], sample: N) -> None:
+    """Append. `prune` bounds a history by time; this bounds it by number, in a flood of messages."""
+    history.append(sample)
+    if len(history) > MOST_SAMPLES:
+        del history[: MOST_SAMPLES // 4]
+
+
+def prune(history: list[N], before_ns: int) -> None:
+    """Forget what came before."""
+    del history[: bisect_left(history, before_ns, key=lambda sample: sample.stamp_ns)]

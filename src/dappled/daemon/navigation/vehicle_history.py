@@ -5,10 +5,10 @@ The state is a fold over packets (number, stamp, message), so a replay that feed
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from dataclasses import dataclass, replace
 
 from dappled.daemon.navigation import samples as telemetry_samples
 from dappled.daemon.navigation.clocks import (
@@ -16,21 +16,29 @@ from dappled.daemon.navigation.clocks import (
     BootClock,
     Feedback,
     TimesyncAnswer,
-    feedback_boot_ns,
     from_arrivals,
+    from_few,
     from_timesync,
+    step_ns,
 )
 from dappled.daemon.navigation.samples import (
     GIMBAL_COMPONENTS,
     HALF_MS_NS,
+    NEAREST_NS,
     AttitudeSample,
     GimbalSample,
     GnssSample,
     PositionSample,
+    Sample,
+    around,
+    between,
+    feedback_boot_ns,
+    keep,
+    last,
+    prune,
 )
 from dappled.drivers.mavlink import MavlinkMessage
 
-NEAREST_NS = 10 * 10**9
 POSITION_GAP_NS = 2_500_000_000
 ATTITUDE_GAP_NS = 1_500_000_000
 GIMBAL_GAP_NS = 1_500_000_000
@@ -38,33 +46,13 @@ TIMESYNC_WINDOW_NS = 120 * 10**9
 ARRIVAL_WINDOW_NS = 60 * 10**9
 REBOOT_BACK_NS = 2 * 10**9
 REBOOT_CONFIRM_NS = 500_000_000
-MOST_SAMPLES = 2**16  # of one kind: three minutes at 360 Hz, more than any autopilot sends
 _ALIVE_NS = 5 * 10**9
 _REQUESTS_KEPT = 64
-_BOOTS_KEPT = 8
+_UNSTEADY_NS = 10 * 10**9  # two steps within this time: the clock does not run steadily
+_FEW = 3
+_ANSWERS_COME_NS = 10**9
 _AUTOPILOT = 1
 _FitKey = tuple[str | int, ...]  # what a fit was made from: its kind, the boot's first packet, the last packets
-
-
-class Numbered(Protocol):
-    """Something from one packet of the telemetry log: its running number, and when it arrived."""
-
-    @property
-    def number(self) -> int: ...
-
-    @property
-    def stamp_ns(self) -> int: ...
-
-
-class Sample(Numbered, Protocol):
-    """Something that also has the vehicle's own time."""
-
-    @property
-    def boot_ns(self) -> int: ...
-
-
-N = TypeVar("N", bound=Numbered)
-S = TypeVar("S", bound=Sample)
 
 
 @dataclass(slots=True)
@@ -78,11 +66,26 @@ class Counts:
 
 
 @dataclass(frozen=True, slots=True)
+class Epoch:
+    """A stretch of packets, from packet `number` on, in which the autopilot's clock ran steadily.
+
+    It holds for certain since `since_ns`, and the clock before it did until `before_ns`. `step_ns` is by how much
+    UTC − boot time changed; None where the autopilot (re)booted.
+    """
+
+    number: int
+    before_ns: int
+    since_ns: int
+    step_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Around:
     """The samples around an instant: of position, attitude and gimbal two, the nearest one, or none; of the receiver
     the nearest one.
 
     `boot_ns` is the instant on the autopilot's clock, known to `sigma_ns` (1 σ); `gimbal_boot_ns` on the gimbal's.
+    `placed`: False where the clock stepped so near to it that the samples may be from before or after it.
     """
 
     utc_ns: int
@@ -93,10 +96,13 @@ class Around:
     gnss: GnssSample | None = None
     gimbals: Sequence[GimbalSample] = ()
     gimbal_boot_ns: int = 0
+    placed: bool = True
 
 
 class AutopilotTime:
-    """The autopilot's reboots, its answers to TIMESYNC, and what it says of UTC.
+    """The autopilot's reboots and the steps of its clock, its answers to TIMESYNC, and what it says of UTC.
+
+    Each reboot and each step begins an epoch. An instant is placed by the answers and samples of its own epoch.
 
     `component_id` is our own: a TIMESYNC request from it whose `ts1` is our UTC is ours, and an answer with the same
     `ts1` answers it; all others belong to other programs.
@@ -109,12 +115,12 @@ class AutopilotTime:
         self._component_id = component_id
         self._answers: list[TimesyncAnswer] = []
         self._requests: dict[int, int] = {}
-        self._boots: list[int] = [0]  # packet numbers at which the autopilot's time began anew
+        self._epochs = [Epoch(0, 0, 0)]
         self._back_since_ns: int | None = None
         self._fitted: tuple[_FitKey | None, BootClock | None] = (None, None)
         self.now_boot_ns: int | None = None
         self.unix_minus_boot_ns: int | None = None
-        self.reboots = 0
+        self.reboots = self.steps = 0
 
     def believe(self, number: int, stamp_ns: int, boot_ns: int) -> bool:
         """Whether a packet's time since boot is plausible.
@@ -127,7 +133,7 @@ class AutopilotTime:
                 self._back_since_ns = stamp_ns
             if stamp_ns - self._back_since_ns < REBOOT_CONFIRM_NS:
                 return False
-            self._boots.append(number)
+            self._epochs.append(Epoch(number, self._back_since_ns, self._back_since_ns))
             self.reboots += 1
             self._requests.clear()
             self.unix_minus_boot_ns = None
@@ -137,8 +143,51 @@ class AutopilotTime:
         return True
 
     def first(self, limit: int) -> int:
-        """The packet number at which the boot began that was current below `limit`."""
-        return self._boots[max(0, bisect_left(self._boots, limit) - 1)]
+        """The packet number at which the epoch began that was current below `limit`."""
+        return self._epoch(limit).number
+
+    def span(self, limit: int, utc_ns: int) -> tuple[int, int]:
+        """The packets of an instant's epoch, as known below `limit`: from the first to before the second."""
+        at = self._place(limit, utc_ns)
+        later = self._epochs[at + 1 : at + 2]
+        return self._epochs[at].number, min([limit, *(one.number for one in later)])
+
+    def is_past(self, utc_ns: int) -> bool:
+        """Whether an instant was before the present epoch: nothing that arrives can say more about it."""
+        return utc_ns <= self._epochs[-1].before_ns
+
+    def awaits_answer(self, utc_ns: int) -> bool:
+        """Whether an answer to TIMESYNC from after an instant is still to come, which may show a step before it."""
+        last_ns = self._answers[-1].stamp_ns if self._answers else 0
+        return last_ns < utc_ns <= last_ns + _ANSWERS_COME_NS
+
+    def last_step(self) -> Epoch | None:
+        """The last step of the clock that is remembered."""
+        return next((one for one in reversed(self._epochs) if one.step_ns is not None), None)
+
+    def is_unsteady(self) -> bool:
+        """Whether the clock has stepped again and again until now."""
+        last = self.last_step()
+        return last is not None and len(self._steps_near(last.since_ns, len(self._epochs))) > 1
+
+    def _place(self, limit: int, utc_ns: int | None = None) -> int:
+        """Which epoch: the last one below `limit`, or that of an instant; between two, where either may be right, the
+        later one."""
+        at = max(0, bisect_left(self._epochs, limit, key=lambda one: one.number) - 1)
+        while utc_ns is not None and at > 0 and utc_ns <= self._epochs[at].before_ns:
+            at -= 1
+        return at
+
+    def _epoch(self, limit: int) -> Epoch:
+        return self._epochs[self._place(limit)]
+
+    def _steps_near(self, utc_ns: int, end: int) -> list[int]:
+        """The sizes of the steps around an instant, among the first `end` epochs."""
+        return [
+            abs(one.step_ns)
+            for one in self._epochs[:end]
+            if one.step_ns is not None and abs(one.since_ns - utc_ns) <= _UNSTEADY_NS
+        ]
 
     def system_time(self, message: MavlinkMessage) -> None:
         """Take a SYSTEM_TIME of the autopilot."""
@@ -161,21 +210,49 @@ class AutopilotTime:
         if self.now_boot_ns is not None and message.tc1 < self.now_boot_ns - REBOOT_BACK_NS:
             return  # from before or after a reboot that the telemetry has yet to show
         del self._requests[message.ts1]  # the same answer on a second link is not a second observation
+        known = between(self._answers, self._epochs[-1].number, number)
+        by_ns = step_ns(known, answer)
+        if by_ns is not None:
+            self._epochs.append(Epoch(number, known[-1].stamp_ns, stamp_ns, by_ns))
+            self.steps += 1
         self._answers.append(answer)
 
-    def clock(self, limit: int, histories: Sequence[Sequence[Sample]]) -> BootClock | None:
-        """The autopilot's clock against ours, from the packets below `limit`; None while unknown.
+    def clock(self, limit: int, histories: Sequence[Sequence[Sample]], utc_ns: int | None = None) -> BootClock | None:
+        """The autopilot's clock against ours at an instant (now), from the packets below `limit`; None while unknown.
 
-        By TIMESYNC where there are answers, else by when the samples of `histories` arrived.
+        By TIMESYNC where there are answers, else by when the samples of `histories` arrived. Next to a step, and while
+        the clock steps again and again, its sigma contains the largest step, and it has a doubt.
         """
-        first = self.first(limit)
-        answers = _between(self._answers, first, limit)
+        at = self._place(limit, utc_ns)
+        found = self._epoch_clock(at, limit, histories)
+        epoch = self._epochs[at]
+        if found is None or utc_ns is None:
+            return found
+        near = self._steps_near(utc_ns, self._place(limit) + 1)
+        between = at > 0 and epoch.step_ns is not None and utc_ns < epoch.since_ns
+        if not between and len(near) < 2:
+            return found
+        widest_ns = max(near)
+        doubt = f"the autopilot's clock stepped by {widest_ns / 1e9:.3f} s"
+        if len(near) > 1:
+            doubt = f"the autopilot's clock stepped {len(near)} times, by up to {widest_ns / 1e9:.3f} s"
+        return replace(found, sigma_ns=math.hypot(found.sigma_ns, widest_ns), doubt=doubt)
+
+    def _epoch_clock(self, at: int, limit: int, histories: Sequence[Sequence[Sample]]) -> BootClock | None:
+        """The clock by the packets of one epoch alone."""
+        epoch = self._epochs[at]
+        first = epoch.number
+        limit = min([limit, *(one.number for one in self._epochs[at + 1 : at + 2])])
+        answers = between(self._answers, first, limit)
         if answers:
+            few = len(answers) < _FEW and epoch.step_ns is not None
             by_timesync: _FitKey = ("timesync", first, answers[-1].number)
-            clock = self._fit(by_timesync, lambda: from_timesync(_last(answers, TIMESYNC_WINDOW_NS)))
+            clock = self._fit(
+                by_timesync, lambda: from_few(answers) if few else from_timesync(last(answers, TIMESYNC_WINDOW_NS))
+            )
             if clock is not None:
                 return clock
-        tails = [_last(_between(one, first, limit), ARRIVAL_WINDOW_NS) for one in histories]
+        tails = [last(between(one, first, limit), ARRIVAL_WINDOW_NS) for one in histories]
         key: _FitKey = ("arrival", first, *(tail[-1].number for tail in tails if tail))
         return self._fit(key, lambda: from_arrivals([(one.boot_ns, one.stamp_ns) for tail in tails for one in tail]))
 
@@ -191,8 +268,8 @@ class AutopilotTime:
 
     def prune(self, before_ns: int) -> None:
         """Forget what came before."""
-        _prune(self._answers, before_ns)
-        del self._boots[:-_BOOTS_KEPT]
+        prune(self._answers, before_ns)
+        del self._epochs[: max(0, bisect_left(self._epochs, before_ns, key=lambda one: one.since_ns) - 1)]
 
 
 class Gimbals:
@@ -221,7 +298,7 @@ class Gimbals:
                 sample = telemetry_samples.gimbal(number, stamp_ns, message, before.epoch + 1)
                 assert sample is not None
         self.seen += 1
-        _keep(self._samples, sample)
+        keep(self._samples, sample)
 
     def around(self, utc_ns: int, boot_ns: int, first: int, limit: int) -> tuple[tuple[GimbalSample, ...], int]:
         """The samples around an instant from the packets below `limit`, and the instant on the gimbal's clock.
@@ -229,21 +306,21 @@ class Gimbals:
         `boot_ns` is the instant on the autopilot's clock, which began at packet `first`. A gimbal's clock need not be
         the autopilot's.
         """
-        known = _between(self._samples, 0, limit)
+        known = between(self._samples, 0, limit)
         if not known:
             return (), boot_ns
         if known[-1].component == _AUTOPILOT:
-            known = _between(known, first, limit)
+            known = between(known, first, limit)
         samples = [sample for sample in known if sample.epoch == known[-1].epoch]
         if samples and samples[0].component != _AUTOPILOT:
-            clock = from_arrivals([(one.boot_ns, one.stamp_ns) for one in _last(samples, ARRIVAL_WINDOW_NS)])
+            clock = from_arrivals([(one.boot_ns, one.stamp_ns) for one in last(samples, ARRIVAL_WINDOW_NS)])
             assert clock is not None
             boot_ns = clock.boot_ns(utc_ns)
-        return _around(samples, boot_ns, gap_ns=GIMBAL_GAP_NS), boot_ns
+        return around(samples, boot_ns, gap_ns=GIMBAL_GAP_NS), boot_ns
 
     def prune(self, before_ns: int) -> None:
         """Forget what came before."""
-        _prune(self._samples, before_ns)
+        prune(self._samples, before_ns)
 
 
 class VehicleHistory:
@@ -268,20 +345,20 @@ class VehicleHistory:
 
     def prune(self, before_ns: int) -> None:
         """Forget what came before."""
-        _prune(self._positions, before_ns)
-        _prune(self._attitudes, before_ns)
-        _prune(self._receiver, before_ns)
-        _prune(self._feedbacks, before_ns)
+        prune(self._positions, before_ns)
+        prune(self._attitudes, before_ns)
+        prune(self._receiver, before_ns)
+        prune(self._feedbacks, before_ns)
         self.gimbals.prune(before_ns)
         self.time.prune(before_ns)
 
-    def clock(self, limit: int) -> BootClock | None:
-        """The autopilot's clock against ours, from the packets below `limit`; None while unknown."""
-        return self.time.clock(limit, (self._positions, self._attitudes))
+    def clock(self, limit: int, utc_ns: int | None = None) -> BootClock | None:
+        """The autopilot's clock against ours at an instant (now), from packets below `limit`; None while unknown."""
+        return self.time.clock(limit, (self._positions, self._attitudes), utc_ns)
 
-    def feedbacks(self, limit: int) -> Sequence[Feedback]:
-        """Messages about the hot shoe, from the packets below `limit` since the autopilot's last boot."""
-        return _between(self._feedbacks, self.time.first(limit), limit)
+    def feedbacks(self, limit: int, utc_ns: int) -> Sequence[Feedback]:
+        """Messages about the hot shoe, from the packets below `limit` of the epoch of an instant."""
+        return between(self._feedbacks, *self.time.span(limit, utc_ns))
 
     def reached(self, boot_ns: int) -> bool:
         """Whether samples from after this instant have arrived. Attitude counts only if some arrived in the last five
@@ -292,10 +369,10 @@ class VehicleHistory:
         alive = bool(attitudes) and attitudes[0].boot_ns >= positions[0].boot_ns - _ALIVE_NS
         return not alive or attitudes[0].boot_ns >= boot_ns
 
-    def around(self, utc_ns: int, boot_ns: int, sigma_ns: float, limit: int) -> Around:
+    def around(self, utc_ns: int, boot_ns: int, sigma_ns: float, limit: int, *, placed: bool = True) -> Around:
         """The samples around an instant (`boot_ns` ± σ on the autopilot's clock), from the packets below `limit`."""
-        first = self.time.first(limit)
-        receiver = _between(self._receiver, first, limit)
+        first, limit = self.time.span(limit, utc_ns)
+        receiver = between(self._receiver, first, limit)
         nearest = min(receiver, key=lambda sample: abs(sample.stamp_ns - utc_ns), default=None)
         if nearest is not None and abs(nearest.stamp_ns - utc_ns) > NEAREST_NS:
             nearest = None
@@ -304,28 +381,29 @@ class VehicleHistory:
             utc_ns,
             boot_ns,
             sigma_ns,
-            _around(_between(self._positions, first, limit), boot_ns, gap_ns=POSITION_GAP_NS),
-            _around(_between(self._attitudes, first, limit), boot_ns, gap_ns=ATTITUDE_GAP_NS),
+            around(between(self._positions, first, limit), boot_ns, gap_ns=POSITION_GAP_NS),
+            around(between(self._attitudes, first, limit), boot_ns, gap_ns=ATTITUDE_GAP_NS),
             nearest,
             gimbals,
             gimbal_boot_ns,
+            placed,
         )
 
     def _position(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         sample = telemetry_samples.position(number, stamp_ns, message)
         if sample is not None and self._believed(sample, message, self._positions):
             self.counts.positions += 1
-            _keep(self._positions, sample)
+            keep(self._positions, sample)
 
     def _attitude(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         sample = telemetry_samples.attitude(number, stamp_ns, message)
         if sample is not None and self._believed(sample, message, self._attitudes):
             self.counts.attitudes += 1
-            _keep(self._attitudes, sample)
+            keep(self._attitudes, sample)
 
     def _gnss(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if self._ours(message):
-            _keep(self._receiver, telemetry_samples.gnss(number, stamp_ns, message))
+            keep(self._receiver, telemetry_samples.gnss(number, stamp_ns, message))
 
     def _gimbal(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if message.get_srcSystem() == self.system_id:
@@ -349,7 +427,7 @@ class VehicleHistory:
             return
         self.counts.feedbacks += 1
         image, contact = (message.img_idx, message.time_usec < EPOCH_US) if by_pin else (message.seq, False)
-        _keep(self._feedbacks, Feedback(number, stamp_ns, boot_ns, message.get_type(), image, contact))
+        keep(self._feedbacks, Feedback(number, stamp_ns, boot_ns, message.get_type(), image, contact))
 
     def _ours(self, message: MavlinkMessage) -> bool:
         if message.get_srcComponent() != 1:
@@ -388,46 +466,3 @@ _HANDLERS: dict[str, Callable[[VehicleHistory, int, int, MavlinkMessage], None]]
     "CAMERA_TRIGGER": VehicleHistory._feedback,
 }
 USED_MESSAGES = frozenset(_HANDLERS)
-
-
-def _between(history: Sequence[N], first: int, limit: int) -> Sequence[N]:
-    """Those of the packets first <= number < limit."""
-    return history[_place(history, first) : _place(history, limit)]
-
-
-def _place(history: Sequence[Numbered], number: int) -> int:
-    """Where packet `number` would stand."""
-    return bisect_left(history, number, key=lambda sample: sample.number)
-
-
-def _last(history: Sequence[N], window_ns: int) -> Sequence[N]:
-    """Those that arrived in the last `window_ns` before the last one."""
-    if not history:
-        return history
-    since = history[-1].stamp_ns - window_ns
-    return history[bisect_left(history, since, key=lambda sample: sample.stamp_ns) :]
-
-
-def _around(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[S, ...]:
-    """The two samples around an instant, not more than `gap_ns` apart; or the nearest one, if it is near enough; or
-    none. `boot_ns` of the history must rise."""
-    at = bisect_left(history, boot_ns, key=lambda sample: sample.boot_ns)
-    sides = tuple(history[max(0, at - 1) : at + 1])
-    if len(sides) == 2 and sides[1].boot_ns - sides[0].boot_ns <= gap_ns:
-        return sides
-    nearest = min(sides, key=lambda sample: abs(sample.boot_ns - boot_ns), default=None)
-    if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS:
-        return ()
-    return (nearest,)
-
-
-def _keep(history: list[N], sample: N) -> None:
-    """Append. `_prune` bounds a history by time; this bounds it by number, in a flood of messages."""
-    history.append(sample)
-    if len(history) > MOST_SAMPLES:
-        del history[: MOST_SAMPLES // 4]
-
-
-def _prune(history: list[N], before_ns: int) -> None:
-    """Forget what came before."""
-    del history[: bisect_left(history, before_ns, key=lambda sample: sample.stamp_ns)]

@@ -40,14 +40,25 @@ _LATENCY_NS = 60_000_000  # from a trigger over a wire to the contact
 
 @dataclass(frozen=True, slots=True)
 class BootTime:
-    """The autopilot's clock: it was booted `offset_s` before the simulation began, and runs fast by `drift`."""
+    """The autopilot's clock: it was booted `offset_s` before the simulation began, and runs fast by `drift`.
+
+    `jumps` are (simulation time, seconds gained), as of a simulator that stalls.
+    """
 
     offset_s: float = 41.7
     drift: float = 50e-6
+    jumps: tuple[tuple[float, float], ...] = ()
 
     def ns(self, t_s: float) -> int:
         """Time since boot at simulation time `t_s`."""
-        return round((self.offset_s + t_s) * (1 + self.drift) * 1e9)
+        gained_s = sum(by_s for at_s, by_s in self.jumps if t_s >= at_s)
+        return round(((self.offset_s + t_s) * (1 + self.drift) + gained_s) * 1e9)
+
+
+def _jump(text: str) -> tuple[float, float]:
+    """From "AT:BY", both in seconds. Raises ValueError."""
+    at_s, _, by_s = text.partition(":")
+    return float(at_s), float(by_s)
 
 
 def telemetry_message(message_id: int, pose: TruePose, boot_ns: int, unix_us: int = 0) -> MavlinkMessage:
@@ -271,11 +282,13 @@ def main(arguments: list[str] | None = None) -> int:
         default=[],
         help="a camera that it triggers on command: mavlink, broadcast or wire, and :pin for a wired hot shoe",
     )
+    parser.add_argument("--drift", type=float, default=BootTime().drift, help="share by which its clock runs fast")
+    parser.add_argument("--jump", action="append", type=_jump, default=[], help="AT:BY, seconds its clock gains at AT")
     parser.add_argument("--with-parent", action="store_true", help="end when standard input is closed")
     wanted = parser.parse_args(arguments)
     start_ns = time.monotonic_ns() if wanted.start_monotonic_ns is None else wanted.start_monotonic_ns
     links = MavlinkLinks([wanted.url], system_id=wanted.system_id, component_id=1, clock=SystemClock())
-    boot = BootTime(wanted.booted)
+    boot = BootTime(wanted.booted, wanted.drift, tuple(wanted.jump))
     cameras = CameraTriggers(wanted.personality, tuple(wanted.camera), wanted.system_id) if wanted.camera else None
     flyer = Flyer(FlightPath(wanted.seed), start_ns, boot, links.sender.send, wanted.jitter, wanted.system_id, cameras)
     try:
