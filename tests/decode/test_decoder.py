@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -71,6 +73,39 @@ def test_views_of_a_hidden_camera_meet_the_truth(seed: int) -> None:
     assert report.views_from == "calibration"
     assert psnr(field.views, truth) > 40
     assert psnr(field.views, truth) > 12 + psnr(mean, truth)
+
+
+@pytest.fixture(scope="module")
+def far_out() -> tuple[Camera, Calibration, Plane]:
+    """A mask 8 % off its stated place, and a frame through it."""
+    camera = Camera.hidden(3)
+    return camera, _calibration(camera), camera.expose(_scene(3))
+
+
+@pytest.mark.parametrize("placed", [False, True])
+@pytest.mark.parametrize("told", [0.67, 0.9, 1.0, 1.5])
+def test_an_f_number_told_wrong_costs_nothing_and_is_doubted(
+    far_out: tuple[Camera, Calibration, Plane], told: float, placed: bool
+) -> None:
+    """`placed`: the mask's distance is known, so that even a tenth is too much for an f-number."""
+    camera, known, plane = far_out
+    if placed:
+        fits = tuple(replace(f, mask_distance_mm=camera.distance_mm, distance_fitted=True) for f in known.fits)
+        known = replace(known, fits=fits)
+    field, report = _decoder(known).decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=told * FULL_F)
+    truth = camera.truth(_scene(3), field.grid, field.views.shape[2:4])
+    assert psnr(field.views, truth) > 40
+    shown = FULL_F if placed else FULL_F * STATED_DISTANCE_MM / camera.distance_mm  # a distance is an aperture, too
+    far = abs(np.log(told * FULL_F / shown)) > (0.08 if placed else 0.25)
+    assert (f"its carriers show f/{shown:.2g}, told is f/{told * FULL_F:.3g}" in (report.doubt or "")) == far
+
+
+@pytest.mark.parametrize("told", [0.5, 2.0])
+def test_an_f_number_that_no_search_reaches_is_doubted(far_out: tuple[Camera, Calibration, Plane], told: float) -> None:
+    _, known, plane = far_out
+    _, report = _decoder(known).decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=told * FULL_F)
+    assert report.doubt is not None
+    assert "agree with no aperture near f/" in report.doubt
 
 
 def test_views_at_a_raw_signal_to_noise_of_100() -> None:

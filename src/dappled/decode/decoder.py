@@ -47,7 +47,7 @@ CarriersFrom = Literal["measured", "calibrated", "predicted", "found"]
 ViewsFrom = Literal["calibration", "frame", "white", "none"]
 _DOUBTED = 0.04  # of a carrier's frequency: a mask at its stated place is never so far off
 _ROTATION = 0.04  # of a carrier's frequency: the search without a calibration allows for 2.3°
-_UNKNOWN: Mapping[str, Any] = {"transfers": None, "aperture": None}
+_UNKNOWN: Mapping[str, Any] = {"transfers": None, "aperture": None, "aperture_doubt": None}
 _LEAST_THROUGH = 0.1  # of a carrier: where the aperture leaves less, the mask's transfer can't be measured
 
 
@@ -59,7 +59,7 @@ class DecodeReport:
     each (None: nothing there), `used` those that the slices were cut at. `carriers_from`: "measured" in this frame;
     "calibrated": predicted by the calibration, as too few were seen; "predicted": by the law alone; "found": an
     unknown lattice found in the frame. `views_from`: whose phases and transfer made the views. `noise_rms` is the
-    plane's white noise, 1.0 = sensor white.
+    plane's white noise, 1.0 = sensor white. `aperture_doubt` says what is strange about the aperture that it shows.
     """
 
     predicted: tuple[Carrier, ...]
@@ -68,6 +68,7 @@ class DecodeReport:
     carriers_from: CarriersFrom
     views_from: ViewsFrom
     noise_rms: float
+    aperture_doubt: str | None = None
 
     @property
     def found(self) -> int:
@@ -76,8 +77,9 @@ class DecodeReport:
 
     @property
     def doubt(self) -> str | None:
-        """What is unusual about the measured carriers, in a sentence; None where nothing is."""
-        return doubt(self.used, self.predicted) if self.carriers_from == "measured" else None
+        """What is unusual about the measured carriers and the aperture, in a sentence; None where nothing is."""
+        place = doubt(self.used, self.predicted) if self.carriers_from == "measured" else None
+        return "; ".join(words for words in (place, self.aperture_doubt) if words) or None
 
 
 def doubt(used: Sequence[Carrier], predicted: Sequence[Carrier]) -> str | None:
@@ -227,7 +229,8 @@ class MaskDecoder:
             )
         else:
             made, offsets, views_from, known = *no_views(slices), "none", _UNKNOWN
-        report = DecodeReport(tuple(predicted), tuple(measured), tuple(used), carriers_from, views_from, noise)
+        strange = known["aperture_doubt"]
+        report = DecodeReport(tuple(predicted), tuple(measured), tuple(used), carriers_from, views_from, noise, strange)
         facts: dict[str, Any] = {
             "law": self.law,
             "focal_length_mm": focal_length_mm,
@@ -238,7 +241,7 @@ class MaskDecoder:
             "level": spectrum.level,
             "band": list(size),
             "taper": self.taper,
-            **known,
+            **{name: value for name, value in known.items() if name != "aperture_doubt"},
         }
         return light_field(slices, made, offsets, shape=plane.shape, report=report, facts=facts), report
 
@@ -325,7 +328,7 @@ class MaskDecoder:
     ) -> tuple[Views, NDArray[np.float64], ViewsFrom, Mapping[str, Any]]:
         """Views of slices that were cut before, their offsets, where phases came from, and what each slice is of the
         light field: `transfers`, rows [ωv, ωu, Re T, Im T], T = 0 where a slice was not used, and the `aperture` that
-        it was taken through (see `Aperture.shape`)."""
+        it was taken through (see `Aperture.shape`), with what is strange about that."""
         none = no_views(slices)
         if f_number is None:
             return *none, "none", _UNKNOWN
@@ -333,6 +336,7 @@ class MaskDecoder:
         aperture = self.aperture or Aperture(self.mask.views_per_axis)
         cycles = kappa(self.mask.frequency_per_mm, self._distance(focal_length_mm), focal_length_mm, f_number)
         keep = np.ones(len(orders), dtype=bool)
+        strange: str | None = None
         if self.calibration is not None:
             known = self.calibration.nearest(focal_length_mm)
             magnitudes = dict(zip(self.mask.half_orders(), known.transfer, strict=True))
@@ -348,7 +352,7 @@ class MaskDecoder:
                 aperture=aperture,
                 distance_known=known.distance_fitted,
             )
-            cycles, aperture = width.kappa, width.aperture
+            cycles, aperture, strange = width.kappa, width.aperture, width.doubt(f_number)
             views_from: ViewsFrom = "calibration"
         elif carriers_from == "measured":
             rotation = turn_between(lattice, self.lattice_at(focal_length_mm))
@@ -374,7 +378,8 @@ class MaskDecoder:
         angular = angular_frequencies(orders, cycles, rotation)
         used = np.where(keep, transfers, 0)
         rows = np.column_stack([angular, used.real, used.imag]).tolist()
-        return views, offsets, views_from, {"transfers": rows, "aperture": aperture.shape}
+        known_of = {"transfers": rows, "aperture": aperture.shape, "aperture_doubt": strange}
+        return views, offsets, views_from, known_of
 
 
 def _own_transfer(

@@ -32,11 +32,17 @@ def _calibrated(shot: Shot, law: str = "fd", film: Film | None = None) -> Calibr
     )
 
 
-def _off_bins(shot: Shot, found: Calibration, some: list[Order] | None = None) -> float:
-    """Rms over some orders, by default over all of the mask's on the sensor."""
-    orders = np.array(some or list(shot.seen()))
+def _off_bins(shot: Shot, found: Calibration) -> float:
+    """Rms over all of the mask's orders on the sensor, seen or not."""
+    orders = np.array(list(shot.seen()))
     off = orders @ (found.fits[0].lattice.matrix() - shot.lattice) * shot.body.shape
     return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+def _reach(shot: Shot, above: list[Order]) -> float:
+    """How much farther out the mask's orders on the sensor lie than those that can be seen: so far errors grow."""
+    farthest = [max(float(np.hypot(*order)) for order in orders) for orders in (shot.seen(), above)]
+    return farthest[0] / farthest[1]
 
 
 def _attempt(shot: Shot) -> tuple[Calibration | None, str]:
@@ -53,11 +59,8 @@ def _holds(shot: Shot) -> bool:
         assert len(orders_above_noise(shot)) < ENOUGH, words
         assert "seen in this frame" in words or "should stand out" in words
         return False
-    off = _off_bins(shot, found)
-    assert off < 0.5
-    if off >= 0.1:
-        above = orders_above_noise(shot)
-        assert len(above) < ENOUGH or _off_bins(shot, found, above) < 0.1
+    above = orders_above_noise(shot)
+    assert _off_bins(shot, found) < (0.1 * _reach(shot, above) if len(above) >= ENOUGH else 0.5)
     assert found.law == "geometric"
     return True
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
@@ -31,10 +31,15 @@ from dappled.decode.optics import Lattice, Order
 
 Shape = Literal["beams", "filled", "round"]
 _PARTS = 15  # of a cell's side, where a circle cuts through cells
-ROUNDING = 0.05  # relative: f-numbers are off by no more (nominal f/22 is 22.6, f/3.5 is 3.56)
-_NOMINAL_SIGMA = 0.02  # relative: the error of an f-number
-UNKNOWN_DISTANCE = 0.35  # relative: how far κ is searched where the mask's distance was not fitted
-_UNKNOWN_SIGMA = 0.2  # relative: the error of κ then
+SEARCHED = 1.7  # times or a fraction of the nominal κ: an f-number told a third wrong, and a distance of a tenth
+_STEP = 5e-4  # relative: of the search
+_NOMINAL_SIGMA = 0.02  # relative: the error of an f-number (nominal f/22 is 22.6, f/3.5 is 3.56)
+_UNKNOWN_SIGMA = 0.2  # relative: the error of κ where the mask's distance was not fitted
+_WRONG, _WRONG_SIGMA = (
+    0.05,
+    0.3,
+)  # how often an f-number is told wrong (an old lens' ring, a step-up ring), and by how much
+_FAR_NOMINAL, _FAR_UNKNOWN = 0.08, 0.25  # relative: κ farther from the nominal one is a reason for doubt
 _TEXTURE = 1.5e-3  # of the mean: what the scene adds to the mean of a slice
 _EVIDENCE = 9.0  # squared deviations: less doesn't tell one shape from another (beams from filled cells never at κ = 1)
 SHAPES: tuple[Shape, ...] = ("beams", "filled", "round")
@@ -176,13 +181,30 @@ def origin_of(orders: Sequence[Order], phases: NDArray[np.complex128]) -> tuple[
 class UsedAperture:
     """κ in periods of the mask's fundamental, and its standard error; `fitted` False is the f-number's own.
 
-    `aperture` says how light comes through: beams, filled cells, or a round stop.
+    `aperture` says how light comes through: beams, filled cells, or a round stop. `share` is κ over the nominal one,
+    where that is farther off than f-number and distance should be, or where the frame agrees with no aperture (NaN);
+    None where there is no such reason for doubt.
     """
 
     kappa: float
     sigma: float
     fitted: bool
     aperture: Aperture
+    share: float | None = None
+
+    def doubt(self, f_number: float) -> str | None:
+        """What is strange about the aperture of a frame at a told f-number, in a sentence; None where nothing is."""
+        if self.share is None:
+            return None
+        if math.isnan(self.share):
+            return (
+                f"its carriers agree with no aperture near f/{f_number:.3g}, which the views take for right: check "
+                "f-number, calibration and clipping"
+            )
+        return (
+            f"its carriers show f/{f_number / self.share:.2g}, told is f/{f_number:.3g}: the views go by the carriers, "
+            "distances by the told one; check the f-number and the mask's distance"
+        )
 
 
 def used_aperture(
@@ -197,10 +219,11 @@ def used_aperture(
 ) -> UsedAperture:
     """The aperture of a frame from its slices complex64 (K, h, w), DC first, and their known transfers T_k (K,).
 
-    The most probable κ near `nominal_kappa`, within `UNKNOWN_DISTANCE` of it where the mask's distance is not known but
-    to some percent (not `distance_known`). The nominal one where the means carry no information or fit no aperture.
+    The most probable κ within a factor `SEARCHED` of `nominal_kappa`. An f-number is near the truth, or now and then
+    told wrong altogether; where the mask's distance is only known to some percent (not `distance_known`), so is κ. The
+    nominal one where the means carry no information or fit no aperture.
     """
-    reach, sigma = (ROUNDING, _NOMINAL_SIGMA) if distance_known else (UNKNOWN_DISTANCE, _UNKNOWN_SIGMA)
+    sigma, far = (_NOMINAL_SIGMA, _FAR_NOMINAL) if distance_known else (_UNKNOWN_SIGMA, _FAR_UNKNOWN)
     nominal = UsedAperture(nominal_kappa, sigma * nominal_kappa, False, aperture)
     means = mean_of_slices(slices)
     known = np.abs(transfers) > 1e-3
@@ -211,7 +234,9 @@ def used_aperture(
     error = _TEXTURE / np.abs(transfers[known])
     wanted = [order for order, usable in zip(orders, known, strict=True) if usable]
 
-    shares = 1 + reach * np.linspace(-1, 1, 2 * round(100 * reach / ROUNDING) + 1)
+    steps = round(math.log(SEARCHED) / _STEP)
+    off = _STEP * np.arange(-steps, steps + 1)
+    prior = np.minimum((off / sigma) ** 2, (off / _WRONG_SIGMA) ** 2 + 2 * math.log(_WRONG_SIGMA / sigma / _WRONG))
     best: UsedAperture | None = None
     least = math.inf
     for shape in SHAPES:
@@ -219,14 +244,17 @@ def used_aperture(
             seen,
             error,
             wanted,
-            nominal_kappa * shares,
+            nominal_kappa * np.exp(off),
             rotation_rad=rotation_rad,
             aperture=Aperture(aperture.views, shape),
-            sigma=sigma,
+            prior=prior,
         )
         if found is not None and cost + (_EVIDENCE if best else 0.0) < least:
             best, least = found, cost
-    return best or nominal
+    if best is None:
+        return replace(nominal, share=math.nan)
+    share = best.kappa / nominal_kappa
+    return replace(best, share=share) if abs(math.log(share)) > far else best
 
 
 def _fitted(
@@ -237,22 +265,24 @@ def _fitted(
     *,
     rotation_rad: float,
     aperture: Aperture,
-    sigma: float,
+    prior: NDArray[np.float64],
 ) -> tuple[UsedAperture | None, float]:
-    """The most probable of evenly spaced `kappas` (the nominal one in the middle), and its cost; None for no fit."""
-    nominal = float(kappas[len(kappas) // 2])
+    """The most probable of `kappas`, evenly spaced in the logarithm, and its cost; None for no fit.
+
+    `prior` is what each costs before the frame is seen.
+    """
     angular = [angular_frequencies(orders, float(kappa), rotation_rad) for kappa in kappas]
-    there = np.array([aperture.transform(a).real for a in angular])
+    there = aperture.transform(np.concatenate(angular)).real.reshape(len(kappas), -1)
     deviations = ((there - seen) / error) ** 2
-    cost = deviations.sum(axis=1) + ((kappas / nominal - 1) / sigma) ** 2
+    cost = deviations.sum(axis=1) + prior
     best = int(np.argmin(cost))
     if best in (0, len(kappas) - 1) or float(deviations[best].mean()) > _AGREEMENT**2:
         return None, math.inf
     below, centre, above = (float(c) for c in cost[best - 1 : best + 2])
     curvature = below - 2 * centre + above
-    step = float(kappas[1] - kappas[0])
-    kappa = float(kappas[best]) + 0.5 * step * (below - above) / curvature
-    return UsedAperture(kappa, step * math.sqrt(2 / curvature), True, aperture), centre
+    step = math.log(kappas[1] / kappas[0])
+    kappa = float(kappas[best]) * math.exp(0.5 * step * (below - above) / curvature)
+    return UsedAperture(kappa, kappa * step * math.sqrt(2 / curvature), True, aperture), centre
 
 
 def mean_of_slices(slices: NDArray[np.complex64]) -> NDArray[np.complex128]:
