@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import platform
 import sqlite3
 from pathlib import Path
 
@@ -70,6 +72,39 @@ def test_replay_verifies(flown: Flown) -> None:
     done = dappled("replay", str(flown.flight), "--verify")
     assert done.returncode == 0, done.stdout + done.stderr
     assert f"verified {FRAMES} frames: all hashes the same" in done.stdout
+
+
+ANOTHER_MACHINE = """
+import platform
+platform.machine = lambda: "aarch64"
+import numpy as np
+from dappled.drivers.raw.darkroom import Darkroom
+decode = Darkroom.decode
+def rounded(self, *words, **names):
+    made = decode(self, *words, **names)
+    slices = made.light_field.slices
+    noise = np.random.default_rng(1).normal(size=slices.shape)
+    slices += ({share} * np.abs(slices).max() * noise).astype(np.float32)
+    return made
+Darkroom.decode = rounded
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("share", "ends"),
+    [(1e-7, (0, "equal within 1e-06 of each frame's largest value")), (1e-5, (1, "the slices differ by "))],
+)
+def test_replay_verifies_numbers_on_another_machine(
+    flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, ends: tuple[int, str]
+) -> None:
+    """Every process of the replay calls itself an aarch64, and its decoder rounds otherwise."""
+    (tmp_path / "sitecustomize.py").write_text(ANOTHER_MACHINE.format(share=share))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    done = dappled("replay", str(flown.flight), "--verify")
+    assert done.returncode == ends[0], done.stdout + done.stderr
+    assert ends[1] in done.stdout + done.stderr
+    assert f"recorded on {platform.machine()}" in done.stdout + done.stderr
 
 
 def test_one_flipped_byte_of_a_raw_file_is_found(copied: Path) -> None:

@@ -23,6 +23,7 @@ from dappled.daemon.replay import playback, replay, runs
 from dappled.daemon.replay.playback import FlownWith
 from dappled.daemon.replay.replay import ReplayError, ReplayProgress
 from dappled.daemon.replay.runs import Run, RunWriter
+from dappled.daemon.replay.verifier import MOST_SHARE, ReplayVerifier
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import counted
 from dappled.flight import LIVE, layout
@@ -127,10 +128,22 @@ def run(arguments: argparse.Namespace) -> int:
     left = f" ({undecoded} left undecoded in flight)" if undecoded else ""
     print(
         f"verified {counted(count, 'frame')}: "
-        + (counted(len(problems), "difference") if problems else "all hashes the same")
+        + (counted(len(problems), "difference") if problems else _same(writer))
         + left
     )
     return 1 if problems else 0
+
+
+def _same(writer: ReplayVerifier) -> str:
+    """In which sense everything was the same."""
+    if not writer.close:
+        return "all hashes the same"
+    share, index = writer.furthest
+    worst = f"; the furthest is frame {index}, {share:.1e}" if index >= 0 and share else ""
+    return (
+        f"equal within {MOST_SHARE:g} of each frame's largest value{worst}; poses and tags within 1e-9; "
+        f"recorded on {writer.elsewhere}"
+    )
 
 
 class PrintedProgress(ReplayProgress):

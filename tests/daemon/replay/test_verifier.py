@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -89,3 +90,47 @@ def test_what_did_not_come_is_a_difference(tmp_path: Path) -> None:
         assert word in text
     with pytest.raises(DappledError, match="no recorded frame"):
         verifier.record(None, "x", Blob.of(b"x"))
+
+
+RECORDED = {"count": 64, "largest": 2.0, "sums": [1.0] * 64}
+
+
+def elsewhere(tmp_path: Path, frame_tag: Tag | None, share: float | None) -> tuple[list[str], Any]:
+    """What a replay says whose hashes differ from those recorded on another machine, and whose slices by `share`."""
+    _, frame = replay(tmp_path)
+    row = ShotRow(SHOT, "safe", None, 30, 40)
+    numbers = None if share is None else RECORDED
+    expected = Expected(row, frame, "0" * 64, "0" * 64, "0" * 64, frame_tag or tag(frame), numbers)
+    verifier = ReplayVerifier(tmp_path, [expected], elsewhere="aarch64")
+    verifier.tagged(tag(frame))
+    found = {**RECORDED, "sums": [1.0] * 63 + [1.0 + 2.0 * (share or 0.0)]}
+    verifier.decoded(Result(0, "5" * 64, 1, 1, "geometric", "predicted", 1.0, "replay", {"fingerprint": found}))
+    return verifier.verdict(), verifier
+
+
+def test_rounding_of_another_machine_is_no_difference(tmp_path: Path) -> None:
+    said, verifier = elsewhere(tmp_path, None, 2e-7)
+    assert said == []
+    assert (verifier.close, verifier.furthest) == (3, (pytest.approx(2e-7), 0))
+
+
+def test_more_than_rounding_is_a_difference_also_elsewhere(tmp_path: Path) -> None:
+    said, _ = elsewhere(tmp_path, None, 3e-6)
+    assert said == ["frame 0: the slices differ by 3.0e-06 of the frame's largest value, recorded on aarch64"]
+    _, frame = replay(tmp_path)
+    for change, fine in (
+        ({"utc_ns": 2}, True),
+        ({"utc_ns": 3}, False),
+        ({"f_number": 8.0 + 1e-9}, True),
+        ({"f_number": 8.0 + 1e-7}, False),
+        ({"index": 1}, False),
+        ({"camera": "another"}, False),
+        ({"iso": None}, False),
+    ):
+        told, _ = elsewhere(tmp_path, replace(tag(frame), **change), 0.0)
+        assert told == ([] if fine else ["frame 0: the tag differs by more than 1e-9"]), change
+
+
+def test_an_older_flight_can_t_be_compared_elsewhere(tmp_path: Path) -> None:
+    (said,) = elsewhere(tmp_path, None, None)[0]
+    assert "recorded elsewhere (aarch64), without the numbers that could be compared" in said

@@ -48,7 +48,8 @@ class DecodedFrame:
     `carriers` are rows [ky, kx, fy, fx]; `grid` (2, 3) leads from (y, x, 1) of a slice to sensor (row, column).
     `preview` is a JPEG of `preview_size` (width, height). `ms` names what took how long. `seen` is what viewers need
     besides, in the words of the `slices` schema. `carriers_found` is None where no carriers can be seen at the frame's
-    aperture, `decision` the law for the flight where this frame decided it.
+    aperture, `decision` the law for the flight where this frame decided it; `fingerprint` see
+    `decode.fingerprint`.
     """
 
     body: mmap.mmap
@@ -65,9 +66,15 @@ class DecodedFrame:
     ms: Mapping[str, float] = field(default_factory=dict)
     seen: Mapping[str, Any] = field(default_factory=dict)
     decision: LawDecision | None = None
+    fingerprint: Mapping[str, Any] | None = None
 
     def result(self, index: int, decode_ms: float | None, run: str = "live") -> Result:
         """The row of the ledger."""
+        details: dict[str, Any] = {"ms": dict(self.ms)}
+        if self.seen.get("doubts"):
+            details["doubts"] = self.seen["doubts"]
+        if self.fingerprint is not None:
+            details["fingerprint"] = dict(self.fingerprint)
         return Result(
             index,
             self.sha256,
@@ -77,7 +84,7 @@ class DecodedFrame:
             self.carriers_from,
             decode_ms,
             run,
-            {"ms": dict(self.ms), **({"doubts": self.seen["doubts"]} if self.seen.get("doubts") else {})},
+            details,
         )
 
 
@@ -271,6 +278,7 @@ def _decoded(answer: ChannelMessage) -> DecodedFrame:
         ms=facts["ms"],
         seen=facts["seen"],
         decision=None if facts["decision"] is None else LawDecision.of_values(facts["decision"]),
+        fingerprint=facts["fingerprint"],
     )
 
 

@@ -21,6 +21,7 @@ from dappled.daemon.pipeline.decode_process import NICENESS, serve
 from dappled.daemon.stream import wire
 from dappled.decode import DecodeError
 from dappled.decode.depth import RANGING, DepthMap, Ranging, estimate, evidence
+from dappled.decode.fingerprint import fingerprint
 from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield.light_field import slice_mosaic
 from dappled.drivers.camera import Blob
@@ -89,6 +90,7 @@ class DecodeWorker:
         slices = np.ascontiguousarray(field.slices)
         data = memoryview(slices.data).cast("B")
         sha256 = hashlib.sha256(data).hexdigest()
+        numbers = fingerprint(slices)
         body = Blob.of(data, "slices")
         ms["hash"] = (time.perf_counter() - began) * 1e3
         began = time.perf_counter()
@@ -98,6 +100,7 @@ class DecodeWorker:
         found, doubts = self._laws.judge(done)
         facts = {
             "sha256": sha256,
+            "fingerprint": numbers,
             "arrays": [wire.describe_array("slices", slices, "1.0 = sensor white")],
             "carriers": field.carriers.tolist(),
             "carriers_from": done.report.carriers_from,

@@ -6,6 +6,7 @@ originals have changed.
 
 from __future__ import annotations
 
+import platform
 import sys
 from dataclasses import dataclass, replace
 from importlib import metadata, resources
@@ -88,8 +89,20 @@ def names(made: Recipe | None) -> Names:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what the results depend on."""
-    return {"python": sys.version.split()[0], **{name: metadata.version(name) for name in _LIBRARIES}}
+    """What the last bits of the results depend on: libraries, and the processor."""
+    machine = {"machine": platform.machine(), "processor": _processor()}
+    return {"python": sys.version.split()[0], **{name: metadata.version(name) for name in _LIBRARIES}, **machine}
+
+
+def _processor() -> str:
+    """The processor's name where Linux tells it: libraries choose their code by it."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except (OSError, ValueError):
+        pass
+    return ""
 
 
 def _law(settings: Settings) -> str:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import sleep
 from typing import Self
 
-from dappled import confined, durable
+from dappled import __version__, confined, durable
 from dappled.clock import RecordedClock
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_vehicles
+from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
 from dappled.daemon.replay.verifier import Expected, ReplayVerifier, ResultWriter
 from dappled.decode.geometry import Pose
@@ -44,7 +45,7 @@ class ReplayError(DappledError):
 class RecordedFlight:
     """What is to be replayed: shots in order with their files, the telemetry beside them, and what was recorded of
     each. `horizons` says how many telemetry packets a frame's pose was made from; `vehicles` whose they were (see
-    `Telemetry`)."""
+    `Telemetry`); `elsewhere` another platform or other versions that it was recorded with."""
 
     root: Path
     shots: Sequence[Shot]
@@ -53,6 +54,7 @@ class RecordedFlight:
     telemetry: Path | None
     horizons: dict[int, int]
     vehicles: Sequence[tuple[int, int]] = ()
+    elsewhere: str | None = None
 
 
 def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
@@ -66,6 +68,8 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
         results = ledger.results(run)
         events = [event for event in ledger.events() if event.index is not None]
         turns = recorded_vehicles(ledger)
+        tags = ledger.tags()
+        made_by = ledger.facts().get(f"run:{run}", {}) if run != LIVE else layout.read_facts(flight)
     texts: dict[int | None, dict[str, str]] = defaultdict(dict)
     for event in events:
         texts[event.index][event.kind] = event.text
@@ -81,6 +85,8 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
                 _recorded(digests["poses"], index),
                 _recorded(digests["tags"], index),
                 None if result is None else result.slices_sha256,
+                tags.get(index),
+                None if result is None else result.details.get("fingerprint"),
                 frozenset(texts[index]),
             )
         )
@@ -89,7 +95,21 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
         raise ReplayError(f"{folder} holds no frames: there is nothing to replay")
     telemetry = flight.telemetry if flight.telemetry.is_file() else None
     horizons = {index: pose.telemetry_packets for index, pose in poses.items()}
-    return RecordedFlight(folder, [row.shot for row in rows], files, expected, telemetry, horizons, turns)
+    elsewhere = _elsewhere(made_by.get("software", {}))
+    return RecordedFlight(folder, [row.shot for row in rows], files, expected, telemetry, horizons, turns, elsewhere)
+
+
+def _elsewhere(recorded: Mapping[str, str]) -> str | None:
+    """Platform and versions that a flight was recorded with, where they are others than here or unknown; None where
+    they are the same."""
+    if "machine" not in recorded:
+        return "a platform that the flight does not name"
+    here = {"dappled": __version__, **recipes.versions()}
+    others = [name for name, value in recorded.items() if here.get(name, value) != value]
+    if not others:
+        return None
+    words = [recorded[name] if name in ("machine", "processor") else f"{name} {recorded[name]}" for name in others]
+    return ", ".join(word for word in words if word) or "another processor"
 
 
 def of_folder(
@@ -243,7 +263,7 @@ def play(
 
 def verifier(recording: RecordedFlight, keep: ResultWriter | None = None) -> ReplayVerifier:
     """A writer that compares a replay with this recording; `keep` takes results that are not to be compared."""
-    return ReplayVerifier(recording.root, recording.expected, keep)
+    return ReplayVerifier(recording.root, recording.expected, keep, elsewhere=recording.elsewhere)
 
 
 def _file(folder: FlightFolder, row: ShotRow, frame: Frame | None, doubt: str | None) -> RecordedShot:

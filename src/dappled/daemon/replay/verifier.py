@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from dappled import durable
+from dappled.decode.fingerprint import difference
 from dappled.drivers.camera import Blob, Fired
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import DappledError
 from dappled.flight import Frame, Result, Shot, ShotRow, Tag, digest
 
+MOST_SHARE = 1e-6  # of a frame's largest value: what rounding on another platform does to slices, with room
+
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What a recording says of one shot. Digests that it lacks are None; `events` are the kinds of its events."""
+    """What a recording says of one shot. Digests that it lacks are None; `events` are the kinds of its events.
+
+    `tag` (with its pose) and `fingerprint` (of the slices) are compared where the last bits can't be the same."""
 
     row: ShotRow
     frame: Frame | None = None
     pose_sha256: str | None = None
     tag_sha256: str | None = None
     slices_sha256: str | None = None
+    tag: Tag | None = None
+    fingerprint: Mapping[str, Any] | None = None
     events: frozenset[str] = frozenset()
 
     @property
@@ -42,10 +50,22 @@ class ReplayVerifier:
     """Compares what the pipeline produces with what was recorded. `differences` are sentences.
 
     `keep`, where given, takes the results of another recipe, which are not compared; else nothing is written.
+    `elsewhere` says where the flight was recorded, if that is another platform or other versions: numbers are then
+    compared where hashes differ. `close` counts what was equal in this sense, `furthest` is the largest difference of
+    slices among them and its frame.
     """
 
-    def __init__(self, root: Path, expected: Iterable[Expected], keep: ResultWriter | None = None) -> None:
-        self.root, self._keep = root, keep
+    def __init__(
+        self,
+        root: Path,
+        expected: Iterable[Expected],
+        keep: ResultWriter | None = None,
+        *,
+        elsewhere: str | None = None,
+    ) -> None:
+        self.root, self._keep, self.elsewhere = root, keep, elsewhere
+        self.close = 0
+        self.furthest: tuple[float, int] = (0.0, -1)
         self._tags: dict[int, Tag] = {}
         self._expected = {one.row.shot.index: one for one in expected}
         self._seen: dict[int, set[str]] = {index: set() for index in self._expected}
@@ -95,8 +115,12 @@ class ReplayVerifier:
         """See FlightWriter."""
         one = self._expected[tag.index]
         self._tags[tag.index] = tag
-        self._compare(tag.index, "pose", one.pose_sha256, digest(tag.pose))
-        self._compare(tag.index, "tag", one.tag_sha256, digest(tag))
+        recorded = None if one.tag is None else asdict(one.tag)
+        found = asdict(tag)
+        near = recorded is not None and _near(recorded["pose"], found["pose"])
+        self._compare(tag.index, "pose", (one.pose_sha256, digest(tag.pose)), near=near)
+        near = recorded is not None and _near(recorded, found)
+        self._compare(tag.index, "tag", (one.tag_sha256, digest(tag)), near=near)
 
     def law_decided(self, decision: LawDecision) -> None:
         """See FlightWriter: a replay goes by what the flight decided."""
@@ -111,7 +135,8 @@ class ReplayVerifier:
         if one.left_undecoded:
             self._seen[result.index].add("slices")  # there is nothing to compare them with, as the flight itself says
         else:
-            self._compare(result.index, "slices", one.slices_sha256, result.slices_sha256)
+            hashes = one.slices_sha256, result.slices_sha256
+            self._compare(result.index, "slices", hashes, share=self._share(one, result))
 
     def event(self, kind: str, text: str, index: int | None = None) -> None:
         """See FlightWriter. An event of a kind that the flight has for this shot too does not count as a difference."""
@@ -132,9 +157,51 @@ class ReplayVerifier:
         ]
         return self.differences + missing
 
-    def _compare(self, index: int, what: str, recorded: str | None, found: str) -> None:
+    def _share(self, one: Expected, result: Result) -> float | None:
+        """How far the slices are from the recorded ones, as a share of the largest value; None where that is not
+        known."""
+        found = result.details.get("fingerprint")
+        return None if one.fingerprint is None or found is None else difference(one.fingerprint, found)
+
+    def _compare(
+        self, index: int, what: str, hashes: tuple[str | None, str], *, near: bool = False, share: float | None = None
+    ) -> None:
+        """Compare (recorded, found) hashes; on another platform `near`, or the `share` by which numbers differ."""
         self._seen[index].add(what)
+        recorded, found = hashes
         if recorded is None:
             self.differences.append(f"frame {index}: the record holds no hash of its {what}")
-        elif recorded != found:
+        elif recorded == found:
+            return
+        elif self.elsewhere is None:
             self.differences.append(f"frame {index}: the {what} came out different")
+        elif near or (share is not None and share <= MOST_SHARE):
+            self.close += 1
+            self.furthest = max(self.furthest, (share or 0.0, index))
+        elif what != "slices":
+            self.differences.append(f"frame {index}: the {what} differs by more than 1e-9")
+        elif share is None:
+            self.differences.append(
+                f"frame {index}: the slices were recorded elsewhere ({self.elsewhere}), without the numbers that could "
+                "be compared: verify them there"
+            )
+        else:
+            by = f"by {share:.1e} of the frame's largest value" if share < math.inf else "in size"
+            self.differences.append(f"frame {index}: the slices differ {by}, recorded on {self.elsewhere}")
+
+
+def _near(recorded: Any, found: Any) -> bool:
+    """Whether two records, as JSON values, differ by rounding alone: real numbers by 1e-9 of themselves or of 1, whole
+    nanoseconds and microseconds by 1."""
+    if isinstance(recorded, Mapping) and isinstance(found, Mapping):
+        return recorded.keys() == found.keys() and all(
+            _near(value, found[key])
+            if not (key.endswith(("_ns", "_us")) and isinstance(value, int) and isinstance(found[key], int))
+            else abs(value - found[key]) <= 1
+            for key, value in recorded.items()
+        )
+    if isinstance(recorded, list | tuple) and isinstance(found, list | tuple):
+        return len(recorded) == len(found) and all(map(_near, recorded, found))
+    if isinstance(recorded, float) and isinstance(found, float):
+        return abs(recorded - found) <= 1e-9 * max(1.0, abs(recorded))
+    return bool(recorded == found)
