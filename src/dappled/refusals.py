@@ -48,6 +48,41 @@ class Refusals:
         return cls(found["peer"], found["reason"], int(found["count"] or 1), seconds)
 
 
+_LOST = re.compile(r"triggers? (?P<first>\d{1,10})(?: to (?P<last>\d{1,10}))? (?P<where>.*)", re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class LostTriggers:
+    """Triggers of the autopilot that became no shot, by its own numbers, the last included; `where` and when it was
+    noticed.
+
+    >>> LostTriggers(13, 15, "noticed at 10:15:03Z").text()
+    'triggers 13 to 15 noticed at 10:15:03Z'
+    """
+
+    first: int
+    last: int
+    where: str
+
+    @property
+    def count(self) -> int:
+        """How many."""
+        return self.last - self.first + 1
+
+    def text(self) -> str:
+        """As an event of the ledger holds it."""
+        numbers = f"trigger {self.first}" if self.first == self.last else f"triggers {self.first} to {self.last}"
+        return f"{numbers} {self.where}"
+
+    @classmethod
+    def of_text(cls, text: str) -> Self | None:
+        """What such an event says; None for another text."""
+        found = _LOST.fullmatch(text)
+        if found is None:
+            return None
+        return cls(int(found["first"]), int(found["last"] or found["first"]), found["where"])
+
+
 @dataclass(slots=True)
 class _Repeated:
     since_ns: int

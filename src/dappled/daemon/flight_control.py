@@ -17,7 +17,7 @@ from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import PacketSender
 from dappled.flight import FlightError, Recording, Shot, layout
 from dappled.flight.layout import DiskSpace
-from dappled.refusals import Refusals
+from dappled.refusals import LostTriggers, Refusals
 
 LOOK_VALID_NS = 5 * 10**9
 
@@ -114,6 +114,10 @@ class FlightControl:
     def troubled(self) -> bool:
         """See CameraModel."""
         return self._alarms.troubled
+
+    def lost(self, triggers: LostTriggers) -> None:
+        """See CameraModel."""
+        self._writer.later("lost trigger", triggers.text())
 
     # DistanceReceiver
 

@@ -13,12 +13,15 @@ from dappled.flight import layout
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.records import Frame, LedgerEvent, Result, ShotRow, Stray, Tag
-from dappled.refusals import OTHERS, Refusals
+from dappled.refusals import OTHERS, LostTriggers, Refusals
+
+LOST = "lost trigger"
 
 
 @dataclass(frozen=True, slots=True)
 class Balance:
-    """The numbers of a flight. Every shot (`wishes`) is safe, failed or open; `refused` requests became no shot.
+    """The numbers of a flight. Every shot (`wishes`) is safe, failed or open; `refused` requests became no shot, and
+    neither did the autopilot's triggers in `lost_triggers` (a text for each run of its numbers, `lost` in all).
 
     `by_source` counts shots, `following` the failed ones whose files are still on the camera, `companions` files beside
     frames. `began_utc_ns` is None where UTC was never known.
@@ -40,13 +43,15 @@ class Balance:
     following: int = 0
     companions: int = 0
     began_utc_ns: int | None = None
+    lost: int = 0
+    lost_triggers: tuple[str, ...] = ()
 
     @property
     def balanced(self) -> bool:
-        """Whether the numbers add up; in a closed flight nothing is open."""
+        """Whether requests, frames and the autopilot's triggers add up; in a closed flight nothing is open."""
         settled = self.wishes == self.safe + self.failed + self.open and self.frames == self.safe
         within = self.tagged <= self.frames and self.decoded <= self.frames
-        return settled and within and (not self.closed or self.open == 0)
+        return settled and within and self.lost == 0 and (not self.closed or self.open == 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +95,8 @@ def balance(path: Path) -> Balance:
     with LedgerReader.open(folder.ledger) as ledger:
         shots, frames, facts = ledger.shots(), ledger.frames(), ledger.facts()
         correction_ns = ledger.utc_correction_ns()
+        events = ledger.events()
+        lost = [one for event in events if event.kind == LOST and (one := LostTriggers.of_text(event.text))]
         states = Counter(row.state for row in shots)
         return Balance(
             flight=folder.name,
@@ -106,7 +113,9 @@ def balance(path: Path) -> Balance:
             closed="closed_utc_ns" in facts,
             following=len(ledger.following()),
             companions=len(ledger.companions()),
-            refused=_refused(ledger.events()).total(),
+            refused=_refused(events).total(),
+            lost=sum(one.count for one in lost),
+            lost_triggers=tuple(one.text() for one in lost),
             began_utc_ns=None
             if correction_ns is None or "began_utc_ns" not in facts
             else facts["began_utc_ns"] + correction_ns,

@@ -21,7 +21,7 @@ from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink import MavlinkLinks, MavlinkMessage, Packet, Signing, mavlink, pack
 from dappled.flight import Cause, Shot
 from dappled.flight.layout import DiskSpace
-from dappled.refusals import Refusals
+from dappled.refusals import LostTriggers, Refusals
 from tests.daemon.fakes import eventually
 
 
@@ -61,6 +61,7 @@ class Camera:
         self.telemetry = Telemetry()
         self.logged = 0
         self.causes: list[Cause] = []
+        self.lost_triggers: list[LostTriggers] = []
         self.done: dict[int, Captured] = {} if done is None else done
         self.hung = False
         self._first, self._exposure_s, self._fails = first, exposure_s, fails
@@ -147,6 +148,9 @@ class Camera:
 
     def pose(self) -> None:
         """Not known."""
+
+    def lost(self, triggers: LostTriggers) -> None:
+        self.lost_triggers.append(triggers)
 
     def troubled(self) -> bool:
         return False

@@ -20,6 +20,7 @@ from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Setting, SettingName, check_change
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink, pack
 from dappled.flight.layout import DiskSpace
+from dappled.refusals import LostTriggers
 from tests.daemon.camera_protocol.rig import NothingEarlier
 from tests.daemon.fakes import FakeSink
 
@@ -65,6 +66,7 @@ class Rig:
         self.copies = 1
         self.trusted = True
         self.sent: list[MavlinkMessage] = []
+        self.lost_triggers: list[LostTriggers] = []
         self.well, self.critical = True, False
         self.clock = RecordedClock(10**18, 10**18 - 10**9)
         self.sink = FakeSink()
@@ -100,6 +102,9 @@ class Rig:
 
     def pose(self) -> None:
         """Not known."""
+
+    def lost(self, triggers: LostTriggers) -> None:
+        self.lost_triggers.append(triggers)
 
     def troubled(self) -> bool:
         return self.critical

@@ -8,8 +8,11 @@ from pathlib import Path
 import pytest
 
 from dappled import durable
-from dappled.flight import FlightError, FlightFolder, LedgerReader, Recording, Result, flight_report
+from dappled.cli.flight import lines as flight_lines
+from dappled.clock import SystemClock
+from dappled.flight import FlightError, FlightFolder, Ledger, LedgerReader, Recording, Result, flight_report
 from dappled.flight.checks.flight_check import check
+from dappled.refusals import LostTriggers
 from tests.flight.makers import deliver, flip, mavlink_2, request, shot, tag
 
 
@@ -150,6 +153,20 @@ def test_the_counts_balance(recorded: FlightFolder) -> None:
     assert counts.balanced
     alter(recorded, "UPDATE shots SET state = 'fired' WHERE idx = 2")
     assert not flight_report.balance(recorded.path).balanced
+
+
+def test_counts_with_lost_triggers_do_not_balance(recorded: FlightFolder) -> None:
+    lost = LostTriggers(13, 15, "noticed at 2026-11-21T10:15:03.2Z near 47.397700, 8.545600")
+    with Ledger(recorded.ledger, SystemClock()) as ledger:
+        ledger.add_event("lost trigger", lost.text())
+    counts = flight_report.balance(recorded.path)
+    assert (counts.lost, counts.lost_triggers) == (3, (lost.text(),))
+    assert not counts.balanced
+    lines = list(flight_lines.of_report(counts, ()))
+    assert lines[-2:] == [
+        "became no shot: the autopilot's triggers 13 to 15 noticed at 2026-11-21T10:15:03.2Z near 47.397700, 8.545600",
+        "THE COUNTS DO NOT AGREE: 3 triggers of the autopilot became no shot",
+    ]
 
 
 def test_a_flight_is_shown_line_by_line(recorded: FlightFolder) -> None:

@@ -90,8 +90,13 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
         yield f"  {counted(found.companions, 'file', 6)} beside frames, such as the JPEG of a raw frame"
     if found.strays:
         yield f"  {counted(found.strays, 'file', 6)} without a shot"
+    for text in found.lost_triggers:
+        yield f"became no shot: the autopilot's {text}"
     if found.balanced and not found.wishes:
         yield "NO SHOT in this flight: there are no counts to compare"
+        return
+    if found.lost:
+        yield f"THE COUNTS DO NOT AGREE: {counted(found.lost, 'trigger')} of the autopilot became no shot"
         return
     yield "the counts agree" if found.balanced else "THE COUNTS DO NOT AGREE: run `dappled flight check`"
 

@@ -21,6 +21,7 @@ from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.errors import DappledError, report
 from dappled.flight import ImageIndex, LedgerReader
 from dappled.flight.layout import DiskSpace
+from dappled.refusals import LostTriggers
 
 log = logging.getLogger(__name__)
 ZOOM = "CAM_FOCALLEN"
@@ -119,6 +120,9 @@ class CameraModel(Protocol):
 
     def troubled(self) -> bool:
         """Whether the heartbeat says MAV_STATE_CRITICAL."""
+
+    def lost(self, triggers: LostTriggers) -> None:
+        """Write down triggers of the autopilot that became no shot."""
 
 
 class CameraStatus:

@@ -6,9 +6,11 @@ by index) waits for `tick`, which the daemon's working loop calls: without the l
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Callable
+from datetime import UTC, datetime
 
 from dappled.clock import Clock
 from dappled.daemon.camera_protocol.camera_status import CameraModel, CameraStatus, Captured, image_captured
@@ -113,6 +115,7 @@ class Component:
         if self._is_duplicate(packet):
             self._acknowledge_again(command)
             return
+        self._count_trigger(command)
         echo = self._commands.fires(command) and self._autopilot.is_echo(packet, str(command.name))
         answer = CommandAnswer(ACCEPTED) if echo else self._commands.answer(command)
         if not command.broadcast or answer.result == ACCEPTED:  # a broadcast is never refused
@@ -124,6 +127,24 @@ class Component:
             self.say(answer.words)
         if answer.result not in (ACCEPTED, UNSUPPORTED):
             self.state_changed()  # a ground station's button waits for the status
+
+    def _count_trigger(self, command: Command) -> None:
+        """ArduPilot numbers its requests as its CAMERA_FEEDBACK; PX4 numbers those to each camera on their own."""
+        if not command.of_autopilot or command.name != mavlink.MAV_CMD_IMAGE_START_CAPTURE:
+            return
+        if not self._identity.is_ardupilot():
+            self._autopilot.numbers["CAMERA_TRIGGER"].unnumbered()
+        elif command.integer(3, 1) == 1 and (number := command.integer(4)) > 0:
+            self._autopilot.numbers["CAMERA_FEEDBACK"].heard(number, self._clock.monotonic_ns(), self._here)
+
+    def _here(self) -> str:
+        """When and where that is noticed, in words."""
+        now = datetime.fromtimestamp(self._clock.utc_ns() / 1e9, UTC)
+        when = f"noticed at {now:%Y-%m-%dT%H:%M:%S}.{now.microsecond // 100_000}Z"
+        pose = self._model.pose()
+        if pose is None or pose.latitude_rad is None or pose.longitude_rad is None:
+            return when
+        return f"{when} near {math.degrees(pose.latitude_rad):.6f}, {math.degrees(pose.longitude_rad):.6f}"
 
     def _acknowledge(self, command: Command, result: int) -> None:
         self._links.send(
@@ -145,8 +166,13 @@ class Component:
         name = message.get_type()
         if message.get_srcSystem() != self._identity.system_id or self._is_duplicate(packet):
             return
-        if name == "CAMERA_FEEDBACK" and not (self._feedback_is_shot and self._is_trigger(message)):
-            return  # the hot shoe's time of a known shot: telemetry uses it
+        if name == "CAMERA_FEEDBACK":
+            ours = self._is_trigger(message)
+            if ours and not self._feedback_is_shot:
+                now_ns = self._clock.monotonic_ns()
+                self._autopilot.numbers[name].reported(message.img_idx, now_ns, self._here)
+            if not (ours and self._feedback_is_shot):
+                return  # the hot shoe's time of a known shot: telemetry uses it
         if self._autopilot.is_echo(packet, name):
             return
         source = f"mavlink:{message.get_srcSystem()}/{message.get_srcComponent()}"
@@ -162,6 +188,8 @@ class Component:
             autopilot=True,
             happened=name == "CAMERA_FEEDBACK" or not self._shutter.fires,
         )
+        numbers = self._autopilot.numbers[name]
+        numbers.heard(sequence, self._clock.monotonic_ns(), self._here)
         decision = self._shutter.request(request)
         if not decision.accepted:
             self.say(f"no photo: {decision.reason}")
@@ -258,6 +286,9 @@ class Component:
                 )
             )
         self._autopilot.ask()
+        for lost in self._autopilot.lost_triggers():
+            self._model.lost(lost)
+            self.say(f"lost: the autopilot's {lost.text()}", mavlink.MAV_SEVERITY_ERROR)
         if (counts := self._shutter.statistics()) != self._reported:
             self._reported = counts
             self._status_wanted.set()

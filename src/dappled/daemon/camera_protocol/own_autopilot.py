@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
 from dappled.clock import Clock
 from dappled.daemon.pipeline.repeats import AutopilotCommands
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
+from dappled.refusals import LostTriggers
 
 TIMESYNC_NS = 200_000_000
 STREAMS_NS = 5 * 10**9
 STALE_US = 5_000_000  # a slow radio is seconds behind
 EPOCH_US = 10**15  # 2001: a time above is UTC, one below counts since boot
+LATE_NS = 2_500_000_000
+MOST_LOST = 256
 _WRAP_US = 2**32
 STREAMS = (  # message, interval in microseconds
     (mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 20_000),
@@ -46,6 +50,7 @@ class SystemIdentity:
         self.system_id = configured_system_id
         self.settled = False
         self.autopilots: dict[int, int] = {}  # system id: link it was last heard on
+        self._ardupilots: set[int] = set()
         self._none_yet = True
         self._start_ns = start_ns
         self._first_heard_ns: int | None = None
@@ -56,6 +61,8 @@ class SystemIdentity:
             return
         if len(self.autopilots) < 32 or message.get_srcSystem() in self.autopilots:
             self.autopilots[message.get_srcSystem()] = link
+            if message.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
+                self._ardupilots.add(message.get_srcSystem())
         if self._first_heard_ns is None:
             self._first_heard_ns = now_ns
 
@@ -88,6 +95,10 @@ class SystemIdentity:
         """
         known = self.settled and (len(self.autopilots) > 1 or self.system_id in self.autopilots)
         return self.system_id if known else None
+
+    def is_ardupilot(self) -> bool:
+        """Whether our own autopilot is ArduPilot, whose requests carry the number of the trigger (parameter 4)."""
+        return self.system_id in self._ardupilots
 
     def autopilot(self) -> tuple[int, int] | None:
         """(system id, link) of our own autopilot; None while it was not heard."""
@@ -129,13 +140,16 @@ class AutopilotNow:
         self._boot: tuple[int, int] | None = None  # its microseconds, our nanoseconds
         self._utc: tuple[int, int] | None = None
 
-    def heard(self, message: MavlinkMessage, now_ns: int) -> None:
-        """Take a message of the autopilot. Times are monotonic."""
+    def heard(self, message: MavlinkMessage, now_ns: int) -> bool:
+        """Take a message of the autopilot; whether it has started again. Times are monotonic."""
         boot_ms = getattr(message, "time_boot_ms", 0)
+        restarted = False
         if boot_ms > 0:
+            restarted = self._boot is not None and boot_ms * 1000 < self._boot[0] - STALE_US
             self._boot = boot_ms * 1000, now_ns
         if message.get_type() == "SYSTEM_TIME" and message.time_unix_usec >= EPOCH_US:
             self._utc = int(message.time_unix_usec), now_ns
+        return restarted
 
     def is_stale(self, time_us: int, now_ns: int) -> bool:
         """See `OwnAutopilot.is_stale`."""
@@ -148,6 +162,64 @@ class AutopilotNow:
         return abs(age_us) > STALE_US
 
 
+class TriggerNumbers:
+    """Which of the autopilot's triggers became no request here, by the numbers that it gives them.
+
+    A number that is passed over is waited for `LATE_NS`: a second link may bring it. Times are monotonic. A jump of
+    more than `MOST_LOST` numbers is a counter that was set, not a loss.
+    """
+
+    def __init__(self) -> None:
+        self._heard: deque[int] = deque(maxlen=MOST_LOST)
+        self._top: int | None = None
+        self._missing: dict[int, tuple[int, str]] = {}  # when it counts as lost, and where that was noticed
+        self._unnumbered = 0  # requests without a number since the last one with one
+
+    def heard(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
+        """A request, or a shot's own message, with this number has come."""
+        self._reach(number, now_ns, where)
+        self._heard.append(number)
+        self._missing.pop(number, None)
+        self._unnumbered = 0
+
+    def reported(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
+        """The autopilot reports a trigger that it has requested. Ignored where it requests none here."""
+        if self._heard and number not in self._heard and number not in self._missing:
+            self._reach(number, now_ns, where)
+            self._missing[number] = now_ns + LATE_NS, where()
+
+    def unnumbered(self) -> None:
+        """One of the other messages of a trigger has come: PX4 sends one for each camera after the numbered one."""
+        self._unnumbered += 1
+
+    def lost(self, now_ns: int) -> list[LostTriggers]:
+        """Those that have not come in time, each told once."""
+        over = sorted(number for number, (due_ns, _) in self._missing.items() if due_ns <= now_ns)
+        found: list[LostTriggers] = []
+        for number in over:
+            _, where = self._missing.pop(number)
+            self._heard.append(number)  # ArduPilot repeats its last report with each one of another camera
+            if found and found[-1].last == number - 1 and found[-1].where == where:
+                found[-1] = LostTriggers(found[-1].first, number, where)
+            else:
+                found.append(LostTriggers(number, number, where))
+        return found
+
+    def restart(self) -> None:
+        """The autopilot has started again, and counts from 1."""
+        self._heard.clear()
+        self._missing.clear()
+        self._top, self._unnumbered = None, 0
+
+    def _reach(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
+        top = self._top
+        if top is not None and top + 1 < number <= top + MOST_LOST:
+            here, requested = where(), max(0, self._unnumbered - 1)  # one of them belongs to the last number heard
+            self._missing |= dict.fromkeys(range(top + 1 + requested, number), (now_ns + LATE_NS, here))
+        if top is None or number > top or number < top - MOST_LOST:
+            self._top = number
+
+
 class OwnAutopilot:
     """The autopilot of the system that the camera belongs to, on the link that it was last heard on."""
 
@@ -157,12 +229,19 @@ class OwnAutopilot:
         self._commands = AutopilotCommands()
         self._requests = AutopilotRequests()
         self._now = AutopilotNow()
+        self.numbers = {"CAMERA_FEEDBACK": TriggerNumbers(), "CAMERA_TRIGGER": TriggerNumbers()}
 
     def heard(self, message: MavlinkMessage) -> None:
         """Take a message of its system."""
         self._requests.heard(message.get_msgId())
-        if message.get_srcComponent() == 1:
-            self._now.heard(message, self._clock.monotonic_ns())
+        if message.get_srcComponent() == 1 and self._now.heard(message, self._clock.monotonic_ns()):
+            for numbers in self.numbers.values():
+                numbers.restart()
+
+    def lost_triggers(self) -> list[LostTriggers]:
+        """Triggers of the autopilot that became no request here, each told once."""
+        now_ns = self._clock.monotonic_ns()
+        return [one for numbers in self.numbers.values() for one in numbers.lost(now_ns)]
 
     def is_stale(self, time_us: int) -> bool:
         """Whether a time of the autopilot's, in microseconds since boot (perhaps of 32 bits) or of UTC, is not about
