@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import logging
 import re
+import sys
+from pathlib import Path
 from typing import ClassVar
 
+SERVICE_MANIFEST = "installed.json"  # which `make install` leaves in its environment
 _NUMBER = re.compile(r"\d+(?:[.,]\d+)*(?:( [a-z]+?)s?\b)?")
 
 
@@ -50,3 +53,11 @@ def report(log: logging.Logger, what: str, error: BaseException) -> None:
     """Log an error as one sentence; the traceback of an unexpected one only in the log's details."""
     details = not isinstance(error, DappledError) and log.isEnabledFor(logging.DEBUG)
     log.warning("%s: %s", what, sentence(error), exc_info=error if details else None)
+
+
+def install_extra(extra: str) -> str:
+    """How a person gets what an extra brings. The service's own environment can't be added to."""
+    wanted = f"pip install 'dappled[{extra}]'"
+    if (Path(sys.prefix) / SERVICE_MANIFEST).exists():
+        return f"the onboard installation leaves it out; on the ground, in an environment of its own: {wanted}"
+    return f"install it with: {wanted}"

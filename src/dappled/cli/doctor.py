@@ -104,6 +104,8 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
     verdict = go_no_go.verdict(checks)
     if arguments.config is not None:
         looked += _differences(arguments.config, settings, report)
+    different = any(one.name == "settings" and one.state == "no-go" for one in looked)
+    verdict = "no-go" if different else verdict
     todo = go_no_go.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
     if arguments.json:
         facts = _facts([*checks, *looked])
@@ -114,7 +116,7 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
         print(f"{whose}, flight {report['flight']}; it reports")
         print("\n".join(_lines([*checks, *looked])))
         print(f"{_VERDICTS[verdict]}{f'; next: {todo}' if todo else ''}")
-    return 1 if verdict == "no-go" or any(one.name == "settings" and one.state == "no-go" for one in looked) else 0
+    return 1 if verdict == "no-go" else 0
 
 
 def _differences(file: Path, wanted: Settings, report: Mapping[str, Any]) -> list[Check]:

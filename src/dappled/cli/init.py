@@ -121,7 +121,7 @@ def tables(answers: dict[str, str]) -> dict[str, dict[str, Any]]:
         found["camera"] = {"profile": body}
     if mask != NONE:
         found["mask"] = {"profile": mask}
-    found["mavlink"] = {"url": [] if link == NONE else [link]}
+    found["mavlink"] = {"url": [] if link == NONE else link}
     if answers["--folder"] != FLIGHTS:
         found["record"] = {"directory": answers["--folder"]}
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from dappled.errors import DappledError
+from dappled.errors import DappledError, install_extra
 
 _PACKAGES = {"cv2": "opencv-python-headless", "distributed": "distributed"}
 _EXTRAS = {"distributed": "cluster"}
@@ -24,6 +24,4 @@ def need(module: str) -> Any:
         if not (isinstance(error, ModuleNotFoundError) and error.name == root):
             raise MissingExtraError(f"{_PACKAGES.get(root, root)} is installed but can't be loaded: {error}") from error
         extra = _EXTRAS.get(root, "ground")
-        raise MissingExtraError(
-            f"this needs {_PACKAGES.get(root, root)}: install it with pip install 'dappled[{extra}]'"
-        ) from error
+        raise MissingExtraError(f"this needs {_PACKAGES.get(root, root)}; {install_extra(extra)}") from error

@@ -373,6 +373,8 @@ def _open(path: str | Path, focus_m: float | None, recipe: Mapping[str, Any]) ->
         _refuse(recipe, found)
         return OpenedLightField(light_files.load(found), found, focus_m)
     if not found.is_dir():
+        if found.suffix.lower() in _TEXTS:
+            raise OpenError(f"{path} is no frame: open takes a raw frame, a decoded light field or a flight")
         darkroom = Darkroom(_recipe(Recipe("auto", "", workers=2), recipe, found))
         return OpenedFrame(found, darkroom, focus_m=focus_m)
     if layout.FlightFolder(found).ledger.exists():
@@ -381,6 +383,9 @@ def _open(path: str | Path, focus_m: float | None, recipe: Mapping[str, Any]) ->
         return OpenedFlight(found, record, None if own is None else Darkroom(own), focus_m)
     _refuse(recipe, found)
     return OpenedLightField(view_folders.read(found), found, focus_m)
+
+
+_TEXTS = (".toml", ".json", ".txt", ".csv", ".md", ".py", ".sqlite", ".tlog", ".ulg")  # given by mistake
 
 
 def light_field(path: str | Path, *, focus_m: float | None = None) -> OpenedLightField:

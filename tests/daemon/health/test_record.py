@@ -138,6 +138,10 @@ def test_a_link_on_which_no_ground_station_is_yet_is_no_problem(tmp_path: Path) 
         "problems"
     ]
     assert "3 forged" in problem
+    here = Pose("interpolated", 0, None, 0.7, -1.6, 200.0, 20.0, None, None, 0.1, None, 40.0, 9)
+    left = replace(never, last_heard_monotonic_ns=95 * S)  # `dappled trigger` came and went
+    assert record(tmp_path, links=[left], positions=5, vehicle=here)["problems"] == []
+    assert record(tmp_path, links=[left], positions=5, vehicle=replace(here, age_ms=6000.0))["problems"] != []
     assert len(record(tmp_path, link=never)["problems"]) == 1
     silent = record(tmp_path, links=[never])["problems"]  # the autopilot's cable may be the silent one
     assert any("udpin:127.0.0.1:2: nothing was heard for 5 s" in text for text in silent)

@@ -144,6 +144,20 @@ def test_a_folder_of_frames(tmp_path: Path) -> None:
     assert [shot.wished_utc_ns for shot in found.shots] == [1_000, 2_000_001_000]
 
 
+@pytest.mark.parametrize(
+    ("start", "words"),
+    [(b"ULog\x01\x12\x35\x01", "log.x is a log of PX4"), (b"\xa3\x95\x80\x80Y", "log.x is a log of ArduPilot's own")],
+)
+@pytest.mark.parametrize("start_utc_ns", [None, 1_000])
+def test_an_autopilot_s_own_log_is_not_taken_for_telemetry(
+    tmp_path: Path, start: bytes, words: str, start_utc_ns: int | None
+) -> None:
+    (tmp_path / "a.png").write_bytes(b"a")
+    (tmp_path / "log.x").write_bytes(start + bytes(500))
+    with pytest.raises(ReplayError, match=f"{words}.*tlog that a ground station"):
+        replay.of_folder(tmp_path, "*.png", tmp_path / "log.x", start_utc_ns, 1.0)
+
+
 def test_a_folder_without_what_was_named(tmp_path: Path) -> None:
     with pytest.raises(ReplayError, match="matches"):
         replay.of_folder(tmp_path, "*.png", None, 0, 1.0)

@@ -160,7 +160,8 @@ def disk(settings: Settings, machine: Machine) -> list[Check]:
         return [Check("disk", "no-go", f"{place} can't be written to", f"make {folder} yours, or set record.directory")]
     space = layout.disk_space(place)
     free = space.available
-    text = f"{free / 1e9:.1f} GB free at {folder}, room for about {counted(int(free / _FRAME_BYTES), 'frame')}"
+    frames = counted(int(free / _FRAME_BYTES), "frame")
+    text = f"{free / 1e9:.1f} GB free at {folder}, room for about {frames} of {_FRAME_BYTES / 1e6:.0f} MB"
     short = space.shortage(settings.record.min_free_mb)
     if short is not None:
         return [Check("disk", "no-go", f"{text}: {short}", "`dappled flight offload DEST --prune` makes room")]

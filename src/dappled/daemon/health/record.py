@@ -77,7 +77,8 @@ def record(
     are the settings of body and decoder; `frame_bytes` is the mean size of this flight's frames, None before the first.
     """
     decoding = decoding or DecodingState()
-    link, silences = _link(settings, links, telemetry, monotonic_ns, began_monotonic_ns)
+    fresh = vehicle is not None and vehicle.age_ms is not None and vehicle.age_ms * 1e6 < SILENT_NS
+    link, silences = _link(settings, links, telemetry, monotonic_ns, began_monotonic_ns, fresh=fresh)
     disk, shortages = _disk(settings.record, folder)
     problems = [
         *(f"the {name} thread has ended: restart dappled" for name in dead_threads),
@@ -127,12 +128,13 @@ def record(
     }
 
 
-def _link_problem(link: LinkStatistics, *, heard: bool) -> str | None:
-    """What is wrong with a silent link. None for one on which nobody was heard yet, where the vehicle is `heard` on
-    another: no ground station is there, nothing is lost, and the counters show it."""
+def _link_problem(link: LinkStatistics, *, heard: bool, fresh: bool) -> str | None:
+    """What is wrong with a silent link. None for one on which nobody was heard yet, where the vehicle was `heard` on
+    another, and for any one while the vehicle's position is `fresh`: a ground station is not there, or has left;
+    nothing is lost, and go/no-go and the counters show it."""
     if link.error:
         return link.error
-    if heard and link.last_heard_monotonic_ns is None and not _refused(link):
+    if (fresh or (heard and link.last_heard_monotonic_ns is None)) and not _refused(link):
         return None
     return f"MAVLink link {link.url}: {_silence(link)}"
 
@@ -148,6 +150,8 @@ def _link(
     telemetry: TelemetryStatistics,
     monotonic_ns: int,
     began_monotonic_ns: int,
+    *,
+    fresh: bool,
 ) -> tuple[dict[str, Any], list[str]]:
     """The state of the links, and a problem for each that should be heard."""
     silent = [
@@ -156,7 +160,7 @@ def _link(
         if link.error or monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS
     ]
     heard = telemetry.positions > 0
-    problems = [text for link in silent if (text := _link_problem(link, heard=heard))]
+    problems = [text for link in silent if (text := _link_problem(link, heard=heard, fresh=fresh))]
     facts = {
         "urls": len(links),
         "silent": len(silent),

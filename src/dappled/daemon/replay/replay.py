@@ -121,6 +121,10 @@ def of_folder(
     if telemetry is not None and not telemetry.is_file():
         raise ReplayError(f"{telemetry}: there is no such telemetry file; check --telemetry")
     telemetry = telemetry or _only_log(folder)
+    if telemetry is not None and (kind := _other_log(telemetry)) is not None:
+        raise ReplayError(
+            f"{telemetry} is {kind}, not MAVLink telemetry: give the .tlog that a ground station recorded"
+        )
     paths = [path for path in sorted(folder.glob(match)) if path.suffix.lower() in FRAME_SUFFIXES and path.is_file()]
     if not paths:
         raise ReplayError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
@@ -294,3 +298,13 @@ def _first_position_utc_ns(path: Path) -> int:
     if utc_ns is None:
         raise ReplayError(f"{path} holds no position: give --start, the time of the first frame")
     return utc_ns
+
+
+_OTHER_LOGS = {b"ULog\x01\x12\x35": "a log of PX4 (ULog)", b"\xa3\x95\x80\x80": "a log of ArduPilot's own (DataFlash)"}
+
+
+def _other_log(path: Path) -> str | None:
+    """What an autopilot's own log is called, by how it begins; None for any other file."""
+    with path.open("rb") as file:
+        start = file.read(8)
+    return next((kind for magic, kind in _OTHER_LOGS.items() if start.startswith(magic)), None)

@@ -18,6 +18,7 @@ from dappled.decode.depth.evidence import Evidence
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.light_field import Image
+from dappled.errors import install_extra
 
 _BASE_PX = 8.0  # views are enlarged until the outermost is so many pixels off for a disparity of 1
 _MOST_ENLARGED = 4
@@ -62,7 +63,7 @@ def opencv() -> Any:
     try:
         import cv2  # noqa: PLC0415  optional: the onboard install leaves it out
     except ImportError as error:
-        raise DecodeError("stereo matching needs OpenCV; install it with: pip install 'dappled[ground]'") from error
+        raise DecodeError(f"stereo matching needs OpenCV; {install_extra('ground')}") from error
     return cv2
 
 

@@ -26,7 +26,7 @@ from scipy import io
 from dappled.decode.depth import DepthMap, DistanceMap
 from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
-from dappled.errors import DappledError
+from dappled.errors import DappledError, install_extra
 from dappled.products.exports import point_cloud, prints
 
 ESLF_LENSLET_PX = 14  # LFToolbox' and LiFF's readers assume this size
@@ -269,5 +269,5 @@ def _rerun() -> Any:
     try:
         import rerun  # noqa: PLC0415  optional: an extra of 764 MB
     except ImportError as error:
-        raise ExportError("a Rerun recording needs its library: pip install 'dappled[rerun]'") from error
+        raise ExportError(f"a Rerun recording needs its library; {install_extra('rerun')}") from error
     return rerun

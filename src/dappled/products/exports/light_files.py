@@ -25,7 +25,7 @@ from dappled.bounds.arrays import read_npz
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import parse_json
 from dappled.decode.lightfield import LightField
-from dappled.errors import DappledError, first_line
+from dappled.errors import DappledError, first_line, install_extra
 from dappled.products.exports import h5_reader, packed_arrays
 
 _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
@@ -234,9 +234,7 @@ def _ground(name: str, path: Path, what: str, instead: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise LightFileError(
-            f"{path.name} needs {what}; install it with: pip install 'dappled[ground]' (or {instead})"
-        ) from error
+        raise LightFileError(f"{path.name} needs {what}; {install_extra('ground')} (or {instead})") from error
 
 
 def _sync(path: Path) -> None:
