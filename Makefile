@@ -2,7 +2,7 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup peers walk clean-room demo test check test-fast coverage test-slow soak faults bench lock deb arm64 install uninstall clean
+.PHONY: help setup peers walk docs notebooks clean-room demo test check test-fast coverage test-slow soak faults bench lock deb arm64 install uninstall clean
 PREFIX ?= /usr/local
 
 help: ## show this list
@@ -48,6 +48,15 @@ walk: setup ## the modules that a command and a frame pass, traced anew and writ
 clean-room: ## the README's commands in bare Debian roots (SUITES="bookworm trixie", RUN="make demo && make test"); as root
 	@for suite in $(or $(SUITES),bookworm trixie); do tools/clean-room $$suite "$${RUN:-make demo && make test}" || exit 1; done
 
+docs: ## build the documents' site in build/site: strict, links checked, nothing fetched by its pages
+	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
+	@$(PYTHON) tools/bootstrap.py docs
+	@NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build -q
+	@echo "build/site/index.html, $$(du -sh build/site | cut -f1)"
+
+notebooks: setup ## run the notebooks of docs/notebooks, and keep what they print and draw
+	@$(BIN)/python tools/notebooks.py --write
+
 soak: setup ## fly half an hour in which something goes wrong every few seconds; MINUTES=n for another time
 	@$(BIN)/python -m dappled.mocks.soak --minutes $(or $(MINUTES),30)
 
@@ -58,11 +67,13 @@ faults: setup ## run every camera fault against the daemon in 20 rounds; ROUNDS=
 bench: setup ## run the benchmarks, print one table with the limits, write docs/performance.md; REPEATS=n
 	@$(BIN)/python benchmarks/table.py --page --repeats $(or $(REPEATS),1)
 
-lock: setup ## resolve the locks anew from pyproject.toml: everything, the peers of tests, and what flies
+lock: setup ## resolve the locks anew from pyproject.toml: everything, the peers of tests, the documents, and what flies
 	@uv=$$(command -v uv || echo .tools/bin/uv); $$uv pip compile -q --universal --python-version 3.11 --generate-hashes \
 	  --no-header --all-extras --group dev pyproject.toml -o requirements.lock; \
 	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --group peers \
 	  -o requirements-peers.lock; \
+	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --group docs \
+	  -o requirements-docs.lock; \
 	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header -c requirements.lock \
 	  --no-annotate pyproject.toml -o requirements-onboard.lock
 
@@ -79,4 +90,4 @@ uninstall: ## remove the service; settings and flights stay
 	@$(PYTHON) tools/install.py uninstall --prefix $(PREFIX) $(if $(DESTDIR),--destdir $(DESTDIR)) $(if $(SYSCONFDIR),--sysconfdir $(SYSCONFDIR))
 
 clean: ## remove what setup and tests made
-	rm -rf .venv .venv-peers .tools build .coverage* htmlcov .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .venv-peers .venv-docs .cache .tools build .coverage* htmlcov .mypy_cache .ruff_cache .pytest_cache .hypothesis

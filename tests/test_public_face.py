@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import json
 import re
 import subprocess
 import sys
@@ -178,6 +179,13 @@ def programs() -> list[tuple[str, str]]:
     for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
         blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
         found += [(page.name, block) for block in blocks]
+    for path in (ROOT / "docs" / "notebooks").glob("*.ipynb"):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        lines = "".join("".join([*cell["source"], "\n"]) for cell in cells if cell["cell_type"] == "code").splitlines()
+        plain = (
+            line for line in lines if re.match(r"import |from ", line)
+        )  # the rest holds commands and file contents
+        found.append((path.name, "\n".join(plain)))
     return found
 
 
@@ -188,4 +196,4 @@ def test_documents_and_examples_import_the_public_face_alone() -> None:
             if module.split(".")[0] == "dappled":
                 assert module in PUBLIC, f"{where} imports {module}"
                 pages.add(where)
-    assert {"drivers.md", "products.md", "wire.md"} <= pages
+    assert {"drivers.md", "products.md", "wire.md", "first-light-field.ipynb"} <= pages

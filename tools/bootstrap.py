@@ -3,6 +3,7 @@
 
     python tools/bootstrap.py          the environment of the project, in .venv
     python tools/bootstrap.py peers    that of MAVSDK and MAVProxy, which some tests talk to, in .venv-peers
+    python tools/bootstrap.py docs     that of the programs that build the documents' site, in .venv-docs
 
 Runs on a bare Python >= 3.11 (no pip, no venv module needed). Says nothing when all is in place.
 """
@@ -25,7 +26,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 TOOLS = ROOT / ".tools"
 VENV = ROOT / ".venv"
-PEERS = ROOT / ".venv-peers"
+APART = ("peers", "docs")
 STAMP = "dappled-set-up"
 # uv's own releases, for machines whose Python has neither pip nor ensurepip. DAPPLED_UV_RELEASES names a mirror.
 RELEASES = "https://github.com/astral-sh/uv/releases/latest/download"
@@ -132,10 +133,13 @@ def make(venv: Path, lock: str, *, project: bool) -> None:
 
 
 def main() -> None:
-    if sys.argv[1:] == ["peers"]:
-        make(PEERS, "requirements-peers.lock", project=False)
-    else:
-        make(VENV, "requirements.lock", project=True)
+    match sys.argv[1:]:
+        case []:
+            make(VENV, "requirements.lock", project=True)
+        case [name] if name in APART:
+            make(ROOT / f".venv-{name}", f"requirements-{name}.lock", project=False)
+        case other:
+            raise SystemExit(f"there is no environment {' '.join(other)}: choose {' or '.join(APART)}, or none")
 
 
 if __name__ == "__main__":

@@ -158,6 +158,11 @@ class OpenedLightField(Refocusable):
         return self.field.slices
 
     @property
+    def carriers(self) -> NDArray[np.float64]:
+        """float64 (K, 4): a row [ky, kx, fy, fx] for each slice, the orders and cycles/pixel."""
+        return self.field.carriers
+
+    @property
     def attributes(self) -> Mapping[str, Any]:
         """Frame shape, camera, mask, law, focal length, f-number …"""
         return self.field.attributes
@@ -264,7 +269,7 @@ class OpenedFrame(Refocusable):
     def __repr__(self) -> str:
         """One line: which frame, and what its tag says."""
         number = "" if self.index is None else f"{self.index}, "
-        return f"<frame {number}{', '.join([self.path.name, self.darkroom.recipe.mask, *_lens(self.tag)])}>"
+        return f"<frame {number}{', '.join([self.path.name, Path(self.darkroom.recipe.mask).stem, *_lens(self.tag)])}>"
 
     def _repr_html_(self) -> str:
         """For notebooks: the line, and the light field once the frame is decoded; showing a frame decodes nothing."""
@@ -287,7 +292,7 @@ class OpenedFlight:
 
     def __repr__(self) -> str:
         """One line: which flight, how many safe frames."""
-        mask = "no mask" if self.darkroom is None else self.darkroom.recipe.mask
+        mask = "no mask" if self.darkroom is None else Path(self.darkroom.recipe.mask).stem
         return f"<flight {self.path.name}: {counted(len(self), 'safe frame')}, {mask}>"
 
     def _repr_html_(self) -> str:
