@@ -120,6 +120,18 @@ def test_the_manifest_is_one_that_sha256sum_reads(closed: Path, tmp_path: Path) 
     assert len(sums.read_text().splitlines()) == 7
 
 
+def test_any_name_that_a_file_system_allows_is_copied_and_forges_no_line(closed: Path, tmp_path: Path) -> None:
+    name = "a\r\n" + "f" * 64 + "  \udcff\\"
+    (closed / name).write_bytes(b"somebody's")
+    done = go(closed, tmp_path / "disk\udcff", prune=True)
+    assert (done.destination / name).read_bytes() == b"somebody's"
+    sums = done.destination.with_name(f"{closed.name}.sha256")
+    subprocess.run(["/usr/bin/sha256sum", "--check", "--strict", "--quiet", sums.name], cwd=sums.parent, check=True)
+    assert len(sums.read_bytes().splitlines()) == 8
+    assert check(closed).problems == check(done.destination).problems == ()
+    geotag(closed, b"again")  # whose event names that file
+
+
 def test_prune_removes_the_frames_and_check_says_where_they_are(closed: Path, tmp_path: Path) -> None:
     done = go(closed, tmp_path / "disk", prune=True)
     assert done.pruned == 2

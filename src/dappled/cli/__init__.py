@@ -15,7 +15,7 @@ from typing import NoReturn
 
 import dappled
 from dappled.daemon.health import systemd
-from dappled.errors import DappledError
+from dappled.errors import DappledError, printable
 
 # Verb: (module, its line in --help). The module has `configure(parser)` and `run(arguments) -> exit code`.
 VERBS: dict[str, tuple[str, str]] = {
@@ -120,7 +120,7 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
 
 def _failed(parsed: argparse.Namespace, text: str, code: int) -> int:
     """Say what went wrong: a person on standard error, and with --json a program too, as {"error": …}."""
-    print(f"dappled {parsed.verb}: {text}", file=sys.stderr)
+    print(f"dappled {parsed.verb}: {printable(text)}", file=sys.stderr)
     if getattr(parsed, "json", False):
         print(json.dumps({"error": text}))
     return code

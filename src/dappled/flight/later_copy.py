@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from dappled import durable
 from dappled.clock import Clock
-from dappled.errors import counted
+from dappled.errors import counted, printable
 from dappled.flight import layout
 from dappled.flight.chain import Column
 from dappled.flight.errors import FlightError
@@ -61,7 +61,7 @@ class Added:
         source.sync()
         with Ledger(folder.ledger, clock) as ledger:
             text = f"{counted(self.count, 'row')} that later work added to the copy {there.path} were brought home"
-            ledger.adopt(self.rows, text)
+            ledger.adopt(self.rows, printable(text))
 
 
 def files(rows: Rows) -> list[Frame | Stray]:

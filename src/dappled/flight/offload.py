@@ -212,7 +212,7 @@ class _Copying:
     def _mark(self) -> None:
         """Mark the copy as unfinished, durably: a daemon that records there would repair it, and work there be lost."""
         if self._there.stat(layout.UNFINISHED) is None:
-            self._there.write(layout.UNFINISHED, [f"offloaded from {self._source.path}\n".encode()])
+            self._there.write(layout.UNFINISHED, [os.fsencode(f"offloaded from {self._source.path}\n")])
             self._there.sync()
 
     def _unmark(self) -> None:
@@ -435,8 +435,14 @@ def _doubts(there: Path, system: str, ways: tuple[ReadBack, ...]) -> list[str]:
 def _write_sums(there: Tree, manifest: Mapping[str, Proved]) -> None:
     """Write the manifest beside the copy, as `sha256sum --check` reads it. Raises FlightError."""
     path = there.path.with_name(f"{there.path.name}.sha256")
-    lines = [f"{one.sha256}  {there.path.name}/{name}\n" for name, one in sorted(manifest.items())]
+    lines = [_sum(one.sha256, f"{there.path.name}/{name}") for name, one in sorted(manifest.items())]
     try:
-        durable.write_file(path, "".join(lines).encode())
+        durable.write_file(path, b"".join(lines))
     except OSError as error:
         raise disk_error("write", path, error) from error
+
+
+def _sum(sha256: str, name: str) -> bytes:
+    """A line of the manifest; a backslash before it says that line breaks in the name are escaped."""
+    escaped = name.replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
+    return os.fsencode(f"{'' if escaped == name else chr(92)}{sha256}  {escaped}\n")

@@ -17,7 +17,7 @@ from dappled import durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
-from dappled.errors import counted
+from dappled.errors import counted, printable
 from dappled.flight.chain import canonical
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
@@ -116,8 +116,8 @@ def note(
     with Ledger(folder.ledger, clock) as ledger:
         ledger.add_event(
             EVENT,
-            f"{counted(len(sure), 'file')} ({which}) were copied to {there}, read back there, and are removed here; "
-            f"{RECORD} (SHA-256 {sha256}) names each",
+            f"{counted(len(sure), 'file')} ({which}) were copied to {printable(str(there))}, read back there, and are "
+            f"removed here; {RECORD} (SHA-256 {sha256}) names each",
         )
     try:
         durable.write_file(folder.path / RECORD, data)

@@ -18,6 +18,7 @@ from dappled import durable, file_lock
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
+from dappled.errors import printable
 from dappled.flight import layout, pruning
 from dappled.flight.chain import canonical
 from dappled.flight.errors import FlightError, disk_error
@@ -146,7 +147,8 @@ def opened_again(folder: FlightFolder, clock: Clock, why: str, key: SealKey | No
         ledger.add_event("opened again", why)
         if last is not None and changed:
             names = ", ".join(changed[:_NAMED]) + (f" and {len(changed) - _NAMED} more" if changed[_NAMED:] else "")
-            ledger.add_event(CHANGED, f"changed, added or removed by something else after seal {last.seal}: {names}")
+            text = f"changed, added or removed by something else after seal {last.seal}: {names}"
+            ledger.add_event(CHANGED, printable(text))
     try:
         yield
     finally:

@@ -230,3 +230,12 @@ def test_what_is_not_intact_or_not_closed_is_not_signed(
     still.close()
     assert main(["flight", "seal", str(copy), "--key", str(tmp_path / "key")]) == 1
     assert "was never closed, and can't be sealed: the next `dappled run` closes it" in capsys.readouterr().err
+
+
+def test_the_name_of_a_file_forges_no_verdict(closed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (closed / f"a\r\n{closed.name}: intact, sealed with key 1a2b3c4d: 1 file\udcff\x1b[2K").write_bytes(b"x")
+    note, verdict = lines(["check", str(closed)], capsys)
+    assert note.startswith(
+        rf"note:  a\r\n{closed.name}: intact, sealed with key 1a2b3c4d: 1 file\udcff\x1b[2K was added"
+    )
+    assert "consistent" in verdict

@@ -18,7 +18,7 @@ from dappled.cli.flight import lines as flight_lines
 from dappled.cli.flight import pickup
 from dappled.clock import SystemClock
 from dappled.config import settings
-from dappled.errors import counted
+from dappled.errors import counted, printable
 from dappled.flight import FlightError, flight_report, index, layout, offload, owner_seal, seal_key
 from dappled.flight.checks import flight_check
 
@@ -179,7 +179,7 @@ def _offload(flight: Path, arguments: argparse.Namespace) -> int:
 
 def _said(values: Any, lines: Iterable[str], as_json: bool) -> int:
     """Print the values as JSON, or the lines. Returns exit code 0."""
-    for text in (json.dumps(values, indent=2),) if as_json else lines:
+    for text in (json.dumps(values, indent=2),) if as_json else map(printable, lines):
         print(text)
     return 0
 
