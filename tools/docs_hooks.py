@@ -40,4 +40,4 @@ def on_post_page(output: str, page: Any, **_: Any) -> str:
 
 def at_top(markdown: str) -> str:
     """A page beside docs/ with its links as seen from within docs/."""
-    return re.sub(r"\]\(docs/", "](", markdown)
+    return re.sub(r"\[([^\]]+)\]\(Containerfile\)", r"\1", re.sub(r"\]\(docs/", "](", markdown))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 ELSEWHERE = {
+    "bash",  # part of every Debian
     "cargo",  # Rust comes from rustup, not from Debian
     "unshare",  # util-linux: part of every Debian
     "mount",  # as above, but not in the smallest root
