@@ -120,4 +120,6 @@ def summary(made: DecodeResult) -> str:
         whole += f", by the law {field.attributes['law']} ({made.search.sentence})"
     if made.report.doubt:
         whole += f": {made.report.doubt}"
+    if made.not_linear:
+        whole += f"; in doubt: {'; '.join(made.not_linear)}"
     return whole

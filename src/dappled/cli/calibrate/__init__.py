@@ -20,6 +20,7 @@ from dappled.decode.calibration.fit import CalibrationFrame, from_lattices, latt
 from dappled.decode.calibration.lattice_fit import FrameLattice
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError
+from dappled.drivers.raw.raw_file import not_linear
 from dappled.errors import DappledError, counted
 
 
@@ -36,7 +37,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", type=Path, required=True, metavar="FILE", help="calibration to write: FILE.toml and FILE.npz"
     )
     add_overwrite(parser)
-    parser.add_argument("--anyway", action="store_true", help="write a calibration that no law explains, too")
+    parser.add_argument(
+        "--anyway",
+        action="store_true",
+        help="write a calibration that no law explains, or of frames that are not linear, too",
+    )
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
 
 
@@ -103,7 +108,7 @@ def _views(darkroom: Darkroom, arguments: argparse.Namespace) -> tuple[list[Cali
     paths = arguments.frames
     for path in tqdm(paths, unit="frame", disable=len(paths) < 2 or not sys.stderr.isatty()):
         try:
-            one = view_of(darkroom, path, arguments.focal_length, arguments.f_number)
+            one = view_of(darkroom, path, arguments.focal_length, arguments.f_number, arguments.anyway)
             if good and (one.shape, one.model) != (good[0].shape, good[0].model):
                 first, this = (f"{s.model} {s.shape[0]} × {s.shape[1]}" for s in (good[0], one))
                 raise DarkroomError(f"{path} is of another camera or size ({this}, the first {first})")
@@ -117,10 +122,16 @@ def _views(darkroom: Darkroom, arguments: argparse.Namespace) -> tuple[list[Cali
 
 
 def view_of(
-    darkroom: Darkroom, path: Path, focal_length_mm: float | None = None, f_number: float | None = None
+    darkroom: Darkroom,
+    path: Path,
+    focal_length_mm: float | None = None,
+    f_number: float | None = None,
+    anyway: bool = False,
 ) -> CalibrationView:
-    """What one frame shows. Raises DappledError where it can't be used."""
+    """What one frame shows, `anyway` also where it is not linear. Raises DappledError where it can't be used."""
     raw = darkroom.read(path)
+    if not anyway and (bent := not_linear(raw)):
+        raise DarkroomError(f"{path}: {'; '.join(bent)}; --anyway calibrates with it")
     length, stop = focal_length_mm or raw.focal_length_mm, f_number or raw.f_number
     if length is None or stop is None:
         raise DarkroomError(f"{path} doesn't say its focal length and f-number: give --focal-length and --f-number")

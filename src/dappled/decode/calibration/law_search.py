@@ -9,14 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
+from dappled.decode.optics import LAWS, Carrier, Lattice, Mask, Sensor
 from dappled.decode.optics.visibility import OrderStrength, order_strengths
 from dappled.decode.spectrum import Spectrum
 from dappled.decode.spectrum.lattice import find_lattice
 from dappled.decode.spectrum.mask_lattice import MaskLattice, PeakList, find_mask_lattice, should_stand
-from dappled.decode.spectrum.peaks import measure, residual_bins
+from dappled.decode.spectrum.peaks import ALONE_NATS, measure, residual_bins
 
 _ALIKE_BINS = 0.5  # rms from their lattice: peaks farther off belong to the scene
+_SCALE_OFF = {"geometric": 0.06, "fd": 0.35}  # relative: no print, and no distance, is farther off than that
+_SCENE = "a pattern of the scene (fence, woven cloth, halftone print, a screen)"
+_STANDS_NATS = 3.5  # above what is around: a peak that is more than noise
 _ENOUGH = 0.6  # of a mask's carriers: a lattice found without a prediction needs so many
 
 
@@ -84,12 +87,55 @@ def search_laws(
         odds.append(LawOdds(name, None if found is None else found.odds_nats))
         if found is not None and found.sure and (best is None or found.odds_nats > best.odds_nats):
             best, chosen = found, name
+    if best is not None:
+        there = order_strengths(mask, sensor, best.lattice, mask_distance_mm=mask_distance_mm, f_number=f_number)
+        foreign = not_this_mask(spectrum, best, there, most_scale=None if anywhere else _SCALE_OFF[chosen or law])
+        if foreign is not None:
+            return LawSearch(tuple(odds), None, None, True, f"no carriers: {foreign}")
     if anywhere and best is None and mask.pattern == "full":
         best = _anywhere(spectrum, mask)
     expects, reason = unseen(
         spectrum, asked, ideal_f_number=mask.frequency_per_mm * mask_distance_mm, f_number=f_number
     )
+    if len(peaks.prominence) and float(peaks.prominence.max()) > _STANDS_NATS:
+        reason += f"; the peaks that do stand belong to {_SCENE}, or to another mask"
     return LawSearch(tuple(odds), best, chosen, expects, "" if best is not None else reason)
+
+
+def not_this_mask(
+    spectrum: Spectrum, found: MaskLattice, expected: Sequence[OrderStrength], *, most_scale: float | None
+) -> str | None:
+    """Why a lattice can't be that of this mask, in a sentence; None where it may be.
+
+    `expected` are the strengths of the mask's half plane on the lattice found; `most_scale` is how far its size may be
+    off the prediction (None: not judged). A pattern of the scene that has the mask's own period can't be told from it.
+    """
+    off = found.scale - 1
+    if most_scale is not None and abs(off) > most_scale:
+        way = "finer" if off > 0 else "coarser"
+        return f"peaks stand on a lattice {abs(off):.0%} {way} than this mask's: {_SCENE}, or another mask"
+    at_most = {one.order: 1.3 * one.pattern for one in expected}
+    c, m = max(found.found, key=lambda pair: pair[1].strength)
+    if m.strength > at_most[c.ky, c.kx]:
+        return (
+            f"peaks are stronger ({m.strength:.2f}) than this mask's carriers can be "
+            f"({at_most[c.ky, c.kx]:.2f}): {_SCENE}, or another mask"
+        )
+    between = [Carrier(0, 0, fy, fx) for fy, fx in np.array([(0.5, 0.5), (0.5, -0.5)]) @ found.lattice.matrix()]
+    halves = [one for one in measure(spectrum, between, 1.5, prominence_nats=ALONE_NATS) if one is not None]
+    if len(halves) == 2 and min(one.strength for one in halves) > m.strength:
+        return "stronger peaks stand half-way between this mask's carriers: another mask, with periods twice as long"
+    stand = sorted(should_stand(spectrum, expected), key=lambda one: -one.least)
+    if not stand:
+        return None
+    seen = measure(spectrum, found.lattice.carriers([one.order for one in stand]), 1.5, prominence_nats=ALONE_NATS)
+    gone = [_name(one) for one, peak in zip(stand, seen, strict=True) if peak is None]
+    if seen[0] is None and len(gone) > 1:
+        return (
+            f"peaks stand where some of this mask's carriers would, but none at {_some(gone)}, which should stand out "
+            f"as well: another mask, or {_SCENE}"
+        )
+    return None
 
 
 def missing(

@@ -30,6 +30,7 @@ from dappled.decode.spectrum.lineariser import check_shape, lineariser
 from dappled.decode.spectrum.plane import Places, coloured, find_defects, local_colours, mended, spread
 from dappled.decode.spectrum.transform import Source, transform
 from dappled.drivers.raw import calibration_files, reading
+from dappled.drivers.raw.raw_file import not_linear
 from dappled.drivers.raw.reading import RawFile
 from dappled.drivers.raw.recipe import FILES, FOLDER, LawDecision, Recipe, of_flight
 from dappled.errors import DappledError
@@ -121,7 +122,7 @@ class DecodeResult:
 
     `search` is what the frame shows under all laws, where they were tried. `contradiction` says in a sentence that
     carriers should be visible and are not; None where there is no such reason for doubt. `calibration_doubt` is what
-    the calibration itself was in doubt about.
+    the calibration itself was in doubt about, `not_linear` why the file's values may not follow the light.
     """
 
     light_field: LightField
@@ -131,6 +132,7 @@ class DecodeResult:
     search: LawSearch | None = None
     contradiction: str | None = None
     calibration_doubt: str | None = None
+    not_linear: tuple[str, ...] = ()
 
     @property
     def observable(self) -> bool:
@@ -235,8 +237,9 @@ class Darkroom:
             "corrected_by": [name for name in ("dark", "white") if getattr(self.recipe, name)],
             **(self._ranging if views and not dropped else {}),
         }
-        made = DecodeResult(light_field, report, raw, ms, search, doubt, doubt_of(decoder))
-        attributes["doubts"] = [words for words in (doubt, report.doubt, made.calibration_doubt) if words]
+        bent = tuple(not_linear(raw)) if isinstance(decoder, MaskDecoder) else ()
+        made = DecodeResult(light_field, report, raw, ms, search, doubt, doubt_of(decoder), bent)
+        attributes["doubts"] = [words for words in (doubt, report.doubt, made.calibration_doubt, *bent) if words]
         if self.recipe.try_laws and not made.observable:
             attributes["carriers_found"] = None
         return replace(made, light_field=replace(light_field, attributes=attributes))

@@ -24,6 +24,7 @@ from dappled.bounds.pictures import open_picture
 RawSource = Path | str | bytes | memoryview | mmap.mmap
 Values = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.float64]
 
+MOST_CLIPPED = 0.01  # of all pixels
 WHITE_SHARE = 0.99  # of white: a pixel of so much light is clipped
 STEPS = 64
 _EVERY = 5  # odd, so that the colours of a mosaic take turns
@@ -63,7 +64,8 @@ class RawFile:
     units; `black` is one number, or one for each colour index. `cfa` is an int array (a, b) of colour indices that
     repeats over the mosaic from its pixel (0, 0), or None for a single colour; `colour_names[i]` names index i.
     `balance` are the file's own white balance gains by colour index, green 1. `taken` is the camera's local time
-    without a zone, ISO 8601. `focal_sigma_mm` is half of what the file rounds its focal length to.
+    without a zone, ISO 8601. `focal_sigma_mm` is half of what the file rounds its focal length to. `developed` says
+    that it is a JPEG, whose values a camera or a program has bent.
     """
 
     mosaic: Values
@@ -80,6 +82,7 @@ class RawFile:
     taken: str | None
     balance: tuple[float, ...] | None
     focal_sigma_mm: float | None = None
+    developed: bool = False
 
     @classmethod
     def of(cls, settings: ExposureSettings, mosaic: Values, **known: Any) -> RawFile:
@@ -141,6 +144,17 @@ def exposure(raw: RawFile, every: int = _EVERY) -> Exposure:
     counts, _ = np.histogram(np.sqrt(np.clip(share, 0, 1)), STEPS, (0, 1))
     shares = tuple(float(one) for one in counts / share.size)
     return Exposure(shares, float(np.mean(share >= WHITE_SHARE)), float(np.mean(share)))
+
+
+def not_linear(raw: RawFile) -> list[str]:
+    """Return why a frame's values do not follow the light, in sentences; empty where nothing speaks against it."""
+    found = []
+    if raw.developed:
+        found.append("it is a JPEG: its tones are not linear, which bends carriers and views; take raw files")
+    clipped = exposure(raw).clipped_share
+    if clipped > MOST_CLIPPED:
+        found.append(f"{clipped:.1%} of its pixels are clipped, which bends carriers and views: expose less")
+    return found
 
 
 def read_exif(file: BinaryIO) -> ExposureSettings:

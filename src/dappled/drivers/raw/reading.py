@@ -236,7 +236,7 @@ def _read_picture(file: BinaryIO) -> RawFile:
     if values.dtype == np.int32:  # Pillow's mode "I": a 16-bit PNG in some versions
         values = values.astype(np.uint16)
     file.seek(0)
-    return _plain(values, read_exif(file))
+    return replace(_plain(values, read_exif(file)), developed=image.format == "JPEG")
 
 
 def _png_is_deep_colour(file: BinaryIO) -> bool:

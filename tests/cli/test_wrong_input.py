@@ -1,0 +1,152 @@
+"""Frames that are not what they are said to be, at the command line: each gets a sentence, none passes in silence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from dappled.cli import main
+from dappled.products.exports import light_files
+from tests.cli.test_thesis_camera import QUARTER, dng_of
+from tests.cli.test_thesis_camera import _quarter as quarter
+from tests.decode.ray_frames import MASKS, Shot
+
+Grid = NDArray[np.float64]
+SHOT = Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, turn_deg=0.7, scene="texture", seed=4, finer=2)
+MASK_PERIOD_PX = 1 / float(np.hypot(*SHOT.lattice[0]))  # of one step: its diagonals are √2 finer
+
+
+def _wave(period_px: float, angle_deg: float) -> Grid:
+    y, x = np.mgrid[0 : QUARTER.shape[0], 0 : QUARTER.shape[1]]
+    angle = np.radians(angle_deg)
+    return np.asarray((x * np.cos(angle) + y * np.sin(angle)) / period_px)
+
+
+def _fence(scene: Grid) -> Grid:
+    return np.asarray(scene * (0.4 + 0.6 * (_wave(23.7, 2) % 1 < 0.7)))
+
+
+def _chain_link(scene: Grid) -> Grid:
+    return np.asarray(scene * (1 - 0.7 * ((_wave(17.3, 46) % 1 < 0.15) | (_wave(17.3, -44) % 1 < 0.15))))
+
+
+def _cloth(scene: Grid) -> Grid:
+    return np.asarray(
+        scene * (1 + 0.25 * np.sign(np.sin(2 * np.pi * _wave(7.3, 3)) * np.sin(2 * np.pi * _wave(7.9, 93))))
+    )
+
+
+def _halftone(scene: Grid) -> Grid:
+    dots = np.cos(2 * np.pi * _wave(9.1, 45)) + np.cos(2 * np.pi * _wave(9.1, -45))
+    return np.asarray(0.05 + (dots / 2 > 1 - 4 * scene))
+
+
+def _halftone_near_the_mask(scene: Grid) -> Grid:
+    dots = [np.cos(2 * np.pi * _wave(1.07 * MASK_PERIOD_PX / np.sqrt(2), angle)) for angle in (46, -44)]
+    return np.asarray(scene * (1 + 0.3 * dots[0] + 0.3 * dots[1]))
+
+
+def _dots_at_the_mask(scene: Grid) -> Grid:
+    dots = [np.cos(2 * np.pi * _wave(MASK_PERIOD_PX / np.sqrt(2), angle)) for angle in (45.3, -44.7)]
+    return np.asarray(0.3 * (1 + 0.98 * (dots[0] + dots[1]) / 1.3) + 0.02 * scene)
+
+
+def _screen(scene: Grid) -> Grid:
+    return np.asarray(scene * (0.3 + 0.7 * (_wave(5.37, 0.8) % 1 < 0.7) * (_wave(5.37, 90.8) % 1 < 0.8)))
+
+
+@pytest.fixture(scope="module")
+def bare() -> Grid:
+    return SHOT.without_film().astype(np.float64)
+
+
+@pytest.fixture(scope="module")
+def masked() -> NDArray[np.float32]:
+    return SHOT.frame()
+
+
+def _noisy(plane: Grid) -> NDArray[np.float32]:
+    plane = np.clip(plane, 0.01, None) * 0.35 / plane.mean()
+    noise = np.random.default_rng(3).normal(size=plane.shape) * np.sqrt(plane * 0.35) / 100
+    return np.clip(plane + noise, 0, 1).astype(np.float32)
+
+
+def _refused(words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """The sentences of decode, carriers and calibrate, each of which must fail and leave no file."""
+    told = []
+    for verb, more in (
+        ("decode", ["-o", str(folder / "f.npz")]),
+        ("carriers", []),
+        ("calibrate", ["-o", str(folder / "c.toml")]),
+    ):
+        assert main([verb, *words, *more]) == 1, verb
+        told.append(capsys.readouterr().err.strip())
+        assert "\n" not in told[-1]
+    assert not (folder / "f.npz").exists()
+    assert not (folder / "c.toml").exists()
+    return told
+
+
+@pytest.mark.parametrize(
+    "pattern", [_fence, _chain_link, _cloth, _halftone, _halftone_near_the_mask, _screen, _dots_at_the_mask]
+)
+def test_a_period_of_the_scene_is_no_light_field(
+    pattern: Callable[[Grid], Grid], bare: Grid, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = dng_of(tmp_path / "f.dng", SHOT, _noisy(pattern(bare)))
+    decode, carriers, _ = _refused([str(path), *quarter(tmp_path)], tmp_path, capsys)
+    assert "pattern of the scene (fence, woven cloth, halftone print, a screen)" in decode
+    assert "or another mask" in carriers or "or to another mask" in carriers
+
+
+@pytest.mark.parametrize(
+    ("named", "told"),
+    [
+        ("mask-1", "stronger peaks stand half-way between this mask's carriers: another mask, with periods twice as"),
+        ("mask-4", "which should stand out as well: another mask"),
+    ],
+)
+def test_another_mask_than_the_camera_s_is_told(
+    named: str, told: str, masked: NDArray[np.float32], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(dng_of(tmp_path / "f.dng", SHOT, masked)), *quarter(tmp_path)[:2], "--mask", named]
+    for sentence in _refused(words, tmp_path, capsys):
+        assert told in sentence
+
+
+def test_another_body_is_told(masked: NDArray[np.float32], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frame = dng_of(tmp_path / "f.dng", SHOT, masked)
+    for verb in (["carriers"], ["decode", "-o", str(tmp_path / "f.npz")]):
+        assert main([verb[0], str(frame), "--camera", "fujifilm-s5200", "--mask", "mask-2", *verb[1:]]) == 2
+        assert "this one is 714 × 1072; choose another camera" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["jpeg", "clipped"])
+def test_what_is_not_linear_is_no_calibration_and_a_doubt_of_the_light_field(
+    kind: str, masked: NDArray[np.float32], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if kind == "jpeg":
+        path, told = tmp_path / "f.jpg", "it is a JPEG: its tones are not linear"
+        Image.fromarray((255 * (masked / masked.max()) ** (1 / 2.2)).astype(np.uint8)).save(path, quality=85)
+    else:
+        path, told = dng_of(tmp_path / "f.dng", SHOT, np.clip(masked * 3.2, 0, 1.3)), "of its pixels are clipped"
+    words = [str(path), *quarter(tmp_path), "--focal-length", "85", "--f-number", "22"]
+    assert main(["calibrate", *words, "-o", str(tmp_path / "c.toml")]) == 1
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / "c.toml").exists()
+    assert main(["calibrate", *words, "--anyway", "-o", str(tmp_path / "c.toml")]) == 0
+    assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 0
+    assert "in doubt: " in capsys.readouterr().out
+    assert any(told in doubt for doubt in light_files.load(tmp_path / "f.npz").attributes["doubts"])
+
+
+def test_the_same_frame_as_it_is_passes_without_a_doubt(masked: NDArray[np.float32], tmp_path: Path) -> None:
+    words = [str(dng_of(tmp_path / "f.dng", SHOT, masked)), *quarter(tmp_path)]
+    assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 0
+    assert light_files.load(tmp_path / "f.npz").attributes["doubts"] == []
+    assert main(["calibrate", *words, "-o", str(tmp_path / "c.toml")]) == 0
