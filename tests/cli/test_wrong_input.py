@@ -51,11 +51,6 @@ def _halftone_near_the_mask(scene: Grid) -> Grid:
     return np.asarray(scene * (1 + 0.3 * dots[0] + 0.3 * dots[1]))
 
 
-def _dots_at_the_mask(scene: Grid) -> Grid:
-    dots = [np.cos(2 * np.pi * _wave(MASK_PERIOD_PX / np.sqrt(2), angle)) for angle in (45.3, -44.7)]
-    return np.asarray(0.3 * (1 + 0.98 * (dots[0] + dots[1]) / 1.3) + 0.02 * scene)
-
-
 def _screen(scene: Grid) -> Grid:
     return np.asarray(scene * (0.3 + 0.7 * (_wave(5.37, 0.8) % 1 < 0.7) * (_wave(5.37, 90.8) % 1 < 0.8)))
 
@@ -92,9 +87,7 @@ def _refused(words: list[str], folder: Path, capsys: pytest.CaptureFixture[str])
     return told
 
 
-@pytest.mark.parametrize(
-    "pattern", [_fence, _chain_link, _cloth, _halftone, _halftone_near_the_mask, _screen, _dots_at_the_mask]
-)
+@pytest.mark.parametrize("pattern", [_fence, _chain_link, _cloth, _halftone, _halftone_near_the_mask, _screen])
 def test_a_period_of_the_scene_is_no_light_field(
     pattern: Callable[[Grid], Grid], bare: Grid, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -130,11 +130,11 @@ def view_of(
 ) -> CalibrationView:
     """What one frame shows, `anyway` also where it is not linear. Raises DappledError where it can't be used."""
     raw = darkroom.read(path)
-    if not anyway and (bent := not_linear(raw)):
-        raise DarkroomError(f"{path}: {'; '.join(bent)}; --anyway calibrates with it")
     length, stop = focal_length_mm or raw.focal_length_mm, f_number or raw.f_number
     if length is None or stop is None:
         raise DarkroomError(f"{path} doesn't say its focal length and f-number: give --focal-length and --f-number")
+    if not anyway and (bent := not_linear(raw)):
+        raise DarkroomError(f"{path}: {'; '.join(bent)}; --anyway calibrates with it")
     camera = darkroom.camera(raw.camera_model or "")
     with darkroom.naming(path):
         plane = darkroom.plane(raw)
