@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dappled.cli import georeference
+from dappled.cli import georeference, geotag
 from dappled.cli.arguments import whole
 from dappled.errors import DappledError, counted
 from dappled.flight import layout
@@ -40,6 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         "with position (photos: 16-bit TIFF and JPEG, and geo.txt for OpenDroneMap)")  # fmt: skip
     parser.add_argument("--pos", type=Path, metavar="FILE",
                         help="marks after PPK, as for dappled geotag; one FLIGHT only")  # fmt: skip
+    geotag.add_mark_arm(parser)
     parser.add_argument("--workers", type=whole, default=os.cpu_count() or 1, metavar="N",
                         help="number of processes (default: one per core)")  # fmt: skip
     parser.add_argument(
@@ -124,7 +125,7 @@ def _planned(flight: Path, arguments: argparse.Namespace) -> tuple[list[Job], li
     marked = geoid = None
     if arguments.pos:
         geoid = earth.geoid(arguments.geoid)
-        marked = marks.find(folder.path, arguments.pos, geoid)
+        marked = marks.find(folder.path, arguments.pos, geoid, geotag.mark_arm(arguments, options.mounting))
         for text in marks.sentences(marked):
             print(text, file=sys.stderr)
     placed, _ = geotags.read(folder.path, options.mounting, geoid, marked)

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from dappled.cli import sealing
 from dappled.clock import TimeOfDayClock
 from dappled.daemon.replay import late_tags
-from dappled.decode.geometry import camera_pose
+from dappled.decode.geometry import Vector3, camera_pose
 from dappled.errors import DappledError, counted
 from dappled.flight import layout, seals
 from dappled.flight.layout import LockHeldError
@@ -31,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n"
         "  dappled geotag ~/flights/20261121T101503Z-0a1b2c3d\n"
-        "  dappled geotag FLIGHT --pos rover_events.pos --lever-arm 0.05 0 0.12\n"
+        "  dappled geotag FLIGHT --pos rover_events.pos --mark-lever-arm 0.05 0 0.12\n"
         "Writes name.ext.xmp beside each frame, and in geotags/\n"
         "geo.txt (OpenDroneMap), pix4d.csv and track.geojson.\n"
         "The frames themselves are not changed."
@@ -43,6 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="positions of the camera's marks after PPK (*_events.pos of RTKLIB or Emlid Studio), in place of the "
         "autopilot's",
     )  # fmt: skip
+    add_mark_arm(parser)
     parser.add_argument("--lightroom", action="store_true", help="name sidecars name.xmp instead of name.ext.xmp")
     parser.add_argument("--force", action="store_true", help="replace sidecars that another program wrote")
     parser.add_argument(
@@ -74,7 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
     into_flight = arguments.output is None
     tagged_late = _tag_late(arguments.flight, key, into_flight=into_flight)
     mounting, geoid = _mounting(arguments, facts), _geoid(arguments.geoid)
-    marked = marks.find(arguments.flight, arguments.pos, geoid) if arguments.pos else None
+    marked = None
+    if arguments.pos:
+        marked = marks.find(arguments.flight, arguments.pos, geoid, mark_arm(arguments, mounting))
     folder = layout.open_folder(arguments.flight)
     clock = TimeOfDayClock()
     with seals.work(folder, clock, "geotag", "geotags flights in", key) if into_flight else nullcontext():
@@ -124,6 +127,25 @@ def run(arguments: argparse.Namespace) -> int:
         if name not in (*written.without_position, *written.without_tag):
             print(f"no copy of {name}: {reason}", file=sys.stderr)
     return 0
+
+
+def add_mark_arm(parser: argparse.ArgumentParser) -> None:
+    """Add the argument that says where the antenna of the marks is."""
+    parser.add_argument(
+        "--mark-lever-arm", nargs=3, type=float, metavar=("F", "R", "D"),
+        help="with --pos: its antenna to camera, metres forward, right, down (default: the autopilot's lever arm)",
+    )  # fmt: skip
+
+
+def mark_arm(arguments: argparse.Namespace, mounting: Mounting) -> Vector3:
+    """From the autopilot's antenna to that of the marks; says so on stderr where the two were taken to be one."""
+    forward, right, down = mounting.lever_m
+    if arguments.mark_lever_arm is None:
+        arm = f"({forward:g}, {right:g}, {down:g}) m, as of the autopilot's antenna"
+        print(f"lever arm of the marks' antenna: {arm}; another is given with --mark-lever-arm", file=sys.stderr)
+        return (0.0, 0.0, 0.0)
+    own = arguments.mark_lever_arm
+    return (forward - own[0], right - own[1], down - own[2])
 
 
 def _tag_late(flight: Path, key: SealKey | None, *, into_flight: bool) -> list[int]:

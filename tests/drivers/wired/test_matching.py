@@ -132,7 +132,7 @@ def test_windows_that_can_t_hold_as_many_pairs_are_not_looked_into(monkeypatch: 
     assert match(shots, [*others, *files]).pairs == truth(files)
     assert len(looked) < 30
     bounds, dozen = matching._bounds, np.array([0.0, 0.1, 1.6])
-    assert list(bounds(np.array([[0.0, 1.0], [1.65, -2.0]]), dozen, 1.6)) == [1, 2, 1]
+    assert list(bounds(np.array([[0.0, 1.0], [1.65, -2.0]]), dozen)) == [1, 2, 1]
 
 
 def test_nothing_to_match() -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 WINDOW_S = 1.6
 """How much offsets of true pairs differ: by the whole second of the camera's time, and the spread of its latency."""
-_GRIDS = 16  # steps of the grid on which a window may begin, in a window
+_GRID_S = 0.1
 _HAIR_S = 1e-5
 PLAUSIBLE_S = 26 * 3600.0
 """A camera's clock is off by a time zone, daylight saving time or some minutes; by more where it was never set."""
@@ -58,12 +58,10 @@ def match(
     *,
     offset_s: float | None = None,
     plausible_s: float = PLAUSIBLE_S,
-    window_s: float = WINDOW_S,
 ) -> Matching:
     """Match shots and files. Files without a time stay doubtful.
 
     `offset_s` is the camera's clock minus the shots' where it is known; else every offset up to `plausible_s` is tried.
-    `window_s` is how much the offsets of true pairs differ.
     """
     shots = sorted(shots, key=lambda shot: (shot.fired_s, shot.index))
     dated = sorted((f for f in files if f.taken_s is not None), key=lambda f: (f.taken_s, f.name))
@@ -77,12 +75,12 @@ def match(
     if not len(fired) or not len(taken):
         return _left(shots, files, (), doubts, None)
     offsets = taken[None, :] - fired[:, None]
-    starts = _starts(offsets, offset_s, plausible_s, window_s)
+    starts = _starts(offsets, offset_s, plausible_s)
     if not len(starts):
         days = abs(float(np.median(offsets))) / 86400
         doubts.append(f"the camera's clock is {days:.0f} days away from the flight's: do these files belong to it?")
         return _left(shots, files, (), doubts, None)
-    sure, possible = _best(offsets, starts, window_s)
+    sure, possible = _best(offsets, starts)
     doubts += _doubts(shots, dated, sure, possible)
     pairs = tuple((shots[i].index, dated[j].name) for i, j in sure)
     middle = float(np.median([offsets[i, j] for i, j in sure])) if sure else None
@@ -106,25 +104,22 @@ def seconds(taken: str | None) -> float | None:
         return None
 
 
-def _starts(
-    offsets: NDArray[np.float64], known_s: float | None, plausible_s: float, window_s: float
-) -> NDArray[np.float64]:
+def _starts(offsets: NDArray[np.float64], known_s: float | None, plausible_s: float) -> NDArray[np.float64]:
     """Return where a window of offsets may begin, on a grid, ascending."""
     flat = np.sort(offsets.ravel())
-    near = flat[np.abs(flat - known_s) <= window_s] if known_s is not None else flat[np.abs(flat) <= plausible_s]
-    grid_s = window_s / _GRIDS
-    return np.unique(np.floor(near / grid_s) * grid_s)
+    near = flat[np.abs(flat - known_s) <= WINDOW_S] if known_s is not None else flat[np.abs(flat) <= plausible_s]
+    return np.unique(np.floor(near / _GRID_S) * _GRID_S)
 
 
-def _bounds(offsets: NDArray[np.float64], starts: NDArray[np.float64], window_s: float) -> NDArray[np.int64]:
+def _bounds(offsets: NDArray[np.float64], starts: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the most pairs that each window can hold: the fewer of the shots and the files with an offset in it."""
-    return np.minimum(_touched(offsets, starts, window_s), _touched(offsets.T, starts, window_s))
+    return np.minimum(_touched(offsets, starts), _touched(offsets.T, starts))
 
 
-def _touched(offsets: NDArray[np.float64], starts: NDArray[np.float64], window_s: float) -> NDArray[np.int64]:
+def _touched(offsets: NDArray[np.float64], starts: NDArray[np.float64]) -> NDArray[np.int64]:
     """Count the rows that have an offset in each window; slightly too many where one lies on its edge."""
     ordered = np.sort(offsets, axis=1)
-    first = np.searchsorted(starts, ordered - window_s - _HAIR_S, "left")
+    first = np.searchsorted(starts, ordered - WINDOW_S - _HAIR_S, "left")
     last = np.searchsorted(starts, ordered + _HAIR_S, "right")
     first[:, 1:] = np.maximum(first[:, 1:], last[:, :-1])  # each window once for a row
     some = first < last
@@ -132,18 +127,16 @@ def _touched(offsets: NDArray[np.float64], starts: NDArray[np.float64], window_s
     return np.cumsum(np.bincount(first[some], minlength=size) - np.bincount(last[some], minlength=size))[:-1]
 
 
-def _best(
-    offsets: NDArray[np.float64], starts: NDArray[np.float64], window_s: float
-) -> tuple[list[tuple[int, int]], NDArray[np.bool_]]:
+def _best(offsets: NDArray[np.float64], starts: NDArray[np.float64]) -> tuple[list[tuple[int, int]], NDArray[np.bool_]]:
     """Return (pairs that all best matchings share, pairs that any has)."""
     best = 0
-    bounds = _bounds(offsets, starts, window_s)
+    bounds = _bounds(offsets, starts)
     seen: set[bytes] = set()
     found: list[tuple[set[tuple[int, int]], NDArray[np.bool_]]] = []
     for which in np.argsort(-bounds, kind="stable"):
         if bounds[which] < max(best, 1):
             break  # this window can't hold as many pairs, nor can any after it
-        fits = (offsets >= starts[which]) & (offsets <= starts[which] + window_s)
+        fits = (offsets >= starts[which]) & (offsets <= starts[which] + WINDOW_S)
         key = np.flatnonzero(fits).tobytes()
         if not key or key in seen:
             continue

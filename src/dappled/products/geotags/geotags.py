@@ -199,9 +199,9 @@ def pix4d(placed: Sequence[Placed]) -> str:
 
 
 def geojson(placed: Sequence[Placed]) -> str:
-    """GeoJSON (RFC 7946): a point for each frame and a line through them, in the order of exposure. The third
+    """GeoJSON (RFC 7946): a point for each frame and a line through them, in the order of the shots. The third
     coordinate is the height above the ellipsoid, where known; the altitude above mean sea level is a property."""
-    known = sorted(((one, one.camera) for one in placed if one.camera), key=lambda pair: pair[0].tag.utc_ns)
+    known = sorted(((one, one.camera) for one in placed if one.camera), key=lambda pair: pair[0].frame.index)
     features: list[dict[str, Any]] = []
     if len(known) > 1:
         line = [_coordinates(camera) for _, camera in known]

@@ -3,30 +3,38 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
-from dappled.decode.geometry import Gnss, Pose, metres_per_radian
-from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching, match
+import numpy as np
+
+from dappled.decode.geometry import Gnss, Vector3, camera_pose, metres_per_radian
 from dappled.errors import DappledError, counted
-from dappled.flight import LedgerReader, Tag, layout
+from dappled.flight import LedgerReader, ShotRow, Tag, layout
 from dappled.products.geotags import pos_file
-from dappled.products.geotags.pos_file import Mark, PosFile
+from dappled.products.geotags.mark_matching import MarkPairs, TimedShot, pair
+from dappled.products.geotags.pos_file import Mark
 from dappled.products.maps.earth import Geoid
 
 MARK_SOURCE = "GNSS mark"
 _CONTACT_SIGMA_NS = 1_000_000  # contact bounce and shutter: as for the autopilot's hot shoe
-_LEAST_WINDOW_S, _MOST_WINDOW_S = 0.06, 0.6
-_SIGMAS = 6
-_SOME = 0.8  # share of marks that intervals alone must explain
+_BOUNCE_NS = 50_000_000
+_PLAUSIBLE_S = 26 * 3600.0  # a time zone, and a clock that was set by hand
+_SOME = 0.6  # share of shots or marks that must be paired
 _LEAST_PAIRS = 3  # for a match without the time
-_EPOCHS = 3  # as many marks a shot and more, evenly spaced, are all epochs of a track
+_OFFSET_S = 0.15  # a larger offset of the clocks is a doubt, if it isn't explained by the shots' sigmas
+_EPOCH_NS, _EPOCHS, _EPOCH_SHARE = (
+    50_000_000,
+    5,
+    0.9,
+)  # receivers give epochs on a grid of 0.05 s; marks come at any time
 _FAR_M = 50.0
 _VERTICAL_M = 15.0  # a geoid left out is more, nearly everywhere; an autopilot's height is better
+_SIGMAS, _LEAST_OUT_M, _AUTOPILOT_SIGMA_M = 5.0, 5.0, 3.0
+_NAMED = 8
 _FIXES = {1: 6, 2: 5, 3: 4, 4: 4, 5: 3, 6: 8}  # RTKLIB's Q → MAVLink's GPS_FIX_TYPE
 
 
@@ -40,7 +48,8 @@ class Marked:
 
     `lost`: frames without a mark. `extra`: sentences about marks without a frame. `offset_s`: the flight's clock minus
     the marks' time (median), `spread_s` how far a mark's time is from that. `shift_m`: the marks minus the autopilot's
-    positions, (north, east, up), medians; None where none has both.
+    positions, (north, east, up), medians; None where none has both. `arm_m` goes from the autopilot's antenna to the
+    marks' (forward, right, down): positions are moved back by it, so that one lever arm leads to the camera.
     """
 
     marks: Mapping[int, Mark]
@@ -50,59 +59,51 @@ class Marked:
     doubts: tuple[str, ...]
     offset_s: float
     spread_s: float
-    shift_m: tuple[float, float, float] | None
+    shift_m: Vector3 | None
+    arm_m: Vector3 = (0.0, 0.0, 0.0)
 
     def tag(self, tag: Tag, geoid: Geoid | None) -> Tag:
         """The tag with time and position of the frame's mark, at mid-exposure; as it is where the frame has none.
 
         The attitude stays the autopilot's. Raises EarthError."""
         mark = self.marks.get(tag.index)
-        return tag if mark is None else _applied(tag, mark, None if self.above_geoid else geoid)
+        return tag if mark is None else _applied(tag, mark, None if self.above_geoid else geoid, self.arm_m)
 
 
-def find(flight: Path, path: Path, geoid: Geoid | None) -> Marked:
-    """Match the marks of a .pos file with the shots of a flight. Raises MarksError, PosError, FlightError."""
+def find(flight: Path, path: Path, geoid: Geoid | None, arm_m: Vector3 = (0.0, 0.0, 0.0)) -> Marked:
+    """Match the marks of a .pos file with the shots of a flight. `arm_m` goes from the autopilot's antenna to the
+    marks' (see `Marked`). Raises MarksError, PosError, FlightError."""
     found = pos_file.read(path)
     if geoid is None and not found.above_geoid:
         raise MarksError(
             f"the heights in {path} are above the ellipsoid, and no geoid grid is on this machine: install Debian's "
             "proj-data, or say with --geoid how many metres mean sea level is above the ellipsoid here"
         )
+    _not_epochs(path, found.marks)
     with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
         tags, rows, correction_ns = ledger.tags(), ledger.shots(), ledger.utc_correction_ns()
     if not tags:
         raise MarksError(f"no frame of {flight} is tagged: there is nothing to match with {path}")
-    shots = []
-    for row in rows:
-        tag = tags.get(row.shot.index)
-        if tag is not None:
-            begins_ns = tag.utc_ns - _half_ns(tag)
-        elif row.fired_called_monotonic_ns is not None:
-            begins_ns = row.fired_called_monotonic_ns + row.shot.wished_utc_ns - row.shot.wished_monotonic_ns
-        else:
-            continue
-        shots.append(FiredShot(row.shot.index, (begins_ns + (correction_ns or 0)) / 1e9))
-    _not_epochs(path, found.marks, len(shots))
-    matched, doubts = _matched(path, found, shots, _window_s(tags.values()), utc_known=correction_ns is not None)
-    by_name = {str(mark.number): mark for mark in found.marks}
-    paired = {index: by_name[name] for index, name in matched.pairs}
-    marks = {index: mark for index, mark in paired.items() if index in tags}
-    shift_m, far = _shift(path, marks, tags, None if found.above_geoid else geoid)
-    began_s = {shot.index: shot.fired_s for shot in shots}
-    late_s = [began_s[index] - mark.utc_ns / 1e9 for index, mark in paired.items()]
-    middle_s = median(late_s)
+    shots = _shots(rows, tags, correction_ns or 0)
+    heard, bounced = _without_bounces(found.marks)
+    matched, doubts = _matched(path, heard, shots, utc_known=correction_ns is not None)
+    paired = {shots[i].index: heard[j] for i, j in matched.pairs}
+    late_s = {shot.index: shot.begins_s - paired[shot.index].utc_ns / 1e9 for shot in shots if shot.index in paired}
+    taken = {mark.number for mark in paired.values()}
+    geoid = None if found.above_geoid else geoid
+    marks, shift_m, far = _placed(path, {index: one for index, one in paired.items() if index in tags}, tags, geoid)
+    extra = [f"mark {one.number} at {_clock(one)} belongs to no shot" for one in heard if one.number not in taken]
+    extra += [f"mark {one.number} is of shot {n}, which left no frame" for n, one in paired.items() if n not in tags]
     return Marked(
         marks,
         found.above_geoid,
         tuple(index for index in sorted(tags) if index not in marks),
-        tuple(
-            [f"mark {by_name[name].number} at {_clock(by_name[name])} belongs to no shot" for name in matched.files]
-            + [f"mark {mark.number} is of shot {n}, which left no frame" for n, mark in paired.items() if n not in tags]
-        ),
-        (*found.doubts, *doubts, *_solutions(marks), *far),
-        middle_s,
-        max(abs(one - middle_s) for one in late_s),
+        (*extra, *bounced),
+        (*found.doubts, *doubts, *_solutions(marks), *far, *_unmoved(marks, tags, arm_m)),
+        matched.offset_s,
+        max(abs(one - matched.offset_s) for one in late_s.values()),
         shift_m,
+        arm_m,
     )
 
 
@@ -117,72 +118,95 @@ def sentences(marked: Marked) -> list[str]:
     return [*lines, *lost, *marked.extra, *(f"in doubt: {text}" for text in marked.doubts)]
 
 
-def _window_s(tags: Iterable[Tag]) -> float:
-    """How much the times of true pairs differ: by the error of each shot's time."""
-    sigma_s = max(tag.utc_sigma_ns for tag in tags) / 1e9
-    return min(max(_SIGMAS * sigma_s, _LEAST_WINDOW_S), _MOST_WINDOW_S)
+def _shots(rows: Sequence[ShotRow], tags: Mapping[int, Tag], correction_ns: int) -> list[TimedShot]:
+    """The shots that fired, in the order of their exposures."""
+    usual_s = float(median(tag.utc_sigma_ns for tag in tags.values())) / 1e9
+    shots = []
+    for row in rows:
+        tag = tags.get(row.shot.index)
+        if tag is not None:
+            begins_ns, sigma_s = tag.utc_ns - _half_ns(tag), tag.utc_sigma_ns / 1e9
+        elif row.fired_called_monotonic_ns is not None:
+            begins_ns = row.fired_called_monotonic_ns + row.shot.wished_utc_ns - row.shot.wished_monotonic_ns
+            sigma_s = max(0.1, usual_s)  # the body's latency is not added
+        else:
+            continue
+        shots.append(TimedShot(row.shot.index, (begins_ns + correction_ns) / 1e9, sigma_s))
+    return sorted(shots, key=lambda shot: (shot.begins_s, shot.index))
+
+
+def _without_bounces(marks: Sequence[Mark]) -> tuple[list[Mark], list[str]]:
+    """The marks without those that follow another at once, and a sentence for each of these."""
+    heard: list[Mark] = []
+    bounced = []
+    for mark in marks:
+        after_ns = mark.utc_ns - heard[-1].utc_ns if heard else _BOUNCE_NS
+        if after_ns < _BOUNCE_NS:
+            bounced.append(
+                f"mark {mark.number} is {after_ns / 1e6:.0f} ms after mark {heard[-1].number}: it was left out"
+            )
+        else:
+            heard.append(mark)
+    return heard, bounced
 
 
 def _matched(
-    path: Path, found: PosFile, shots: Sequence[FiredShot], window_s: float, *, utc_known: bool
-) -> tuple[Matching, list[str]]:
-    """The pairs by time, or by count and interval where the times don't agree; with doubts. Raises MarksError."""
-    dated = [DatedFile(str(mark.number), mark.utc_ns / 1e9) for mark in found.marks]
-    if utc_known:
-        by_time = match(shots, dated, offset_s=0.0, window_s=window_s)
-        if len(by_time.pairs) >= max(1, _SOME * min(len(shots), len(dated))):
-            return by_time, _named(by_time.doubts)
-    apart_s = median(shot.fired_s for shot in shots) - median(mark.utc_ns / 1e9 for mark in found.marks)
-    if abs(apart_s) > PLAUSIBLE_S:
-        days = [datetime.fromtimestamp(s, UTC).strftime("%Y-%m-%d") for s in (dated[0].taken_s or 0, shots[0].fired_s)]
+    path: Path, marks: Sequence[Mark], shots: Sequence[TimedShot], *, utc_known: bool
+) -> tuple[MarkPairs, list[str]]:
+    """The pairs by time, count and interval, with doubts. Raises MarksError."""
+    times_s = [mark.utc_ns / 1e9 for mark in marks]
+    if abs(shots[len(shots) // 2].begins_s - times_s[len(times_s) // 2]) > _PLAUSIBLE_S:
+        days = [datetime.fromtimestamp(s, UTC).strftime("%Y-%m-%d") for s in (times_s[0], shots[0].begins_s)]
         raise MarksError(f"the marks in {path} are of {days[0]}, the flight of {days[1]}: give the file of this flight")
-    matched = match(shots, dated, window_s=window_s)
-    enough = max(_LEAST_PAIRS, _SOME * min(len(shots), len(dated)))
-    if matched.offset_s is None or len(matched.pairs) < enough:
+    matched = pair(shots, times_s, utc_known=utc_known, most_s=_PLAUSIBLE_S)
+    usual_s = float(median(shot.sigma_s for shot in shots))
+    by_time = utc_known and abs(matched.offset_s) <= max(_OFFSET_S, 6 * usual_s)
+    enough = max(1 if by_time else _LEAST_PAIRS, _SOME * min(len(shots), len(marks)))
+    if not matched.certain or len(matched.pairs) < enough:
         raise MarksError(
-            f"{counted(len(dated), 'mark')} of {path} and {counted(len(shots), 'shot')}: neither their times nor count "
+            f"{counted(len(marks), 'mark')} of {path} and {counted(len(shots), 'shot')}: neither their times nor count "
             "and intervals say which belong together; is it the file of this flight?"
         )
-    how = "the flight never knew UTC" if not utc_known else f"their times are {-matched.offset_s:.3f} s from the shots'"
-    return matched, [
-        f"the marks were matched by count and intervals alone: {how}; compare a picture with its place",
-        *_named(matched.doubts),
-    ]
+    if by_time:
+        return matched, []
+    why = f"their times are {-matched.offset_s:.3f} s from the shots'" if utc_known else "the flight never knew UTC"
+    return matched, [f"the marks were matched by count and intervals alone: {why}; compare a picture with its place"]
 
 
-def _named(doubts: Sequence[str]) -> list[str]:
-    return [f"mark {text}" for text in doubts]
-
-
-def _not_epochs(path: Path, marks: Sequence[Mark], shots: int) -> None:
+def _not_epochs(path: Path, marks: Sequence[Mark]) -> None:
     """Raises MarksError for the file of all epochs in place of the events'."""
-    steps = [after.utc_ns - before.utc_ns for before, after in pairwise(marks)]
-    if len(marks) > _EPOCHS * shots and len(steps) > 9:
-        usual = median(steps)
-        if sum(abs(step % usual) < 2_000_000 for step in steps if usual) > 0.9 * len(steps):
-            raise MarksError(
-                f"{path} holds {len(marks)} positions every {usual / 1e9:g} s, the whole track and not the camera's "
-                "marks: give the file of events that was written beside it (…_events.pos)"
-            )
+    on_grid = sum(min(mark.utc_ns % _EPOCH_NS, -mark.utc_ns % _EPOCH_NS) <= 1000 for mark in marks)
+    if len(marks) >= _EPOCHS and on_grid > _EPOCH_SHARE * len(marks):
+        raise MarksError(
+            f"{path} holds {len(marks)} positions at a receiver's even times, the whole track and not the camera's "
+            "marks: give the file of events that was written beside it (…_events.pos)"
+        )
 
 
 def _solutions(marks: Mapping[int, Mark]) -> list[str]:
-    """A sentence for the marks that are not fixed."""
-    worse = [mark for mark in marks.values() if mark.quality != 1]
-    if not worse:
-        return []
-    kinds = ", ".join(
-        f"{sum(mark.solution == kind for mark in worse)} {kind}" for kind in sorted({mark.solution for mark in worse})
-    )
-    return [f"{len(worse)} of {counted(len(marks), 'mark')} {'is' if len(worse) == 1 else 'are'} not fixed: {kinds}"]
+    """A sentence that names the marks that are not fixed."""
+    worse = [f"{mark.number} (frame {n}, {mark.solution})" for n, mark in marks.items() if mark.quality != 1]
+    more = ", …" if len(worse) > _NAMED else ""
+    many = counted(len(worse), "mark")
+    return [f"{many} of {len(marks)} not fixed: {', '.join(worse[:_NAMED])}{more}"] if worse else []
 
 
-def _shift(
+def _unmoved(marks: Mapping[int, Mark], tags: Mapping[int, Tag], arm_m: Vector3) -> list[str]:
+    """Sentences about frames whose mark can't be brought to mid-exposure, or to the other antenna."""
+    poses = {index: tags[index].pose for index in marks}
+    unknown = sum(tags[index].exposure_s is None or poses[index].velocity_ned_m_s is None for index in marks)
+    untold = sum(pose.attitude is None for pose in poses.values()) if any(arm_m) else 0
+    said = "exposure or speed unknown for {}: the position is that of the contact, not of mid-exposure"
+    armless = "no attitude for {}: the lever arm of the marks' antenna was not applied"
+    return [text.format(counted(n, "frame")) for text, n in ((said, unknown), (armless, untold)) if n]
+
+
+def _placed(
     path: Path, marks: Mapping[int, Mark], tags: Mapping[int, Tag], geoid: Geoid | None
-) -> tuple[tuple[float, float, float] | None, list[str]]:
-    """The medians of marks minus the autopilot's positions, and a doubt about heights. Raises MarksError where they are
-    too far apart to be of one flight."""
-    steps = []
+) -> tuple[dict[int, Mark], Vector3 | None, list[str]]:
+    """The marks that are where the others and the autopilot are, the medians of marks minus autopilot, and doubts: each
+    mark that lies elsewhere, and heights. Raises MarksError where all are too far away to be of this flight."""
+    steps: dict[int, Vector3] = {}
     for index, mark in marks.items():
         pose = tags[index].pose
         if pose.latitude_rad is None or pose.longitude_rad is None or pose.altitude_msl_m is None:
@@ -190,43 +214,65 @@ def _shift(
         north, east = metres_per_radian(mark.latitude_rad, mark.height_m)
         turn = math.remainder(mark.longitude_rad - pose.longitude_rad, math.tau)
         up = mark.height_m - _undulation_m(mark, geoid) - pose.altitude_msl_m
-        steps.append(((mark.latitude_rad - pose.latitude_rad) * north, turn * east, up))
+        steps[index] = ((mark.latitude_rad - pose.latitude_rad) * north, turn * east, up)
     if not steps:
-        return None, []
-    north_m, east_m, up_m = (float(median(part)) for part in zip(*steps, strict=True))
+        return dict(marks), None, ["no position of the autopilot is known: whether the marks are of this place is not"]
+    north_m, east_m, up_m = (float(median(part)) for part in zip(*steps.values(), strict=True))
     if math.hypot(north_m, east_m) > _FAR_M:
         raise MarksError(
             f"the marks in {path} lie {math.hypot(north_m, east_m):,.0f} m from where the autopilot was: are they of "
             "this flight, and were the base's coordinates right and in WGS 84?"
         )
+    kept, doubts = dict(marks), []
+    for index, (north, east, up) in steps.items():
+        pose = tags[index].pose
+        sigma_m = math.hypot(pose.position_sigma_m or _AUTOPILOT_SIGMA_M, pose.vertical_sigma_m or _AUTOPILOT_SIGMA_M)
+        away_m = math.dist((north, east, up), (north_m, east_m, up_m))
+        if away_m > max(_LEAST_OUT_M, _SIGMAS * sigma_m):
+            number = kept.pop(index).number
+            doubts.append(f"mark {number} (frame {index}) lies {away_m:,.0f} m from where the others would have it")
     if abs(up_m) > _VERTICAL_M:
-        doubt = (
+        doubts.append(
             f"the marks are {abs(up_m):.1f} m {'above' if up_m > 0 else 'below'} the autopilot's heights: was the "
             "base's height above sea level in place of above the ellipsoid, or is the geoid wrong?"
         )
-        return (north_m, east_m, up_m), [doubt]
-    return (north_m, east_m, up_m), []
+    return kept, (north_m, east_m, up_m), doubts
 
 
-def _applied(tag: Tag, mark: Mark, geoid: Geoid | None) -> Tag:
-    half_ns = _half_ns(tag)
+def _applied(tag: Tag, mark: Mark, geoid: Geoid | None, arm_m: Vector3) -> Tag:
+    half_ns, pose = _half_ns(tag), tag.pose
+    velocity = np.array(pose.velocity_ned_m_s or (0.0, 0.0, 0.0))
+    moved = velocity * half_ns / 1e9  # from the contact to mid-exposure, and to the autopilot's antenna
+    if pose.attitude is not None:
+        moved = moved - camera_pose.matrix_of(pose.attitude) @ np.array(arm_m)
     north, east = metres_per_radian(mark.latitude_rad, mark.height_m)
-    v_north, v_east, v_down = tag.pose.velocity_ned_m_s or (0.0, 0.0, 0.0)  # from the contact to mid-exposure
-    covariance = mark.covariance_m2
-    pose: Pose = replace(
-        tag.pose,
+    altitude_m = mark.height_m - _undulation_m(mark, geoid) - float(moved[2])
+    height_m = pose.height_above_home_m
+    if height_m is not None and pose.altitude_msl_m is not None:
+        height_m += altitude_m - pose.altitude_msl_m
+    covariance = None
+    if mark.covariance_m2 is not None:
+        blur = velocity * _CONTACT_SIGMA_NS / 1e9
+        pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+        nn, ne, nd, ee, ed, dd = (
+            own + float(blur[i] * blur[j]) for own, (i, j) in zip(mark.covariance_m2, pairs, strict=True)
+        )
+        covariance = (nn, ne, nd, ee, ed, dd)
+    placed = replace(
+        pose,
         source="mark",
         utc_ns=mark.utc_ns + half_ns,
-        latitude_rad=mark.latitude_rad + v_north * half_ns / 1e9 / north,
-        longitude_rad=mark.longitude_rad + v_east * half_ns / 1e9 / east,
-        altitude_msl_m=mark.height_m - _undulation_m(mark, geoid) - v_down * half_ns / 1e9,
+        latitude_rad=mark.latitude_rad + float(moved[0]) / north,
+        longitude_rad=mark.longitude_rad + float(moved[1]) / east,
+        altitude_msl_m=altitude_m,
+        height_above_home_m=height_m,
         position_sigma_m=None if covariance is None else math.sqrt(covariance[0] + covariance[3]),
         vertical_sigma_m=None if covariance is None else math.sqrt(covariance[5]),
         position_covariance_m2=covariance,
         gnss=Gnss(_FIXES.get(mark.quality, 0), mark.satellites, None, None, None, None, None, half_ns / 1e6),
         age_ms=half_ns / 1e6,
     )
-    return replace(tag, utc_ns=pose.utc_ns, utc_sigma_ns=_CONTACT_SIGMA_NS, time_source=MARK_SOURCE, pose=pose)
+    return replace(tag, utc_ns=placed.utc_ns, utc_sigma_ns=_CONTACT_SIGMA_NS, time_source=MARK_SOURCE, pose=placed)
 
 
 def _half_ns(tag: Tag) -> int:

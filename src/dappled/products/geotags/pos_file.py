@@ -172,10 +172,13 @@ def _mark(number: int, fields: list[str], columns: Sequence[str], system: str) -
         if covariance is not None:
             down = np.diag([1.0, 1.0, -1.0])
             covariance = down @ covariance @ down
+    if satellites is not None and satellites < 0:
+        raise ValueError("not a number of satellites")
     if not (abs(latitude) <= math.pi / 2 and abs(longitude) <= 2 * math.pi and -1e3 < height < 1e5):
         raise ValueError("not a place near the ground")
     upper = None if covariance is None else tuple(float(covariance[i, j]) for i in range(3) for j in range(i, 3))
     assert upper is None or len(upper) == 6
+    longitude = math.remainder(longitude, math.tau)
     return Mark(number, utc_ns, latitude, longitude, height, quality, satellites, upper)
 
 
@@ -213,6 +216,8 @@ def _utc_ns(first: str, second: str, system: str) -> int:
     if "/" in first:
         hours, minutes, rest = second.split(":")
         whole, _, fraction = rest.partition(".")
+        if not (0 <= int(hours) < 24 and 0 <= int(minutes) <= 60 and 0 <= int(whole) <= 60):
+            raise ValueError("not a time of a day")
         day = datetime.strptime(first, "%Y/%m/%d").replace(tzinfo=UTC)
         ticks = int(fraction[:9].ljust(9, "0"))
         at = day + timedelta(hours=int(hours), minutes=int(minutes), seconds=int(whole))
