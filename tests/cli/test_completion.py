@@ -10,6 +10,7 @@ import pytest
 from dappled.cli import VERBS, main
 from tests.needs import without
 
+pytestmark = pytest.mark.slow  # it loads every verb
 BASH = shutil.which("bash") or ""
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from dappled.__main__ import INTERRUPTED
+from dappled.cli import VERBS, main
 from dappled.mocks.simulation import free_port
 
 # Sends itself a SIGINT as soon as a module begins to load, as a person's ^C may come at any time.
@@ -83,3 +84,61 @@ def _interrupted(tmp_path: Path, sockets: str, port: int, pages: int) -> list[st
         assert process.wait(50) == 0
         reader.join(10)
     return said
+
+
+REFERENCE = ["--camera", "reference-36mm", "--mask", "reference-5x5"]
+PRINTING = [
+    ["config", "show"],
+    ["config", "show", "--json"],
+    ["profiles"],
+    ["profiles", "--json"],
+    ["mask", "table", "--camera", "canon-eos-450d", "--mask", "mask-2"],
+    ["carriers", "--shape", "1388", "1844", *REFERENCE, "--focal-length", "50"],
+]
+
+
+@pytest.mark.parametrize("words", PRINTING, ids=lambda words: " ".join(words[:3]))
+def test_a_reader_that_has_gone_ends_a_command_quietly(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """As with `dappled … | head -1`."""
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as closed:
+        monkeypatch.setattr(sys, "stdout", closed)
+        assert main(words) == 1
+        monkeypatch.undo()
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("verb", sorted(VERBS))
+def test_help_comes_on_a_narrow_terminal_and_without_colour_where_none_is_wanted(
+    verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setenv("NO_COLOR", "1")
+    with pytest.raises(SystemExit) as ended:
+        main([verb, "--help"])
+    assert ended.value.code == 0
+    told = capsys.readouterr()
+    assert "\x1b" not in told.out + told.err
+    assert told.out.startswith("usage: dappled")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", ["watch", "trigger"])
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
+def test_a_command_that_waits_ends_at_once_without_a_traceback(verb: str, sent: signal.Signals, tmp_path: Path) -> None:
+    with tempfile.TemporaryDirectory(prefix="dpl-") as sockets:
+        udp = f"udpout:127.0.0.1:{free_port(socket.SOCK_DGRAM)}"
+        where = {"watch": [f"ipc://{sockets}/s"], "trigger": ["--url", udp]}[verb]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "dappled", verb, *where],
+            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith("waiting for a ")
+        process.send_signal(sent)
+        out, err = process.communicate(timeout=30)
+    assert process.returncode == (INTERRUPTED if sent == signal.SIGINT else -signal.SIGTERM)
+    assert (out, err) == ("", "")

@@ -230,6 +230,7 @@ def test_a_frame_is_shown_without_being_decoded_and_drawn_with_its_own_spectrum(
 @pytest.mark.parametrize("name", ["mask.toml", "flight.tlog", "log.ulg"])
 def test_a_file_that_is_no_frame_is_not_called_one(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"anything")
-    for recipe in ({}, {"mask": "mask-2"}):
+    recipes: tuple[dict[str, Any], ...] = ({}, {"mask": "mask-2"})
+    for recipe in recipes:
         with pytest.raises(opened.OpenError, match=rf"{name} is no frame: open takes"):
             opened.open(tmp_path / name, **recipe)
