@@ -79,8 +79,8 @@ class MavlinkSettings:
     )
     feedback_is_shot: bool = setting(
         False,
-        "The autopilot fires the camera by wire, and each of its CAMERA_FEEDBACK messages is a shot; "
-        'always so with camera.shutter = "outside"',
+        "The autopilot fires the camera by wire, and each of its CAMERA_FEEDBACK messages is a shot; always so with, "
+        'and only for, camera.shutter = "outside"',
     )
     autopilot_camera: int = setting(
         0,

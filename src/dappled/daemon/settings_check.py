@@ -112,6 +112,14 @@ def _links(settings: Settings) -> None:
         raise ConfigError("\n".join(wrong))
 
 
+def _feedback(settings: Settings) -> None:
+    if settings.mavlink.feedback_is_shot and not settings.camera.fired_outside:
+        raise ConfigError(
+            "mavlink.feedback_is_shot is for a camera that the autopilot fires, and dappled would fire it once more: "
+            'set camera.shutter = "outside"'
+        )
+
+
 def _link_keys(settings: Settings) -> None:
     keys, links = settings.mavlink.keys, len(settings.mavlink.url)
     if len(keys) not in (0, 1, links):
@@ -202,6 +210,7 @@ RULES: tuple[SettingsRule, ...] = (
     SettingsRule("camera.profile", _camera_profile),
     SettingsRule("mask.profile", _mask_profile),
     SettingsRule("mavlink.url", _links),
+    SettingsRule("mavlink.feedback_is_shot", _feedback, ("camera.shutter", "camera.driver")),
     SettingsRule("mavlink.keys", _link_keys, ("mavlink.url",), secrets=lambda settings: settings.mavlink.keys),
     SettingsRule("record.directory", _directory),
     SettingsRule("record.seal_key", _seal, secrets=lambda settings: (settings.record.seal_key,)),

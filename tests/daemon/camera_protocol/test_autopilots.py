@@ -104,6 +104,65 @@ def test_px4_that_fires_by_wire_and_commands_too_is_accepted_as_the_same_shot() 
     assert GCS not in {(m.target_system, m.target_component) for m in rig.of("COMMAND_ACK")}
 
 
+@pytest.mark.parametrize("own", [0, 1])
+@pytest.mark.parametrize("gap_s", [0.2, 1.0, 4.0])
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_two_wired_cameras_triggered_together_are_one_shot_of_ours_each_time(
+    own: int, gap_s: float, order: tuple[int, int]
+) -> None:
+    rig = rig_of(feedback_is_shot=True, cam_idx=own)
+    autopilot = CameraTriggers(cameras=(CameraPort("wire", pin=True), CameraPort("wire", pin=True)))
+    for number in range(6):
+        rig.clock.advance(gap_s)
+        at_us = BOOT_US + round(number * gap_s * 1e6)
+        rig.hear(mavlink.MAVLink_attitude_message(at_us // 1000, 0, 0, 0, 0, 0, 0), AUTOPILOT)
+        hear(rig, autopilot.trigger(at_us))
+        for place, camera in enumerate(order):
+            hear(rig, autopilot.contact(at_us + 55_000 + 5_000 * place, camera))
+        assert len(rig.fired) == number + 1
+
+
+@pytest.mark.parametrize("unix_us", [0, UNIX_US])
+def test_what_another_camera_repeats_before_any_clock_is_known_is_no_shot(unix_us: int) -> None:
+    """The daemon starts in flight; ours was last triggered a minute ago, without satellites or before SYSTEM_TIME."""
+    autopilot = CameraTriggers(cameras=(CameraPort("wire"), CameraPort("wire")))
+    for number in range(5):
+        autopilot.trigger(BOOT_US + number * 10**6, unix_us and unix_us + number * 10**6, camera=0)
+    rig = rig_of(feedback_is_shot=True)
+    for number in range(60, 63):
+        rig.clock.advance(1)
+        hear(rig, autopilot.trigger(BOOT_US + number * 10**6, unix_us and unix_us + number * 10**6, camera=1))
+    assert rig.fired == []
+    hear(rig, autopilot.trigger(BOOT_US + 64 * 10**6, unix_us and unix_us + 64 * 10**6, camera=0))
+    assert len(rig.fired) == 1
+
+
+@pytest.mark.parametrize("personality", ["ardupilot", "px4"])
+@pytest.mark.parametrize(("command", "parameters"), [(2000, (0, 0, 1, 0)), (203, (0, 0, 0, 0, 1))])
+@pytest.mark.parametrize("autopilot_first", [True, False])
+def test_a_broadcast_through_the_component_is_one_shot_and_one_refusal(
+    personality: str, command: int, parameters: tuple[float, ...], autopilot_first: bool
+) -> None:
+    for capacity in (8, 0):
+        rig = rig_of(capacity=capacity)
+        autopilot = CameraTriggers(personality)
+        for turn in range(3):
+            rig.tick(3)
+            padded = (*parameters, *[0.0] * (7 - len(parameters)))
+            asked = mavlink.MAVLink_command_long_message(0, 0, command, 0, *padded)
+            made = autopilot.trigger(BOOT_US + turn * 3 * 10**6, UNIX_US + turn * 3 * 10**6)
+            made = [m for m in made if getattr(m, "target_component", 100) in (0, 100)]
+            if autopilot_first:
+                hear(rig, made)
+            rig.hear(asked)
+            if not autopilot_first:
+                hear(rig, made)
+        if capacity:
+            assert len(rig.fired) == 3
+        elif personality == "ardupilot":
+            assert (rig.fired, rig.shutter.statistics().refused) == ([], 3)
+
+
 LOST = ((4,), (4, 5, 6), (2, 9), ())
 
 

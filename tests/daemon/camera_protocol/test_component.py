@@ -469,7 +469,7 @@ def test_an_unsigned_heartbeat_does_not_decide_whose_camera_this_is(late_s: floa
 def test_feedback_is_a_shot_only_where_the_autopilot_fires(counts: bool) -> None:
     rig = Rig(feedback_is_shot=counts)
     rig.tick(4)
-    feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 0, 7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+    feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
     rig.hear(feedback, AUTOPILOT)
     rig.hear(feedback, (9, 1))  # somebody else's autopilot
     assert rig.fired == ([5] if counts else [])
@@ -480,7 +480,7 @@ def test_the_echo_of_an_order_is_no_wish_and_the_next_trigger_is_one() -> None:
     rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), AUTOPILOT)
     rig.tick(4)
     fire = mavlink.MAVLink_command_long_message(0, 0, mavlink.MAV_CMD_DO_DIGICAM_CONTROL, 0, 0, 0, 0, 0, 1, 0, 0)
-    feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 0, 7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+    feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
     for turn in range(2):
         assert rig.autopilot.command(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1)) is None
         rig.clock.advance(0.05)

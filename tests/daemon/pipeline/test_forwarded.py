@@ -183,3 +183,38 @@ def test_an_interval_that_only_the_camera_runs_keeps_its_own_pace() -> None:
         clock.advance(0.05)
         shutter.serve()
     assert len(sink.fired) == 5
+
+
+def test_a_broadcast_interval_that_is_sent_again_is_still_its_count() -> None:
+    """ArduPilot does not recognise a repeat: it begins again, with a trigger at once."""
+    clock, sink = RecordedClock(10**18, 10**18 - 10**9), FakeSink()
+    shutter = Shutter(sink, clock, next_index=0, capacity=1000)
+    autopilot = CameraTriggers()
+    asked = mavlink.MAVLink_command_long_message(0, 0, 2000, 0, 0, 2.0, 10, 7, 0, 0, 0)
+    request = CaptureRequest("mavlink:255/190", START, 7, 0, 0, broadcast=True)
+    for step in range(round(28 / 0.02)):
+        clock.advance(0.02)
+        answers = autopilot.due(step * 20_000, 10**15)
+        if step in (0, 25):
+            shutter.start_interval(request, 2.0, 10)
+            answers += autopilot.command(asked, step * 20_000, 10**15)
+        for message in answers:
+            if message.get_type() == "COMMAND_LONG":
+                shutter.request(CaptureRequest(VEHICLE, START, round(message.param4), 0, 0, autopilot=True))
+        shutter.serve()
+    assert len(sink.fired) == 10
+
+
+def test_the_autopilots_own_triggers_are_not_an_intervals_shots() -> None:
+    """A broadcast interval of 2 s beside a distance trigger of 1.5 s: 10 and 13 photographs, less those within 0.25 s.
+    When each trigger counted as the interval's, there were 13 in all."""
+    clock, sink = RecordedClock(10**18, 10**18 - 10**9), FakeSink()
+    shutter = Shutter(sink, clock, next_index=0, capacity=1000)
+    shutter.start_interval(CaptureRequest("mavlink:255/190", START, 7, 0, 0, broadcast=True), 2.0, 10)
+    for step in range(1, round(20.4 / 0.05)):
+        clock.advance(0.05)
+        if step % 30 == 15:
+            shutter.request(CaptureRequest(VEHICLE, START, step, 0, 0, autopilot=True))
+        shutter.serve()
+    assert len(sink.fired) >= 18
+    assert shutter.statistics().interval_s is None

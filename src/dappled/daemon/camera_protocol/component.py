@@ -30,10 +30,12 @@ from dappled.daemon.health.status_text import GroundStations, PilotMessages
 from dappled.daemon.pipeline.repeats import CaptureRequest, PacketDedup
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
+from dappled.refusals import LostTriggers
 
 HEARTBEAT_NS = 10**9
 STATUS_NS = 100_000_000
 _OLD_IMAGES_A_TICK = 2
+_IMAGES = 2**16  # img_idx has 16 bits
 
 
 class Component:
@@ -59,7 +61,8 @@ class Component:
         self._shutter, self._clock = shutter, clock
         self._model, self._earlier = model, earlier
         self._feedback_is_shot, self._cam_idx = feedback_is_shot or not shutter.fires, cam_idx
-        self._last_feedback = 0
+        self._last_feedback: int | None = None
+        self._stamps: deque[int] = deque(maxlen=64)
         self._status = CameraStatus(model, shutter, parameters, clock, component_id=links.component_id)
         self._intervals = MessageIntervals()
         self._commands = CameraCommands(shutter, clock, self._status, parameters, self._intervals)
@@ -198,15 +201,29 @@ class Component:
     def _is_trigger(self, feedback: MavlinkMessage) -> bool:
         """Whether a CAMERA_FEEDBACK reports a trigger of our camera.
 
-        ArduPilot sends one for each of its cameras at every trigger of one. The others repeat their last trigger, or
-        have neither time nor number. Without satellites it has no time, and then a new number shows a trigger.
+        ArduPilot sends one for each of its cameras at every trigger or contact of one. The others repeat their last
+        time, or have neither time nor number. Without a time, or before the autopilot's clock is known, a number that
+        is newer than the last one shows a trigger.
         """
         if feedback.cam_idx != self._cam_idx:
             return False
-        known, self._last_feedback = self._last_feedback, feedback.img_idx
-        if feedback.time_usec == 0:
-            return bool(feedback.img_idx not in (0, known))
-        return not self._autopilot.is_stale(feedback.time_usec)
+        time_us, image, known = int(feedback.time_usec), int(feedback.img_idx), self._last_feedback
+        newer = image == 1 and known != 1
+        if known is not None:
+            newer = newer or 0 < (image - known) % _IMAGES < _IMAGES // 2
+        if known is None or newer:
+            self._last_feedback = image
+        if time_us == 0:
+            return newer
+        if time_us in self._stamps:
+            return False
+        self._stamps.append(time_us)
+        stale = self._autopilot.is_stale(time_us)
+        if stale and newer and known is not None and self._feedback_is_shot:
+            late = LostTriggers(image, image, f"reported more than 5 s late, {self._here()}")
+            self._model.lost(late)
+            self.say(f"lost: the autopilot's {late.text()}", mavlink.MAV_SEVERITY_ERROR)
+        return newer if stale is None else not stale
 
     def _parameter(self, packet: Packet) -> None:
         message = packet.message

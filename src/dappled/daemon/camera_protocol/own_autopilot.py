@@ -151,11 +151,11 @@ class AutopilotNow:
             self._utc = int(message.time_unix_usec), now_ns
         return restarted
 
-    def is_stale(self, time_us: int, now_ns: int) -> bool:
+    def is_stale(self, time_us: int, now_ns: int) -> bool | None:
         """See `OwnAutopilot.is_stale`."""
         shown = self._utc if time_us >= EPOCH_US else self._boot
         if shown is None:
-            return False
+            return None
         age_us = shown[0] + (now_ns - shown[1]) // 1000 - time_us
         if time_us < _WRAP_US:
             age_us = (age_us + _WRAP_US // 2) % _WRAP_US - _WRAP_US // 2
@@ -243,9 +243,9 @@ class OwnAutopilot:
         now_ns = self._clock.monotonic_ns()
         return [one for numbers in self.numbers.values() for one in numbers.lost(now_ns)]
 
-    def is_stale(self, time_us: int) -> bool:
+    def is_stale(self, time_us: int) -> bool | None:
         """Whether a time of the autopilot's, in microseconds since boot (perhaps of 32 bits) or of UTC, is not about
-        now: more than `STALE_US` ago, or ahead. False where its clock is not known yet."""
+        now: more than `STALE_US` ago, or ahead. None where its clock is not known yet."""
         return self._now.is_stale(time_us, self._clock.monotonic_ns())
 
     def ask(self) -> None:

@@ -4,9 +4,9 @@ The expected time is the trigger call's plus the body's latency. The autopilot's
 camera's own clock stands in where the trigger call is unknown. Pure functions of what was observed, so a replay gets
 the same numbers.
 
-Hot-shoe feedback is CAMERA_FEEDBACK (ArduPilot: boot time with a feedback pin, else GPS epoch) and CAMERA_TRIGGER (PX4:
-boot time). Both are also sent for the mere command to fire, without a contact in the hot shoe. Such a message is
-recognised by its time: it is not after our own trigger call, and nothing exposes before that.
+Hot-shoe feedback is CAMERA_FEEDBACK with a time since boot (ArduPilot with a feedback pin). One with a GPS time, and
+CAMERA_TRIGGER (PX4), have the time of the command to fire. A contact counts if it is after our own trigger call:
+nothing exposes before that.
 
 Where the autopilot fires the body, its message comes before we know of the shot. Such a shot has the time of the
 message that created it (`TriggerMessage`). No other message is considered, and no call of ours is compared with it.
@@ -44,6 +44,7 @@ _UNSEEN_NS = 10**9  # how late a trigger call may be, where not even the file's 
 _REACH_SIGMAS = 4
 _REACH_NS = 10_000_000  # with the default 30 ms in all 130 ms: at 5 Hz the next shot's contact is farther away
 _AFTER_CALL_NS = 3_000_000
+_HEARD_NS = 300_000_000
 _OWN_NS = 2_500_000_000  # a message that a slow link repeats is the same until then
 _CAMERA_SHOTS_KEPT = 256
 _CAMERA_SHOTS_LEAST = 3
@@ -104,8 +105,7 @@ class ExposureTime:
 def owned(exposure: ExposureTime, shot: Shot, latency: BodyLatency) -> ExposureTime:
     """The expected exposure with the autopilot's message that created the shot, where that message is about it."""
     cause = shot.cause
-    kinds = ("CAMERA_FEEDBACK", "CAMERA_TRIGGER") if latency.fired_outside else ("CAMERA_FEEDBACK",)
-    if cause.kind not in kinds or cause.sequence is None:
+    if not latency.fired_outside or cause.kind not in ("CAMERA_FEEDBACK", "CAMERA_TRIGGER") or cause.sequence is None:
         return exposure
     return replace(exposure, trigger=TriggerMessage(cause.kind, cause.sequence, shot.wished_utc_ns, latency))
 
@@ -283,6 +283,7 @@ class Feedback:
     kind: str
     image: int = 0
     contact: bool = True
+    time_us: int = 0  # as it was sent
 
 
 def reach_ns(exposure: ExposureTime) -> int:
@@ -291,7 +292,7 @@ def reach_ns(exposure: ExposureTime) -> int:
 
 
 def choose_feedback(events: Sequence[Feedback], exposure: ExposureTime, clock: BootClock) -> Feedback | None:
-    """Choose the event of this exposure; None where there is none.
+    """Choose the contact of this exposure; None where there is none.
 
     It is the one nearest to when the exposure was expected to begin, within 4 σ + 10 ms of that (σ of the body and of
     the clocks), and after the trigger call. None also where two are so near that either may be it (half the nearer
@@ -306,7 +307,7 @@ def choose_feedback(events: Sequence[Feedback], exposure: ExposureTime, clock: B
     near = sorted(
         (abs(event.boot_ns - expected_ns), event.number, event)
         for event in events
-        if event.boot_ns >= earliest_ns and abs(event.boot_ns - expected_ns) <= within_ns
+        if event.contact and event.boot_ns >= earliest_ns and abs(event.boot_ns - expected_ns) <= within_ns
     )
     if not near:
         return None
@@ -317,14 +318,24 @@ def choose_feedback(events: Sequence[Feedback], exposure: ExposureTime, clock: B
 
 
 def own_feedback(events: Sequence[Feedback], trigger: TriggerMessage) -> Feedback | None:
-    """The message that created a shot, among those of the log; None where it had no time that can be used."""
+    """The message that created a shot, among those of the log; None where it had no time that can be used.
+
+    The last time with its number: while ArduPilot waits for a contact, another camera's report repeats the number of
+    the new trigger with the time of the contact before.
+    """
     mine = [
-        (abs(event.stamp_ns - trigger.heard_utc_ns), event.number, event)
+        (event.boot_ns, event.number, event)
         for event in events
         if (event.kind, event.image) == (trigger.kind, trigger.number)
+        and abs(event.stamp_ns - trigger.heard_utc_ns) < _OWN_NS
     ]
-    distance_ns, _, event = min(mine, default=(_OWN_NS, 0, None))
-    return event if distance_ns < _OWN_NS else None
+    return max(mine)[2] if mine else None
+
+
+def unseen(exposure: ExposureTime) -> ExposureTime:
+    """The exposure of a shot whose message had no time: it was before the message was heard, by an unknown delay."""
+    source = f"{REQUEST_SOURCE}; in doubt: the autopilot's message had no time that can be used"
+    return replace(exposure, sigma_ns=round(math.hypot(exposure.sigma_ns, _HEARD_NS)), source=source)
 
 
 def by_trigger(

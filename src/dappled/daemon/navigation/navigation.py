@@ -26,6 +26,7 @@ from dappled.daemon.navigation.clocks import (
     own_feedback,
     reach_ns,
     refine,
+    unseen,
 )
 from dappled.daemon.navigation.samples import HALF_MS_NS, AttitudeSample, PositionSample
 from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, USED_MESSAGES, Around, Counts, VehicleHistory
@@ -166,6 +167,7 @@ class Telemetry:
         if clock is not None:
             event = own_feedback(events, trigger) if trigger else choose_feedback(events, exposure, clock)
         if clock is None or event is None:
+            exposure = unseen(exposure) if trigger else exposure
             pose = self.pose_at(exposure.utc_ns, exposure.sigma_ns, upto_packet=limit)
             return _in_doubt(exposure, clock), pose
         sigma_ns = CONTACT_SIGMA_NS

@@ -51,6 +51,7 @@ _REQUESTS_KEPT = 64
 _UNSTEADY_NS = 10 * 10**9  # two steps within this time: the clock does not run steadily
 _FEW = 3
 _ANSWERS_COME_NS = 10**9
+_REPEATS = 64
 _AUTOPILOT = 1
 _FitKey = tuple[str | int, ...]  # what a fit was made from: its kind, the boot's first packet, the last packets
 
@@ -425,9 +426,13 @@ class VehicleHistory:
         boot_ns = None if now_ns is None else feedback_boot_ns(message, self.time.unix_minus_boot_ns, now_ns)
         if boot_ns is None or now_ns is None or abs(boot_ns - now_ns) > NEAREST_NS:
             return
+        time_us = int(message.time_usec)
+        image = message.img_idx if by_pin else message.seq
+        if any(one.time_us == time_us and one.image != image for one in self._feedbacks[-_REPEATS:]):
+            return  # the report of another camera repeats this one's last time, with the number of a trigger to come
         self.counts.feedbacks += 1
-        image, contact = (message.img_idx, message.time_usec < EPOCH_US) if by_pin else (message.seq, False)
-        keep(self._feedbacks, Feedback(number, stamp_ns, boot_ns, message.get_type(), image, contact))
+        contact = by_pin and time_us < EPOCH_US
+        keep(self._feedbacks, Feedback(number, stamp_ns, boot_ns, message.get_type(), image, contact, time_us))
 
     def _ours(self, message: MavlinkMessage) -> bool:
         if message.get_srcComponent() != 1:

@@ -173,6 +173,7 @@ class ForwardedRequests:
 
     def __init__(self) -> None:
         self._unpaired: deque[_Unpaired] = deque(maxlen=_UNPAIRED_KEPT)
+        self._refused: deque[tuple[int, bool, str]] = deque(maxlen=_UNPAIRED_KEPT)  # when, by the autopilot, why
 
     def partner(self, request: CaptureRequest, now_ns: int) -> int | None:
         """The image index of the shot that the other side's message got; None where there is none. It has its partner
@@ -186,6 +187,21 @@ class ForwardedRequests:
                 self._unpaired.remove(one)
                 return one.index
         return None
+
+    def refusal(self, request: CaptureRequest, now_ns: int) -> str | None:
+        """Why the other side's message was refused; None where none was. It has its partner then."""
+        while self._refused and now_ns - self._refused[0][0] > FORWARDED_NS:
+            self._refused.popleft()
+        for one in self._refused:
+            if (request.autopilot or request.broadcast) and one[1] != request.autopilot:
+                self._refused.remove(one)
+                return one[2]
+        return None
+
+    def refuse(self, request: CaptureRequest, now_ns: int, reason: str) -> None:
+        """A request was refused; so is its partner, which is not counted."""
+        if request.autopilot or request.broadcast:
+            self._refused.append((now_ns, request.autopilot, reason))
 
     def add(self, request: CaptureRequest, now_ns: int, index: int) -> None:
         """A request that belongs to shot `index` may have a partner that comes later."""

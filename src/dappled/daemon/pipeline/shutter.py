@@ -146,15 +146,17 @@ class Shutter:
         and not made up for.
 
         An autopilot that heard the same broadcast runs the interval as well, and requests each shot. From its first
-        request on these are the interval's shots; one that is 0.25 s late is taken without it. That holds for intervals
-        of 0.5 s and more.
+        request on these are the interval's shots where they come within 0.25 s of their time; one that is later is
+        taken without it. That holds for intervals of 0.5 s and more.
         """
         if not (math.isfinite(interval_s) and 0 <= interval_s <= 86400) or count < 0:
             with self._lock:
                 return self._refuse(request, "an interval must be 0 to 86400 s, and a count 0 or more")
         request = replace(request, series=(interval_s, float(count)))
         with self._lock:
-            if (known := self._recent.same(request, self._clock.monotonic_ns())) is not None:
+            now_ns = self._clock.monotonic_ns()
+            if (known := self._recent.same(request, now_ns)) is not None:
+                self._forwarded.add(request, now_ns, known)  # the autopilot begins again, with a trigger at once
                 return ShotDecision("duplicate", index=known)
             decision = self._judge(request)  # a duplicate of the autopilot's first request begins the interval as well
             if decision.accepted and count != 1:
@@ -261,6 +263,8 @@ class Shutter:
                 self._recent.add(request, now_ns, partner)
             self._follow_autopilot(request, now_ns, new=False)
             return ShotDecision("duplicate", index=partner)
+        if (refused := self._forwarded.refusal(request, now_ns)) is not None:
+            return ShotDecision("refused", reason=refused)  # the same request, which was counted already
         reason = self._why_not(happened=request.happened)
         if reason is None:
             shot = Shot(
@@ -271,6 +275,8 @@ class Shutter:
             except (OSError, FlightError) as error:
                 reason = f"the request could not be written down: {error}"
         if reason is not None:
+            self._forwarded.refuse(request, now_ns, reason)
+            self._follow_autopilot(request, now_ns, new=True)
             return self._refuse(request, reason)
         self._next_index += 1
         self._shots += 1
@@ -299,6 +305,9 @@ class Shutter:
         if not interval.driven:
             return
         if new:
+            expected_ns = interval.due_ns - FORWARDED_NS
+            if abs(now_ns - expected_ns) > FORWARDED_NS:
+                return  # a trigger of the autopilot's own
             interval.took()
         if interval.left == 0:
             self._interval = None
