@@ -39,7 +39,7 @@ def test_table_11_and_14_by_command(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize("name", ["m.png", "m.tif"])
 def test_make_writes_the_thesis_negative(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["mask", "make", "mask-2", "--size-mm", "2", "3", "-o", str(tmp_path / name)]
+    words = ["mask", "make", "mask-2", "--size-mm", "2", "3", "--overwrite", "-o", str(tmp_path / name)]
     told = _json([*words, "--negative"], capsys)
     assert told["period_px"] == [10, 10]
     negative = np.asarray(Image.open(tmp_path / name)).astype(int)
@@ -58,7 +58,7 @@ def test_make_warns_of_mask_4_and_compensates_film(tmp_path: Path, capsys: pytes
     err = capsys.readouterr().err
     assert err.count("warning: harmonic") == 6
     assert "left out" in err
-    assert main(["mask", "make", "--wedge", "11", "-o", out]) == 0
+    assert main(["mask", "make", "--wedge", "11", "--overwrite", "-o", out]) == 0
     assert len(np.unique(np.asarray(Image.open(out)))) == 11
 
 
@@ -158,3 +158,25 @@ def test_the_table_says_how_strong_each_order_is_and_what_takes_the_rest(capsys:
     assert told[92.0, 8, 8]["cause"] == "at 91 cycles/mm, which the film cannot draw"
     assert main([*words, "--focal-length", "50"]) == 0
     assert "averaged out over the stop" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["make", "mask-2", "--film", "300x200", "--density", "113.8", "-o"],
+        ["diffraction", "--mask", "mask-2", "--picture"],
+        ["design", "--altitude", "10", "--camera", "fujifilm-s5200", "--law", "geometric", "--focal-length", "63",
+         "--f-number", "8", "--film", "16k", "--picture"],
+    ],
+    ids=["make", "diffraction", "design"],
+)  # fmt: skip
+def test_a_picture_that_is_there_is_not_replaced_unasked(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "negative.png"
+    path.write_bytes(b"the only copy")
+    assert main(["mask", *words, str(path)]) == 1
+    assert "exists already: choose another name, or --overwrite replaces it" in capsys.readouterr().err
+    assert path.read_bytes() == b"the only copy"
+    assert main(["mask", *words, str(path), "--overwrite"]) == 0
+    assert path.read_bytes().startswith(b"\x89PNG")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from dappled.cli.arguments import add_overwrite, refuse_existing
 from dappled.cli.mask import arguments as mask_arguments
 from dappled.decode.optics import carrier_tables
 from dappled.decode.optics.film import FILMS
@@ -42,10 +43,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--mask", metavar="P", help="print the best focal length of this installed mask instead")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the carriers on the spectrum")
+    add_overwrite(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
+    if arguments.picture:
+        refuse_existing(arguments, arguments.picture)
     if arguments.mask:
         return _best(arguments)
     camera, sensor, length = mask_arguments.camera_set(arguments)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from dappled.cli.arguments import add_overwrite, refuse_existing
 from dappled.cli.mask import arguments as mask_arguments
 from dappled.cli.mask import make
 from dappled.config import profiles
@@ -40,6 +41,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--tolerance", type=float, default=0.5, metavar="MM", help="tolerance of the measurement (default: %(default)g)"
     )
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw what the wall should show")
+    add_overwrite(parser)
     parser.add_argument(
         "--image", type=Path, metavar="FILE", help="draw it for this mask image (a positive) instead of the design"
     )
@@ -50,6 +52,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    if arguments.picture:
+        refuse_existing(arguments, arguments.picture)
     known = profiles.mask(arguments.mask)
     wavelength, distance = arguments.wavelength, arguments.distance
     found = [(i, i.landing_mm(wavelength, distance)) for i in laser_bench.impulses(known.mask)]

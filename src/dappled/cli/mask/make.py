@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from dappled.cli.arguments import add_overwrite, refuse_existing
 from dappled.config import profiles
 from dappled.config.profiles import MaskProfile
 from dappled.config.schema import ConfigError
@@ -63,10 +64,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--wedge", type=int, nargs="?", const=21, metavar="STEPS", help="write a step wedge instead (default: 21 steps)"
     )
+    add_overwrite(parser)
     parser.add_argument("--json", action="store_true", help="print what was written as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
+    refuse_existing(arguments, arguments.output)
     chosen = _film(arguments)
     if arguments.size_mm:
         chosen = chosen.cut_to(*arguments.size_mm)
