@@ -63,7 +63,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--telemetry",
         type=Path,
         metavar="FILE",
-        help="telemetry for a folder of frames (default: the only .tlog in it)",
+        help="telemetry for a folder of frames: a .tlog, or ArduPilot's own log, a .bin (default: the only one in it)",
     )
     parser.add_argument("--white", metavar="FILE", help="white frame")
     parser.add_argument("--dark", metavar="FILE", help="dark frame")

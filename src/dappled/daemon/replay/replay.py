@@ -116,20 +116,22 @@ def of_folder(
     folder: Path, match: str, telemetry: Path | None, start_utc_ns: int | None, interval_s: float
 ) -> RecordedFlight:
     """Frames in a folder, in the order of their names; the first at `start_utc_ns` (None: the telemetry's first
-    position, or 1970 without telemetry), the others at `interval_s` after each other. A single .tlog in the folder is
-    the telemetry, where none is named."""
+    position, or 1970 without telemetry), the others at `interval_s` after each other. A single .tlog (or, without
+    one, a single .bin of ArduPilot) in the folder is the telemetry, where none is named."""
     if telemetry is not None and not telemetry.is_file():
         raise ReplayError(f"{telemetry}: there is no such telemetry file; check --telemetry")
     telemetry = telemetry or _only_log(folder)
-    if telemetry is not None and (kind := _other_log(telemetry)) is not None:
+    if telemetry is not None and _begins(telemetry, _ULOG):
         raise ReplayError(
-            f"{telemetry} is {kind}, not MAVLink telemetry: give the .tlog that a ground station recorded"
+            f"{telemetry} is a log of PX4 (ULog), not MAVLink telemetry: give the .tlog that a ground station recorded"
         )
     paths = [path for path in sorted(folder.glob(match)) if path.suffix.lower() in FRAME_SUFFIXES and path.is_file()]
     if not paths:
         raise ReplayError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
     if start_utc_ns is None:
         start_utc_ns = _first_position_utc_ns(telemetry) if telemetry else 0
+    elif telemetry is not None and _begins(telemetry, _DATAFLASH):
+        next(_packets(telemetry), None)  # a log that can't be used is refused before anything is replayed
     shots, files, expected = [], [], []
     for index, path in enumerate(paths):
         utc_ns = start_utc_ns + round(index * interval_s * 1e9)
@@ -148,8 +150,12 @@ def of_folder(
 
 def _only_log(folder: Path) -> Path | None:
     logs = sorted(folder.glob("*.tlog"))
+    kind = ".tlog"
+    if not logs:
+        kind = ".bin"
+        logs = sorted(path for path in folder.glob("*.[bB][iI][nN]") if path.is_file() and _begins(path, _DATAFLASH))
     if len(logs) > 1:
-        raise ReplayError(f"{folder} holds {len(logs)} .tlog files: say which with --telemetry")
+        raise ReplayError(f"{folder} holds {len(logs)} {kind} files: say which with --telemetry")
     return logs[0] if logs else None
 
 
@@ -286,11 +292,20 @@ def _recorded(digests: dict[int, tuple[str, str]], index: int) -> str | None:
 
 
 def _packets(path: Path) -> Iterator[tuple[int, int, MavlinkMessage]]:
+    """The messages of a .tlog or of ArduPilot's own log. Raises FlightError and DataFlashError."""
     decoder = PacketParser()
-    for number, stamp_us, raw in log_reading.read_telemetry(path):
+    for number, stamp_us, raw in _logged(path):
         message = decoder(raw)
         if message is not None:  # a packet with a wrong checksum was never acted on either
             yield number, stamp_us, message
+
+
+def _logged(path: Path) -> Iterator[tuple[int, int, bytes]]:
+    if not _begins(path, _DATAFLASH):
+        return log_reading.read_telemetry(path)
+    from dappled.drivers.mavlink import dataflash  # noqa: PLC0415  its reader takes a tenth of a second to load
+
+    return dataflash.packets(path)
 
 
 def _first_position_utc_ns(path: Path) -> int:
@@ -300,11 +315,10 @@ def _first_position_utc_ns(path: Path) -> int:
     return utc_ns
 
 
-_OTHER_LOGS = {b"ULog\x01\x12\x35": "a log of PX4 (ULog)", b"\xa3\x95\x80\x80": "a log of ArduPilot's own (DataFlash)"}
+_DATAFLASH = b"\xa3\x95\x80\x80"
+_ULOG = b"ULog\x01\x12\x35"
 
 
-def _other_log(path: Path) -> str | None:
-    """What an autopilot's own log is called, by how it begins; None for any other file."""
-    with path.open("rb") as file:
-        start = file.read(8)
-    return next((kind for magic, kind in _OTHER_LOGS.items() if start.startswith(magic)), None)
+def _begins(path: Path, magic: bytes) -> bool:
+    with open(path, "rb", opener=durable.without_waiting) as file:
+        return file.read(len(magic)) == magic
