@@ -34,6 +34,8 @@ log = logging.getLogger(__name__)
 
 LATENCY_SOURCE = "trigger call + body latency"
 REQUEST_SOURCE = "wish + body latency"
+TAGGING_RULES = 2  # recorded with each flight. 1: those of flights that were recorded without a number
+_REACH_1_NS = 50_000_000
 CAMERA_SOURCE = "camera clock (EXIF)"
 CONTACT_SIGMA_NS = 1_000_000  # interrupt and contact bounce; the best bodies were measured at 0.56 ms
 EPOCH_US = 10**15  # 2001; no autopilot has been running for that long
@@ -253,7 +255,7 @@ def _line(x: Floats, y: Floats, weight: Floats) -> tuple[Floats, Floats, Floats]
     return found, inverse, y - found @ sides
 
 
-def from_arrivals(arrivals: Sequence[tuple[int, int]]) -> BootClock | None:
+def from_arrivals(arrivals: Sequence[tuple[int, int]], rules: int = TAGGING_RULES) -> BootClock | None:
     """Take the least of (arrival − boot time) over `arrivals`, pairs (boot_ns, received_utc_ns); None from none.
 
     It is late by the delay of the quickest packet, which can't be observed: sigma allows 5 ms for it, and a tenth of
@@ -266,7 +268,8 @@ def from_arrivals(arrivals: Sequence[tuple[int, int]]) -> BootClock | None:
     since_ns = max(received for _, received in arrivals) - _RECENT_NS
     later_ns = min(received - boot for boot, received in arrivals if received >= since_ns) - offsets[0]
     median_excess = offsets[len(offsets) // 2] - offsets[0]
-    sigma_ns = math.hypot(_ARRIVAL_FLOOR_NS, 0.1 * median_excess, later_ns)
+    parts = (_ARRIVAL_FLOOR_NS, 0.1 * median_excess, later_ns)
+    sigma_ns = math.hypot(*parts) if rules > 1 else math.hypot(*parts[:2])
     return BootClock("arrival", arrivals[-1][0], offsets[0], 0.0, sigma_ns)
 
 
@@ -286,12 +289,14 @@ class Feedback:
     time_us: int = 0  # as it was sent
 
 
-def reach_ns(exposure: ExposureTime) -> int:
+def reach_ns(exposure: ExposureTime, rules: int = TAGGING_RULES) -> int:
     """How far from its expected time an exposure may be."""
-    return _REACH_SIGMAS * exposure.sigma_ns + _REACH_NS
+    return _REACH_SIGMAS * exposure.sigma_ns + (_REACH_NS if rules > 1 else _REACH_1_NS)
 
 
-def choose_feedback(events: Sequence[Feedback], exposure: ExposureTime, clock: BootClock) -> Feedback | None:
+def choose_feedback(
+    events: Sequence[Feedback], exposure: ExposureTime, clock: BootClock, rules: int = TAGGING_RULES
+) -> Feedback | None:
     """Choose the contact of this exposure; None where there is none.
 
     It is the one nearest to when the exposure was expected to begin, within 4 σ + 10 ms of that (σ of the body and of
@@ -300,7 +305,7 @@ def choose_feedback(events: Sequence[Feedback], exposure: ExposureTime, clock: B
     """
     if exposure.called_utc_ns is None:
         return None
-    within_ns = reach_ns(exposure) + _REACH_SIGMAS * clock.sigma_ns
+    within_ns = reach_ns(exposure, rules) + _REACH_SIGMAS * clock.sigma_ns
     expected_ns = clock.boot_ns(exposure.utc_ns - exposure.half_ns)
     # command and contact can be told apart no better than the clocks agree
     earliest_ns = clock.boot_ns(exposure.called_utc_ns) + max(_AFTER_CALL_NS, 3 * clock.sigma_ns)

@@ -17,6 +17,7 @@ from dappled.clock import Clock
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation.clocks import (
     CONTACT_SIGMA_NS,
+    TAGGING_RULES,
     BootClock,
     ExposureTime,
     UtcCorrection,
@@ -77,7 +78,8 @@ class Telemetry:
 
     `vehicles` are (packet number, system id) in order, as a recorded flight followed them. `component_id` is our own
     (see AutopilotTime), `cam_idx` our camera's number in CAMERA_FEEDBACK. `attitude_sigma_rad` is how well the
-    autopilot knows its attitude, where it doesn't say; 0 is not known. All methods may be called from any thread.
+    autopilot knows its attitude, where it doesn't say; 0 is not known. `rules`
+    are those of the flight (`TAGGING_RULES`). All methods may be called from any thread.
     """
 
     def __init__(
@@ -87,13 +89,14 @@ class Telemetry:
         component_id: int = 100,
         cam_idx: int = 0,
         attitude_sigma_rad: float = 0.0,
+        rules: int = TAGGING_RULES,
     ) -> None:
-        self._turns = deque(vehicles)
+        self._turns, self._rules = deque(vehicles), rules
         self._component_id, self._cam_idx, self._attitude_sigma_rad = component_id, cam_idx, attitude_sigma_rad
         self._lock = threading.Lock()
         self._packets = self._prune_at = 0
         self._counts = Counts()
-        self._history = VehicleHistory(None, component_id, self._counts, cam_idx=cam_idx)
+        self._history = VehicleHistory(None, component_id, self._counts, cam_idx=cam_idx, rules=rules)
 
     def feed(self, number: int, stamp_us: int, message: MavlinkMessage) -> None:
         """Take one packet. Numbers must rise. Messages that are not used only count."""
@@ -101,7 +104,9 @@ class Telemetry:
             while self._turns and self._turns[0][0] <= number:
                 _, system_id = self._turns.popleft()
                 if system_id != self._history.system_id:
-                    self._history = VehicleHistory(system_id, self._component_id, self._counts, cam_idx=self._cam_idx)
+                    self._history = VehicleHistory(
+                        system_id, self._component_id, self._counts, cam_idx=self._cam_idx, rules=self._rules
+                    )
             self._packets = number + 1
             if message.get_type() not in USED_MESSAGES:
                 return
@@ -147,7 +152,7 @@ class Telemetry:
         Samples from after it have arrived, and, from an autopilot that reports the hot shoe, everything that it could
         report about this exposure.
         """
-        later_ns = reach_ns(exposure) if self._counts.feedbacks else 0
+        later_ns = reach_ns(exposure, self._rules) if self._counts.feedbacks else 0
         return self.bracketed(exposure.utc_ns + later_ns)
 
     def locate(self, exposure: ExposureTime, *, upto_packet: int | None = None) -> tuple[ExposureTime, Pose]:
@@ -162,10 +167,10 @@ class Telemetry:
             limit = self._packets if upto_packet is None else upto_packet
             clock = self._history.clock(limit, exposure.utc_ns)
             events = self._history.feedbacks(limit, exposure.utc_ns)
-        trigger = exposure.trigger
+        trigger = exposure.trigger if self._rules > 1 else None
         event = None
         if clock is not None:
-            event = own_feedback(events, trigger) if trigger else choose_feedback(events, exposure, clock)
+            event = own_feedback(events, trigger) if trigger else choose_feedback(events, exposure, clock, self._rules)
         if clock is None or event is None:
             exposure = unseen(exposure) if trigger else exposure
             pose = self.pose_at(exposure.utc_ns, exposure.sigma_ns, upto_packet=limit)
@@ -199,7 +204,7 @@ class Telemetry:
             else:
                 sigma_ns = utc_sigma_ns
             at = self._history.around(utc_ns, boot_ns, sigma_ns, limit, placed=not clock.doubt)
-        return pose_around(at, packets=limit, attitude_sigma_rad=self._attitude_sigma_rad)
+        return pose_around(at, packets=limit, attitude_sigma_rad=self._attitude_sigma_rad, rules=self._rules)
 
     def clock_problem(self, utc_ns: int) -> str | None:
         """A sentence where the autopilot's clock has stepped in the last minute."""
@@ -306,7 +311,7 @@ def first_position_utc_ns(packets: Iterable[tuple[int, int, MavlinkMessage]]) ->
     return None
 
 
-def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) -> Pose:
+def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, rules: int = TAGGING_RULES) -> Pose:
     """The pose at an instant, from `packets` packets.
 
     Position: cubic Hermite with the reported velocities. Attitude and gimbal: slerp. With one sample only, that one,
@@ -315,7 +320,7 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) ->
     attitude's own, as the autopilot reports it, else `attitude_sigma_rad` (without either the attitude's are None).
     """
     sigma_s = math.hypot(at.sigma_ns, HALF_MS_NS / math.sqrt(3)) / 1e9
-    attitude, attitude_sigma, attitude_covariance = _attitude(at, sigma_s, attitude_sigma_rad)
+    attitude, attitude_sigma, attitude_covariance = _attitude(at, sigma_s, attitude_sigma_rad, rules)
     gimbal, gimbal_source = _gimbal(at, attitude)
     made = replace(
         unknown_pose(at.utc_ns, packets),
@@ -418,14 +423,16 @@ def attitude_at(samples: Sequence[AttitudeSample], boot_ns: int) -> tuple[Quater
     return slerp(a.attitude, b.attitude, share), doubt
 
 
-def _attitude(at: Around, sigma_s: float, own_rad: float) -> tuple[Quaternion | None, float | None, Symmetric | None]:
+def _attitude(
+    at: Around, sigma_s: float, own_rad: float, rules: int
+) -> tuple[Quaternion | None, float | None, Symmetric | None]:
     """Attitude, σ of the whole rotation, and the covariance where the body's rates are known."""
     samples = at.attitudes
     if not samples:
         return None, None, None
     found, doubt = attitude_at(samples, at.boot_ns)
     reported_rad = max((sample.sigma_rad for sample in samples if sample.sigma_rad is not None), default=own_rad)
-    if reported_rad <= 0:
+    if reported_rad <= 0 and rules > 1:
         return found, None, None  # the error of the interpolation alone says nothing about the autopilot's own
     rates = max((s.rates_rad_s for s in samples if s.rates_rad_s is not None), key=norm, default=None)
     if len(samples) == 1:

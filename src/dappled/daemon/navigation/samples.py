@@ -179,7 +179,9 @@ def _scaled(value: int, unknown: int, parts: int) -> float | None:
     return value / parts if 0 < value < unknown else None
 
 
-def feedback_boot_ns(message: MavlinkMessage, unix_minus_boot_ns: int | None, now_boot_ns: int) -> int | None:
+def feedback_boot_ns(
+    message: MavlinkMessage, unix_minus_boot_ns: int | None, now_boot_ns: int, *, unwrap: bool = True
+) -> int | None:
     """The message's time since boot. None for 0, which is no time, and for a GPS time before SYSTEM_TIME has given the
     offset.
 
@@ -191,7 +193,7 @@ def feedback_boot_ns(message: MavlinkMessage, unix_minus_boot_ns: int | None, no
         return None
     if time_us >= EPOCH_US:
         return None if unix_minus_boot_ns is None else time_us * 1000 - unix_minus_boot_ns
-    if message.get_type() == "CAMERA_FEEDBACK" and time_us < _WRAP_US:
+    if unwrap and message.get_type() == "CAMERA_FEEDBACK" and time_us < _WRAP_US:
         time_us += max(0, round((now_boot_ns // 1000 - time_us) / _WRAP_US)) * _WRAP_US
     return time_us * 1000
 

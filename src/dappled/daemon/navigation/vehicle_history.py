@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from dappled.daemon.navigation import samples as telemetry_samples
 from dappled.daemon.navigation.clocks import (
     EPOCH_US,
+    TAGGING_RULES,
     BootClock,
     Feedback,
     TimesyncAnswer,
@@ -112,8 +113,8 @@ class AutopilotTime:
     better observation has arrived.
     """
 
-    def __init__(self, component_id: int) -> None:
-        self._component_id = component_id
+    def __init__(self, component_id: int, rules: int = TAGGING_RULES) -> None:
+        self._component_id, self._rules = component_id, rules
         self._answers: list[TimesyncAnswer] = []
         self._requests: dict[int, int] = {}
         self._epochs = [Epoch(0, 0, 0)]
@@ -175,6 +176,8 @@ class AutopilotTime:
         """Which epoch: the last one below `limit`, or that of an instant; between two, where either may be right, the
         later one."""
         at = max(0, bisect_left(self._epochs, limit, key=lambda one: one.number) - 1)
+        if self._rules < 2:
+            return at
         while utc_ns is not None and at > 0 and utc_ns <= self._epochs[at].before_ns:
             at -= 1
         return at
@@ -212,7 +215,7 @@ class AutopilotTime:
             return  # from before or after a reboot that the telemetry has yet to show
         del self._requests[message.ts1]  # the same answer on a second link is not a second observation
         known = between(self._answers, self._epochs[-1].number, number)
-        by_ns = step_ns(known, answer)
+        by_ns = step_ns(known, answer) if self._rules > 1 else None
         if by_ns is not None:
             self._epochs.append(Epoch(number, known[-1].stamp_ns, stamp_ns, by_ns))
             self.steps += 1
@@ -255,7 +258,9 @@ class AutopilotTime:
                 return clock
         tails = [last(between(one, first, limit), ARRIVAL_WINDOW_NS) for one in histories]
         key: _FitKey = ("arrival", first, *(tail[-1].number for tail in tails if tail))
-        return self._fit(key, lambda: from_arrivals([(one.boot_ns, one.stamp_ns) for tail in tails for one in tail]))
+        return self._fit(
+            key, lambda: from_arrivals([(one.boot_ns, one.stamp_ns) for tail in tails for one in tail], self._rules)
+        )
 
     def _fit(self, key: _FitKey, make: Callable[[], BootClock | None]) -> BootClock | None:
         if self._fitted[0] != key:
@@ -276,7 +281,8 @@ class AutopilotTime:
 class Gimbals:
     """Attitudes of the first gimbal heard. MOUNT_ORIENTATION counts until it sends the modern message."""
 
-    def __init__(self) -> None:
+    def __init__(self, rules: int = TAGGING_RULES) -> None:
+        self._rules = rules
         self._samples: list[GimbalSample] = []
         self.seen = 0
 
@@ -314,7 +320,8 @@ class Gimbals:
             known = between(known, first, limit)
         samples = [sample for sample in known if sample.epoch == known[-1].epoch]
         if samples and samples[0].component != _AUTOPILOT:
-            clock = from_arrivals([(one.boot_ns, one.stamp_ns) for one in last(samples, ARRIVAL_WINDOW_NS)])
+            arrivals = [(one.boot_ns, one.stamp_ns) for one in last(samples, ARRIVAL_WINDOW_NS)]
+            clock = from_arrivals(arrivals, self._rules)
             assert clock is not None
             boot_ns = clock.boot_ns(utc_ns)
         return around(samples, boot_ns, gap_ns=GIMBAL_GAP_NS), boot_ns
@@ -331,10 +338,18 @@ class VehicleHistory:
     (see AutopilotTime), `cam_idx` our camera's number at the autopilot. Not thread-safe.
     """
 
-    def __init__(self, system_id: int | None, component_id: int, counts: Counts, *, cam_idx: int = 0) -> None:
-        self.system_id, self.counts, self._cam_idx = system_id, counts, cam_idx
-        self.time = AutopilotTime(component_id)
-        self.gimbals = Gimbals()
+    def __init__(
+        self,
+        system_id: int | None,
+        component_id: int,
+        counts: Counts,
+        *,
+        cam_idx: int = 0,
+        rules: int = TAGGING_RULES,
+    ) -> None:
+        self.system_id, self.counts, self._cam_idx, self._rules = system_id, counts, cam_idx, rules
+        self.time = AutopilotTime(component_id, rules)
+        self.gimbals = Gimbals(rules)
         self._positions: list[PositionSample] = []
         self._attitudes: list[AttitudeSample] = []
         self._receiver: list[GnssSample] = []
@@ -419,19 +434,23 @@ class VehicleHistory:
 
     def _feedback(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         """ArduPilot reports every camera at each trigger of one: only our camera's message counts."""
-        by_pin = message.get_type() == "CAMERA_FEEDBACK"
-        if not self._ours(message) or (by_pin and message.cam_idx != self._cam_idx):
+        by_pin, older = message.get_type() == "CAMERA_FEEDBACK", self._rules < 2
+        if not self._ours(message) or (by_pin and message.cam_idx != self._cam_idx and not older):
             return
         now_ns = self.time.now_boot_ns
-        boot_ns = None if now_ns is None else feedback_boot_ns(message, self.time.unix_minus_boot_ns, now_ns)
+        boot_ns = (
+            None
+            if now_ns is None
+            else feedback_boot_ns(message, self.time.unix_minus_boot_ns, now_ns, unwrap=not older)
+        )
         if boot_ns is None or now_ns is None or abs(boot_ns - now_ns) > NEAREST_NS:
             return
         time_us = int(message.time_usec)
         image = message.img_idx if by_pin else message.seq
-        if any(one.time_us == time_us and one.image != image for one in self._feedbacks[-_REPEATS:]):
+        if not older and any(one.time_us == time_us and one.image != image for one in self._feedbacks[-_REPEATS:]):
             return  # the report of another camera repeats this one's last time, with the number of a trigger to come
         self.counts.feedbacks += 1
-        contact = by_pin and time_us < EPOCH_US
+        contact = older or (by_pin and time_us < EPOCH_US)
         keep(self._feedbacks, Feedback(number, stamp_ns, boot_ns, message.get_type(), image, contact, time_us))
 
     def _ours(self, message: MavlinkMessage) -> bool:

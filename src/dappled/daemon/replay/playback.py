@@ -56,7 +56,9 @@ def run(
             decoder = DecodeProcess(recipe)
             stack.callback(decoder.close)
             decoder.warm_up()
-        telemetry = RecordedTelemetry.flown(flown.settings, recording.telemetry, recording.horizons, recording.vehicles)
+        telemetry = RecordedTelemetry.flown(
+            flown.settings, recording.telemetry, recording.horizons, recording.vehicles, rules=recording.rules
+        )
         publisher = None
         if publish is not None:
             publisher = _open_publisher(publish, writer, decoder, stack)

@@ -9,12 +9,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import sleep
-from typing import Self
+from typing import Any, Self
 
 from dappled import __version__, confined, durable
 from dappled.clock import RecordedClock
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_vehicles
+from dappled.daemon.navigation.clocks import TAGGING_RULES
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
 from dappled.daemon.replay.verifier import Expected, ReplayVerifier, ResultWriter
@@ -45,7 +46,8 @@ class ReplayError(DappledError):
 class RecordedFlight:
     """What is to be replayed: shots in order with their files, the telemetry beside them, and what was recorded of
     each. `horizons` says how many telemetry packets a frame's pose was made from; `vehicles` whose they were (see
-    `Telemetry`); `elsewhere` another platform or other versions that it was recorded with."""
+    `Telemetry`); `elsewhere` another platform or other versions that it was recorded with; `rules` those it was
+    tagged by."""
 
     root: Path
     shots: Sequence[Shot]
@@ -55,6 +57,7 @@ class RecordedFlight:
     horizons: dict[int, int]
     vehicles: Sequence[tuple[int, int]] = ()
     elsewhere: str | None = None
+    rules: int = TAGGING_RULES
 
 
 def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
@@ -96,7 +99,9 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
     telemetry = flight.telemetry if flight.telemetry.is_file() else None
     horizons = {index: pose.telemetry_packets for index, pose in poses.items()}
     elsewhere = _elsewhere(made_by.get("software", {}))
-    return RecordedFlight(folder, [row.shot for row in rows], files, expected, telemetry, horizons, turns, elsewhere)
+    shots = [row.shot for row in rows]
+    rules = tagging_rules(layout.read_facts(flight))
+    return RecordedFlight(folder, shots, files, expected, telemetry, horizons, turns, elsewhere, rules)
 
 
 def _elsewhere(recorded: Mapping[str, str]) -> str | None:
@@ -159,6 +164,12 @@ def _only_log(folder: Path) -> Path | None:
     return logs[0] if logs else None
 
 
+def tagging_rules(facts: Mapping[str, Any]) -> int:
+    """The rules that a flight was tagged by, of its flight.toml."""
+    found = facts.get("tagging_rules")
+    return found if isinstance(found, int) and not isinstance(found, bool) else 1
+
+
 class RecordedTelemetry:
     """Poses from a telemetry file, fed packet by packet just as far as each frame's pose was made from."""
 
@@ -172,18 +183,30 @@ class RecordedTelemetry:
         component_id: int = 100,
         cam_idx: int = 0,
         attitude_sigma_rad: float = 0.0,
+        rules: int = TAGGING_RULES,
     ) -> None:
-        """`vehicles`, `component_id`, `cam_idx` and `attitude_sigma_rad` are those that the recording daemon had."""
+        """`vehicles`, `component_id`, `cam_idx`, `attitude_sigma_rad` and `rules` are those that the recording daemon
+        had."""
         self._horizons, self._wait_ns = horizons, round(wait_s * 1e9)
         self._telemetry = Telemetry(
-            vehicles=vehicles, component_id=component_id, cam_idx=cam_idx, attitude_sigma_rad=attitude_sigma_rad
+            vehicles=vehicles,
+            component_id=component_id,
+            cam_idx=cam_idx,
+            attitude_sigma_rad=attitude_sigma_rad,
+            rules=rules,
         )
         self._packets = _packets(path) if path else iter(())
         self._fed = 0
 
     @classmethod
     def flown(
-        cls, settings: Settings, path: Path | None, horizons: dict[int, int], vehicles: Sequence[tuple[int, int]]
+        cls,
+        settings: Settings,
+        path: Path | None,
+        horizons: dict[int, int],
+        vehicles: Sequence[tuple[int, int]],
+        *,
+        rules: int,
     ) -> Self:
         """As the daemon of these settings had it."""
         return cls(
@@ -194,6 +217,7 @@ class RecordedTelemetry:
             component_id=settings.mavlink.component_id,
             cam_idx=settings.mavlink.cam_idx,
             attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
+            rules=rules,
         )
 
     def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
