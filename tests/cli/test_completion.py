@@ -35,6 +35,7 @@ def test_bash_offers_verbs_actions_options_and_choices(capsys: pytest.CaptureFix
     assert offered(made, "geo") == {"geotag", "georeference"}
     assert {"make", "table", "diffraction"} <= offered(made, "mask", "")
     assert "--tile" in offered(made, "mask", "make", "--") or "--output" in offered(made, "mask", "make", "--")
+    assert offered(made, "decode", "/etc/pass") >= {"/etc/passwd"}  # a file, beside what else may come
     assert "--overwrite" in offered(made, "decode", "frame.dng", "--o")
     assert offered(made, "completion", "") >= {"bash", "zsh", "fish"}
     assert "--simulate" in offered(made, "--debug", "run", "--s")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled.cli import decode_arguments, parser
+from dappled.cli import decode_arguments, main, parser
 from dappled.cli.arguments import OutputExistsError, refuse_existing
 from dappled.errors import DappledError
 
@@ -25,9 +25,10 @@ def test_a_folder_stands_for_the_frames_in_it(tmp_path: Path) -> None:
     flight, folder = tmp_path / "flight", tmp_path / "card"
     (flight / "frames").mkdir(parents=True)
     folder.mkdir()
-    for name in ("000001.cr2", "000000.cr2", "000000.jpg", "000000.cr2.xmp"):
+    (flight / "flight.toml").touch()
+    for name in ("000001.cr2", "000000.cr2", "000000.jpg", "000000.cr2.xmp", "stray-1.cr2"):
         (flight / "frames" / name).touch()
-    for name in ("B.RAF", "A.dng", "notes.txt"):
+    for name in ("B.RAF", "A.dng", "notes.txt", "._B.RAF"):
         (folder / name).touch()
     alone = tmp_path / "one.dng"
     found = decode_arguments.frames([alone, flight, folder])
@@ -54,3 +55,27 @@ def test_what_is_there_is_refused_by_name_and_with_the_remedy(tmp_path: Path) ->
             refuse_existing(kept, tmp_path / "new.png", path)
     refuse_existing(kept, tmp_path / "new.png")
     refuse_existing(argparse.Namespace(overwrite=True), there)
+
+
+@pytest.mark.parametrize("given", ["c", "c.toml", "c.npz"])
+@pytest.mark.parametrize("there", ["c.toml", "c.npz"])
+def test_a_calibration_replaces_neither_of_its_files_unasked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], given: str, there: str
+) -> None:
+    (tmp_path / there).write_bytes(b"of before")
+    assert main(["calibrate", "x.dng", "--mask", "mask-2", "-o", str(tmp_path / given)]) == 1
+    assert f"{there} exists already: " in capsys.readouterr().err
+    assert (tmp_path / there).read_bytes() == b"of before"
+
+
+@pytest.mark.parametrize(("kind", "words"), [("npz", "--overwrite replaces it"), ("mat", "move it away")])
+def test_an_export_is_refused_with_a_remedy_that_works(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, words: str
+) -> None:
+    out = tmp_path / "out.npz"
+    out.touch()
+    assert main(["export", "x.zarr", "--as", kind, "-o", str(out)]) == 1
+    assert words in capsys.readouterr().err
+    if kind == "mat":
+        assert main(["export", "x.zarr", "--as", kind, "-o", str(tmp_path / "new.mat"), "--overwrite"]) == 1
+        assert "remove what is there yourself" in capsys.readouterr().err

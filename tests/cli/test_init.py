@@ -21,7 +21,7 @@ def proposed(found: list[UsbBody], serial: list[str]) -> dict[str, str]:
 
 def test_what_is_plugged_in_is_proposed() -> None:
     assert proposed([CANON_450D], ["/dev/ttyACM0,115200"])["--body"] == "canon-eos-450d"
-    assert proposed([S5200], [])["--body"] == "fujifilm-s5200"
+    assert proposed([S5200], [])["--body"] == ""  # any body of that make may be one: a person says
     assert proposed([], [])["--body"] == "auto"
     assert proposed([], ["/dev/ttyACM0,115200"])["--link"] == "/dev/ttyACM0,115200"
     assert proposed([], [])["--link"].startswith("udpin:")
@@ -94,3 +94,17 @@ def test_what_config_check_refuses_is_not_written(
 def test_without_a_person_the_mask_must_be_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["init", str(tmp_path / "x.toml"), "--json"]) == 1
     assert "give --mask" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("alone")
+def test_a_body_that_usb_can_t_fire_gets_its_driver_and_needs_a_shutter(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "x.toml"
+    words = ["init", str(file), "--body", "fujifilm-s5200", "--mask", "mask-2", "--link", "none"]
+    assert main([*words, "--json"]) == 1
+    assert "give --shutter" in capsys.readouterr().err
+    assert main([*words, "--shutter", "autopilot", "--json"]) == 0
+    loaded = settings.load(file)
+    assert (loaded.camera.driver, loaded.camera.shutter) == ("fujifilm", "autopilot")
+    assert main(["config", "check", str(file)]) == 0

@@ -20,12 +20,14 @@ _dappled() {{
   case "$at" in
 {cases}
   esac
-  COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
-  [ ${{#COMPREPLY[@]}} -gt 0 ] || COMPREPLY=($(compgen -f -- "${{COMP_WORDS[COMP_CWORD]}}"))
+  local now="${{COMP_WORDS[COMP_CWORD]}}" files=""
+  case "$at" in ?*) case "$now" in -*) ;; *) files=yes ;; esac ;; esac
+  local IFS=$'\n'
+  COMPREPLY=($(compgen -W "${{words// /$'\n'}}" -- "$now") ${{files:+$(compgen -f -- "$now")}})
 }}
 complete -o filenames -F _dappled dappled
 """
-_ZSH = "autoload -U +X bashcompinit && bashcompinit\n"
+_ZSH = "autoload -Uz compinit && compinit\nautoload -U +X bashcompinit && bashcompinit\n"
 _WHERE = {
     "bash": "~/.local/share/bash-completion/completions/dappled",
     "zsh": "a file that ~/.zshrc sources",

@@ -15,6 +15,7 @@ from dappled.errors import DappledError
 from dappled.products import opened
 from dappled.products.opened import OpenedLightField
 
+# No JPEG: beside a raw file it is the same picture again. One that is named is taken.
 FRAME_SUFFIXES = (".arw", ".cr2", ".dng", ".lfp", ".lfr", ".nef", ".npy", ".png", ".raf", ".tif", ".tiff")
 
 
@@ -30,7 +31,7 @@ def add_frames(parser: argparse.ArgumentParser, count: str) -> None:
 
 
 def frames(given: Sequence[Path]) -> list[Path]:
-    """The frames that were named, and those in the folders that were: of a flight, those in its record.
+    """The frames that were named, and those in the folders that were: of a flight, those in its folder of frames.
 
     Raises DappledError for a folder without frames.
     """
@@ -39,13 +40,19 @@ def frames(given: Sequence[Path]) -> list[Path]:
         if not path.is_dir():
             found.append(path)
             continue
-        folder = path / "frames" if (path / "frames").is_dir() else path
-        inside = sorted(one for one in folder.iterdir() if one.suffix.lower() in FRAME_SUFFIXES and one.is_file())
+        flight = (path / "flight.toml").is_file()
+        folder = path / "frames" if flight else path
+        inside = sorted(one for one in folder.iterdir() if _is_frame(one) and (not flight or one.stem.isdigit()))
         if not inside:
             kinds = ", ".join(FRAME_SUFFIXES)
             raise DappledError(f"{folder} holds no frame ({kinds}): name frames, a folder of frames, or a flight")
         found += inside
     return found
+
+
+def _is_frame(path: Path) -> bool:
+    """Whether a name is a frame's. Hidden ones are what other systems leave on cards, or half-written."""
+    return path.suffix.lower() in FRAME_SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
 def add_law(parser: argparse.ArgumentParser) -> None:

@@ -21,6 +21,9 @@ KINDS = {
 }  # fmt: skip
 
 
+REPLACED = ("h5", "npz", "zarr", "rerun")
+
+
 def configure(parser: argparse.ArgumentParser) -> None:
     lines = "\n".join(f"  {name:6} {what}" for name, what in KINDS.items())
     parser.epilog = f"formats:\n{lines}\n\nexample: dappled export frame.zarr --as hci -o hci/frame"
@@ -42,11 +45,21 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    refuse_existing(arguments, arguments.output)
+    _make_room(arguments)
     found = decode_arguments.opened_field(arguments)
     written = write(found, arguments.kind, arguments.output, arguments)
     print(json.dumps({"file": str(written), "as": arguments.kind}) if arguments.json else written)
     return 0
+
+
+def _make_room(arguments: argparse.Namespace) -> None:
+    """Refuse an output that exists before the work is done. Raises DappledError. A quilt's name is known only then."""
+    if arguments.kind in REPLACED:
+        refuse_existing(arguments, arguments.output)
+    elif arguments.overwrite:
+        raise exports.ExportError(f"--overwrite goes with --as {', '.join(REPLACED)}: remove what is there yourself")
+    elif arguments.kind != "quilt" and arguments.output.exists():
+        raise exports.ExportError(f"{arguments.output} exists already: move it away, or choose another name")
 
 
 def write(found: OpenedLightField, kind: str, path: Path, arguments: argparse.Namespace) -> Path:

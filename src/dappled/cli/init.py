@@ -12,6 +12,7 @@ from typing import Any
 
 import tomli_w
 
+from dappled import durable
 from dappled.cli.arguments import add_overwrite, refuse_existing
 from dappled.config import profiles, settings
 from dappled.config.settings import RecordSettings
@@ -22,6 +23,7 @@ from dappled.errors import DappledError
 
 ANY, NONE = "auto", "none"
 FLIGHTS = RecordSettings().directory
+WIRED = "fujifilm"  # bodies of this make are fired by a line, not over USB
 _SERIAL = ("ttyACM*", "ttyUSB*", "ttyAMA0", "serial0", "ttyTHS1")
 _BAUD = {"ttyACM": ",115200", "ttyUSB": ",57600"}  # USB of an autopilot; a telemetry radio
 _WIRED_BAUD = ",921600"
@@ -49,6 +51,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="settings file to write")
     parser.add_argument("--body", metavar="P", help="camera profile or TOML file, or auto: the one that fits the body")
+    parser.add_argument("--shutter", metavar="LINE", help="Fujifilm: what fires it (camera.shutter)")
     parser.add_argument("--mask", metavar="P", help="mask profile or TOML file, or none")
     parser.add_argument("--link", metavar="URL", help="the autopilot's link, such as /dev/ttyAMA0,921600, or none")
     parser.add_argument("--folder", metavar="DIR", help="folder for flights")
@@ -59,12 +62,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     refuse_existing(arguments, arguments.file)
     asks = sys.stdin.isatty() and sys.stderr.isatty() and not arguments.json
-    given = {"--body": arguments.body, "--mask": arguments.mask, "--link": arguments.link, "--folder": arguments.folder}
+    given = {f"--{name}": getattr(arguments, name) for name in ("body", "shutter", "mask", "link", "folder")}
     found = bodies()
     if asks:
         print(f"on the bus: {', '.join(_named(body) for body in found) or 'no camera'}", file=sys.stderr)
     answers: dict[str, str] = {}
     for question in questions(found, serial_devices()):
+        if question.flag == "--shutter" and not answers["--body"].startswith(WIRED):
+            continue
         answer = given[question.flag]
         if answer is None:
             answer = ask(question, input) if asks else question.proposed
@@ -85,11 +90,12 @@ def questions(found: Sequence[UsbBody], serial: Sequence[str]) -> list[Question]
     """What is asked, with what is proposed by what is plugged in; "" where nothing can be proposed."""
     cameras, masks = profiles.shipped("cameras"), profiles.shipped("masks")
     fits = [profile.name for body in found if (profile := profiles.camera_for_model(body.name)) is not None]
-    fujifilm = [body for body in found if not body.fires and body.vendor == usb_bus.FUJIFILM]
-    body = fits[0] if fits else "fujifilm-s5200" if fujifilm else ANY
+    strange = [body for body in found if not fits and not body.fires]  # a reader of cards or another camera: ask
+    body = fits[0] if fits else "" if strange else ANY
     link = serial[0] if serial else _DEFAULT_LINK
     return [
         Question("--body", "which camera body", body, [ANY, *cameras]),
+        Question("--shutter", "how its shutter is fired: USB can't", "", ["outside", "autopilot"]),
         Question("--mask", "which mask is in it", "", [NONE, *masks]),
         Question("--link", "where the autopilot is", link, [*serial, _DEFAULT_LINK, NONE]),
         Question("--folder", "where flights are kept (~ is the home of the user who runs the daemon)", FLIGHTS),
@@ -119,6 +125,8 @@ def tables(answers: dict[str, str]) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     if body != ANY:
         found["camera"] = {"profile": body}
+    if body.startswith(WIRED):
+        found["camera"] |= {"driver": "fujifilm", "shutter": answers["--shutter"]}
     if mask != NONE:
         found["mask"] = {"profile": mask}
     found["mavlink"] = {"url": [] if link == NONE else link}
@@ -141,7 +149,7 @@ def write(file: Path, text: str) -> None:
             settings_check.checked(settings.examine_file(part), by_this_user=False)
         except DappledError as error:
             raise type(error)(str(error).replace(str(part), str(file))) from None
-        part.replace(file)
+        durable.write_file(file, text.encode())
     except OSError as error:
         raise InitError(f"{file} can't be written: {error.strerror}") from error
     finally:

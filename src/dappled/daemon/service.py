@@ -376,7 +376,7 @@ class Service:
             dead_threads=[name for part in (*self._vital, *viewers) for name in part.dead_threads()],
             doubts=[text for text in (*doubts, *(task.problem for task in self._tasks)) if text],
             parameters=[asdict(one) for one in self._parameters.all()],
-            frame_bytes=self._events.frame_bytes,
+            frame_bytes=self._writer.frame_bytes,
         )
 
     # what others may look at, and ask for

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
 
 from dappled.daemon.camera_protocol.camera_status import ReportedCamera, captured_shot
 from dappled.daemon.camera_protocol.component import Component
@@ -20,7 +19,6 @@ from dappled.errors import DappledError, report
 from dappled.flight import Recording
 
 log = logging.getLogger(__name__)
-_RECENT = 50
 
 
 class ShotEvents(Observer):
@@ -48,13 +46,6 @@ class ShotEvents(Observer):
         self._depth, self._recipe, self._outside = depth, recipe, outside
         self.misfit = ""
         self.doubt: str | None = None
-        self._sizes = deque[int](maxlen=_RECENT)
-
-    @property
-    def frame_bytes(self) -> float | None:
-        """The mean size of the flight's last frames on disk; None before the first."""
-        sizes = list(self._sizes)
-        return sum(sizes) / len(sizes) if sizes else None
 
     def settled(self, index: int, ok: bool) -> None:
         """See Observer."""
@@ -78,8 +69,6 @@ class ShotEvents(Observer):
     def finished(self, pending: PendingShot) -> None:
         """See Observer."""
         self._logbook.add(*of_shot(pending))
-        if pending.frame is not None:
-            self._sizes.append(pending.frame.size)
         if self._depth is not None:
             self._depth.offer(pending)
         self._outside.finished(pending)

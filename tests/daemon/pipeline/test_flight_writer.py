@@ -33,6 +33,7 @@ def recorded(writer: LedgerWriter, index: int | None, data: bytes = DATA) -> Fra
 def test_a_shot_is_entered_fired_and_recorded(tmp_path: Path) -> None:
     flight = recording.begin(tmp_path, SystemClock())
     writer = LedgerWriter(flight, SystemClock())
+    assert writer.frame_bytes is None
     flight.journal.note(SHOT)
     writer.requested(SHOT)
     writer.fired(Fired(0, 30, 40))
@@ -41,6 +42,11 @@ def test_a_shot_is_entered_fired_and_recorded(tmp_path: Path) -> None:
     assert (row.state, row.fired_called_monotonic_ns) == ("fired", 30)
     frame = recorded(writer, 0)
     assert writer.frame(0) == frame
+    assert writer.frame_bytes == len(DATA)
+    jpeg = Blob.of(b"beside it")
+    writer.companion(0, "IMG_0001.JPG", jpeg)
+    jpeg.close()
+    assert writer.frame_bytes == len(DATA) + len(b"beside it")
     assert Path(writer.path(frame)).read_bytes() == DATA
     entry = flight.index.lookup(0)
     assert entry is not None

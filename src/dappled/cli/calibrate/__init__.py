@@ -46,7 +46,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    refuse_existing(arguments, arguments.output)
+    refuse_existing(arguments, *([arguments.output] if arguments.lens else calibration_files.pair(arguments.output)))
     arguments.frames = decode_arguments.frames(arguments.frames)
     if arguments.lens:
         arguments.mask = arguments.mask or ""

@@ -11,6 +11,7 @@ import tomli_w
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from dappled import durable
 from dappled.config import profiles
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
 from dappled.errors import DappledError, counted
@@ -97,7 +98,7 @@ def _write(camera: str, lens: profiles.Lens, output: Path) -> None:
         "distortion": list(lens.distortion),
     }
     tables["lens"] = sorted([*others, mine], key=lambda one: float(one["focal_length_mm"]))
-    output.write_text(tomli_w.dumps(tables), encoding="utf-8")
+    durable.write_file(output, tomli_w.dumps(tables).encode())
 
 
 def _board(text: str) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from typing import Any
 import tomli_w
 from tqdm import tqdm
 
+from dappled import durable
 from dappled.config import profiles
 from dappled.decode.depth import RANGING, Ranging
 from dappled.decode.depth.ranging import Target, fit_targets, target_shift
@@ -77,7 +78,7 @@ def _listed(values: set[float | None]) -> str:
 def _write(recipe: Recipe, output: Path, found: Ranging) -> list[Path]:
     more: dict[str, Any] = {RANGING: {k: v for k, v in found.to_dict().items() if v is not None}}
     if not recipe.calibration:
-        output.write_text(tomli_w.dumps(more), encoding="utf-8")
+        durable.write_file(output, tomli_w.dumps(more).encode())
         return [output]
     known = calibration_files.load(Path(recipe.calibration))
     return list(calibration_files.save(output, known, more))

@@ -65,7 +65,8 @@ class ConsoleRequests:
         if (known := self._done.get(number)) is not None:
             return {**known, "text": f"already {known['text']}"} if known["ok"] else known
         late = self._too_late(request)
-        self._done[number] = {"ok": False, "error": "it may have fired: see the flight's record", "index": None}
+        open_words = "it may have been set" if request["do"] == "set" else "it may have fired: see the flight's record"
+        self._done[number] = {"ok": False, "error": open_words, "index": None}
         if len(self._done) > _REMEMBERED:
             self._done.popitem(last=False)
         answer = {"ok": False, "error": late, "index": None} if late else self._do(request)

@@ -15,6 +15,7 @@ from dappled.flight import Frame, Recording, Result, Shot, Tag
 
 log = logging.getLogger(__name__)
 _LATER = 1000
+_RECENT = 10  # frames: another image format soon counts
 
 
 class FlightWriter(Protocol):
@@ -66,6 +67,7 @@ class LedgerWriter:
     def __init__(self, recording: Recording, clock: Clock) -> None:
         self._recording, self._clock = recording, clock
         self._later: deque[tuple[str, str]] = deque(maxlen=_LATER)
+        self._sizes: deque[int] = deque(maxlen=_RECENT)
 
     def requested(self, shot: Shot) -> None:
         """See FlightWriter."""
@@ -97,6 +99,7 @@ class LedgerWriter:
             stray = recorder.record_stray(name, blob, reason, arrived_utc_ns=arrived_utc_ns)
             raise DappledError(f"{reason} in {stray.name}")
         frame = recorder.record(index, name, blob, arrived_utc_ns=arrived_utc_ns)
+        self._sizes.append(frame.size)
         self._index(index)
         return frame
 
@@ -109,6 +112,14 @@ class LedgerWriter:
         """See FlightWriter."""
         recorder = self._recording.recorder
         recorder.record_companion(index, name, blob, arrived_utc_ns=self._clock.utc_ns())
+        if self._sizes:
+            self._sizes[-1] += blob.size
+
+    @property
+    def frame_bytes(self) -> float | None:
+        """What the last frames took on disk each, with their companions, bytes; None before the first."""
+        sizes = list(self._sizes)
+        return sum(sizes) / len(sizes) if sizes else None
 
     def path(self, frame: Frame) -> str:
         """See FlightWriter."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import tomli_w
 
+from dappled import durable
 from dappled.bounds.arrays import read_npz
 from dappled.bounds.parsing import parse_toml
 from dappled.config import profiles
@@ -20,10 +22,11 @@ _TEXT = "calibration_toml"
 
 
 def save(path: Path, found: Calibration, more: dict[str, Any] | None = None) -> tuple[Path, Path]:
-    """Write both files; `path` names either. `more` are tables beside the calibration. Returns both paths."""
+    """Write both files, each whole or not at all; `path` names either. `more` are tables beside the calibration.
+
+    Returns both paths. Raises OSError."""
     text = tomli_w.dumps({**found.to_dict(), **(more or {})})
-    toml, npz = path.with_suffix(".toml"), path.with_suffix(".npz")
-    toml.write_text(text, encoding="utf-8")
+    toml, npz = pair(path)
     arrays = {
         _TEXT: np.array(text),
         "orders": np.array(found.mask.half_orders()),
@@ -34,8 +37,16 @@ def save(path: Path, found: Calibration, more: dict[str, Any] | None = None) -> 
         "mask_distance_mm": np.array([fit.mask_distance_mm for fit in found.fits]),
         "transfer": np.array([fit.transfer for fit in found.fits]),
     }
-    np.savez(npz, **arrays)  # type: ignore[arg-type]  # savez takes whatever asarray takes
+    packed = io.BytesIO()
+    np.savez(packed, **arrays)  # type: ignore[arg-type]  # savez takes whatever asarray takes
+    durable.write_file(npz, packed.getvalue())
+    durable.write_file(toml, text.encode())  # last: it is the one that settings name
     return toml, npz
+
+
+def pair(path: Path) -> tuple[Path, Path]:
+    """Both files of a calibration; `path` names either."""
+    return path.with_suffix(".toml"), path.with_suffix(".npz")
 
 
 def tables(path: Path) -> dict[str, Any]:

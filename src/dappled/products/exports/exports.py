@@ -218,7 +218,7 @@ def _png16(path: Path, values: NDArray[np.uint16]) -> None:
 def _whole(path: Path, write: Callable[[Path], Any]) -> None:
     """`write` under another name, then rename. Raises ExportError where `path` exists, or the disk refuses."""
     if path.exists():
-        raise ExportError(f"{path} exists already; choose another name")
+        raise ExportError(f"{path} exists already: move it away, or choose another name")
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         write(part)

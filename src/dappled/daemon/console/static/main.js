@@ -104,7 +104,7 @@ function histogramCell() {
   const highest = Math.max(...histogram.slice(1, -1), 1e-9), n = histogram.length;
   const bars = histogram.map((share, at) => `M${at + 0.5} 24V${(24 - 24 * Math.min(1, share / highest)).toFixed(2)}`).join("");
   const drawn = svg("svg", { viewBox: `0 0 ${n} 24`, preserveAspectRatio: "none", role: "img", "aria-label": "histogram of the frame, black to white" }, svg("path", { d: bars, stroke: "currentColor", "stroke-width": 1 }));
-  const text = clipped > 0 && clipped < 0.0005 ? "< 0.1 % clipped" : `${fixed(100 * clipped, 1)} % clipped`;
+  const text = clipped < 0.0005 ? "< 0.1 % clipped" : `${fixed(100 * clipped, 1)} % clipped`;
   return element("div", { class: "histogram", "data-known": "true", "data-clipped": clipped > 0.01 ? "much" : null }, element("dt", {}, drawn), element("dd", {}, text));
 }
 
@@ -239,6 +239,7 @@ const tellAnswer = (answer) => tell(answer.ok ? answer.text : answer.error ?? "r
 async function fire(path, body) {
   sequence = (sequence + 1) % 2 ** 31;
   const request = { sequence, token, elapsed_ms: Math.round(performance.now() - tokenAt), ...body };
+  const kind = path === "/api/setting" ? "set" : "fire";
   sending = true;
   tell("sending…", "busy");
   tick();
@@ -247,35 +248,48 @@ async function fire(path, body) {
     answer = await post(path, request);
     tellAnswer(answer);
   } catch {
-    keep(request);
+    keep({ ...request, kind });
   }
   sending = false;
   tick();
   if (unconfirmed) settle();
-  return Boolean(answer?.ok);
+  return answer ? Boolean(answer.ok) : true;   // without an answer it may have been taken
 }
 
 // A request without an answer. It outlives a reload of the page: the question is still open then.
 function keep(request) {
   unconfirmed = request;
   try {
-    if (request) sessionStorage.setItem("unconfirmed", JSON.stringify({ sequence: request.sequence, token: request.token, elapsed_ms: request.elapsed_ms }));
+    if (request) sessionStorage.setItem("unconfirmed", JSON.stringify({ sequence: request.sequence, token: request.token, elapsed_ms: request.elapsed_ms, kind: request.kind }));
     else sessionStorage.removeItem("unconfirmed");
   } catch { /* without storage a reload forgets it */ }
 }
 
+const UNCONFIRMED = {
+  fire: {
+    open: "not confirmed; it may have fired",
+    never: "nothing was fired: the request did not reach the vehicle in time",
+    restarted: "not confirmed; the daemon was started again since: see whether the frame is there",
+  },
+  set: {
+    open: "not confirmed; it may have been set",
+    never: "nothing was set: the request did not reach the vehicle in time",
+    restarted: "not confirmed; the daemon was started again since: see what the setting is",
+  },
+};
+
 // Ask what became of it until the daemon says so.
 async function settle() {
-  const { sequence, token, elapsed_ms } = unconfirmed;
+  const { sequence, token, elapsed_ms, kind } = unconfirmed, words = UNCONFIRMED[kind] ?? UNCONFIRMED.fire;
   while (unconfirmed) {
-    tell("not confirmed; it may have fired", "bad");
+    tell(words.open, "bad");
     try {
       const answer = await post("/api/outcome", { sequence, token, elapsed_ms });
       if (answer.ok && answer.state !== "waiting") {
         keep(null);
         if (answer.state === "known") tellAnswer(answer.answer);
-        else if (answer.state === "never") tell("nothing was fired: the request did not reach the vehicle in time", "bad");
-        else tell("not confirmed; the daemon was started again since: see whether the frame is there", "bad");
+        else if (answer.state === "never") tell(words.never, "bad");
+        else tell(words.restarted, "bad");
         break;
       }
     } catch { /* no link yet */ }
