@@ -26,8 +26,9 @@ from dappled.decode.lightfield.aperture import (
     transfer,
     used_aperture,
 )
+from dappled.decode.lightfield.frame_views import views_of
 from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.lightfield.views import Views, from_slices
+from dappled.decode.lightfield.views import Views
 from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Order, Sensor
 from dappled.decode.spectrum.peaks import (
     ALONE_NATS,
@@ -47,7 +48,13 @@ CarriersFrom = Literal["measured", "calibrated", "predicted", "found"]
 ViewsFrom = Literal["calibration", "frame", "white", "none"]
 _DOUBTED = 0.04  # of a carrier's frequency: a mask at its stated place is never so far off
 _ROTATION = 0.04  # of a carrier's frequency: the search without a calibration allows for 2.3°
-_UNKNOWN: Mapping[str, Any] = {"transfers": None, "aperture": None, "aperture_doubt": None}
+_UNKNOWN: Mapping[str, Any] = {
+    "transfers": None,
+    "aperture": None,
+    "aperture_doubt": None,
+    "views_model": None,
+    "view_sigma": None,
+}
 _LEAST_THROUGH = 0.1  # of a carrier: where the aperture leaves less, the mask's transfer can't be measured
 
 
@@ -144,7 +151,8 @@ class MaskDecoder:
     slices are there, and `views` has the shape (0, 0, h, w). `colours` says that the planes are colour mosaics.
     `taper` apodises the bands, see `slices.extract`. `at` is this frame's own lattice where a search has found it,
     `ratio` the matrix, row by row, of the lattice found in a flight over the law's: a print scaled and turned.
-    `buffers` are reused from frame to frame.
+    Without `joint_views` the views are made quickly, each spatial frequency alike (see `views`): depth is computed from
+    slices and needs no better ones. `buffers` are reused from frame to frame.
     """
 
     sensor: Sensor
@@ -160,6 +168,7 @@ class MaskDecoder:
     taper: float = 0.0
     at: Lattice | None = None
     ratio: tuple[float, float, float, float] | None = None
+    joint_views: bool = True
     buffers: SpectrumBuffers = field(default_factory=SpectrumBuffers, repr=False)
 
     def __post_init__(self) -> None:
@@ -365,21 +374,32 @@ class MaskDecoder:
         else:
             return *none, "none", _UNKNOWN
         keep &= np.abs(transfers) > 1e-3  # a carrier that the mask doesn't make carries no information
-        views, offsets = from_slices(
+        angular = angular_frequencies(orders, cycles, rotation)
+        across, down = math.hypot(*self.sensor.column_mm), math.hypot(*self.sensor.row_mm)
+        kept = [c for c, usable in zip(slices.carriers, keep, strict=True) if usable]
+        made = views_of(
             slices.values if keep.all() else slices.values[keep],
-            [order for order, usable in zip(orders, keep, strict=True) if usable],
+            kept,
             transfers[keep],
             kappa_cycles=cycles,
             rotation_rad=rotation,
             aperture=aperture,
+            samples_px=(float(np.hypot(*slices.grid[:, 0])), float(np.hypot(*slices.grid[:, 1]))),
+            row_over_column=down / across,
             noise_variance=noise_rms**2 * slices.band,
             colours=self.colours,
+            joint=self.joint_views,
         )
-        angular = angular_frequencies(orders, cycles, rotation)
         used = np.where(keep, transfers, 0)
         rows = np.column_stack([angular, used.real, used.imag]).tolist()
-        known_of = {"transfers": rows, "aperture": aperture.shape, "aperture_doubt": strange}
-        return views, offsets, views_from, known_of
+        facts = {
+            "transfers": rows,
+            "aperture": aperture.shape,
+            "aperture_doubt": strange,
+            "views_model": made.model,
+            "view_sigma": made.sigma,
+        }
+        return made.views, aperture.offsets(), views_from, facts
 
 
 def _own_transfer(

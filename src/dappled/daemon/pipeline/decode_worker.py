@@ -195,7 +195,8 @@ def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
     """Disparity and its sigma of one frame, float32 (h, w) each, at a lower priority than decoding."""
     if os.nice(0) < DEPTH_NICENESS:
         os.nice(DEPTH_NICENESS - os.nice(0))
-    done = darkroom.decode(asked["path"], focal_length_mm=asked["focal_length_mm"], f_number=asked["f_number"])
+    lens = {"focal_length_mm": asked["focal_length_mm"], "f_number": asked["f_number"]}
+    done = darkroom.decode(asked["path"], **lens, joint_views=False)
     field = done.light_field
     found = estimate.estimate(evidence.of_light_field(field), asked["method"])
     both = [np.ascontiguousarray(one, dtype=np.float32) for one in (found.disparity, found.sigma)]

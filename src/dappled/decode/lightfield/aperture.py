@@ -74,15 +74,24 @@ class Aperture:
             if self.shape == "filled":
                 cells *= np.sinc(angular / n).prod(axis=1)[:, None]
             return cells
+        # A part's phase is a product of one along each axis, so that the parts of a column are summed first.
         fine = n * _PARTS
-        parts = np.exp(2j * np.pi * angular @ _middles(fine).T) * _in_circle(fine)
-        parts *= np.sinc(angular / fine).prod(axis=1)[:, None]
-        return np.asarray(parts.reshape(-1, n, _PARTS, n, _PARTS).sum(axis=(2, 4)).reshape(-1, n * n))
+        axis = (np.arange(fine) - (fine - 1) / 2) / fine
+        down, across = (np.exp(2j * np.pi * np.outer(angular[:, i], axis)) for i in (0, 1))
+        circle = _in_circle(fine).reshape(n, _PARTS, fine)
+        rows = [down[:, v * _PARTS : (v + 1) * _PARTS] @ circle[v] * across for v in range(n)]
+        cells = np.stack(rows, axis=1).reshape(-1, n, n, _PARTS).sum(axis=3).reshape(-1, n * n)
+        return np.asarray(cells * np.sinc(angular / fine).prod(axis=1)[:, None])
 
     def transform(self, angular: NDArray[np.float64]) -> NDArray[np.complex128]:
         """(K,) the same over the whole aperture; 1 at 0."""
         if self.shape != "round":
-            return np.asarray(self.cells(angular).sum(axis=1), dtype=np.complex128)
+            axis = (np.arange(self.views) - (self.views - 1) / 2) / self.views
+            frequencies = np.asarray(angular)
+            along = np.cos(2 * np.pi * frequencies[..., None] * axis).mean(axis=-1)
+            if self.shape == "filled":
+                along *= np.sinc(frequencies / self.views)
+            return np.asarray(along.prod(axis=-1), dtype=np.complex128)
         turns = np.pi * np.hypot(*np.asarray(angular).T)
         whole = 2 * special.j1(turns) / np.where(turns > 0, turns, 1.0)
         return np.where(turns > 0, whole, 1.0).astype(np.complex128)

@@ -96,6 +96,13 @@ def finest_detail(image: NDArray[np.complexfloating]) -> float:
     return float(np.mean(both.real**2 + both.imag**2)) / 36
 
 
+def chroma_noise(slices: NDArray[np.complex64], common: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """(K,) variance of chroma in the slices of a colour mosaic, from their finest detail beside `common` (K,) times the
+    first slice; 0 for the first."""
+    noise = [_COLOURED * finest_detail(s - c * slices[0]) for s, c in zip(slices[1:], common[1:], strict=True)]
+    return np.array([0.0, *noise])
+
+
 def combine(coefficients: NDArray[np.complex128], slices: NDArray[np.complex64]) -> Views:
     """Re(G @ slices) as float32 (rows of G, h, w)."""
     count, height, width = slices.shape
@@ -135,7 +142,7 @@ def from_slices(
     noise = noise_variance + model_error**2 * shared * np.any(angular != 0, axis=1)
     if colours:
         common = transfers * aperture.transform(angular)
-        noise[1:] += [_COLOURED * finest_detail(s - c * slices[0]) for s, c in zip(slices[1:], common[1:], strict=True)]
+        noise += chroma_noise(slices, common)
     alone = view_variance(slices, angular, transfers, aperture, noise)
     coefficients = unmixing(angular, transfers, aperture, noise_variance=noise, view_variance=alone)
     n = aperture.views

@@ -183,8 +183,10 @@ class Darkroom:
         focal_length_mm: float | None = None,
         f_number: float | None = None,
         views: bool = True,
+        joint_views: bool = True,
     ) -> DecodeResult:
-        """Decode a frame. Arguments that are None are taken from its file. Without `views` only the slices are made.
+        """Decode a frame. Arguments that are None are taken from its file. Without `views` only the slices are made,
+        without `joint_views` views of less quality, quickly.
 
         Raises DappledError with the file's name and what is wrong.
         """
@@ -198,6 +200,7 @@ class Darkroom:
             decoder = self.decoder(plane.shape, raw.camera_model or "", colours=raw.cfa is not None)
             if isinstance(decoder, MaskDecoder):
                 decoder = known_to(decoder, None if focal_length_mm else raw.focal_sigma_mm)
+                decoder = replace(decoder, joint_views=joint_views)
             focal_length_mm = focal_length_mm or raw.focal_length_mm
             f_number = f_number or raw.f_number
             search, doubt = None, None

@@ -1,0 +1,79 @@
+"""Cut slices into overlapping patches, and put patches of views together again."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+
+from dappled.decode.array_types import Complexes, Floats, Singles
+
+
+@dataclass(frozen=True, slots=True)
+class Patches:
+    """Square patches of `side` samples, half overlapping, over images of `shape`; those at the edges reach beyond it.
+
+    A patch is weighed by half a period of a sine along each axis, before and after.
+    """
+
+    shape: tuple[int, int]
+    side: int
+
+    @property
+    def corners(self) -> list[tuple[int, int]]:
+        """Where each patch begins, in an image that is continued by one side at the top and the left."""
+        half = self.side // 2
+        rows, columns = (range(half, side + self.side, half) for side in self.shape)
+        return list(itertools.product(rows, columns))
+
+    @property
+    def window(self) -> Floats:
+        """(side, side) the weight of a patch's samples, of unit sum of squares over all overlapping patches."""
+        along = np.sin(np.pi * (np.arange(self.side) + 0.5) / self.side)
+        return np.outer(along, along)
+
+    @property
+    def bins(self) -> Floats:
+        """(F, 2) the frequencies of half a plane in cycles/sample, as `fft.rfft2` lists them."""
+        down, across = fft.fftfreq(self.side), fft.rfftfreq(self.side)
+        return np.stack(np.meshgrid(down, across, indexing="ij"), axis=-1).reshape(-1, 2)
+
+    @property
+    def multiplicity(self) -> Floats:
+        """(F,) how many of the whole plane's frequencies each of `bins` stands for."""
+        columns = self.side // 2 + 1
+        at = np.arange(self.side * columns) % columns
+        return np.where((at == 0) | (2 * at == self.side), 1.0, 2.0)
+
+    def cut(self, images: Complexes) -> Complexes:
+        """(K, N, side, side) the patches of images (K, h, w), continued at their edges by reflection."""
+        n = self.side
+        wide = np.pad(images, ((0, 0), (n, 2 * n), (n, 2 * n)), mode="symmetric")
+        return np.stack([wide[:, top : top + n, left : left + n] for top, left in self.corners], axis=1)
+
+    def spectra(self, patches: Complexes) -> Complexes:
+        """(F, 2K − 1, N) the spectra of patches (K, N, side, side), of the slices and then of their conjugates but the
+        first's, scaled so that white noise keeps its variance."""
+        columns = self.side // 2 + 1
+        scaled = (self.window * (2 / self.side)).astype(np.float32)
+        whole = fft.fft2(patches * scaled)
+        mirrored = np.conj(np.roll(whole[1:, :, ::-1, ::-1], 1, axis=(-2, -1)))
+        both = np.concatenate([whole[..., :columns], mirrored[..., :columns]])
+        return np.ascontiguousarray(both.reshape(*both.shape[:2], -1).transpose(2, 0, 1))
+
+    def images(self, spectra: Complexes) -> Singles:
+        """(N, V, side, side) the windowed patches of real images from their half spectra (F, V, N)."""
+        columns = self.side // 2 + 1
+        whole = spectra.transpose(2, 1, 0).reshape(spectra.shape[2], spectra.shape[1], self.side, columns)
+        return np.asarray(fft.irfft2(whole, s=(self.side, self.side)) * (self.side / 2), dtype=np.float32)
+
+    def joined(self, patches: Singles) -> Singles:
+        """(V, h, w) of windowed patches (N, V, side, side)."""
+        n, (height, width) = self.side, self.shape
+        total = np.zeros((patches.shape[1], height + 3 * n, width + 3 * n), dtype=np.float32)
+        window = self.window.astype(np.float32)
+        for (top, left), patch in zip(self.corners, patches, strict=True):
+            total[:, top : top + n, left : left + n] += patch * window
+        return np.ascontiguousarray(total[:, n : n + height, n : n + width])

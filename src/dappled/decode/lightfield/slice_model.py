@@ -1,0 +1,113 @@
+"""Model what the slices of a masked frame hold of a scene at one disparity.
+
+A scene at one disparity D is s(x − D·θ) from aperture point θ. At spatial frequency f the band around carrier k then
+holds, with W the stop's transform (see `aperture`) and T_k the carrier's transfer,
+
+    slice_k(f) = Σ_m T_{k−m} W(ω_{k−m} − D·g_m) ŝ(g_m),   g_m = f + F_m,
+
+F_m being the carrier's frequency of order m. The term m = 0 is the band's own detail. The others are detail beyond the
+band, which the mask multiplies before the sensor samples, so that it folds into other bands. W is that of the whole
+stop: a continuous one has angular orders that no carrier measures, and they are contained in it. View v, the mean over
+its cell of the stop, holds W_v(−D·f) ŝ(f).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.decode.array_types import Complexes, Floats
+from dappled.decode.lightfield.aperture import Aperture
+from dappled.decode.optics import Order
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SliceModel:
+    """The carriers of the whole plane: `orders` (A, 2), `transfers` (A,), `angular` ω (A, 2) in cycles over the
+    aperture, `carriers` F (A, 2) in cycles per sensor column, both axes; and the `aperture`. Disparities are in sensor
+    columns over the whole aperture."""
+
+    orders: NDArray[np.int64]
+    transfers: NDArray[np.complex128]
+    angular: Floats
+    carriers: Floats
+    aperture: Aperture
+
+    @classmethod
+    def of_half(
+        cls,
+        orders: Sequence[Order],
+        transfers: NDArray[np.complex128],
+        angular: Floats,
+        carriers: Floats,
+        aperture: Aperture,
+    ) -> SliceModel:
+        """The model of a half plane's carriers, DC first: their conjugates are added behind them."""
+        half = np.asarray(orders, dtype=np.int64).reshape(-1, 2)
+        return cls(
+            np.concatenate([half, -half[1:]]),
+            np.concatenate([transfers, transfers[1:].conj()]),
+            np.concatenate([angular, -angular[1:]]),
+            np.concatenate([carriers, -carriers[1:]]),
+            aperture,
+        )
+
+    def common(self) -> NDArray[np.complex128]:
+        """(A,) what each slice holds of a scene without texture, over what slice (0, 0) holds."""
+        return np.asarray(self.transfers * self.aperture.transform(self.angular))
+
+    def alone(self) -> Complexes:
+        """(A, V·U) what the slices hold of a view that has detail which no other view has, of unit spectrum."""
+        return (self.transfers[:, None] * self.aperture.cells(self.angular)).astype(np.complex64)
+
+    def seen(self, frequencies: Floats, disparities: Floats) -> Complexes:
+        """(D, F, A) each band's own detail in the slices, of a scene of unit spectrum at each disparity."""
+        at = self.angular - disparities[:, None, None, None] * frequencies[:, None]
+        through = self.aperture.transform(at.reshape(-1, 2)).real.reshape(at.shape[:-1])
+        return np.asarray(self.transfers * through, dtype=np.complex64)
+
+    def viewed(self, frequencies: Floats, disparities: Floats) -> Complexes:
+        """(D, F, V·U) the same in the views. A view whose cell is closed sees what its middle would."""
+        at = (-disparities[:, None, None] * frequencies).reshape(-1, 2)
+        share = self.aperture.cells(np.zeros((1, 2)))[0].real
+        middle = np.exp(2j * np.pi * at @ self.aperture.points().T)
+        cells = np.where(share > 1e-6, self.aperture.cells(at) / np.maximum(share, 1e-6), middle)
+        return cells.reshape(len(disparities), len(frequencies), -1).astype(np.complex64)
+
+    def folds(self, frequencies: Floats, disparities: Floats) -> list[Fold]:
+        """Detail that folds in from beyond the band, at any of these disparities with equal odds."""
+        places = {(int(ky), int(kx)): n for n, (ky, kx) in enumerate(self.orders)}
+        steps = {(a[0] - b[0], a[1] - b[1]) for a in places for b in places} - {(0, 0)}
+        lattice = np.linalg.lstsq(self.orders.astype(np.float64), self.carriers, rcond=None)[0]
+        found = []
+        for step in sorted(steps):
+            pairs = [(n, places.get((ky - step[0], kx - step[1]))) for (ky, kx), n in places.items()]
+            to, source = np.array([(n, other) for n, other in pairs if other is not None]).T
+            out = frequencies + np.array(step) @ lattice
+            at = self.angular[source] - disparities[:, None, None, None] * out[:, None]
+            through = self.aperture.transform(at.reshape(-1, 2)).real.reshape(at.shape[:-1])
+            waves = self.transfers[source] * through / np.sqrt(len(disparities))
+            found.append(Fold(to, out, waves.astype(np.complex64).transpose(1, 2, 0)))
+        return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fold:
+    """Detail at `beyond` (F, 2), in cycles per sensor column, that folds into the slices `into` (n,): `waves`
+    (F, n, D) of unit spectrum."""
+
+    into: NDArray[np.int64]
+    beyond: Floats
+    waves: Complexes
+
+
+def folded(folds: Sequence[Fold], powers: Sequence[Floats], slices: int) -> Complexes:
+    """(F, A, A) covariance of folded detail of these powers (F,) in A slices."""
+    total = np.zeros((len(powers[0]), slices, slices), dtype=np.complex64)
+    for fold, power in zip(folds, powers, strict=True):
+        one = (fold.waves @ fold.waves.conj().transpose(0, 2, 1)) * power.astype(np.float32)[:, None, None]
+        total[:, fold.into[:, None], fold.into[None, :]] += one
+    return total

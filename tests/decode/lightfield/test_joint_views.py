@@ -1,0 +1,87 @@
+"""Views by the joint model, against sums over rays and against the model that takes each frequency alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from dappled.decode.lightfield.light_field import LightField
+from tests.decode.lightfield.ray_sums import FOCAL_MM, MASK, RaySum, on_slices, psnr
+
+BAND = 0.4 * MASK.frequency_per_mm * 0.01  # cycles/pixel: inside a slice's band
+
+
+@dataclass(frozen=True)
+class Reached:
+    """PSNR of the views in dB: by the joint model, the quick one, and of the true views' mean."""
+
+    joint: float
+    quick: float
+    mean: float
+    field: LightField
+    truth: np.ndarray
+
+
+def _reached(scene: RaySum) -> Reached:
+    plane, true = scene.expose()
+    fields = [
+        scene.decoder(joint_views=joint).decode(plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
+        for joint in (True, False)
+    ]
+    assert [field.attributes["views_model"] for field in fields] == ["joint", "independent"]
+    np.testing.assert_array_equal(fields[0].slices, fields[1].slices)
+    truth = on_slices(true, fields[0].grid, fields[0].slices.shape[1:])
+    mean = np.broadcast_to(np.nanmean(truth, axis=(0, 1)), truth.shape)
+    joint, quick = (psnr(field.views, truth) for field in fields)
+    return Reached(joint, quick, psnr(mean, truth), fields[0], truth)
+
+
+def test_noise_is_kept_out_of_views_by_the_disparities_that_are_there() -> None:
+    found = _reached(RaySum(finest=BAND, snr=50))
+    assert found.joint > max(found.quick + 4, found.mean + 6), found
+    sigma = np.array(found.field.attributes["view_sigma"])[:, :, None, None]
+    errors = np.abs(found.field.views - found.truth)[..., 5:-5, 5:-5]
+    assert 0.5 < float(np.mean(errors < sigma)) < 0.9
+
+
+@pytest.mark.slow
+def test_detail_that_folds_in_from_beyond_the_band_does_not_spoil_the_views() -> None:
+    found = _reached(RaySum(exponent=1.1))
+    assert found.joint > max(found.quick + 4, found.mean + 4), found
+
+
+@pytest.mark.slow
+def test_without_noise_and_folded_detail_the_slices_decide() -> None:
+    assert _reached(RaySum(finest=BAND)).joint > 42
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("round_", [False, True])
+def test_a_continuous_stop_s_unmeasured_orders_belong_to_the_model(seed: int, round_: bool) -> None:
+    found = _reached(RaySum(points=2, round=round_, snr=100, seed=seed))
+    assert found.joint > max(found.quick + 2.5, found.mean + 4), found
+
+
+@pytest.mark.slow
+def test_a_scene_beyond_the_range_of_disparities_is_not_smeared() -> None:
+    found = _reached(RaySum(boards=(45.0,), finest=BAND, snr=100))
+    assert found.joint > found.mean + 1, found
+
+
+@pytest.mark.slow
+def test_a_frame_without_texture_has_views_like_its_mean() -> None:
+    scene = RaySum(contrast=0.0, boards=(6.0,), snr=100)
+    plane, true = scene.expose()
+    field = scene.decoder(joint_views=True).decode(plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
+    assert psnr(field.views, on_slices(true, field.grid, field.slices.shape[1:])) > 55
+
+
+def test_slices_smaller_than_a_patch_get_quick_views() -> None:
+    scene = RaySum(shape=(120, 140), finest=BAND, snr=100)
+    plane, _ = scene.expose()
+    field = scene.decoder(joint_views=True).decode(plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
+    assert min(field.slices.shape[1:]) < 24
+    assert (field.attributes["views_model"], field.attributes["view_sigma"]) == ("independent", None)
