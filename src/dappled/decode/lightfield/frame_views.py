@@ -19,6 +19,9 @@ ViewsModel = Literal["joint", "independent"]
 _REACH = 1.0  # samples of a slice from view to view: a carrier's order further, and parallax can't be told apart
 _WIDER = 2.0  # times that, where a frame's disparities are at the ends of the range
 _AT_THE_ENDS = 0.1  # of a frame
+_CLEAN = (
+    5e-4  # of the mean: a frame with less noise, and so without folded detail, is inverted better than it is modelled
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,10 +51,13 @@ def views_of(
     """The views of slices complex64 (K, h, w), DC first, cut at `carriers`; see `views.from_slices`.
 
     `samples_px` are the rows and columns of the sensor in a sample of a slice, `row_over_column` the height of a pixel
-    over its width. With `joint` views are made by the joint model where slices are as large as a patch.
+    over its width. With `joint` views are made by the joint model, unless slices are smaller than a patch or the frame
+    has next to no noise, as only simulated ones.
     """
     orders = [(c.ky, c.kx) for c in carriers]
-    if not joint or min(slices.shape[1:]) < SIDE:
+    plane_variance = noise_variance * samples_px[0] * samples_px[1]
+    clean = plane_variance < (_CLEAN * float(slices[0].real.mean())) ** 2
+    if not joint or clean or min(slices.shape[1:]) < SIDE:
         made, _ = from_slices(
             slices,
             orders,

@@ -16,7 +16,7 @@ estimated from what s leaves of the slices: without noise and folded detail the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,7 @@ _BEYOND_DISPARITIES = 5
 _INDEPENDENT = 0.5  # of a patch's samples are measurements of their own: patches overlap, windows correlate
 _ERROR = 5e-4  # of a slice's power: what no light field explains
 _MEAN_ERROR = 1e-3  # of a patch's mean: what a wrong aperture leaves in each slice
+_RING = 0.06  # of what a slice holds of a scene's mean: the frame's end rings in it, as far as a patch from the edge
 _LEAST_NOISE = 1e-12
 _NEGLIGIBLE = 0.01  # of a patch's probability
 _ROUNDS = 3
@@ -82,12 +83,17 @@ def joint_views(
     texture = _texture(cut[0].real, patches.window)
     groups = max(1, min(_TEXTURES, len(means) // _FEWEST))
     group = np.searchsorted(np.quantile(texture, np.arange(1, groups) / groups), texture)
+    group[patches.at_edges] = groups
+    rings = _RING * np.abs(model.common())
+    rings[0] = 0
     count = model.aperture.views
     windowed = np.empty((len(means), count * count, SIDE, SIDE), dtype=np.float32)
     variance, histogram, likelihood = np.zeros(count * count), np.zeros(_HYPOTHESES), 0.0
-    for number in range(groups):
+    for number in np.unique(group):
         members = np.flatnonzero(group == number)
-        found = _solve(frame, patches.spectra(cut[:, members]), float(np.sqrt(np.mean(means[members] ** 2))))
+        mean = float(np.sqrt(np.mean(means[members] ** 2)))
+        here = replace(frame, noise=frame.noise + (rings * mean) ** 2) if number == groups else frame
+        found = _solve(here, patches.spectra(cut[:, members]), mean)
         windowed[members] = patches.images(found.spectra)
         variance += found.variance * len(members) / len(means)
         histogram += found.histogram * len(members) / len(means)

@@ -6,6 +6,7 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
 from dappled.decode.array_types import Complexes, Floats, Singles
@@ -27,6 +28,12 @@ class Patches:
         half = self.side // 2
         rows, columns = (range(half, side + self.side, half) for side in self.shape)
         return list(itertools.product(rows, columns))
+
+    @property
+    def at_edges(self) -> NDArray[np.bool_]:
+        """(N,) which patches reach beyond the images, or to their edges."""
+        corners = np.array(self.corners) - self.side
+        return np.asarray(((corners <= 0) | (corners + self.side >= np.array(self.shape))).any(axis=1))
 
     @property
     def window(self) -> Floats:
