@@ -17,6 +17,7 @@ from dappled.flight import (
     Ledger,
     LedgerReader,
     Recording,
+    later_copy,
     layout,
     ledger_copies,
     offload,
@@ -165,6 +166,12 @@ def test_two_that_went_apart_are_refused_and_the_way_home_that_is_told_leads_the
 
 def test_nothing_was_added() -> None:
     assert not Added({}, {}, seals=False)
+
+
+@pytest.mark.parametrize("row", [(2, b"frames/a", "A", 4, "ab", 1), (2, "frames/a")])
+def test_a_row_of_the_copy_that_is_none_is_refused_in_a_sentence(row: tuple[str | int | bytes, ...]) -> None:
+    with pytest.raises(FlightError, match="a row in the ledger of the copy can't be read"):
+        later_copy.files({"frames": [row]})
 
 
 def test_a_different_frame_on_another_machine_is_not_written_over(
