@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
@@ -45,6 +46,7 @@ def test_a_light_field_becomes_layers(tmp_path: Path, kind: str, colour: bool, g
     assert views[1]["metadata"]["camera"] == "reference-36mm"
     assert slices[0].shape == (3, 60, 80)
     assert slices[0].dtype == np.float32
+    assert 0 < slices[0][1].max() <= 1  # a carrier is as bright as the mean
     assert not slices[1]["visible"]
     assert len(get_reader([str(path)] * 2)([str(path)] * 2)) == 4
 
@@ -52,6 +54,12 @@ def test_a_light_field_becomes_layers(tmp_path: Path, kind: str, colour: bool, g
 def test_files_of_others_are_left_to_their_readers(tmp_path: Path, get_reader: Any) -> None:
     np.savez(tmp_path / "theirs.npz", a=np.ones(3))
     (tmp_path / "no.npz").write_bytes(b"nothing")
+    whole = (tmp_path / "theirs.npz").read_bytes()
+    (tmp_path / "damaged.npz").write_bytes(whole[: len(whole) // 2] + whole[-22:])  # the end record of a zip is there
     (tmp_path / "theirs.zarr").mkdir()
-    for name in ("theirs.npz", "no.npz", "theirs.zarr", "picture.tif", "gone.h5"):
+    with h5py.File(tmp_path / "theirs.h5", "w") as file:
+        file["data"] = np.ones(3)
+    (tmp_path / "no.h5").write_bytes(b"nothing")
+    names = ("theirs.npz", "no.npz", "damaged.npz", "theirs.zarr", "picture.tif", "theirs.h5", "no.h5", "gone.h5")
+    for name in names:
         assert get_reader(str(tmp_path / name)) is None

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 import pytest
 from matplotlib import pyplot
@@ -24,6 +25,11 @@ from dappled.products import opened
 from dappled.products.exports import light_files
 from dappled.products.opened import OpenedFrame, OpenedLightField, OpenError
 from tests.products.fields import DISPARITY, light_field
+
+
+@pytest.fixture(autouse=True)
+def no_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(matplotlib.rcParams, "backend", "agg")
 
 
 @pytest.fixture
@@ -174,6 +180,12 @@ def test_a_notebook_shows_a_picture_and_the_doubts() -> None:
         assert picture.size == (80, 60)
         shown_px, middle = np.asarray(picture, dtype=float), found.views[2, 2]
     assert np.corrcoef(shown_px.ravel(), middle.ravel())[0, 1] > 0.95
+    empty = replace(
+        light_field(doubts=["one"] * 15),
+        slices=np.ones((3, 0, 0), np.complex64),
+        views=np.zeros((5, 5, 0, 0), np.float32),
+    )
+    assert OpenedLightField(empty)._repr_html_().endswith("<div>and 5 more</div>")
     bare = replace(light_field(), views=np.zeros((0, 0, 60, 80), np.float32), view_offsets=np.zeros((0, 0, 2)))
     assert "data:image/jpeg" in OpenedLightField(bare)._repr_html_()  # the mean, from slices alone
 
@@ -206,6 +218,10 @@ def test_what_cannot_be_drawn_is_told(path: Path, monkeypatch: pytest.MonkeyPatc
     found = opened.light_field(path)
     with pytest.raises(OpenError, match="'picture' can't be drawn: choose views, slices, spectrum or depth"):
         found.plot("picture")  # type: ignore[arg-type]  # mypy refuses it too
+    with pytest.raises(OpenError, match="a depth map is no part of a picture of views"):
+        found.plot("views", depth=found.depth("contrast"))
+    with pytest.raises(OpenError, match=r"the depth map is \(30, 40\), the views are \(60, 80\)"):
+        found.plot("depth", depth=OpenedLightField(light_field(shape=(30, 40))).depth("contrast"))
     none = replace(light_field(), slices=np.zeros((0, 60, 80), np.complex64), carriers=np.zeros((0, 4)))
     with pytest.raises(DappledError, match="has no slices"):
         OpenedLightField(none).plot("slices")

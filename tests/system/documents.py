@@ -47,6 +47,7 @@ def commands(document: Path) -> list[str]:
 
 SUBSTITUTES = {
     "white-f22.cr2 --mask mask-2": "white.dng --camera reference-36mm --mask reference-5x5",
+    "-o calibration.toml": "-o calibration.toml --overwrite",  # the stage has one
     "/media/$USER/FINEPIX/DCIM": "DCIM",
     "~/flights/20261121T*": "build/demo/flights/*Z-*",
     "127.0.0.1:8042": "127.0.0.1:0",

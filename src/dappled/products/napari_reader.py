@@ -12,9 +12,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from dappled.products.extras import MissingExtraError, need
 from dappled.products.opened import OpenedLightField, light_field
 
 _Layer: TypeAlias = tuple[Any, dict[str, Any], str]
+_ARRAYS = ("views", "carriers")  # both are in every light field, and in few files of others
+_WHITE = 0.995  # quantile that is shown as white
 
 
 def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[_Layer]] | None:
@@ -23,7 +26,7 @@ def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], lis
 
 
 def read(path: str | Sequence[str]) -> list[_Layer]:
-    """Return the layers of these light fields: views (v, u, y, x), and the slices' magnitudes, hidden at first.
+    """Return the layers of these light fields: views (v, u, y, x), and the slices' magnitudes, hidden behind views.
 
     Raises DappledError for what can't be read.
     """
@@ -34,24 +37,38 @@ def _layers(found: OpenedLightField, name: str) -> list[_Layer]:
     about = {"metadata": dict(found.attributes)}
     layers: list[_Layer] = []
     if found.views.size:
-        options = {"name": f"{name} views", "rgb": found.views.ndim == 5, "axis_labels": ("v", "u", "y", "x")}
-        layers.append((found.views, {**options, **about}, "image"))
+        top = max(float(np.nanquantile(found.views, _WHITE)), 1e-9)
+        if found.views.ndim == 5:  # napari takes colours from 0 to 1 and clips them
+            layers.append((np.clip(found.views / top, 0, 1), {"name": f"{name} views", "rgb": True, **about}, "image"))
+        else:
+            options = {"name": f"{name} views", "rgb": False, "contrast_limits": (0.0, top)}
+            layers.append((found.views, {**options, **about}, "image"))
     if found.slices.size:
-        options = {"name": f"{name} slices", "visible": not layers, "axis_labels": ("slice", "y", "x")}
-        layers.append((np.abs(found.slices), {**options, **about}, "image"))
+        size = np.abs(found.slices)
+        white = np.maximum(np.quantile(size, _WHITE, axis=(1, 2), keepdims=True), 1e-12).astype(np.float32)
+        options = {
+            "name": f"{name} slices, each by its own white",
+            "visible": not layers,
+            "contrast_limits": (0.0, 1.0),
+        }
+        layers.append((size / white, {**options, **about}, "image"))
     return layers
 
 
 def _may_be(path: Path) -> bool:
-    """Whether a path looks like a light field of ours: other programs write .zarr and .npz too."""
+    """Whether a path looks like a light field of ours: other programs write .zarr, .npz and .h5 too."""
     if path.suffix == ".zarr":
-        return (path / "views" / "zarr.json").is_file() and (path / "carriers" / "zarr.json").is_file()
-    if path.suffix == ".npz":
-        if not zipfile.is_zipfile(path):
-            return False
-        with zipfile.ZipFile(path) as file:
-            return {"views.npy", "carriers.npy"} <= set(file.namelist())
-    return path.suffix == ".h5" and path.is_file()
+        return all((path / name / "zarr.json").is_file() for name in _ARRAYS)
+    try:
+        if path.suffix == ".npz":
+            with zipfile.ZipFile(path) as file:
+                return {f"{name}.npy" for name in _ARRAYS} <= set(file.namelist())
+        if path.suffix == ".h5":
+            with need("h5py").File(path, "r") as file:
+                return set(_ARRAYS) <= set(file)
+    except (zipfile.BadZipFile, OSError, ValueError, MissingExtraError):
+        return False
+    return False
 
 
 def _each(path: str | Sequence[str]) -> Sequence[str]:

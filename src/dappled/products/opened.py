@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _LIGHT_FIELDS = (".zarr", ".npz", ".h5")
-_SHOWN = 10  # frames of a flight in its table
+_SHOWN = 10  # frames of a flight, or doubts of a light field, in a notebook
 
 
 class OpenError(DappledError):
@@ -103,16 +103,21 @@ class Refocusable(ABC):
         default `self.depth()`; in metres where they are known. Raises DappledError for another word, for what the light
         field lacks, and without matplotlib.
         """
+        drawings = {"views": figures.views, "slices": figures.slices, "spectrum": self._draw_spectrum}
+        if what != "depth" and what not in drawings:
+            raise OpenError(f"{what!r} can't be drawn: choose views, slices, spectrum or depth")
+        if depth is not None and what != "depth":
+            raise OpenError(f"a depth map is no part of a picture of {what}: ask for plot('depth'), or leave depth out")
         one = self._decoded()
         if what == "depth":
             made = self.depth() if depth is None else depth
+            if made.disparity.shape != one.views.shape[2:4]:
+                mine, theirs = one.views.shape[2:4], made.disparity.shape
+                raise OpenError(f"the depth map is {theirs}, the views are {mine}: draw it with its own light field")
             if one.ranging is None:
                 return figures.depth(made.disparity, "disparity, px/view", made.method, axes)
             return figures.depth(one.distances(made).distance_m, "distance, m", made.method, axes)
-        drawn = {"views": figures.views, "slices": figures.slices, "spectrum": self._draw_spectrum}.get(what)
-        if drawn is None:
-            raise OpenError(f"{what!r} can't be drawn: choose views, slices, spectrum or depth")
-        return drawn(one.field, axes)
+        return drawings[what](one.field, axes)
 
     def _draw_spectrum(self, field: LightField, axes: Axes | None) -> Axes:
         return figures.bands(field, axes)
@@ -149,8 +154,10 @@ class OpenedLightField(Refocusable):
         picture: NDArray[np.float32] | None = np.abs(self.slices[0]) if len(self.slices) else None
         with contextlib.suppress(DecodeError):
             picture = self.stack.middle()
-        doubts = (f"doubt: {one}" for one in self.attributes.get("doubts") or ())
-        return summaries.block(repr(self), None if picture is None else figures.bright(picture), doubts)
+        doubts = [f"doubt: {one}" for one in self.attributes.get("doubts") or ()]
+        more = [f"and {len(doubts) - _SHOWN} more"] if len(doubts) > _SHOWN else []
+        shown = None if picture is None or not picture.size else figures.bright(picture)
+        return summaries.block(repr(self), shown, [*doubts[:_SHOWN], *more])
 
     @property
     def slices(self) -> NDArray[np.complex64]:

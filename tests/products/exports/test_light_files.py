@@ -143,6 +143,13 @@ def test_without_hdf5_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Mon
         save(tmp_path / "a.h5", light_field())
 
 
+def test_doubts_that_are_no_sentences_are_told(tmp_path: Path) -> None:
+    for bad in (5, "one", [1]):
+        save(tmp_path / "a.npz", replace(light_field(), attributes={"doubts": bad}), overwrite=True)
+        with pytest.raises(LightFileError, match="its attribute doubts is not a list of texts"):
+            load(tmp_path / "a.npz")
+
+
 @pytest.mark.parametrize("name", ["a.tiff", "a"])
 def test_other_extensions_are_told(tmp_path: Path, name: str) -> None:
     for act in (lambda: save(tmp_path / name, light_field()), lambda: load(tmp_path / name)):

@@ -143,6 +143,9 @@ def _check_attributes(path: Path, attributes: Any) -> None:
         if value is not None and (not isinstance(value, kind) or isinstance(value, bool)):
             what = "a text" if kind == (str,) else "a number"
             raise LightFileError(f"{path}: its attribute {name} is not {what}; decode the frame again")
+    doubts = attributes.get("doubts") or []
+    if not (isinstance(doubts, list) and all(isinstance(one, str) for one in doubts)):
+        raise LightFileError(f"{path}: its attribute doubts is not a list of texts; decode the frame again")
     shape = attributes.get("shape", [1, 1])
     if not (isinstance(shape, list) and len(shape) == 2 and all(type(side) is int and side > 0 for side in shape)):
         raise LightFileError(f"{path}: its attribute shape is not rows and columns; decode the frame again")
