@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from dappled.cli import decode_arguments, main, parser
+from dappled.cli import VERBS, completion, decode_arguments, main, parser
 from dappled.cli.arguments import OutputExistsError, refuse_existing
 from dappled.errors import DappledError
 
+FOLDERS = {"batch", "geotag", "georeference"}  # their -o is a folder that they add to
 WRITERS = {
     "decode": ["x.dng", "--mask", "m"],
     "calibrate": ["x.dng"],
@@ -79,3 +80,13 @@ def test_an_export_is_refused_with_a_remedy_that_works(
     if kind == "mat":
         assert main(["export", "x.zarr", "--as", kind, "-o", str(tmp_path / "new.mat"), "--overwrite"]) == 1
         assert "remove what is there yourself" in capsys.readouterr().err
+
+
+@pytest.mark.slow  # it loads every verb
+def test_every_verb_with_a_named_output_can_be_told_to_replace_it() -> None:
+    missing = set()
+    for verb in VERBS:
+        for words, options in completion.words(verb, completion.below(parser(verb))[verb]).items():
+            if {"--output", "--picture", "--index"} & set(options) and "--overwrite" not in options:
+                missing.add(words.replace("/", " "))
+    assert missing - FOLDERS == set()

@@ -44,7 +44,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     found: dict[str, list[str]] = {"": [*VERBS, "--help", "--version", "--debug"]}
     for verb in VERBS:
-        found |= words(verb, _below(parser(verb))[verb])
+        found |= words(verb, below(parser(verb))[verb])
     print(
         _fish(found) if arguments.shell == "fish" else (_ZSH if arguments.shell == "zsh" else "") + _bash(found), end=""
     )
@@ -60,14 +60,15 @@ def words(path: str, parser: argparse.ArgumentParser) -> dict[str, list[str]]:
         if action.choices and not isinstance(action, argparse._SubParsersAction)
         for choice in action.choices
     ]
-    below = _below(parser)
-    found = {path: [*below, *options, *choices]}
-    for name, one in below.items():
+    actions = below(parser)
+    found = {path: [*actions, *options, *choices]}
+    for name, one in actions.items():
         found |= words(f"{path}/{name}", one)
     return found
 
 
-def _below(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+def below(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """The parsers of the actions of a parser, by name."""
     return {
         name: one
         for action in parser._actions

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import io
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import durable
 from dappled.cli import decode_arguments
 from dappled.cli.arguments import add_overwrite, metres, refuse_existing
 from dappled.decode.lightfield.fourier_refocus import Spectrum4D, difference
@@ -162,7 +164,9 @@ def _fourier(found: OpenedLightField, planes: list[tuple[str, float]]) -> list[P
 
 def _write(path: Path, pictures: list[Picture], captions: list[str]) -> None:
     if path.suffix == ".npy":
-        np.save(path, pictures[0] if len(pictures) == 1 else np.stack(pictures))
+        array = io.BytesIO()
+        np.save(array, pictures[0] if len(pictures) == 1 else np.stack(pictures))
+        durable.write_file(path, array.getvalue())
     else:
         white = prints.white_of(pictures)
         toned = [prints.toned(p, white) for p in pictures]

@@ -33,7 +33,7 @@ def recorded(writer: LedgerWriter, index: int | None, data: bytes = DATA) -> Fra
 def test_a_shot_is_entered_fired_and_recorded(tmp_path: Path) -> None:
     flight = recording.begin(tmp_path, SystemClock())
     writer = LedgerWriter(flight, SystemClock())
-    assert writer.frame_bytes is None
+    assert LedgerWriter(flight, SystemClock()).frame_bytes is None
     flight.journal.note(SHOT)
     writer.requested(SHOT)
     writer.fired(Fired(0, 30, 40))
