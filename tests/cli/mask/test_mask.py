@@ -180,3 +180,30 @@ def test_a_picture_that_is_there_is_not_replaced_unasked(
     assert path.read_bytes() == b"the only copy"
     assert main(["mask", *words, str(path), "--overwrite"]) == 0
     assert path.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_a_kit_is_printed_and_shot_by_its_list(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["mask", "kit", str(tmp_path / "kit"), "--camera", "canon-eos-450d", "--film", "4k"]
+    assert main(words) == 0
+    folder = tmp_path / "kit"
+    assert {path.name for path in folder.iterdir()} == {
+        "full.png", "full.toml", "diagonal.png", "diagonal.toml", "wedge.png", "target.png", "shots.txt",
+    }  # fmt: skip
+    for name, carriers in (("full", {(0, 1), (1, 0), (1, 1), (2, 2)}), ("diagonal", {(1, 1), (2, 2)})):
+        image = np.asarray(Image.open(folder / f"{name}.png"), dtype=float)
+        assert image.shape == (2732, 4096)
+        block = image[:800, :800] - image[:800, :800].mean()  # 80 periods of 10 px
+        spectrum = np.abs(np.fft.fft2(block)) / block.size / image.mean()
+        assert {(y, x) for y in range(3) for x in range(3) if spectrum[80 * y, 80 * x] > 0.05} >= carriers
+        assert (spectrum[0, 80] > 0.02) == (name == "full")
+    with Image.open(folder / "target.png") as target:
+        assert target.info["dpi"][0] == pytest.approx(25.4 * 12, rel=1e-3)
+        below = np.asarray(target)[-12 * 15]
+    assert np.count_nonzero(below < 200) == 100 * 12  # a bar of 100 mm
+    told = (folder / "shots.txt").read_text()
+    assert told.count("[ ] full: ") == told.count("[ ] bare: ") + 1 == 10
+    assert "dappled calibrate full/* --camera canon-eos-450d --mask full.toml" in told
+    capsys.readouterr()
+    assert main(words) == 1
+    assert "exists already" in capsys.readouterr().err

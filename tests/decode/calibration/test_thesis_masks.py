@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image, ImageDraw, ImageFont
 
 from dappled.decode.calibration.calibration import Calibration
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
@@ -164,3 +165,48 @@ def test_no_wrong_lattice_in_two_hundred_seeds(part: int) -> None:
         frame = CalibrationFrame(shot.without_film(), shot.focal_length_mm, shot.f_number)
         with pytest.raises(DecodeError, match="no carriers"):
             calibrate([frame], sensor=sensor, mask=_mask(shot.film), law="geometric", mask_distance_mm=1.01)
+
+
+def _edges(rng: np.random.Generator) -> np.ndarray:
+    """Roofs: half planes of all directions over each other, with a sky."""
+    y, x = np.mgrid[0 : SMALL.shape[0], 0 : SMALL.shape[1]]
+    picture = 0.7 + 0.1 * y / y.max()
+    for angle, place, level in zip(
+        rng.uniform(0, np.pi, 25), rng.uniform(-0.2, 1.2, 25), rng.uniform(0.1, 1, 25), strict=True
+    ):
+        inside = np.cos(angle) * x + np.sin(angle) * y < place * np.hypot(*SMALL.shape)
+        picture = np.where(inside & (y > rng.uniform(0, 300)), level, picture)
+    return np.asarray(picture)
+
+
+def _text(rng: np.random.Generator) -> np.ndarray:
+    """A printed page, turned a little: lines at one distance, words at none."""
+    page = Image.new("L", (900, 900), 230)
+    pen = ImageDraw.Draw(page)
+    size = int(rng.integers(9, 17))
+    for line in range(0, 900, round(1.6 * size)):
+        words = " ".join("".join(map(chr, rng.integers(97, 123, rng.integers(2, 10)))) for _ in range(25))
+        pen.text((20, line), words, fill=25, font=ImageFont.load_default(size))
+    turned = page.rotate(float(rng.uniform(-8, 8)), Image.Resampling.BICUBIC, fillcolor=230)
+    high, wide = SMALL.shape
+    return np.asarray(turned, dtype=np.float64)[200 : 200 + high, 180 : 180 + wide] / 255
+
+
+def _power_law(rng: np.random.Generator) -> np.ndarray:
+    exponent, seed = float(rng.uniform(0.9, 2.0)), int(rng.integers(10000))
+    shot = Shot(MASKS["mask-2"], SMALL, scene="texture", exponent=exponent, seed=seed, finer=1)
+    return shot.without_film().astype(np.float64)
+
+
+@pytest.mark.slow
+def test_no_carriers_in_thirty_ordinary_photographs() -> None:
+    sensor = Sensor(SMALL.shape, (SMALL.pitch_mm[0], 0.0), (0.0, SMALL.pitch_mm[1]))
+    for number in range(30):
+        rng = np.random.default_rng([number, 30])
+        scene = (_edges, _text, _power_law)[number % 3](rng)
+        plane = scene * 0.35 / scene.mean()
+        plane = np.clip(plane + rng.normal(size=plane.shape) * np.sqrt(np.maximum(plane, 0) * 0.35) / 100, 0, 1)
+        frame = CalibrationFrame(plane.astype(np.float32), float(rng.choice([20.0, 50.0])), float(rng.choice([8, 22])))
+        for name in ("mask-1", "mask-2", "mask-2-full", "mask-4-linear"):
+            with pytest.raises(DecodeError, match="no carriers"):
+                calibrate([frame], sensor=sensor, mask=_mask(MASKS[name]), law="geometric", mask_distance_mm=1.01)

@@ -1,4 +1,4 @@
-"""`dappled mask make|table|diffraction|design|plan`: design a printed mask, draw it, and test it on the bench."""
+"""`dappled mask make|table|diffraction|design|plan|kit`: design a printed mask, draw it, and test it on the bench."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from typing import Protocol
 
 from dappled.cli.arguments import Actions
-from dappled.cli.mask import design, diffraction, make, plan, table
+from dappled.cli.mask import design, diffraction, kit, make, plan, table
 
 
 class Action(Protocol):
@@ -26,6 +26,7 @@ _ACTIONS: dict[str, Action] = {
     "diffraction": diffraction,
     "design": design,
     "plan": plan,
+    "kit": kit,
 }
 
 
