@@ -73,7 +73,7 @@ def files(rows: Rows) -> list[Frame | Stray]:
         strays = [Stray(*row) for row in rows.get("strays", ())]  # type: ignore[arg-type]  # likewise
     except TypeError as error:
         raise FlightError(f"a row in the ledger of the copy can't be read: {error}") from error
-    found = [*frames, *companions, *strays]
+    found: list[Frame | Stray] = [*frames, *companions, *strays]
     if not all(isinstance(row.name, str) and isinstance(row.sha256, str) for row in found):
         raise FlightError("a row in the ledger of the copy can't be read: its columns have other types")
     return found
