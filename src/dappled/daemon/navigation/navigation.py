@@ -29,8 +29,8 @@ from dappled.daemon.navigation.clocks import (
     refine,
     unseen,
 )
-from dappled.daemon.navigation.samples import HALF_MS_NS, AttitudeSample, PositionSample
-from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, USED_MESSAGES, Around, Counts, VehicleHistory
+from dappled.daemon.navigation.samples import HALF_MS_NS, Around, AttitudeSample, Counts, PositionSample
+from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, USED_MESSAGES, VehicleHistory
 from dappled.decode.geometry import (
     Gnss,
     Pose,

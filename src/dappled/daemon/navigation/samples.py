@@ -1,4 +1,4 @@
-"""Turn telemetry messages into samples of position, attitude, receiver and gimbal, and find samples in a history.
+"""Turn telemetry messages into samples of position, attitude, receiver and gimbal, and keep histories of them.
 
 A message without a value gives None. A history is a list of samples in the order of their packets.
 """
@@ -100,6 +100,50 @@ class GimbalSample:
     kind: str
 
 
+@dataclass(slots=True)
+class Counts:
+    """How much of all vehicles was used so far, and how much came out of order."""
+
+    positions: int = 0
+    attitudes: int = 0
+    feedbacks: int = 0
+    out_of_order: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Epoch:
+    """A stretch of packets, from packet `number` on, in which the autopilot's clock ran steadily.
+
+    It holds for certain since `since_ns`, and the clock before it did until `before_ns`. `step_ns` is by how much
+    UTC − boot time changed; None where the autopilot (re)booted.
+    """
+
+    number: int
+    before_ns: int
+    since_ns: int
+    step_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Around:
+    """The samples around an instant: of position, attitude and gimbal two, the nearest one, or none; of the receiver
+    the nearest one.
+
+    `boot_ns` is the instant on the autopilot's clock, known to `sigma_ns` (1 σ); `gimbal_boot_ns` on the gimbal's.
+    `placed`: False where the clock stepped so near to it that the samples may be from before or after it.
+    """
+
+    utc_ns: int
+    boot_ns: int
+    sigma_ns: float
+    positions: Sequence[PositionSample] = ()
+    attitudes: Sequence[AttitudeSample] = ()
+    gnss: GnssSample | None = None
+    gimbals: Sequence[GimbalSample] = ()
+    gimbal_boot_ns: int = 0
+    placed: bool = True
+
+
 def boot_ns(message: MavlinkMessage) -> int:
     """A message's time since boot, from time_boot_ms or time_usec."""
     if message.get_type() == "ATTITUDE_QUATERNION_COV":
@@ -196,37 +240,6 @@ def feedback_boot_ns(
     if unwrap and message.get_type() == "CAMERA_FEEDBACK" and time_us < _WRAP_US:
         time_us += max(0, round((now_boot_ns // 1000 - time_us) / _WRAP_US)) * _WRAP_US
     return time_us * 1000
-
-
-def between(history: Sequence[N], first: int, limit: int) -> Sequence[N]:
-    """Those of the packets first <= number < limit."""
-    return history[_place(history, first) : _place(history, limit)]
-
-
-def _place(history: Sequence[Numbered], number: int) -> int:
-    """Where packet `number` would stand."""
-    return bisect_left(history, number, key=lambda sample: sample.number)
-
-
-def last(history: Sequence[N], window_ns: int) -> Sequence[N]:
-    """Those that arrived in the last `window_ns` before the last one."""
-    if not history:
-        return history
-    since = history[-1].stamp_ns - window_ns
-    return history[bisect_left(history, since, key=lambda sample: sample.stamp_ns) :]
-
-
-def around(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[S, ...]:
-    """The two samples around an instant, not more than `gap_ns` apart; or the nearest one, if it is near enough; or
-    none. `boot_ns` of the history must rise."""
-    at = bisect_left(history, boot_ns, key=lambda sample: sample.boot_ns)
-    sides = tuple(history[max(0, at - 1) : at + 1])
-    if len(sides) == 2 and sides[1].boot_ns - sides[0].boot_ns <= gap_ns:
-        return sides
-    nearest = min(sides, key=lambda sample: abs(sample.boot_ns - boot_ns), default=None)
-    if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS:
-        return ()
-    return (nearest,)
 
 
 def keep(history: list[N], sample: N) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from dappled.daemon.navigation import samples as telemetry_samples
 from dappled.daemon.navigation.clocks import (
@@ -26,16 +26,19 @@ from dappled.daemon.navigation.samples import (
     GIMBAL_COMPONENTS,
     HALF_MS_NS,
     NEAREST_NS,
+    Around,
     AttitudeSample,
+    Counts,
+    Epoch,
     GimbalSample,
     GnssSample,
+    N,
+    Numbered,
     PositionSample,
+    S,
     Sample,
-    around,
-    between,
     feedback_boot_ns,
     keep,
-    last,
     prune,
 )
 from dappled.drivers.mavlink import MavlinkMessage
@@ -55,50 +58,6 @@ _ANSWERS_COME_NS = 10**9
 _REPEATS = 64
 _AUTOPILOT = 1
 _FitKey = tuple[str | int, ...]  # what a fit was made from: its kind, the boot's first packet, the last packets
-
-
-@dataclass(slots=True)
-class Counts:
-    """How much of all vehicles was used so far, and how much came out of order."""
-
-    positions: int = 0
-    attitudes: int = 0
-    feedbacks: int = 0
-    out_of_order: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Epoch:
-    """A stretch of packets, from packet `number` on, in which the autopilot's clock ran steadily.
-
-    It holds for certain since `since_ns`, and the clock before it did until `before_ns`. `step_ns` is by how much
-    UTC − boot time changed; None where the autopilot (re)booted.
-    """
-
-    number: int
-    before_ns: int
-    since_ns: int
-    step_ns: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Around:
-    """The samples around an instant: of position, attitude and gimbal two, the nearest one, or none; of the receiver
-    the nearest one.
-
-    `boot_ns` is the instant on the autopilot's clock, known to `sigma_ns` (1 σ); `gimbal_boot_ns` on the gimbal's.
-    `placed`: False where the clock stepped so near to it that the samples may be from before or after it.
-    """
-
-    utc_ns: int
-    boot_ns: int
-    sigma_ns: float
-    positions: Sequence[PositionSample] = ()
-    attitudes: Sequence[AttitudeSample] = ()
-    gnss: GnssSample | None = None
-    gimbals: Sequence[GimbalSample] = ()
-    gimbal_boot_ns: int = 0
-    placed: bool = True
 
 
 class AutopilotTime:
@@ -214,7 +173,7 @@ class AutopilotTime:
         if self.now_boot_ns is not None and message.tc1 < self.now_boot_ns - REBOOT_BACK_NS:
             return  # from before or after a reboot that the telemetry has yet to show
         del self._requests[message.ts1]  # the same answer on a second link is not a second observation
-        known = between(self._answers, self._epochs[-1].number, number)
+        known = _between(self._answers, self._epochs[-1].number, number)
         by_ns = step_ns(known, answer) if self._rules > 1 else None
         if by_ns is not None:
             self._epochs.append(Epoch(number, known[-1].stamp_ns, stamp_ns, by_ns))
@@ -247,16 +206,16 @@ class AutopilotTime:
         epoch = self._epochs[at]
         first = epoch.number
         limit = min([limit, *(one.number for one in self._epochs[at + 1 : at + 2])])
-        answers = between(self._answers, first, limit)
+        answers = _between(self._answers, first, limit)
         if answers:
             few = len(answers) < _FEW and epoch.step_ns is not None
             by_timesync: _FitKey = ("timesync", first, answers[-1].number)
             clock = self._fit(
-                by_timesync, lambda: from_few(answers) if few else from_timesync(last(answers, TIMESYNC_WINDOW_NS))
+                by_timesync, lambda: from_few(answers) if few else from_timesync(_last(answers, TIMESYNC_WINDOW_NS))
             )
             if clock is not None:
                 return clock
-        tails = [last(between(one, first, limit), ARRIVAL_WINDOW_NS) for one in histories]
+        tails = [_last(_between(one, first, limit), ARRIVAL_WINDOW_NS) for one in histories]
         key: _FitKey = ("arrival", first, *(tail[-1].number for tail in tails if tail))
         return self._fit(
             key, lambda: from_arrivals([(one.boot_ns, one.stamp_ns) for tail in tails for one in tail], self._rules)
@@ -313,18 +272,18 @@ class Gimbals:
         `boot_ns` is the instant on the autopilot's clock, which began at packet `first`. A gimbal's clock need not be
         the autopilot's.
         """
-        known = between(self._samples, 0, limit)
+        known = _between(self._samples, 0, limit)
         if not known:
             return (), boot_ns
         if known[-1].component == _AUTOPILOT:
-            known = between(known, first, limit)
+            known = _between(known, first, limit)
         samples = [sample for sample in known if sample.epoch == known[-1].epoch]
         if samples and samples[0].component != _AUTOPILOT:
-            arrivals = [(one.boot_ns, one.stamp_ns) for one in last(samples, ARRIVAL_WINDOW_NS)]
+            arrivals = [(one.boot_ns, one.stamp_ns) for one in _last(samples, ARRIVAL_WINDOW_NS)]
             clock = from_arrivals(arrivals, self._rules)
             assert clock is not None
             boot_ns = clock.boot_ns(utc_ns)
-        return around(samples, boot_ns, gap_ns=GIMBAL_GAP_NS), boot_ns
+        return _around(samples, boot_ns, gap_ns=GIMBAL_GAP_NS), boot_ns
 
     def prune(self, before_ns: int) -> None:
         """Forget what came before."""
@@ -374,7 +333,7 @@ class VehicleHistory:
 
     def feedbacks(self, limit: int, utc_ns: int) -> Sequence[Feedback]:
         """Messages about the hot shoe, from the packets below `limit` of the epoch of an instant."""
-        return between(self._feedbacks, *self.time.span(limit, utc_ns))
+        return _between(self._feedbacks, *self.time.span(limit, utc_ns))
 
     def reached(self, boot_ns: int) -> bool:
         """Whether samples from after this instant have arrived. Attitude counts only if some arrived in the last five
@@ -388,7 +347,7 @@ class VehicleHistory:
     def around(self, utc_ns: int, boot_ns: int, sigma_ns: float, limit: int, *, placed: bool = True) -> Around:
         """The samples around an instant (`boot_ns` ± σ on the autopilot's clock), from the packets below `limit`."""
         first, limit = self.time.span(limit, utc_ns)
-        receiver = between(self._receiver, first, limit)
+        receiver = _between(self._receiver, first, limit)
         nearest = min(receiver, key=lambda sample: abs(sample.stamp_ns - utc_ns), default=None)
         if nearest is not None and abs(nearest.stamp_ns - utc_ns) > NEAREST_NS:
             nearest = None
@@ -397,8 +356,8 @@ class VehicleHistory:
             utc_ns,
             boot_ns,
             sigma_ns,
-            around(between(self._positions, first, limit), boot_ns, gap_ns=POSITION_GAP_NS),
-            around(between(self._attitudes, first, limit), boot_ns, gap_ns=ATTITUDE_GAP_NS),
+            _around(_between(self._positions, first, limit), boot_ns, gap_ns=POSITION_GAP_NS),
+            _around(_between(self._attitudes, first, limit), boot_ns, gap_ns=ATTITUDE_GAP_NS),
             nearest,
             gimbals,
             gimbal_boot_ns,
@@ -490,3 +449,34 @@ _HANDLERS: dict[str, Callable[[VehicleHistory, int, int, MavlinkMessage], None]]
     "CAMERA_TRIGGER": VehicleHistory._feedback,
 }
 USED_MESSAGES = frozenset(_HANDLERS)
+
+
+def _between(history: Sequence[N], first: int, limit: int) -> Sequence[N]:
+    """Those of the packets first <= number < limit."""
+    return history[_place(history, first) : _place(history, limit)]
+
+
+def _place(history: Sequence[Numbered], number: int) -> int:
+    """Where packet `number` would stand."""
+    return bisect_left(history, number, key=lambda sample: sample.number)
+
+
+def _last(history: Sequence[N], window_ns: int) -> Sequence[N]:
+    """Those that arrived in the last `window_ns` before the last one."""
+    if not history:
+        return history
+    since = history[-1].stamp_ns - window_ns
+    return history[bisect_left(history, since, key=lambda sample: sample.stamp_ns) :]
+
+
+def _around(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[S, ...]:
+    """The two samples around an instant, not more than `gap_ns` apart; or the nearest one, if it is near enough; or
+    none. `boot_ns` of the history must rise."""
+    at = bisect_left(history, boot_ns, key=lambda sample: sample.boot_ns)
+    sides = tuple(history[max(0, at - 1) : at + 1])
+    if len(sides) == 2 and sides[1].boot_ns - sides[0].boot_ns <= gap_ns:
+        return sides
+    nearest = min(sides, key=lambda sample: abs(sample.boot_ns - boot_ns), default=None)
+    if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS:
+        return ()
+    return (nearest,)
