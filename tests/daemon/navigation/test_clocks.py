@@ -147,6 +147,8 @@ def test_what_exif_shows() -> None:
 def benchmark() -> ModuleType:
     file = Path(__file__).parents[3] / "benchmarks" / "pose.py"
     spec = importlib.util.spec_from_file_location("pose_benchmark", file)
+    if str(file.parent) not in sys.path:
+        sys.path.append(str(file.parent))  # as Python does for a script: benchmarks share a module
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
