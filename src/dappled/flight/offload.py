@@ -390,12 +390,12 @@ def _open_copy(stack: ExitStack, source: Tree, destination: Path, *, same_device
         parent.enter(source.path.name, make=True)
     there = stack.enter_context(Tree(top / source.path.name))
     places.refuse_same_place(source, there, same_device=same_device)
-    stack.enter_context(layout.work_lock(top, "offloads into"))
     for name in sorted(source.folders):
         there.enter(name, make=True)
         places.refuse_same_place(source, there, same_device=same_device)
     there.enter("frames", make=True)  # also of a flight without a frame
     places.refuse_reexport(source, there)
+    stack.enter_context(layout.work_lock(top, "offloads into"))  # last: of one folder under two names it is held
     return there
 
 
