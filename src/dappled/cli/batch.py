@@ -135,7 +135,13 @@ def _planned(flight: Path, arguments: argparse.Namespace) -> tuple[list[Job], li
 
 def _lists(manifest: Manifest, placed: Sequence[Placed], jobs: Sequence[Job]) -> None:
     """Write geo.txt beside the pictures of a flight that are there."""
-    there = {job.frame.index for job in jobs if manifest.holds(job.key)}
+    if not jobs:
+        return
+    folder = manifest.path.parent / Path(jobs[0].flight).name / "photos"
+    for job in jobs:
+        if not manifest.holds(job.key):  # a picture of an earlier call has other positions
+            for path in photo_files.paths(folder, job.frame):
+                path.unlink(missing_ok=True)
+    there = [one for one in placed if all(path.is_file() for path in photo_files.paths(folder, one.frame))]
     if there:
-        folder = manifest.path.parent / Path(jobs[0].flight).name / "photos"
-        photo_files.write_lists(folder, [one for one in placed if one.frame.index in there])
+        photo_files.write_lists(folder, there)

@@ -15,7 +15,7 @@ from PIL import Image
 
 from dappled import __version__, durable
 from dappled.decode.array_types import Floats, Singles
-from dappled.flight import Tag
+from dappled.flight import Frame, Tag
 from dappled.products.geotags import exif_gps, geotags, sidecars
 from dappled.products.geotags.exif_gps import Entry
 from dappled.products.geotags.geotags import Placed
@@ -75,6 +75,11 @@ def encoded(one: Photograph, station: Station, utc_ns: int | None) -> dict[str, 
     packet = _XMP_HEAD + xmp
     jpeg = jpeg[:2] + struct.pack(">BBH", 0xFF, 0xE1, len(packet) + 2) + packet + jpeg[2:]
     return {"tiff": tiff, "jpeg": jpeg}
+
+
+def paths(folder: Path, frame: Frame) -> list[Path]:
+    """Where the pictures of a frame stand, one of each kind."""
+    return [folder / form / (Path(frame.name).stem + suffix) for form, suffix in SUFFIXES.items()]
 
 
 def write_lists(folder: Path, placed: Sequence[Placed]) -> None:
