@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 
-FOLDER = Path(__file__).parents[2] / "benchmarks"
-sys.path.insert(0, str(FOLDER))  # they are programs, not a package
+from tests.benchmarks import FOLDER
 
-from limits import Limit, flat, read_limits  # noqa: E402  # once their folder is known
-from table import Row, measured, page  # noqa: E402  # the same
+sys.path.insert(0, str(FOLDER))
+
+from limits import Limit, flat, read_limits  # once their folder is known
+from table import Row, measured, page  # the same
 
 
 def limit(at_most: float | None = None, at_least: float | None = None, noise: float = 0.1) -> Limit:

@@ -2,23 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
-
-def benchmark() -> ModuleType:
-    file = Path(__file__).parents[2] / "benchmarks" / "sustained.py"
-    spec = importlib.util.spec_from_file_location("sustained_benchmark", file)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+from tests.benchmarks import program
 
 
 @pytest.mark.parametrize(
@@ -27,7 +15,7 @@ def benchmark() -> ModuleType:
 def test_frames_come_faster_than_they_can_be_decoded(
     tmp_path: Path, seconds: float, rate: float, megabytes: float
 ) -> None:
-    figures = benchmark().measure(tmp_path, seconds, rate, round(megabytes * 1e6), decode_s=0.5)
+    figures = program("sustained").measure(tmp_path, seconds, rate, round(megabytes * 1e6), decode_s=0.5)
     assert figures["shots"] == figures["frames"] == rate * seconds
     assert figures["lost"] == 0
     assert figures["left_undecoded"] > 0

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -15,6 +12,7 @@ from dappled.daemon.navigation.clocks import Feedback, camera_time, exposure_fro
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath
+from tests.benchmarks import program
 
 MS = 10**6
 START_NS = 1_790_000_000 * 10**9
@@ -144,24 +142,11 @@ def test_what_exif_shows() -> None:
     assert camera_time(None) is None
 
 
-def benchmark() -> ModuleType:
-    file = Path(__file__).parents[3] / "benchmarks" / "pose.py"
-    spec = importlib.util.spec_from_file_location("pose_benchmark", file)
-    if str(file.parent) not in sys.path:
-        sys.path.append(str(file.parent))  # as Python does for a script: benchmarks share a module
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
 def test_a_flight_is_placed_as_well_as_promised_and_says_so(seed: int) -> None:
     """The body's latency has σ = 10 ms: 15 cm and 0.30° at this speed and turn, and a fifteenth by chance."""
-    figures: dict[str, Any] = benchmark().measure(300, seed)
+    figures: dict[str, Any] = program("pose").measure(300, seed)
     assert figures["hot_shoe"]["position_rms_m"] <= 0.03
     assert figures["hot_shoe"]["attitude_rms_deg"] <= 0.05
     assert figures["body_latency"]["position_rms_m"] <= 0.16
@@ -175,7 +160,7 @@ def test_a_flight_is_placed_as_well_as_promised_and_says_so(seed: int) -> None:
 def test_each_sample_of_a_real_flight_is_predicted_by_its_neighbours(shared_data: Path) -> None:
     """A copter, one sample in half a second: with one left out a second is bridged, and the doubt is as large as the
     error."""
-    rows: dict[str, Any] = benchmark().leave_one_out(shared_data / "telemetry" / "dronekit-flight.tlog")
+    rows: dict[str, Any] = program("pose").leave_one_out(shared_data / "telemetry" / "dronekit-flight.tlog")
     assert rows["position_m"]["samples"] > 2600
     assert rows["attitude_deg"]["samples"] > 2800
     assert rows["position_m"]["median"] < 0.05
