@@ -135,6 +135,24 @@ def test_what_another_camera_repeats_before_any_clock_is_known_is_no_shot(unix_u
     assert rig.fired == []
     hear(rig, autopilot.trigger(BOOT_US + 64 * 10**6, unix_us and unix_us + 64 * 10**6, camera=0))
     assert len(rig.fired) == 1
+    rig.tick(4)
+    assert [(one.first, one.last) for one in rig.lost_triggers] == [(5, 5)]  # it may have been one: it is told
+
+
+def test_an_autopilot_without_time_that_starts_again_begins_its_numbers_again() -> None:
+    """The first of its messages is lost: the second may be a repeated one and is told, the third is a shot."""
+    rig = rig_of(feedback_is_shot=True)
+    for missed in (0, 1):
+        autopilot = CameraTriggers(cameras=(CameraPort("wire"),))
+        rig.hear(mavlink.MAVLink_attitude_message(BOOT_US // 1000, 0, 0, 0, 0, 0, 0), AUTOPILOT)
+        for number in range(3):
+            rig.clock.advance(1)
+            messages = autopilot.trigger(BOOT_US + number * 10**6)
+            hear(rig, messages if number >= missed else [])
+        rig.hear(mavlink.MAVLink_attitude_message(BOOT_US // 1000 + 60_000, 0, 0, 0, 0, 0, 0), AUTOPILOT)
+    rig.tick(4)
+    assert len(rig.fired) == 4
+    assert [(one.first, one.last) for one in rig.lost_triggers] == [(2, 2)]
 
 
 @pytest.mark.parametrize("personality", ["ardupilot", "px4"])

@@ -30,7 +30,6 @@ from dappled.daemon.health.status_text import GroundStations, PilotMessages
 from dappled.daemon.pipeline.repeats import CaptureRequest, PacketDedup
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
-from dappled.refusals import LostTriggers
 
 HEARTBEAT_NS = 10**9
 STATUS_NS = 100_000_000
@@ -62,6 +61,7 @@ class Component:
         self._model, self._earlier = model, earlier
         self._feedback_is_shot, self._cam_idx = feedback_is_shot or not shutter.fires, cam_idx
         self._last_feedback: int | None = None
+        self._restarts = autopilot.restarts
         self._stamps: deque[int] = deque(maxlen=64)
         self._status = CameraStatus(model, shutter, parameters, clock, component_id=links.component_id)
         self._intervals = MessageIntervals()
@@ -203,26 +203,31 @@ class Component:
 
         ArduPilot sends one for each of its cameras at every trigger or contact of one. The others repeat their last
         time, or have neither time nor number. Without a time, or before the autopilot's clock is known, a number that
-        is newer than the last one shows a trigger.
+        is newer than the last one shows a trigger; the first number of all may be a repeated one, and is told as lost.
         """
         if feedback.cam_idx != self._cam_idx:
             return False
+        if self._restarts != self._autopilot.restarts:
+            self._restarts, self._last_feedback = self._autopilot.restarts, None
         time_us, image, known = int(feedback.time_usec), int(feedback.img_idx), self._last_feedback
         newer = image == 1 and known != 1
         if known is not None:
             newer = newer or 0 < (image - known) % _IMAGES < _IMAGES // 2
         if known is None or newer:
             self._last_feedback = image
-        if time_us == 0:
-            return newer
         if time_us in self._stamps:
             return False
-        self._stamps.append(time_us)
-        stale = self._autopilot.is_stale(time_us)
-        if stale and newer and known is not None and self._feedback_is_shot:
-            late = LostTriggers(image, image, f"reported more than 5 s late, {self._here()}")
-            self._model.lost(late)
-            self.say(f"lost: the autopilot's {late.text()}", mavlink.MAV_SEVERITY_ERROR)
+        if time_us:
+            self._stamps.append(time_us)
+        stale = self._autopilot.is_stale(time_us) if time_us else None
+        why = ""
+        if stale and newer and known is not None:
+            why = "reported more than 5 s late"
+        elif stale is None and known is None and image > 1:
+            why = "the first report heard, without a time that is known: perhaps another camera's"
+        if why and self._feedback_is_shot:
+            numbers = self._autopilot.numbers["CAMERA_FEEDBACK"]
+            numbers.late(image, self._clock.monotonic_ns(), lambda: f"{why}, {self._here()}")
         return newer if stale is None else not stale
 
     def _parameter(self, packet: Packet) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
@@ -166,10 +167,11 @@ class TriggerNumbers:
     """Which of the autopilot's triggers became no request here, by the numbers that it gives them.
 
     A number that is passed over is waited for `LATE_NS`: a second link may bring it. Times are monotonic. A jump of
-    more than `MOST_LOST` numbers is a counter that was set, not a loss.
+    more than `MOST_LOST` numbers is a counter that was set, not a loss. All methods may be called from any thread.
     """
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()
         self._heard: deque[int] = deque(maxlen=MOST_LOST)
         self._top: int | None = None
         self._missing: dict[int, tuple[int, str]] = {}  # when it counts as lost, and where that was noticed
@@ -177,28 +179,39 @@ class TriggerNumbers:
 
     def heard(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
         """A request, or a shot's own message, with this number has come."""
-        self._reach(number, now_ns, where)
-        self._heard.append(number)
-        self._missing.pop(number, None)
-        self._unnumbered = 0
+        with self._lock:
+            self._reach(number, now_ns, where)
+            self._heard.append(number)
+            self._missing.pop(number, None)
+            self._unnumbered = 0
+
+    def late(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
+        """A trigger is reported too late to be a shot: it is lost, unless its own message still comes."""
+        with self._lock:
+            if number not in self._heard:
+                self._reach(number, now_ns, where)
+                self._missing[number] = now_ns + LATE_NS, where()
 
     def reported(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
         """The autopilot reports a trigger that it has requested. Ignored where it requests none here."""
-        if self._heard and number not in self._heard and number not in self._missing:
-            self._reach(number, now_ns, where)
-            self._missing[number] = now_ns + LATE_NS, where()
+        with self._lock:
+            if self._heard and number not in self._heard and number not in self._missing:
+                self._reach(number, now_ns, where)
+                self._missing[number] = now_ns + LATE_NS, where()
 
     def unnumbered(self) -> None:
         """One of the other messages of a trigger has come: PX4 sends one for each camera after the numbered one."""
-        self._unnumbered += 1
+        with self._lock:
+            self._unnumbered += 1
 
     def lost(self, now_ns: int) -> list[LostTriggers]:
         """Those that have not come in time, each told once."""
-        over = sorted(number for number, (due_ns, _) in self._missing.items() if due_ns <= now_ns)
+        with self._lock:
+            over = sorted(number for number, (due_ns, _) in self._missing.items() if due_ns <= now_ns)
+            places = [(number, self._missing.pop(number)[1]) for number in over]
+            self._heard.extend(over)  # ArduPilot repeats its last report with each one of another camera
         found: list[LostTriggers] = []
-        for number in over:
-            _, where = self._missing.pop(number)
-            self._heard.append(number)  # ArduPilot repeats its last report with each one of another camera
+        for number, where in places:
             if found and found[-1].last == number - 1 and found[-1].where == where:
                 found[-1] = LostTriggers(found[-1].first, number, where)
             else:
@@ -207,9 +220,10 @@ class TriggerNumbers:
 
     def restart(self) -> None:
         """The autopilot has started again, and counts from 1."""
-        self._heard.clear()
-        self._missing.clear()
-        self._top, self._unnumbered = None, 0
+        with self._lock:
+            self._heard.clear()
+            self._missing.clear()
+            self._top, self._unnumbered = None, 0
 
     def _reach(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
         top = self._top
@@ -230,11 +244,13 @@ class OwnAutopilot:
         self._requests = AutopilotRequests()
         self._now = AutopilotNow()
         self.numbers = {"CAMERA_FEEDBACK": TriggerNumbers(), "CAMERA_TRIGGER": TriggerNumbers()}
+        self.restarts = 0  # of the autopilot, so far: its numbers begin again
 
     def heard(self, message: MavlinkMessage) -> None:
         """Take a message of its system."""
         self._requests.heard(message.get_msgId())
         if message.get_srcComponent() == 1 and self._now.heard(message, self._clock.monotonic_ns()):
+            self.restarts += 1
             for numbers in self.numbers.values():
                 numbers.restart()
 
