@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 import dappled
+from dappled.config.schema import ConfigError
 from dappled.daemon.health import systemd
 from dappled.errors import DappledError, printable
 
@@ -96,7 +97,7 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
     except DappledError as error:
         if parsed.debug:
             raise
-        return _failed(parsed, str(error), error.exit_code)
+        return _failed(parsed, str(error), error.exit_code, several=isinstance(error, ConfigError))
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
@@ -118,9 +119,11 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
     return code
 
 
-def _failed(parsed: argparse.Namespace, text: str, code: int) -> int:
-    """Say what went wrong: a person on standard error, and with --json a program too, as {"error": …}."""
-    print(f"dappled {parsed.verb}: {printable(text)}", file=sys.stderr)
+def _failed(parsed: argparse.Namespace, text: str, code: int, *, several: bool = False) -> int:
+    """Say what went wrong: a person on standard error, and with --json a program too, as {"error": …}. With `several`
+    each line of the text is a sentence of its own; else a line's end comes from a file's name."""
+    shown = "\n".join(map(printable, text.split("\n"))) if several else printable(text)
+    print(f"dappled {parsed.verb}: {shown}", file=sys.stderr)
     if getattr(parsed, "json", False):
         print(json.dumps({"error": text}))
     return code
