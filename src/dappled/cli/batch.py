@@ -138,10 +138,11 @@ def _lists(manifest: Manifest, placed: Sequence[Placed], jobs: Sequence[Job]) ->
     if not jobs:
         return
     folder = manifest.path.parent / Path(jobs[0].flight).name / "photos"
-    for job in jobs:
-        if not manifest.holds(job.key):  # a picture of an earlier call has other positions
-            for path in photo_files.paths(folder, job.frame):
-                path.unlink(missing_ok=True)
-    there = [one for one in placed if all(path.is_file() for path in photo_files.paths(folder, one.frame))]
+    failed = {job.frame for job in jobs if not manifest.holds(job.key)}  # pictures of an earlier call: other positions
+    there = [
+        one
+        for one in placed
+        if one.frame not in failed and all(path.is_file() for path in photo_files.paths(folder, one.frame))
+    ]
     if there:
         photo_files.write_lists(folder, there)

@@ -141,8 +141,8 @@ def _same(writer: ReplayVerifier) -> str:
     share, index = writer.furthest
     worst = f"; the furthest is frame {index}, {share:.1e}" if index >= 0 and share else ""
     return (
-        f"equal within {MOST_SHARE:g} of each frame's largest value{worst}; poses and tags within 1e-9; "
-        f"recorded on {writer.elsewhere}"
+        f"equal within {MOST_SHARE:g} of each frame's largest value, root mean square{worst}; "
+        f"poses and tags within 1e-9; recorded on {writer.elsewhere}"
     )
 
 
