@@ -77,29 +77,31 @@ def search_laws(
     peaks = PeakList.of(spectrum)
     odds: list[LawOdds] = []
     asked: list[list[OrderStrength]] = []
-    best: MaskLattice | None = None
-    chosen: str | None = None
+    sure: list[tuple[MaskLattice, str]] = []
     for name in (law, *(other for other in LAWS if other != law)):
         predicted = LAWS[name](mask, sensor, mask_distance_mm, focal_length_mm)
         expected = order_strengths(mask, sensor, predicted, mask_distance_mm=mask_distance_mm, f_number=f_number)
         found = find_mask_lattice(peaks, predicted, expected)
         asked.append(expected)
         odds.append(LawOdds(name, None if found is None else found.odds_nats))
-        if found is not None and found.sure and (best is None or found.odds_nats > best.odds_nats):
-            best, chosen = found, name
-    if best is not None:
-        there = order_strengths(mask, sensor, best.lattice, mask_distance_mm=mask_distance_mm, f_number=f_number)
-        foreign = not_this_mask(spectrum, best, there, most_scale=None if anywhere else _SCALE_OFF[chosen or law])
-        if foreign is not None:
-            return LawSearch(tuple(odds), None, None, True, f"no carriers: {foreign}")
-    if anywhere and best is None and mask.pattern == "full":
-        best = _anywhere(spectrum, mask)
+        if found is not None and found.sure:
+            sure.append((found, name))
     expects, reason = unseen(
         spectrum, asked, ideal_f_number=mask.frequency_per_mm * mask_distance_mm, f_number=f_number
     )
+    foreign: list[str] = []
+    for lattice, name in sorted(sure, key=lambda one: -one[0].odds_nats):
+        there = order_strengths(mask, sensor, lattice.lattice, mask_distance_mm=mask_distance_mm, f_number=f_number)
+        wrong = not_this_mask(spectrum, lattice, there, most_scale=None if anywhere else _SCALE_OFF[name])
+        if wrong is None:
+            return LawSearch(tuple(odds), lattice, name, expects, "")
+        foreign.append(wrong)
+    if foreign:
+        return LawSearch(tuple(odds), None, None, True, f"no carriers: {foreign[0]}")
+    best = _anywhere(spectrum, mask) if anywhere and mask.pattern == "full" else None
     if expects and len(peaks.prominence) and float(peaks.prominence.max()) > _STANDS_NATS:
         reason += f"; the peaks that do stand belong to {_SCENE}, or to another mask"
-    return LawSearch(tuple(odds), best, chosen, expects, "" if best is not None else reason)
+    return LawSearch(tuple(odds), best, None, expects, "" if best is not None else reason)
 
 
 def not_this_mask(
