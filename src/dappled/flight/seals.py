@@ -200,7 +200,11 @@ def changed_since(folder: FlightFolder) -> list[str]:
         recorded = recorded_files(ledger)
     present = {path.relative_to(folder.path).as_posix(): path for path in sealed_paths(folder)}
     wal = folder.ledger.with_name(folder.ledger.name + "-wal")
-    found = {*(last.files.keys() - present.keys() - pruning.removed(folder).keys())}
+    found = {*(last.files.keys() - present.keys())}
+    try:
+        found -= pruning.removed(folder).keys()
+    except FlightError:  # `flight check` says what is wrong with it
+        found.add(pruning.RECORD)
     try:
         if wal.is_file() and wal.stat().st_size:
             found.add(folder.ledger.name)
