@@ -388,7 +388,7 @@ class MaskDecoder:
             row_over_column=down / across,
             noise_variance=noise_rms**2 * slices.band,
             colours=self.colours,
-            joint=self.joint_views,
+            joint=self.joint_views and strange is None,  # the joint model trusts the aperture
         )
         used = np.where(keep, transfers, 0)
         rows = np.column_stack([angular, used.real, used.imag]).tolist()

@@ -19,9 +19,8 @@ ViewsModel = Literal["joint", "independent"]
 _REACH = 1.0  # samples of a slice from view to view: a carrier's order further, and parallax can't be told apart
 _WIDER = 2.0  # times that, where a frame's disparities are at the ends of the range
 _AT_THE_ENDS = 0.1  # of a frame
-_CLEAN = (
-    5e-4  # of the mean: a frame with less noise, and so without folded detail, is inverted better than it is modelled
-)
+_MOST_VIEWS = 5  # along an axis: with more, the outer ones move by more than a patch can tell, and nobody measured it
+_CLEAN = 5e-4  # of the mean: with less noise, and so without folded detail, inverting is better than modelling
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,13 +50,14 @@ def views_of(
     """The views of slices complex64 (K, h, w), DC first, cut at `carriers`; see `views.from_slices`.
 
     `samples_px` are the rows and columns of the sensor in a sample of a slice, `row_over_column` the height of a pixel
-    over its width. With `joint` views are made by the joint model, unless slices are smaller than a patch or the frame
-    has next to no noise, as only simulated ones.
+    over its width. With `joint` views are made by the joint model, unless slices are smaller than a patch, there are
+    more views than it was measured with, the frame has next to no noise, or disparities are beyond the widest range.
     """
     orders = [(c.ky, c.kx) for c in carriers]
     plane_variance = noise_variance * samples_px[0] * samples_px[1]
     clean = plane_variance < (_CLEAN * float(slices[0].real.mean())) ** 2
-    if not joint or clean or min(slices.shape[1:]) < SIDE:
+
+    def independent() -> FrameViews:
         made, _ = from_slices(
             slices,
             orders,
@@ -69,6 +69,9 @@ def views_of(
             colours=colours,
         )
         return FrameViews(made, "independent", None)
+
+    if not joint or clean or min(slices.shape[1:]) < SIDE or aperture.views > _MOST_VIEWS:
+        return independent()
     angular = angular_frequencies(orders, kappa_cycles, rotation_rad)
     variances = np.full(len(slices), noise_variance)
     if colours:
@@ -81,4 +84,6 @@ def views_of(
     if found.at_the_ends > _AT_THE_ENDS:
         wider = joint_views(slices, model, samples_px=samples, noise=variances, reach=_WIDER * reach)
         found = max(found, wider, key=lambda one: one.log_likelihood)
+        if found.at_the_ends > _AT_THE_ENDS:
+            return independent()  # it supposes no range
     return FrameViews(found.views, "joint", found.sigma.tolist())

@@ -61,8 +61,9 @@ class JointViews:
 
     @property
     def at_the_ends(self) -> float:
-        """The share of the frame whose disparity is at an end of the range: it may be beyond."""
-        return float(self.histogram[[0, -1]].sum())
+        """The share of the frame whose disparity is at an end of the range, so that it may be beyond; patches without
+        texture, which have each disparity alike, don't count."""
+        return float(self.histogram[[0, -1]].sum() - 2 * np.median(self.histogram))
 
 
 def joint_views(
@@ -345,11 +346,14 @@ def _expected(
     """The views' spectra (F, V·U, N), averaged over hypotheses, and their mean variance (V·U,) a pixel."""
     count = len(_STRENGTHS)
     patches = odds.shape[1]
+    probable = odds.reshape(len(hypotheses), count, patches)
+    probable = np.where(probable.sum(axis=1, keepdims=True) > _NEGLIGIBLE, probable, 0)
+    probable /= probable.sum(axis=(0, 1))
     made = background.unmixed @ spectra
     variance = frame.multiplicity @ background.left
-    for number, one in enumerate(hypotheses):
-        odd = odds[number * count : (number + 1) * count].astype(np.float32)
-        used = np.flatnonzero(odd.sum(axis=0) > _NEGLIGIBLE)
+    for one, some in zip(hypotheses, probable, strict=True):
+        odd = some.astype(np.float32)
+        used = np.flatnonzero(odd.sum(axis=0))
         if not len(used):
             continue
         scaled = _STRENGTHS[:, None, None]
