@@ -12,7 +12,7 @@ from dappled.products.extras import MissingExtraError, need
 
 def test_a_missing_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)  # Python's own way to say: not there
-    with pytest.raises(MissingExtraError, match=r"opencv-python-headless: .*'dappled\[ground\]'"):
+    with pytest.raises(MissingExtraError, match=r"opencv-python-headless; .*'dappled\[ground\]'"):
         need("cv2")
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingExtraError, match=r"'dappled\[cluster\]'"):
