@@ -6,8 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
+from dappled.decode.lightfield.aperture import Aperture, angular_frequencies
+from dappled.decode.lightfield.joint_views import joint_views
 from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.slice_model import SliceModel
 from tests.decode.lightfield.ray_sums import FOCAL_MM, MASK, RaySum, on_slices, psnr
 
 BAND = 0.4 * MASK.frequency_per_mm * 0.01  # cycles/pixel: inside a slice's band
@@ -65,7 +69,7 @@ def test_a_frame_without_noise_or_folded_detail_is_inverted_as_before() -> None:
 @pytest.mark.parametrize("round_", [False, True])
 def test_a_continuous_stop_s_unmeasured_orders_belong_to_the_model(seed: int, round_: bool) -> None:
     found = _reached(RaySum(points=2, round=round_, snr=100, seed=seed))
-    assert found.joint > max(found.quick + 2.5, found.mean + 4), found
+    assert found.joint > max(found.quick + 2.5, found.mean + 3.5), found
 
 
 @pytest.mark.slow
@@ -88,3 +92,22 @@ def test_slices_smaller_than_a_patch_get_quick_views() -> None:
     field = scene.decoder(joint_views=True).decode(plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
     assert min(field.slices.shape[1:]) < 24
     assert (field.attributes["views_model"], field.attributes["view_sigma"]) == ("independent", None)
+
+
+def test_few_slices_don_t_blow_rounding_up() -> None:
+    """Nine slices see fewer directions than a patch's disparities have: the rest is rounding, and was divided by."""
+    orders = [(0, 0), (0, 1), (1, -1), (1, 0), (1, 1)]
+    aperture = Aperture(5)
+    angular = angular_frequencies(orders, 0.5, 0.0)
+    transfers = np.array([1.0, 0.39, 0.21, 0.39, 0.21], dtype=np.complex128)
+    frequencies = np.array([(0.075 * ky, 0.075 * kx) for ky, kx in orders])
+    model = SliceModel.of_half(orders, transfers, angular, frequencies, aperture)
+    chance = np.random.default_rng(1)
+    scene = ndimage.gaussian_filter(chance.normal(size=(96, 96)), 1.5)
+    scene = 0.3 + 0.05 * scene / scene.std()
+    through = transfers * aperture.transform(angular)
+    slices = (through[:, None, None] * scene).astype(np.complex64)
+    slices += (1e-4 * (chance.normal(size=slices.shape) + 1j * chance.normal(size=slices.shape))).astype(np.complex64)
+    made = joint_views(slices, model, samples_px=(6.6, 6.6), noise=np.full(5, 1e-8), reach=33.0)
+    assert psnr(made.views[2, 2].astype(np.float64), scene) > 35
+    assert np.abs(made.views - scene).max() < 0.3

@@ -51,7 +51,8 @@ def views_of(
 
     `samples_px` are the rows and columns of the sensor in a sample of a slice, `row_over_column` the height of a pixel
     over its width. With `joint` views are made by the joint model, unless slices are smaller than a patch, there are
-    more views than it was measured with, the frame has next to no noise, or disparities are beyond the widest range.
+    more views than it was measured with or fewer orders than views have, the frame has next to no noise, or disparities
+    are beyond the widest range.
     """
     orders = [(c.ky, c.kx) for c in carriers]
     plane_variance = noise_variance * samples_px[0] * samples_px[1]
@@ -70,7 +71,8 @@ def views_of(
         )
         return FrameViews(made, "independent", None)
 
-    if not joint or clean or min(slices.shape[1:]) < SIDE or aperture.views > _MOST_VIEWS:
+    few = len(orders) < (aperture.views**2 + 1) // 2
+    if not joint or clean or few or min(slices.shape[1:]) < SIDE or aperture.views > _MOST_VIEWS:
         return independent()
     angular = angular_frequencies(orders, kappa_cycles, rotation_rad)
     variances = np.full(len(slices), noise_variance)

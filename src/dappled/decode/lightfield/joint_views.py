@@ -41,6 +41,7 @@ _ERROR = 5e-4  # of a slice's power: what no light field explains
 _MEAN_ERROR = 1e-3  # of a patch's mean: what a wrong aperture leaves in each slice
 _RING = 0.06  # of what a slice holds of a scene's mean: the frame's end rings in it, as far as a patch from the edge
 _LEAST_NOISE = 1e-12
+_ROUNDING = 1e-6  # of the strongest degree of freedom: a few of the last places of single precision
 _NEGLIGIBLE = 0.01  # of a patch's probability
 _ROUNDS = 3
 
@@ -233,7 +234,12 @@ class _Hypothesis:
         else:
             strength, left = np.linalg.eigh(rows.transpose(0, 2, 1) @ rows.conj())
             strength, left = strength[:, -most:], left[:, :, -most:]
-            turn = rows.conj() @ left / np.sqrt(np.maximum(strength, _LEAST_NOISE))[:, None, :]
+            seen_well = (
+                strength > _ROUNDING * strength[:, -1:]
+            )  # what few slices don't see is rounding, not a direction
+            strength = np.where(seen_well, strength, 0)
+            scale = np.where(seen_well, 1 / np.sqrt(np.maximum(strength, _LEAST_NOISE)), 0)
+            turn = rows.conj() @ left * scale[:, None, :].astype(np.float32)
         turned = turn.transpose(0, 2, 1)
         beside = viewed - seen @ background.unmixed.transpose(0, 2, 1)
         return cls(np.maximum(strength, 0).astype(np.float32), turned @ beside, (turned @ rows).conj() @ white)
