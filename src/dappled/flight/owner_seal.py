@@ -13,13 +13,14 @@ from dappled.flight import layout, seals
 from dappled.flight.checks import flight_check
 from dappled.flight.checks.flight_check import CheckReport
 from dappled.flight.errors import FlightError
-from dappled.flight.ledger import LedgerReader
+from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.seal_key import SealKey
 
 
 def sign(flight: Path, clock: Clock, key: SealKey) -> CheckReport:
     """Check a whole flight and, where nothing is wrong, add a seal by this key; none where the newest one is its
-    already. Returns what a check then says.
+    already. What the check notes becomes an event, which `flight check` repeats: a signature does not hide it.
+    Returns what a check then says.
 
     Raises FlightError: the flight is open or not intact, another process works there, a disk refuses.
     """
@@ -36,6 +37,8 @@ def sign(flight: Path, clock: Clock, key: SealKey) -> CheckReport:
             )
         if found.vouched == "signed":
             return found
-        with seals.opened_again(folder, clock, seals.BY_OWNER, key):
-            pass
+        with seals.opened_again(folder, clock, seals.BY_OWNER, key), Ledger(folder.ledger, clock) as ledger:
+            known = {event.text for event in ledger.events() if event.kind == seals.CHANGED}
+            if told := [note for note in found.notes if note not in known]:
+                ledger.add_event(seals.CHANGED, f"noted before key {key.name} signed it: {'; '.join(told)}")
     return flight_check.check(folder.path, key)

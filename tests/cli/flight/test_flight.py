@@ -13,6 +13,7 @@ import pytest
 from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.flight import Recording, Result, layout, recording, seal_key, seals
+from dappled.flight.ledger import Ledger
 from tests.flight.makers import deliver, flip, request, tag
 
 START_UTC_NS = 1_795_256_103_000_000_000  # 2026-11-21T10:15:03Z
@@ -212,6 +213,24 @@ def test_a_flight_is_signed_later_by_its_owner(
         "up to seal 2, then not signed" in lines(["check", str(closed), "--key", str(tmp_path / "key")], capsys, 1)[-1]
     )
     assert f"intact, sealed with key {name}" in lines(words, capsys)[-1]
+
+
+def test_what_a_check_notes_before_the_owner_signs_is_noted_ever_after(
+    closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Anybody can add a row and its link, and change a sidecar meanwhile: a signature must not make that vanish."""
+    seal_key.make(tmp_path / "key")
+    words = [str(closed), "--key", str(tmp_path / "key")]
+    (closed / "frames" / "000000.xmp").write_bytes(b"<x:xmpmeta/>")
+    seals.seal(layout.open_folder(closed), RecordedClock(START_UTC_NS), "geotag")
+    lines(["seal", *words], capsys)
+    with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
+        ledger.add_event("opened again", "by a stranger")
+    (closed / "frames" / "000000.xmp").write_bytes(b"<x:forged/>")
+    assert any("frames/000000.xmp was changed" in line for line in lines(["check", *words], capsys, 1))
+    for verb in ("seal", "check"):
+        said = lines([verb, *words], capsys)
+        assert any("frames/000000.xmp was changed" in line for line in said[:-1]), said
 
 
 def test_what_is_not_intact_or_not_closed_is_not_signed(

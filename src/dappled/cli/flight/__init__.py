@@ -151,7 +151,8 @@ def _seal(flight: Path, config: Path | None, file: Path | None, as_json: bool) -
             "no key is named to sign with: give --key FILE, or record.seal_key in --config; dappled keys seal makes one"
         )
     found = owner_seal.sign(flight, SystemClock(), key)
-    return _said({**_plain(found), "intact": found.intact}, flight_lines.of_check(found), as_json)
+    _said({**_plain(found), "intact": found.intact}, flight_lines.of_check(found), as_json)
+    return 0 if found.intact and found.vouched == "signed" else 1
 
 
 def _report(flight: Path, as_json: bool) -> int:
