@@ -271,9 +271,8 @@ def compare(ours: Path, theirs: Path) -> bool:
     number, which = done.stdout.split()
     worst = float(number)
     passed = worst <= WITHIN
-    print(
-        f"arm64 {'passed' if passed else 'FAILED'}: largest difference of the light fields {worst:.1e} ({which}, relative)"
-    )
+    word = "passed" if passed else "FAILED"
+    print(f"arm64 {word}: largest difference of the light fields {worst:.1e} ({which}, relative)")
     return passed
 
 
