@@ -20,6 +20,11 @@ class DappledError(Exception):
 
     exit_code: ClassVar[int] = 1
 
+    @property
+    def sentences(self) -> list[str]:
+        """The message; a kind of error that gathers several things gives a sentence for each."""
+        return [str(self)]
+
 
 def sentence(error: BaseException) -> str:
     """An error as a sentence: its own, or its kind where it was not meant for a person."""

@@ -26,7 +26,6 @@ import numpy as np
 import uvicorn
 
 from dappled.config import profiles, settings
-from dappled.config.schema import ConfigError
 from dappled.daemon.console.__main__ import configuration
 from dappled.daemon.console.access import Access
 from dappled.daemon.console.app import ConsoleApp
@@ -90,8 +89,7 @@ def _outcome(door: Callable[[Path], object], path: Path) -> str:
         text, cause = str(error), error.__cause__
         if isinstance(cause, MemoryError):
             return f"unexpected: out of memory ({text[:200]})"
-        lines = text.split("\n") if isinstance(error, ConfigError) else [text]  # settings: all findings, a line each
-        if any("\n" in line or len(line) > 1000 for line in lines) or re.search(r"unexpected \w+Error", text):
+        if any("\n" in one or len(one) > 1000 for one in error.sentences) or re.search(r"unexpected \w+Error", text):
             return f"unexpected: not a sentence: {text[:1000]!r}"
         return f"refused: {text}"
     except BaseException as error:  # noqa: BLE001  # whatever it is, it is what the test looks for

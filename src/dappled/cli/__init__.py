@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 import dappled
-from dappled.config.schema import ConfigError
 from dappled.daemon.health import systemd
 from dappled.errors import DappledError, printable
 
@@ -97,7 +96,7 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
     except DappledError as error:
         if parsed.debug:
             raise
-        return _failed(parsed, str(error), error.exit_code, several=isinstance(error, ConfigError))
+        return _failed(parsed, error.sentences, error.exit_code)
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
@@ -107,7 +106,7 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
         if parsed.debug:
             raise
         where = f"{error.filename}: " if error.filename else ""
-        return _failed(parsed, f"{where}{error.strerror or error}", 1)
+        return _failed(parsed, [f"{where}{error.strerror or error}"], 1)
     except Exception as error:
         if parsed.debug:
             raise
@@ -115,15 +114,15 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
         if isinstance(error, MemoryError):
             wanted = f" ({error})" if str(error) else ""
             said = f"not enough memory{wanted}: close other programs, or use a machine with more memory"
-        return _failed(parsed, said, 1)
+        return _failed(parsed, [said], 1)
     return code
 
 
-def _failed(parsed: argparse.Namespace, text: str, code: int, *, several: bool = False) -> int:
-    """Say what went wrong: a person on standard error, and with --json a program too, as {"error": …}. With `several`
-    each line of the text is a sentence of its own; else a line's end comes from a file's name."""
-    shown = "\n".join(map(printable, text.split("\n"))) if several else printable(text)
+def _failed(parsed: argparse.Namespace, sentences: Sequence[str], code: int) -> int:
+    """Say what went wrong, a line for each sentence: a person on standard error, and with --json a program too, as
+    {"error": …}."""
+    shown = "\n".join(map(printable, sentences))
     print(f"dappled {parsed.verb}: {shown}", file=sys.stderr)
     if getattr(parsed, "json", False):
-        print(json.dumps({"error": text}))
+        print(json.dumps({"error": "\n".join(sentences)}))
     return code

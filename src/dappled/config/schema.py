@@ -24,6 +24,11 @@ class ConfigError(DappledError):
 
     exit_code = 2
 
+    @property
+    def sentences(self) -> list[str]:
+        """See DappledError."""
+        return str(self).split("\n")
+
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Finding:

@@ -79,7 +79,7 @@ def findings(file: SettingsFile, *, by_this_user: bool = True, starting: bool = 
         try:
             rule.check(file.settings)
         except DappledError as error:
-            for text in str(error).splitlines():
+            for text in error.sentences:
                 if not any(text in other.text for other in found):  # a rule may need what another one checks
                     found.append(_finding(file, rule.place, text))
     return found
