@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -22,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from limits import Limit, flat, read_limits
+
+from dappled.daemon.pipeline.recipes import versions
 
 FOLDER = Path(__file__).parent
 BASELINE = FOLDER / "baseline.json"
@@ -116,16 +117,11 @@ def measured(
 
 def machine() -> dict[str, str | int | float]:
     """What the figures were measured on."""
-    model = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), model)
-    except OSError:
-        pass  # not Linux
+    known = versions()
     return {
-        "model": model,
+        "model": known["processor"] or known["machine"],
         "cores": os.cpu_count() or 0,
-        "python": platform.python_version(),
+        "python": known["python"],
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "load_before": round(os.getloadavg()[0], 2),
     }
