@@ -73,7 +73,7 @@ def write_file(path: Path, data: bytes, mode: int = 0o644) -> None:
         while view:
             view = view[os.write(fd, view) :]
 
-    _put(path, fill, mode)
+    fill_file(path, fill, mode)
 
 
 def copy_in(source_fd: int, size: int, path: Path) -> str:
@@ -94,7 +94,7 @@ def copy_in(source_fd: int, size: int, path: Path) -> str:
 
     with ThreadPoolExecutor(1, "dappled-hash") as beside:
         sha256 = beside.submit(hash_descriptor, source_fd, size)
-        _put(path, fill)
+        fill_file(path, fill)
         return sha256.result()
 
 
@@ -132,7 +132,8 @@ def pieces(fd: int, size: int) -> Iterator[memoryview]:
         done += got
 
 
-def _put(path: Path, fill: Callable[[int], None], mode: int = 0o644) -> None:
+def fill_file(path: Path, fill: Callable[[int], None], mode: int = 0o644) -> None:
+    """`write_file` where `fill` writes into a descriptor; what it raises leaves `path` as it was. Raises OSError."""
     part = temporary(path)
     try:
         fd = _new(part, mode)

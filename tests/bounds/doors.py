@@ -73,7 +73,7 @@ def main(folder: Path) -> None:
             for one in sorted((folder / name).iterdir())[1:]:
                 _say(f"> {name}/{one.name}")
                 faulthandler.dump_traceback_later(PATIENCE_S, exit=True)
-                _say(f"< {_outcome(doors[name], one)}")
+                _say(f"< {' / '.join(_outcome(doors[name], one).splitlines())}")  # several sentences are several lines
         faulthandler.cancel_dump_traceback_later()
 
 

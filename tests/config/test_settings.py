@@ -48,6 +48,20 @@ def test_wrong_values_are_named(text: str, said: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('kind = "dappled calibration"\nversion = 1\nfits = []\n', "is a calibration, no settings: .* in \\[decode\\]"),
+        ("p = 2\nfrequency_per_mm = 11.38\n", "is a mask's profile, no settings: .* in \\[mask\\]"),
+        ('law = "fd"\n[[raw]]\nname = "all"\n', "is a camera's profile, no settings: .* in \\[camera\\]"),
+    ],
+)
+def test_another_kind_of_file_is_named_in_one_sentence(text: str, said: str) -> None:
+    """Not a line for each of its keys, with the settings that they resemble."""
+    with pytest.raises(ConfigError, match=f"^test.toml {said}$"):
+        parse(text)
+
+
 def test_url_may_be_one_or_a_list() -> None:
     assert parse("[mavlink]\nurl = 'udpin:127.0.0.1:14550'").mavlink.url == ("udpin:127.0.0.1:14550",)
     assert parse("[mavlink]\nurl = ['a', 'b']").mavlink.url == ("a", "b")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dappled.clock import RecordedClock
-from dappled.flight import Recording, recording
+from dappled.flight import Recording, places, recording
 
 
 @pytest.fixture
@@ -24,6 +24,12 @@ def flight(flights: Path) -> Iterator[Recording]:
     yield begun
     if not begun.closed:
         begun.close()
+
+
+@pytest.fixture
+def on_ext4(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The temporary folder is believed to be on ext4, wherever it is: a prune there is trusted."""
+    monkeypatch.setattr(places, "file_system", lambda fd: "ext4")
 
 
 START_UTC_NS = 1_795_256_103_000_000_000  # 2026-11-21T10:15:03Z

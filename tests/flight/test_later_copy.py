@@ -36,10 +36,7 @@ from tests.flight.makers import deliver, mavlink_2, request
 CLOCK = RecordedClock(START_UTC_NS)
 
 
-@pytest.fixture(autouse=True)
-def disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The temporary folder is believed to be on ext4, wherever it is."""
-    monkeypatch.setattr(places, "file_system", lambda fd: "ext4")
+pytestmark = pytest.mark.usefixtures("on_ext4")
 
 
 @pytest.fixture

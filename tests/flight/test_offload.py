@@ -29,7 +29,6 @@ from dappled.flight import (
     Stray,
     layout,
     offload,
-    places,
     pruning,
     read_back,
     recording,
@@ -42,11 +41,7 @@ from tests.flight.checks.test_chain_check import without_chain
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, flip, held, mavlink_2, request
 
-
-@pytest.fixture(autouse=True)
-def disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The temporary folder is believed to be on ext4, wherever it is."""
-    monkeypatch.setattr(places, "file_system", lambda fd: "ext4")
+pytestmark = pytest.mark.usefixtures("on_ext4")
 
 
 @pytest.fixture

@@ -27,9 +27,11 @@ def read_npy(file: IO[bytes], stored: int, what: str) -> NDArray[Any]:
     return np.asarray(npy.read_array(file, allow_pickle=False))
 
 
-def read_npz(path: Path, names: Collection[str]) -> dict[str, NDArray[Any]]:
-    """Read these arrays of an NPZ file. Raises ClaimError, KeyError where one is missing, and what zipfile raises."""
+def read_npz(path: Path, names: Collection[str], *, also: Collection[str] = ()) -> dict[str, NDArray[Any]]:
+    """Read these arrays of an NPZ file, `also` those where they are there. Raises ClaimError, KeyError where one of
+    `names` is missing, and what zipfile raises."""
     with zipfile.ZipFile(path) as archive:
+        names = [*names, *(name for name in also if f"{name}.npy" in archive.namelist())]
         if missing := {f"{name}.npy" for name in names}.difference(archive.namelist()):
             raise KeyError(min(missing).removesuffix(".npy"))  # zipfile's own error has a sentence of its own
         members = {name: archive.getinfo(f"{name}.npy") for name in names}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,29 @@ class Lens:
 
 
 @dataclass(frozen=True, slots=True)
+class VerdictBounds:
+    """Bounds by which the frames of a flight are judged: above the first of a pair a frame is only usable, above the
+    second it is bad. Blur is in pixels of a view."""
+
+    blur_usable_px: float = setting(
+        0.5, "motion blur above which a frame is only usable", unit="view px", low=0, high=100
+    )
+    blur_bad_px: float = setting(1.0, "motion blur above which a frame is bad", unit="view px", low=0, high=100)
+    defocus_usable_px: float = setting(
+        0.7, "defocus above which a frame is only usable", unit="view px", low=0, high=100
+    )
+    defocus_bad_px: float = setting(1.3, "defocus above which a frame is bad", unit="view px", low=0, high=100)
+    clipped_usable: float = setting(0.01, "clipped share above which a frame is only usable", low=0, high=1)
+    clipped_bad: float = setting(0.05, "clipped share above which a frame is bad", low=0, high=1)
+    black_usable: float = setting(0.5, "black share above which a frame is only usable", low=0, high=1)
+    mean_least: float = setting(0.01, "mean share of white below which a frame is bad", low=0, high=1)
+    carriers_share: float = setting(0.5, "share of the predicted carriers that a good frame shows", low=0, high=1)
+    position_sigma_m: float = setting(
+        10.0, "position's sigma above which a frame is only usable", unit="m", low=0, high=1e6
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class CameraProfile:
     """The properties of a body that the prediction of carriers needs. `law` is a name in
     `dappled.decode.optics.carriers.LAWS`. No mask can be mounted nearer than `least_mask_distance_mm` to the sensor;
@@ -55,6 +78,7 @@ class CameraProfile:
     lenses: tuple[Lens, ...] = ()
     least_mask_distance_mm: float | None = None
     f_numbers: tuple[float, float] | None = None
+    verdict: VerdictBounds = field(default_factory=VerdictBounds)
 
     def lens(self, focal_length_mm: float) -> Lens | None:
         """The lens calibrated within 2 % of a focal length; None where there is none."""
@@ -111,6 +135,7 @@ class _CameraTable:
         None, "nearest that a mask can be mounted to the sensor: its cover glass", unit="mm", low=0, high=100
     )
     f_number: tuple[float, float] | None = setting(None, "widest and narrowest stop of the lens", low=0.5, high=256)
+    verdict: dict | None = setting(None, "bounds for frames")  # type: ignore[type-arg]  # noqa: RUF009  # likewise
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +208,7 @@ def camera(name: str) -> CameraProfile:
         tuple(lenses),
         table.least_mask_distance_mm,
         table.f_number,
+        build(VerdictBounds, table.verdict or {}, source, "verdict"),
     )
 
 

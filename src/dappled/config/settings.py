@@ -12,7 +12,7 @@ from typing import Any
 
 from dappled.config.schema import Finding, Rule, TomlSource, examine, read_toml, refuse, setting
 
-DEPTH_METHODS = ("gradient", "contrast", "combined")  # fast to good
+DEPTH_METHODS = ("contrast", "combined")
 SIMULATED_FLIGHTS = Path("flights")  # where `dappled run --simulate` records without a file
 SOCKET_MODES = ("0600", "0660", "0666")
 
@@ -56,6 +56,30 @@ class CameraSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class PlannedBody:
+    check: str = setting(
+        "set",
+        "A body that is not as planned when it is opened: set (what it lets be set; the rest is told); tell; off",
+        choices=("set", "tell", "off"),
+    )
+    exposure_mode: str = setting("manual", "Exposure mode: manual, or the body's own word (AV); empty: any")
+    focus_mode: str = setting("manual", "Focus mode: manual, or the body's own word; empty: any")
+    drive_mode: str = setting("single", "Drive mode: single, or the body's own word; empty: any")
+    white_balance: str = setting(
+        "", "White balance in the body's own word (Daylight); empty: any, raw files keep it out"
+    )
+    image_format: str = setting("raw", "Image format: raw, or the body's own words (L + RAW); empty: any")
+    auto_power_off: str = setting("off", "Automatic power-off: off, or the body's own word; empty: any")
+    mirror_lockup: str = setting("off", "Mirror lock-up: off or on; empty: any")
+    iso: str = setting("", 'ISO, such as "400"; empty: as the body has it')
+    shutter_speed: str = setting("", 'Exposure time, such as "1/1000"; empty: as the body has it')
+    aperture: str = setting("", 'F-number, such as "5.6"; empty: as the body has it')
+    focal_length_mm: float = setting(
+        0.0, "Focal length that each frame's EXIF is compared with; 0: any", unit="mm", low=0, high=10_000
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class MaskSettings:
     profile: str = setting(
         "", "Mask profile by name or TOML file, or lenslet; empty: frames are recorded but not decoded"
@@ -79,8 +103,8 @@ class MavlinkSettings:
     )
     feedback_is_shot: bool = setting(
         False,
-        "The autopilot fires the camera by wire, and each of its CAMERA_FEEDBACK messages is a shot; always so with, "
-        'and only for, camera.shutter = "outside"',
+        "The autopilot fires the camera by wire, and each of its CAMERA_FEEDBACK messages is a shot; always so, and "
+        'only, where something else fires it: camera.shutter = "outside", or the driver folder without a shutter',
     )
     autopilot_camera: int = setting(
         0,
@@ -88,6 +112,11 @@ class MavlinkSettings:
         low=0,
         high=9,
     )
+
+    @property
+    def link_keys(self) -> tuple[str, ...]:
+        """The key file of each url in order, "" for none, where `keys` names none, one, or one for each url."""
+        return self.keys * len(self.url) if len(self.keys) == 1 else self.keys or ("",) * len(self.url)
 
     @property
     def cam_idx(self) -> int:
@@ -123,7 +152,7 @@ class PoseSettings:
     )
     attitude_sigma_deg: float = setting(
         0.0,
-        "Standard deviation of the attitude where the autopilot sends none; 0: not known, as is then that of each pose",
+        "Least standard deviation of the attitude; the autopilot may send a larger one. 0: as the autopilot sends it",
         unit="°",
         low=0,
         high=90,
@@ -199,6 +228,7 @@ class Settings:
     """All settings, validated and resolved."""
 
     camera: CameraSettings = field(default_factory=CameraSettings)
+    body: PlannedBody = field(default_factory=PlannedBody)
     mask: MaskSettings = field(default_factory=MaskSettings)
     mavlink: MavlinkSettings = field(default_factory=MavlinkSettings)
     record: RecordSettings = field(default_factory=RecordSettings)
@@ -244,7 +274,20 @@ def parse(tables: Mapping[str, Any], source: TomlSource) -> Settings:
     return settings
 
 
+def _other_kind(tables: Mapping[str, Any]) -> str:
+    """What a file is instead of settings, and where settings name it; "" where it may be settings."""
+    if tables.get("kind") == "dappled calibration":
+        return "a calibration, no settings: name it in a settings file, as calibration in [decode]"
+    if "frequency_per_mm" in tables or "period_px" in tables:
+        return "a mask's profile, no settings: name it in a settings file, as profile in [mask]"
+    if "raw" in tables and not tables.keys() & TABLES.keys():
+        return "a camera's profile, no settings: name it in a settings file, as profile in [camera]"
+    return ""
+
+
 def _examine_tables(tables: Mapping[str, Any], source: TomlSource) -> tuple[Settings, list[Finding]]:
+    if other := _other_kind(tables):
+        return Settings(), [Finding("", "", f"{source.name} is {other}")]
     records: dict[str, Any] = {}
     findings: list[Finding] = []
     for name, table in tables.items():

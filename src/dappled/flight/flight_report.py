@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,8 @@ class Balance:
     neither did the autopilot's triggers in `lost_triggers` (a text for each run of its numbers, `lost` in all).
 
     `by_source` counts shots, `following` the failed ones whose files are still on the camera, `companions` files beside
-    frames. `began_utc_ns` is None where UTC was never known.
+    frames. `began_utc_ns` is None where UTC was never known. `judged` counts frames by their verdict in flight (a frame
+    without one is unknown; empty where none was judged), `bad` says of each bad one why.
     """
 
     flight: str
@@ -45,6 +46,8 @@ class Balance:
     began_utc_ns: int | None = None
     lost: int = 0
     lost_triggers: tuple[str, ...] = ()
+    judged: Mapping[str, int] = field(default_factory=dict)
+    bad: tuple[str, ...] = ()
 
     @property
     def balanced(self) -> bool:
@@ -96,6 +99,8 @@ def balance(path: Path) -> Balance:
         shots, frames, facts = ledger.shots(), ledger.frames(), ledger.facts()
         correction_ns = ledger.utc_correction_ns()
         events = ledger.events()
+        results = ledger.results()
+        judged = {index: found for index, one in results.items() if (found := one.verdict)}
         lost = [one for event in events if event.kind == LOST and (one := LostTriggers.of_text(event.text))]
         states = Counter(row.state for row in shots)
         return Balance(
@@ -106,7 +111,7 @@ def balance(path: Path) -> Balance:
             open=states["wished"] + states["fired"],
             frames=len(frames),
             tagged=len(ledger.tags()),
-            decoded=len(ledger.results()),
+            decoded=len(results),
             strays=len(ledger.strays()),
             size=sum(frame.size for frame in frames),
             by_source=dict(sorted(Counter(row.shot.cause.source for row in shots).items())),
@@ -119,7 +124,24 @@ def balance(path: Path) -> Balance:
             began_utc_ns=None
             if correction_ns is None or "began_utc_ns" not in facts
             else facts["began_utc_ns"] + correction_ns,
+            judged=_by_verdict(judged, len(frames)),
+            bad=tuple(
+                f"frame {index}: {'; '.join(reasons)}" for index, (state, reasons) in judged.items() if state == "bad"
+            ),
         )
+
+
+def _by_verdict(judged: Mapping[int, tuple[str, list[str]]], frames: int) -> dict[str, int]:
+    """How many frames have each verdict; empty where the flight's frames were not judged."""
+    if not judged:
+        return {}
+    states = Counter(state for state, _ in judged.values())
+    return {
+        "good": states["good"],
+        "usable": states["usable"],
+        "bad": states["bad"],
+        "unknown": frames - states["good"] - states["usable"] - states["bad"],
+    }
 
 
 def show(path: Path) -> FlightContents:
