@@ -91,10 +91,18 @@ class Camera:
         shape: tuple[int, int],
         f_number: float = FULL_F,
     ) -> NDArray[np.float64]:
-        """(5, 5, h, w) the views on a decoder's grid."""
+        """(5, 5, h, w) the views on a decoder's grid: each the mean of its own beams, where there are 5 n × 5 n."""
         rows, columns = np.arange(shape[0]) * grid[0, 0], np.arange(shape[1]) * grid[1, 1]
-        steps = (np.arange(5) - 2) / 5 * FOCAL_MM / f_number
-        return np.array([[self._views(layers, rows, columns, (v, u)) for u in steps] for v in steps])
+        cells = (np.arange(self.beams) - (self.beams - 1) / 2).reshape(5, -1) / self.beams * FOCAL_MM / f_number
+        return np.array(
+            [
+                [
+                    np.mean([self._views(layers, rows, columns, (v, u)) for v in down for u in across], axis=0)
+                    for across in cells
+                ]
+                for down in cells
+            ]
+        )
 
     def _views(
         self,

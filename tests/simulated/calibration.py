@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dappled.cli.calibrate import fit_views, view_of
+from dappled.cli.calibrate.frames import fit_views, view_of
 from dappled.decode.calibration.calibration import Calibration
 from dappled.drivers.raw.darkroom import Darkroom
 

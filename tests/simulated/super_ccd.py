@@ -83,7 +83,7 @@ class MaskedFinePix:
                 radiance,
                 grid,
                 lattice,
-                angular=lens.angular_phases(optics, self.installed, orders, points),
+                angular=lens.angular_phases(optics, self.installed, orders, points) / len(points),
                 weights=weights,
                 origin_phase=2 * np.pi * (k @ shift - k @ lattice.matrix() @ centre),
                 sites=sites,

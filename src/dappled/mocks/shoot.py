@@ -2,6 +2,7 @@
 
 python -m dappled.mocks.shoot frame.dng
 python -m dappled.mocks.shoot white.dng --scene white --f-number 59.2
+python -m dappled.mocks.shoot white-f22.dng --scene white --mask mask-2 --seed 1
 python -m dappled.mocks.shoot hard.dng --rays print_scale=1.003 stop=square falloff=0.4 --scale 0.1
 python -m dappled.mocks.shoot hard.jpg --rays --scale 0.1 --super-ccd
 """
@@ -17,7 +18,15 @@ import numpy as np
 
 from dappled.config import profiles
 from dappled.mocks.scene import dng
-from dappled.mocks.scene.masked_camera import EXPOSURE_S, ISO, MAKE, MODEL, reference_camera
+from dappled.mocks.scene.masked_camera import (
+    EXPOSURE_S,
+    ISO,
+    MAKE,
+    MODEL,
+    eos450d_camera,
+    eos450d_f_number,
+    reference_camera,
+)
 from dappled.mocks.scene.ray_camera import REAL_COLOURS, WHITE, RayCamera
 from dappled.mocks.scene.super_ccd import SuperCcdBody
 
@@ -27,7 +36,10 @@ def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m dappled.mocks.shoot", description="A simulated frame.")
     parser.add_argument("output", type=Path, metavar="FILE", help=".dng, with --rays also .jpg")
     parser.add_argument("--scene", default="bench", choices=("bench", "white", "terrain"), help="default: bench")
-    parser.add_argument("--f-number", type=float, metavar="N", help="default: open, f/7.4")
+    parser.add_argument("--f-number", type=float, metavar="N", help="default: open, f/7.4; with --mask f/22")
+    parser.add_argument(
+        "--mask", metavar="P", help="by a Canon EOS 450D with this mask instead: a profile or TOML file"
+    )
     parser.add_argument(
         "--seed", type=int, default=3, help="seed of the scene and of how the mask is installed (default: 3)"
     )
@@ -43,8 +55,12 @@ def main(words: list[str] | None = None) -> int:
     arguments = parser.parse_args(words)
     if arguments.rays is not None:
         return _by_rays(parser, arguments)
-    camera = reference_camera(arguments.seed, scale=arguments.scale, scene=arguments.scene)
-    shot = camera.expose(0.0, 0, f_number=arguments.f_number)
+    if arguments.mask is not None:
+        camera = eos450d_camera(arguments.seed, profiles.mask(arguments.mask).mask, scene=arguments.scene, real=True)
+        shot = camera.expose(0.0, 0, f_number=arguments.f_number or eos450d_f_number(camera))
+    else:
+        camera = reference_camera(arguments.seed, scale=arguments.scale, scene=arguments.scene)
+        shot = camera.expose(0.0, 0, f_number=arguments.f_number)
     arguments.output.write_bytes(shot.file)
     if arguments.truth is not None:
         shot.truth.save(arguments.truth)

@@ -97,7 +97,7 @@ def test_the_simulated_camera_is_asked_in_its_own_time_and_its_truth_is_kept(
     assert isinstance(wanted, dict)
     now_t_s = time.time() - wanted.pop("epoch_utc_s")  # the epoch is the wall clock's time at the simulation's start
     assert abs(now_t_s - (time.monotonic_ns() - 1_000_000_000) / 1e9) < 5.0
-    assert wanted == {"scale": 0.5, "scene": "terrain", "law": "geometric"}
+    assert wanted == {"scale": 0.5, "scene": "terrain", "law": "geometric", "real": False}
     assert asked[1] == (2.5, 4)
     assert (tmp_path / "000004.npz").read_bytes() == b"truth"
     times = json.loads((tmp_path / "000004.json").read_text())

@@ -286,6 +286,8 @@ def test_a_jpeg_has_the_tone_curve_of_srgb() -> None:
 
 
 def test_what_no_camera_is_has_a_sentence() -> None:
+    with pytest.raises(ValueError, match=r"2\.5 times finer than its pixels"):
+        replace(CLEAN, finer=2)
     with pytest.raises(ValueError, match="finer than its pixels"):
         replace(CLEAN, mask_distance_mm=60.0)
     with pytest.raises(ValueError, match="must be positive"):

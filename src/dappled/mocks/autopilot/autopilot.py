@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -34,6 +34,7 @@ RATES_HZ: dict[int, float] = {
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
 }
+_GIMBAL = mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS
 _FASTEST_HZ = 100.0
 _LATENCY_NS = 60_000_000  # from a trigger over a wire to the contact
 
@@ -92,6 +93,13 @@ def telemetry_message(message_id: int, pose: TruePose, boot_ns: int, unix_us: in
     raise ValueError(f"the simulated autopilot has no message {message_id}")
 
 
+def _gimbal_ahead(boot_ns: int) -> MavlinkMessage:
+    """A gimbal's attitude: level, looking ahead, turning with the vehicle."""
+    flags = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
+    level = [1.0, 0.0, 0.0, 0.0]
+    return mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, boot_ns // 10**6, flags, level, 0, 0, 0, 0)
+
+
 def flight(path: FlightPath, boot: BootTime, start_s: float, stop_s: float) -> Iterator[tuple[float, MavlinkMessage]]:
     """All telemetry of a stretch of flight, (simulation time, message) in order, without a link."""
     events = sorted(
@@ -103,11 +111,50 @@ def flight(path: FlightPath, boot: BootTime, start_s: float, stop_s: float) -> I
         yield t_s, telemetry_message(message_id, path.pose(t_s), boot.ns(t_s))
 
 
+class Forwarded:
+    """A packet of another component's, which is sent on as it came."""
+
+    def __init__(self, packet: Packet) -> None:
+        self._packet = packet
+
+    @property
+    def source(self) -> tuple[int, int]:
+        """System and component of its sender."""
+        return self._packet.message.get_srcSystem(), self._packet.message.get_srcComponent()
+
+    def get_msgId(self) -> int:  # noqa: N802 (as pymavlink's messages have it)
+        """Its number."""
+        return int(self._packet.message.get_msgId())
+
+    def pack(self, _packer: object, force_mavlink1: bool = False) -> bytes:
+        """Its bytes."""
+        return self._packet.raw
+
+
+@dataclass(slots=True)
+class PortRelay:
+    """Forwards between ports as ArduPilot does (MAVLink_routing): never to the port that a packet came on, and no
+    heartbeat to a port that is known as a source of its sender."""
+
+    ports: int
+    send: Callable[[MavlinkMessage, int], object]
+    sources: set[tuple[int, int, int]] = field(default_factory=set)  # system, component, port
+
+    def __call__(self, message: Forwarded, link: int) -> None:
+        self.sources.add((*message.source, link))
+        for port in range(self.ports):
+            known = message.get_msgId() == mavlink.MAVLINK_MSG_ID_HEARTBEAT and (*message.source, port) in self.sources
+            if port != link and not known:
+                self.send(message, port)
+
+
 @dataclass(slots=True)
 class Flyer:
     """The running autopilot: sends what is due, answers TIMESYNC and message interval requests, delays telemetry.
 
-    `cameras` are those that it triggers itself, on command; none: it leaves these commands to cameras.
+    `cameras` are those that it triggers itself, on command; none: it leaves these commands to cameras. `relay` sends
+    what is not for it alone on its other ports, as ArduPilot does; None: it forwards nothing. `gimbal`: it has one, and
+    sends its attitude on request alone.
     """
 
     path: FlightPath
@@ -117,6 +164,8 @@ class Flyer:
     jitter_s: float = 0.0
     system_id: int = 1
     cameras: CameraTriggers | None = None
+    relay: Callable[[Forwarded, int], object] | None = None
+    gimbal: bool = False
     due_ns: dict[int, int] = field(default_factory=dict)
     interval_ns: dict[int, int] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -144,7 +193,12 @@ class Flyer:
         for number in due:
             if pose is None:
                 pose = self.path.pose((now_ns - self.start_monotonic_ns) / 1e9)
-            self._later(telemetry_message(number, pose, self.boot_ns(now_ns), time.time_ns() // 1000), now_ns)
+            boot_ns = self.boot_ns(now_ns)
+            if number == _GIMBAL:
+                message = _gimbal_ahead(boot_ns)
+            else:
+                message = telemetry_message(number, pose, boot_ns, time.time_ns() // 1000)
+            self._later(message, now_ns)
         if self.cameras is not None:
             with self.lock:
                 triggered = self.cameras.due(self.boot_ns(now_ns) // 1000, time.time_ns() // 1000)
@@ -169,7 +223,10 @@ class Flyer:
         message = packet.message
         if packet.sent:
             return
-        if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+        target = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
+        if self.relay is not None and target != (self.system_id, 1) and message.get_type() != "TIMESYNC":
+            self.relay(Forwarded(packet), packet.link)
+        if message.get_type() == "TIMESYNC" and message.tc1 == 0 and self._asks_us(packet.raw):
             self.send(mavlink.MAVLink_timesync_message(self.boot_ns(time.monotonic_ns()), message.ts1))
         if message.get_type() == "COMMAND_LONG" and message.target_system in (0, self.system_id):
             if self.cameras is not None:
@@ -183,13 +240,21 @@ class Flyer:
             sender = (message.get_srcSystem(), message.get_srcComponent())
             self.send(mavlink.MAVLink_command_ack_message(message.command, result, 0, 0, *sender))
 
+    def _asks_us(self, request: bytes) -> bool:
+        """Whether a TIMESYNC is for this component: its target is an extension of version 2 that pymavlink leaves
+        out."""
+        payload = request[10 : 10 + request[1]] if request[0] == 0xFD else b""
+        system, component = (*payload[16:18], 0, 0)[:2]
+        return system in (0, self.system_id) and component in (0, 1)
+
     def _set_interval(self, number: float, interval_us: float) -> int:
-        if number not in RATES_HZ:
+        if number not in RATES_HZ and not (self.gimbal and number == _GIMBAL):
             return int(mavlink.MAV_RESULT_UNSUPPORTED)
         if not (math.isfinite(interval_us) and interval_us > 0):
             return int(mavlink.MAV_RESULT_DENIED)
         with self.lock:
             self.interval_ns[int(number)] = max(round(interval_us * 1e3), round(1e9 / _FASTEST_HZ))
+            self.due_ns.setdefault(int(number), 0)
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _triggered(self, messages: list[MavlinkMessage], now_ns: int) -> None:
@@ -224,11 +289,12 @@ class Autopilot:
         start_monotonic_ns: int,
         jitter_s: float = 0.0,
         booted_s: float = BootTime().offset_s,
+        more: Sequence[str] = (),
     ) -> Autopilot:
         """Start one that flies `FlightPath(seed)` since `start_monotonic_ns` and speaks on `url` (udpout:HOST:PORT).
 
-        It was
-        booted `booted_s` before the flight began; less than zero: in flight."""
+        It was booted `booted_s` before the flight began; less than zero: in flight. `more` are options of the
+        process, such as `--forward` and further ports (`--url=…`)."""
         command = [
             sys.executable,
             "-m",
@@ -240,7 +306,7 @@ class Autopilot:
             str(seed),
         ]
         command += ["--start-monotonic-ns", str(start_monotonic_ns), "--jitter", str(jitter_s)]
-        command += [f"--booted={booted_s}"]
+        command += [f"--booted={booted_s}", *more]
         return cls(subprocess.Popen(command, stdin=subprocess.PIPE, process_group=0))
 
     def running(self) -> bool:
@@ -268,7 +334,7 @@ def _euler(pose: TruePose) -> tuple[float, float, float]:
 def main(arguments: list[str] | None = None) -> int:
     """Run the process."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--url", required=True)
+    parser.add_argument("--url", required=True, action="append", help="a port of it; several: it sends on each")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--start-monotonic-ns", type=int, default=None, help="when the flight began; default now")
     parser.add_argument("--system-id", type=int, default=1)
@@ -284,13 +350,18 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--drift", type=float, default=BootTime().drift, help="share by which its clock runs fast")
     parser.add_argument("--jump", action="append", type=_jump, default=[], help="AT:BY, seconds its clock gains at AT")
+    parser.add_argument("--gimbal", action="store_true", help="it has a gimbal, and sends its attitude on request")
+    parser.add_argument("--forward", action="store_true", help="forward between its ports, as ArduPilot does")
     parser.add_argument("--with-parent", action="store_true", help="end when standard input is closed")
     wanted = parser.parse_args(arguments)
     start_ns = time.monotonic_ns() if wanted.start_monotonic_ns is None else wanted.start_monotonic_ns
-    links = MavlinkLinks([wanted.url], system_id=wanted.system_id, component_id=1, clock=SystemClock())
+    links = MavlinkLinks(wanted.url, system_id=wanted.system_id, component_id=1, clock=SystemClock())
     boot = BootTime(wanted.booted, wanted.drift, tuple(wanted.jump))
     cameras = CameraTriggers(wanted.personality, tuple(wanted.camera), wanted.system_id) if wanted.camera else None
     flyer = Flyer(FlightPath(wanted.seed), start_ns, boot, links.sender.send, wanted.jitter, wanted.system_id, cameras)
+    flyer.gimbal = wanted.gimbal
+    if wanted.forward:
+        flyer.relay = PortRelay(len(wanted.url), links.sender.send)
     try:
         links.start(flyer)
     except LinkError as error:

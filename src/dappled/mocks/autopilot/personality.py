@@ -93,7 +93,8 @@ class CameraTriggers:
                 period_us = round(message.param2 * 1e6)
                 left = max(0, round(message.param3))
                 self._interval = (boot_us + period_us, period_us, left - 1) if left != 1 else None
-            return self.trigger(boot_us, unix_us)
+            camera = round(message.param1) - 1  # parameter 1 is the camera, from 1; 0 is all of them
+            return self.trigger(boot_us, unix_us, camera if camera in range(len(self.cameras)) else None)
         return []
 
     def due(self, boot_us: int, unix_us: int = 0) -> list[MavlinkMessage]:

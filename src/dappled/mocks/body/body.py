@@ -2,9 +2,9 @@
 
     python -m dappled.mocks.body.body --seed 1 --scale 0.25
 
-prints `port N` once it listens, then obeys lines on standard input: a fault of `faults` ("busy 2"), or "releases",
-"contact", "card", "move". It answers every line with one line, `ok …` or `error …`. It ends when its input ends, so it
-never outlives the process that started it.
+prints `port N` once it listens, then obeys lines on standard input: a fault of `faults` ("busy 2"), "releases",
+"contact", "card", "move", or what a hand turns or runs low: "turn dial 2" (see `eos450d`). It answers every line with
+one line, `ok …` or `error …`. It ends when its input ends, so it never outlives the process that started it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.clock import SystemClock
+from dappled.config import profiles
 from dappled.errors import DappledError
 from dappled.mocks.body.eos450d import SERIAL, Eos450d, Expose
 from dappled.mocks.body.eos_card import CARD_BYTES
@@ -43,10 +44,13 @@ class BodyOptions:
     `picture`: "simulated" (the reference camera's raw files), "pattern:SIZE:EXTENSION" (bytes that `pattern` makes),
     or a file's path (its bytes, every time). `start_monotonic_ns`: when the simulation's time began (None: when the
     body starts). `scale`: share of the reference sensor that is rendered. `scene`, `law`: as
-    `reference_camera` has them. `truth`: a folder for the simulated camera's truth about each shot (000001.npz, and its
-    times in seconds since the simulation's start in 000001.json). `delay_s`: how long a pattern or
+    `reference_camera` has them. `mask`: the pictures are those of a Canon EOS 450D with this mask (a profile or TOML
+    file), not of the reference camera; `scale` and `law` are not used then. `truth`: a folder for
+    the simulated camera's truth about each shot (000001.npz, and its times in seconds since the simulation's start in
+    000001.json). `delay_s`: how long a pattern or
     file takes to expose. `card_bytes`: the card's size; a full one refuses to shoot. `clock_offset_s`: how far the
-    body's own clock is wrong. `pairs`: raw and JPEG of each picture. `addresses`: how many ports it has.
+    body's own clock is wrong. `pairs`: raw and JPEG of each picture. `addresses`: how many ports it has. `real`: as
+    `reference_camera` has it.
     """
 
     picture: str = "simulated"
@@ -54,6 +58,7 @@ class BodyOptions:
     scale: float = 1.0
     scene: str = "terrain"
     law: str = "geometric"
+    mask: str = ""
     f_number: float | None = None
     start_monotonic_ns: int | None = None
     truth: Path | None = None
@@ -63,6 +68,7 @@ class BodyOptions:
     clock_offset_s: float = 0.0
     pairs: bool = False
     addresses: int = 1
+    real: bool = False
     faults: tuple[str, ...] = ()
 
     def arguments(self) -> list[str]:
@@ -73,6 +79,7 @@ class BodyOptions:
             "--scale": self.scale,
             "--scene": self.scene,
             "--law": self.law,
+            "--mask": self.mask or None,
             "--f-number": self.f_number,
             "--start-monotonic-ns": self.start_monotonic_ns,
             "--truth": self.truth,
@@ -83,7 +90,7 @@ class BodyOptions:
             "--addresses": self.addresses,
         }
         given = [text for name, value in named.items() if value is not None for text in (name, str(value))]
-        given += ["--pairs"] if self.pairs else []
+        given += ["--pairs"] * self.pairs + ["--real"] * self.real
         return [*given, *(text for fault in self.faults for text in ("--fault", fault))]
 
 
@@ -224,16 +231,29 @@ def _delayed(delay_s: float, make: Callable[[int], bytes], extension: str) -> Ex
 
 def _simulated(options: BodyOptions) -> Expose:
     # Imported here: it loads the whole renderer, which a body that shows patterns doesn't need.
-    from dappled.mocks.scene.masked_camera import reference_camera  # noqa: PLC0415  # reason above
-
     start_ns = time.monotonic_ns() if options.start_monotonic_ns is None else options.start_monotonic_ns
-    camera = reference_camera(
-        options.seed,
-        scale=options.scale,
-        scene=options.scene,
-        law=options.law,
-        epoch_utc_s=time.time() + options.clock_offset_s - (time.monotonic_ns() - start_ns) / 1e9,
-    )
+    epoch_utc_s = time.time() + options.clock_offset_s - (time.monotonic_ns() - start_ns) / 1e9
+    if options.mask:
+        from dappled.mocks.scene.masked_camera import eos450d_camera  # noqa: PLC0415  # reason above
+
+        camera = eos450d_camera(
+            options.seed,
+            profiles.mask(options.mask).mask,
+            scene=options.scene,
+            epoch_utc_s=epoch_utc_s,
+            real=options.real,
+        )
+    else:
+        from dappled.mocks.scene.masked_camera import reference_camera  # noqa: PLC0415  # reason above
+
+        camera = reference_camera(
+            options.seed,
+            scale=options.scale,
+            scene=options.scene,
+            law=options.law,
+            epoch_utc_s=epoch_utc_s,
+            real=options.real,
+        )
 
     def expose(trigger_monotonic_ns: int, shot_number: int) -> tuple[bytes, str]:
         trigger_t_s = (trigger_monotonic_ns - start_ns) / 1e9
@@ -258,7 +278,11 @@ def _obey(line: str, eos: Eos450d, responder: Responder, faults: BodyFaults) -> 
         responder.move()
         return "ok"
     try:
-        faults.command(line)
+        match line.split():
+            case ["turn", what, value]:
+                eos.turn(what, int(value, 0))
+            case _:
+                faults.command(line)
     except ValueError as error:
         return f"error {error}"
     return "ok"
@@ -271,6 +295,7 @@ def _options(arguments: Sequence[str] | None) -> BodyOptions:
     parser.add_argument("--scale", type=float, default=1.0, help="share of the reference sensor's side")
     parser.add_argument("--scene", default="terrain", help="terrain, bench, white, or a folder of views")
     parser.add_argument("--law", default="geometric", help="geometric or fd: where the carriers stand")
+    parser.add_argument("--mask", default="", help="a 450D with this mask, in place of the reference camera")
     parser.add_argument("--f-number", type=float, help="the simulated lens' aperture; open without it")
     parser.add_argument("--start-monotonic-ns", type=int, help="CLOCK_MONOTONIC at the simulation's start")
     parser.add_argument("--truth", type=Path, help="folder for what the simulation knows of each shot")
@@ -280,6 +305,7 @@ def _options(arguments: Sequence[str] | None) -> BodyOptions:
     parser.add_argument("--clock-offset", dest="clock_offset_s", type=float, default=0.0, help="s the body is wrong by")
     parser.add_argument("--pairs", action="store_true", help="raw and JPEG of each picture")
     parser.add_argument("--addresses", type=int, default=1, help="ports that it can be moved between")
+    parser.add_argument("--real", action="store_true", help="a round stop, a print error, detail beyond a slice's band")
     parser.add_argument("--fault", dest="faults", action="append", default=[], help='in force from the start: "busy 2"')
     found = vars(parser.parse_args(arguments))
     return BodyOptions(**{**found, "faults": tuple(found["faults"])})
@@ -304,6 +330,7 @@ def serve(options: BodyOptions, lines: Iterable[str]) -> None:
         serial=options.serial,
         card_bytes=options.card_bytes,
         pairs=options.pairs,
+        f_number=options.f_number,
     )
     responder = Responder(eos, faults, addresses=options.addresses)
     _say(f"port {' '.join(map(str, responder.ports))}")

@@ -8,6 +8,7 @@ busy during a capture, and no shot to memory before the computer has announced r
 from __future__ import annotations
 
 import io
+import math
 import struct
 import threading
 import time
@@ -36,7 +37,7 @@ _HUNT_S = 0.3
 _OPERATIONS = sorted(
     set(Op) - {Op.EOS_AF_CANCEL, Op.GET_THUMB}
     | {0x100A, 0x100C, 0x100D, 0x100F, 0x9103, 0x9106, 0x910A, 0x910B, 0x910C, 0x910E, 0x9113, 0x9118}
-    | {0x911E, 0x911F, 0x9120, 0x9121, 0x9125, 0x9126, 0x9153, 0x9154, 0x9155, 0x9157, 0x9158, 0x9159}
+    | {0x911E, 0x911F, 0x9120, 0x9121, 0x9125, 0x9126, 0x9154, 0x9155, 0x9157, 0x9158, 0x9159}
 )
 _EVENTS = (0x4009, 0x4004, 0x4005, 0x4003, 0x4002, 0x4007, 0xC101)
 
@@ -53,16 +54,18 @@ class Eos450d:
         serial: str = SERIAL,
         card_bytes: int = CARD_BYTES,
         pairs: bool = False,
+        f_number: float | None = None,
     ) -> None:
+        """`f_number` is what the body says its lens is set to, to the next full stop (None: f/2.8)."""
         self._expose = expose
         self._faults = faults
         self._serial = serial
         self._clock = clock
         self._lock = threading.Lock()  # held around all that follows
         self._session = self._working = False
-        self._releases = 0
+        self._releases = self._looks = 0
         self._card = Card(card_bytes, faults, clock.utc_ns() // 10**9)
-        self._properties = Properties(serial, pairs=pairs)
+        self._properties = Properties(serial, pairs=pairs, f_number=f_number)
         self._handlers: dict[int, Handler] = {
             Op.GET_DEVICE_INFO: self._device_info,
             Op.OPEN_SESSION: self._open,
@@ -70,6 +73,7 @@ class Eos450d:
             Op.GET_DEVICE_PROP_DESC: self._prop_desc,
             Op.EOS_GET_DEVICE_INFO_EX: self._eos_device_info,
             Op.EOS_REMOTE_RELEASE: self._release,
+            Op.EOS_GET_VIEWFINDER_DATA: self._viewfinder,
             Op.EOS_SET_REMOTE_MODE: self._nothing,
             Op.EOS_SET_UI_LOCK: self._nothing,
             Op.EOS_RESET_UI_LOCK: self._nothing,
@@ -94,6 +98,11 @@ class Eos450d:
         """Close the contact of the remote socket: an exposure, with or without a link. False if there is none."""
         with self._lock:
             return self._release(PtpRequest(Op.EOS_REMOTE_RELEASE, 0, ()), b"").code == Code.OK
+
+    def turn(self, what: str, value: int) -> None:
+        """A hand turns something at the body, or something in it runs low; it announces that. Raises ValueError."""
+        with self._lock:
+            self._properties.turn(what, value)
 
     def disconnected(self) -> None:
         """The link is gone, and the session with it. The card and a running capture stay."""
@@ -173,6 +182,15 @@ class Eos450d:
         Loop("capture", partial(capture, *work)).start()
         return PtpResponse(parameters=(0,))
 
+    def _viewfinder(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
+        if not self._properties.shows_viewfinder:
+            return PtpResponse(Code.GENERAL_ERROR)
+        if self._working:
+            return PtpResponse(Code.DEVICE_BUSY)
+        self._looks += 1
+        picture = chart(self._looks)
+        return PtpResponse(data=struct.pack("<II", 8 + len(picture), _VIEWFINDER_JPEG) + picture)
+
     def _hunt(self, _triggered_ns: int, _number: int, _to_memory: bool) -> None:
         """Simulate an autofocus that fails: no picture is taken."""
         time.sleep(_HUNT_S)
@@ -220,6 +238,22 @@ def thumbnail(number: int) -> bytes:
     return file.getvalue()
 
 
+def chart(number: int) -> bytes:
+    """The viewfinder's JPEG: bars from dark to clipped, fine lines, and a mark that moves from look to look."""
+    picture = Image.new("L", (480, 320))
+    for bar in range(8):
+        picture.paste(min(36 * bar + 20, 255), (60 * bar, 0, 60 * bar + 60, 160))
+    for line in range(0, 480, 4):
+        picture.paste(200, (line, 160, line + 2, 320))
+    left = 8 * number % 460
+    picture.paste(255, (left, 230, left + 20, 250))
+    file = io.BytesIO()
+    picture.save(file, "JPEG", quality=85)
+    return file.getvalue()
+
+
+_VIEWFINDER_JPEG = 1  # type of a block of the viewfinder's data; length and type go before the bytes
+_TO_COMPUTER = 2
 _TO_CARD = 2
 _TO_MEMORY = 4
 
@@ -233,23 +267,44 @@ class Prop(IntEnum):
     AUTO_EXPOSURE_MODE = 0xD105
     DRIVE_MODE = 0xD106
     FOCUS_MODE = 0xD108
+    WHITE_BALANCE = 0xD109
     BATTERY = 0xD111
+    AUTO_POWER_OFF = 0xD114
     OWNER = 0xD115
     MODEL_ID = 0xD116
     AVAILABLE_SHOTS = 0xD11B
     CAPTURE_DESTINATION = 0xD11C
     IMAGE_FORMAT = 0xD120
+    CUSTOM_FUNCTIONS = 0xD1A0
     SERIAL_NUMBER = 0xD1AF
     EVF_OUTPUT = 0xD1B0
 
 
 _CHOICES = {
-    Prop.APERTURE: (0x15, 0x18, 0x1D, 0x20, 0x25, 0x28, 0x2D, 0x30),
+    Prop.APERTURE: (0x15, 0x18, 0x1D, 0x20, 0x25, 0x28, 0x2D, 0x30, 0x38, 0x40, 0x48, 0x50, 0x58),
     Prop.SHUTTER_SPEED: (0x68, 0x70, 0x78, 0x80, 0x88, 0x90),
     Prop.ISO: (0x48, 0x50, 0x58, 0x60, 0x68),
     Prop.DRIVE_MODE: (0, 1, 0x10),
+    Prop.WHITE_BALANCE: (0, 1, 2, 3, 4, 5, 6),
     Prop.CAPTURE_DESTINATION: (_TO_CARD, _TO_MEMORY),
 }
+_BY_HAND = (Prop.AUTO_EXPOSURE_MODE, Prop.FOCUS_MODE, Prop.BATTERY, Prop.CUSTOM_FUNCTIONS)
+"""What the mode dial, the switch at the lens, the cells and the menu decide: the computer can't set it."""
+
+_DIALS = {
+    "dial": Prop.AUTO_EXPOSURE_MODE,
+    "focus": Prop.FOCUS_MODE,
+    "drive": Prop.DRIVE_MODE,
+    "battery": Prop.BATTERY,
+    "room": Prop.AVAILABLE_SHOTS,
+    "power-off": Prop.AUTO_POWER_OFF,
+    "iso": Prop.ISO,
+    "mirror": Prop.CUSTOM_FUNCTIONS,
+}
+"""What `Eos450d.turn` turns. dial: 0 P, 1 Tv, 2 Av, 3 M. focus: 0 one shot, 3 manual. drive: 0 single, 1 continuous,
+0x10 timer. battery: 0 low, 1 half, 2 full. power-off: seconds, 0 never. mirror: 1 lock-up."""
+
+_MIRROR_LOCKUP = 0x60F
 _RAW = (1, 16, 6, 0, 4)
 _RAW_AND_JPEG = (2, 16, 1, 0, 3, 16, 6, 0, 4)
 _FORMATS = (_RAW, _RAW_AND_JPEG)
@@ -259,21 +314,24 @@ _FORMATS = (_RAW, _RAW_AND_JPEG)
 class Properties:
     """The values of the properties, and the events not fetched yet. The caller holds the body's lock."""
 
-    def __init__(self, serial: str, *, pairs: bool) -> None:
+    def __init__(self, serial: str, *, pairs: bool, f_number: float | None = None) -> None:
         self._events: deque[bytes] = deque()
         self._values: dict[int, bytes] = {
-            Prop.APERTURE: _u32(0x20),
+            Prop.APERTURE: _u32(0x20 if f_number is None else _aperture(f_number)),
             Prop.SHUTTER_SPEED: _u32(0x78),
             Prop.ISO: _u32(0x48),
             Prop.AUTO_EXPOSURE_MODE: _u32(3),
             Prop.DRIVE_MODE: _u32(0),
             Prop.FOCUS_MODE: _u32(3),
+            Prop.WHITE_BALANCE: _u32(0),
             Prop.BATTERY: _u32(2),
+            Prop.AUTO_POWER_OFF: _u32(0),
             Prop.OWNER: b"dappled\0",
             Prop.MODEL_ID: _u32(0x80000176),
             Prop.AVAILABLE_SHOTS: _u32(100),
             Prop.CAPTURE_DESTINATION: _u32(_TO_CARD),
             Prop.IMAGE_FORMAT: _words(_RAW_AND_JPEG if pairs else _RAW),
+            Prop.CUSTOM_FUNCTIONS: _custom_functions(mirror_lockup=0),
             Prop.SERIAL_NUMBER: serial.encode() + b"\0",
             Prop.EVF_OUTPUT: _u32(0),
         }
@@ -282,6 +340,11 @@ class Properties:
     def to_memory(self) -> bool:
         """Whether captures go to the body's memory, not to its card."""
         return self._values[Prop.CAPTURE_DESTINATION][:4] == _u32(_TO_MEMORY)
+
+    @property
+    def shows_viewfinder(self) -> bool:
+        """Whether the viewfinder's picture goes to the computer."""
+        return bool(struct.unpack_from("<I", self._values[Prop.EVF_OUTPUT])[0] & _TO_COMPUTER)
 
     @property
     def pairs(self) -> bool:
@@ -340,6 +403,8 @@ class Properties:
         if prop not in self._values:
             return PtpResponse(Code.DEVICE_PROP_NOT_SUPPORTED)
         value = data[8:]
+        if prop in _BY_HAND:
+            return PtpResponse(Code.GENERAL_ERROR)
         if prop in _CHOICES and struct.unpack_from("<I", value)[0] not in _CHOICES[Prop(prop)]:
             return PtpResponse(Code.GENERAL_ERROR)
         if prop == Prop.IMAGE_FORMAT and value not in map(_words, _FORMATS):
@@ -353,9 +418,39 @@ class Properties:
         self._put(Prop.AVAILABLE_SHOTS, _u32(min(request.parameter(0) // 4096, 9999)))
         return PtpResponse()
 
+    def turn(self, what: str, value: int) -> None:
+        """A hand turns a dial, or something runs low: see `_DIALS`. Raises ValueError for what the body hasn't."""
+        prop = _DIALS.get(what)
+        if prop is None:
+            raise ValueError(f"the body has no {what!r} to turn; it has {', '.join(_DIALS)}")
+        self._put(prop, _custom_functions(mirror_lockup=value) if what == "mirror" else _u32(value))
+
     def _put(self, prop: int, value: bytes) -> None:
         self._values[prop] = value
         self.announce(ptp.eos_property(prop, value))
+
+
+def _custom_functions(*, mirror_lockup: int) -> bytes:
+    """The custom functions as a 450D writes them: size, groups; of each its number, size, count, and (function, values,
+    value). As users have read them from the body (indilib/indi-3rdparty, issue 804); but four bytes follow, without
+    which libgphoto2 2.5.34 says "bad length"."""
+    groups = (
+        (1, (0x101, 0), (0x10F, 0)),
+        (2, (0x201, 0), (0x202, 0), (0x203, 0), (0x204, 0)),
+        (3, (0x50E, 0), (0x511, 0), (_MIRROR_LOCKUP, mirror_lockup)),
+        (4, (0x701, 0), (0x704, 0), (0x811, 0), (0x80F, 0)),
+    )
+    words = [
+        word
+        for number, *functions in groups
+        for word in (number, 8 + 12 * len(functions), len(functions), *(w for f, v in functions for w in (f, 1, v)))
+    ]
+    return _words((4 * (len(words) + 2), len(groups), *words, 0))
+
+
+def _aperture(f_number: float) -> int:
+    """The code of the full stop next to an f-number, f/2.8 (0x20) to f/32 (0x58): eight to a stop."""
+    return min(max(8 + 8 * round(2 * math.log2(f_number)), 0x20), 0x58)
 
 
 def _words(values: Iterable[int]) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from dappled.decode.array_types import Singles
 from dappled.decode.geometry import Quaternion
 from dappled.mocks.autopilot.path import TruePose
 from dappled.mocks.scene import landscape
-from dappled.mocks.scene.landscape import DETAIL_TEXEL_M, TEXEL_M, Landscape
+from dappled.mocks.scene.landscape import TEXEL_M, Landscape
 from dappled.mocks.scene.lens import Rays, Rendering
 
 MARCH_STEP_M = 0.3
@@ -35,14 +35,16 @@ def rotation(attitude: Quaternion) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, slots=True)
 class TerrainScene:
-    """The landscape as a scene."""
+    """The landscape as a scene. Where `sharp`, only every second ray of each axis is followed to the ground; the others
+    meet it between their neighbours."""
 
     ground: Landscape
+    sharp: bool = False
 
     @classmethod
-    def of(cls, seed: int, finest_period_m: float = 0.037) -> TerrainScene:
+    def of(cls, seed: int, finest_period_m: float = 0.037, *, sharp: bool = False) -> TerrainScene:
         """The landscape of a seed; nothing in its fine texture is finer than `finest_period_m` (metres a cycle)."""
-        return cls(landscape.build(seed, finest_period_m))
+        return cls(landscape.build(seed, finest_period_m, sharp=sharp), sharp)
 
     @property
     def mean_radiance(self) -> float:
@@ -63,7 +65,7 @@ class TerrainScene:
         """
         if pose is None:
             raise ValueError("a scene of terrain needs a path of the camera")
-        hits = _centre_hits(self.ground, rays, pose)
+        hits = _hits_between(self.ground, rays, pose) if self.sharp else _centre_hits(self.ground, rays, pose)
         surface = _Surface.under(self.ground, hits)
         radiance = np.empty((len(rays.aperture_mm), 3, len(rays.y_mm), len(rays.x_mm)), dtype=np.float32)
 
@@ -84,14 +86,15 @@ class TerrainScene:
 @dataclass(frozen=True, slots=True)
 class _Surface:
     """The part of the ground that is in the picture, its colours (3, rows, columns) at the detail map's texel, and the
-    landscape's indices (row, column) of its first texel."""
+    landscape's indices (row, column) of its first texel; `finer` of its texels are one of the landscape's."""
 
     colours: Singles
     corner: tuple[int, int]
+    finer: int
 
     @classmethod
     def under(cls, ground: Landscape, hits: _Hits) -> _Surface:
-        finer = round(TEXEL_M / DETAIL_TEXEL_M)
+        finer = round(TEXEL_M / ground.detail_texel_m)
         corner, indices = [], []
         for place in (hits.row, hits.column):
             first, last = math.floor(float(place.min())) - 2, math.ceil(float(place.max())) + 2
@@ -100,12 +103,13 @@ class _Surface:
         at = np.stack(np.meshgrid(*(i.astype(np.float32) / finer for i in indices), indexing="ij"))
         detail = ground.detail[np.ix_(*(i % n for i, n in zip(indices, ground.detail.shape, strict=True)))]
         texture = 1 + _look(ground.roughness, at) * detail
-        return cls(np.stack([_look(albedo, at) * texture for albedo in ground.albedo]), (corner[0], corner[1]))
+        colours = np.stack([_look(albedo, at) * texture for albedo in ground.albedo])
+        return cls(colours, (corner[0], corner[1]), finer)
 
     def look(self, at: Singles, out: Singles) -> None:
         """Colours (3, h, w) at (2, h, w) landscape indices, which are used up."""
         at -= np.array(self.corner, dtype=np.float32)[:, None, None]
-        at *= np.float32(TEXEL_M / DETAIL_TEXEL_M)
+        at *= np.float32(self.finer)
         for plane, colour in zip(out, self.colours, strict=True):
             ndimage.map_coordinates(colour, at, output=plane, order=1, mode="nearest", prefilter=False)
 
@@ -184,6 +188,28 @@ def _centre_hits(ground: Landscape, rays: Rays, pose: TruePose) -> _Hits:
         row_per_m=(rows[0], rows[1]),
         column_per_m=(columns[0], columns[1]),
     )
+
+
+def _hits_between(ground: Landscape, rays: Rays, pose: TruePose) -> _Hits:
+    """The hits of an even number of rays along each axis, by those of every second one."""
+    y, x = (np.append(at[::2], 2 * at[-1] - at[-2]) for at in (rays.y_mm, rays.x_mm))
+    some = _centre_hits(ground, replace(rays, y_mm=y, x_mm=x), pose)
+    return _Hits(
+        depth_m=_doubled(some.depth_m),
+        row=_doubled(some.row),
+        column=_doubled(some.column),
+        row_per_m=(_doubled(some.row_per_m[0]), _doubled(some.row_per_m[1])),
+        column_per_m=(_doubled(some.column_per_m[0]), _doubled(some.column_per_m[1])),
+    )
+
+
+def _doubled(plane: Singles) -> Singles:
+    """(2h - 2, 2w - 2): the values of (h, w), and their means between them."""
+    rows = np.empty((2 * len(plane) - 2, plane.shape[1]), dtype=np.float32)
+    rows[::2], rows[1::2] = plane[:-1], (plane[:-1] + plane[1:]) / 2
+    out = np.empty((len(rows), 2 * plane.shape[1] - 2), dtype=np.float32)
+    out[:, ::2], out[:, 1::2] = rows[:, :-1], (rows[:, :-1] + rows[:, 1:]) / 2
+    return out
 
 
 def _relief_range(

@@ -21,6 +21,7 @@ EXTENT_M = 80.0
 TEXEL_M = 0.05
 DETAIL_PERIOD_M = 20.0
 DETAIL_TEXEL_M = 0.0125
+SHARP_DETAIL = 10.0, 0.005, 1.2  # its period, texel (metres) and slope
 HEADROOM = 2.3  # brightest surface over the mean
 SUN = (0.45, -0.5, 0.74)  # towards the sun: north, east, up
 
@@ -54,7 +55,7 @@ class Landscape:
     """The landscape as maps.
 
     `albedo` (3, n, n) with sunlight and shadow in it, `relief` (n, n) heights, `roughness` (n, n): how much of the fine
-    texture shows; all at TEXEL_M. `detail` (m, m) at DETAIL_TEXEL_M: fine texture of unit variance, clipped at ±2.2.
+    texture shows; all at TEXEL_M. `detail` (m, m) at `detail_texel_m`: fine texture of unit variance, clipped at ±2.2.
     """
 
     albedo: Singles
@@ -63,10 +64,14 @@ class Landscape:
     detail: Singles
     targets: tuple[GroundTarget, ...]
     mean_radiance: float
+    detail_texel_m: float = DETAIL_TEXEL_M
 
 
-def build(seed: int, finest_period_m: float) -> Landscape:
-    """The landscape of a seed. The fine texture has nothing finer than `finest_period_m` (metres a cycle)."""
+def build(seed: int, finest_period_m: float, *, sharp: bool = False) -> Landscape:
+    """The landscape of a seed. The fine texture has nothing finer than `finest_period_m` (metres a cycle).
+
+    Its amplitude falls as frequency^-0.85; where `sharp`, as frequency^-1.2, on a finer map.
+    """
     rng = np.random.default_rng([seed, 10])
     n = round(EXTENT_M / TEXEL_M)
     axis = (np.arange(n) * TEXEL_M - EXTENT_M / 2).astype(np.float32)
@@ -90,15 +95,15 @@ def build(seed: int, finest_period_m: float) -> Landscape:
 
     lit = canvas.albedo * _sunlight(canvas.relief)
     mean = float(lit.mean())
+    period_m, texel_m, slope = SHARP_DETAIL if sharp else (DETAIL_PERIOD_M, DETAIL_TEXEL_M, 0.85)
     return Landscape(
         albedo=np.minimum(lit, HEADROOM / 1.15 * mean).astype(np.float32),
         relief=canvas.relief,
         roughness=canvas.rough,
-        detail=noise(
-            rng, round(DETAIL_PERIOD_M / DETAIL_TEXEL_M), DETAIL_TEXEL_M, slope=0.85, finest_m=finest_period_m
-        ),
+        detail=noise(rng, round(period_m / texel_m), texel_m, slope=slope, finest_m=finest_period_m),
         targets=targets,
         mean_radiance=mean,
+        detail_texel_m=texel_m,
     )
 
 

@@ -188,9 +188,18 @@ def angular_phases(
     return np.asarray(np.exp(2j * np.pi * (k @ points_mm.T)))
 
 
-def peak_over_mean(optics: Optics, installation: Installation, points_mm: NDArray[np.float64]) -> float:
-    """The ratio of a white frame's brightest pixel to its mean: 1 where the aperture averages the mask away."""
+def peak_over_mean(
+    optics: Optics,
+    installation: Installation,
+    points_mm: NDArray[np.float64],
+    shares: NDArray[np.float64] | None = None,
+) -> float:
+    """The ratio of a white frame's brightest pixel to its mean: 1 where the aperture averages the mask away.
+
+    `shares` (J,) are those of the light that come through the points (J, 2); without them, equal ones.
+    """
     weights = modulation(optics.mask)
     orders = list(weights)
-    held = np.abs(angular_phases(optics, installation, orders, points_mm).mean(axis=1))
+    through = np.full(len(points_mm), 1 / len(points_mm)) if shares is None else shares
+    held = np.abs(angular_phases(optics, installation, orders, points_mm) @ through)
     return 1 + sum(2 * weights[order] * float(h) for order, h in zip(orders[1:], held[1:], strict=True))

@@ -21,6 +21,7 @@ from dappled.mocks.scene import dng, lens, synthesis
 from dappled.mocks.scene.bench import RealViews, WhiteCard, boards
 from dappled.mocks.scene.flyover import TerrainScene, finest_period_m
 from dappled.mocks.scene.lens import Installation, Optics, Rays, Rendering, Scene
+from dappled.mocks.scene.opening import Opening
 from dappled.mocks.scene.synthesis import PASS, Grid
 
 MAKE, MODEL = "dappled", "Simulated Masked Camera"
@@ -28,6 +29,7 @@ ISO = 100
 EXPOSURE_S = 1 / 1000  # metered, in ordinary light at full aperture
 LEVEL = 0.4  # of white, where a scene's mean is metered
 BRIGHTEST = 0.92  # of white, where the brightest pixel is kept
+PRINT_SCALE = 1.003  # of a real camera's film
 LATENCY_S, LATENCY_SPREAD_S = 0.060, 0.015
 
 
@@ -53,7 +55,8 @@ class MaskedCamera:
     """A camera body with a mask inside, before a scene. Everything drawn at random comes from `seed`.
 
     `path` says where the vehicle is, None on a bench. `installation` is drawn from the seed unless it is given.
-    `epoch_utc_s` is what the body's own clock shows at the simulation's start.
+    `epoch_utc_s` is what the body's own clock shows at the simulation's start, `name` its make and model. `real`: the
+    stop is round and open everywhere, and the scene's detail does not end where a slice's band does.
     """
 
     seed: int
@@ -63,6 +66,8 @@ class MaskedCamera:
     path: FlightPath | None = None
     installation: Installation | None = None
     epoch_utc_s: float = 1_781_517_600.0
+    name: tuple[str, str] = (MAKE, MODEL)
+    real: bool = False
 
     @property
     def installed(self) -> Installation:
@@ -85,8 +90,8 @@ class MaskedCamera:
         Stopped down, a mask is no longer averaged over the aperture and its clear spots are far brighter than the mean:
         the mean is then held lower, so that they stay below white.
         """
-        points = self.optics.aperture_points_mm(f_number).reshape(-1, 2)
-        peak = lens.peak_over_mean(self.optics, self.installed, points)
+        opening = self._opening(f_number)
+        peak = lens.peak_over_mean(self.optics, self.installed, opening.points_mm, opening.shares)
         level = min(LEVEL, BRIGHTEST / (peak * self.scene.headroom))
         return EXPOSURE_S * (f_number / self.optics.f_number) ** 2 * level / LEVEL, level
 
@@ -104,7 +109,7 @@ class MaskedCamera:
         aperture that the lens doesn't have, an exposure that is not positive, and what the scene can't show.
         """
         n_stop = self.optics.f_number if f_number is None else f_number
-        points = self.optics.aperture_points_mm(n_stop)
+        opening = self._opening(n_stop)
         metered_s, level = self.metered(n_stop)
         if exposure_s is not None:
             if not exposure_s > 0:
@@ -116,15 +121,15 @@ class MaskedCamera:
         pose = None if self.path is None else self.path.pose(middle_t_s)
 
         lattice = self.lattice
-        grid = Grid.of(self.sensor.shape, lattice)
-        rendering = self.scene.render(self._rays(grid, points.reshape(-1, 2)), pose)
+        grid = Grid.of(self.sensor.shape, lattice, sharp=self.real and self.path is not None)
+        rendering = self.scene.render(self._rays(grid, opening.nodes_mm), pose)
         radiance = rendering.radiance
         radiance *= np.float32(level / self.scene.mean_radiance)
-        plane = self._masked(radiance, grid, lattice, points.reshape(-1, 2))
+        plane = self._masked(radiance, grid, lattice, opening)
         raw = self.sensor.develop(plane, np.random.default_rng([self.seed, 3, shot_number]))
         exif = dng.Exif(
-            make=MAKE,
-            model=MODEL,
+            make=self.name[0],
+            model=self.name[1],
             serial=f"SIM{self.seed:08d}",
             focal_length_mm=self.optics.focal_length_mm,
             f_number=n_stop,
@@ -137,13 +142,18 @@ class MaskedCamera:
             mid_exposure_t_s=middle_t_s,
             latency_s=latency_s,
             raw=raw,
-            _truth=partial(self._truth, rendering, grid=grid, points_mm=points, pose=pose, middle_t_s=middle_t_s),
+            _truth=partial(self._truth, rendering, grid=grid, f_number=n_stop, pose=pose, middle_t_s=middle_t_s),
         )
 
     def bench_frame(self, *, f_number: float | None = None, shot_number: int = 0) -> SimulatedExposure:
         """Photograph a white card for calibration: 1/8 of the aperture unless `f_number` is given."""
         bench = replace(self, scene=WhiteCard(), path=None)
         return bench.expose(0.0, shot_number, f_number=8 * self.optics.f_number if f_number is None else f_number)
+
+    def _opening(self, f_number: float) -> Opening:
+        if self.real:
+            return Opening.round(self.optics.used_aperture_mm(f_number), self.optics.aperture_samples)
+        return Opening.of_beams(self.optics.aperture_points_mm(f_number))
 
     def _rays(self, grid: Grid, points_mm: NDArray[np.float64]) -> Rays:
         places = grid.places()
@@ -153,14 +163,14 @@ class MaskedCamera:
         )
         return Rays(y, x, points_mm, self.optics.focal_length_mm, self.optics.focus_m)
 
-    def _masked(self, radiance: Singles, grid: Grid, lattice: Lattice, points_mm: NDArray[np.float64]) -> Singles:
+    def _masked(self, radiance: Singles, grid: Grid, lattice: Lattice, opening: Opening) -> Singles:
         weights = lens.modulation(self.optics.mask)
         orders = list(weights)
         k = np.array(orders, dtype=np.float64)
         centre = (np.array(self.sensor.shape) - 1) / 2
         shift = np.array(self.installed.shift_mm) * self.optics.mask.frequency_per_mm
         origin = 2 * np.pi * (k @ shift - k @ lattice.matrix() @ centre)
-        angular = lens.angular_phases(self.optics, self.installed, orders, points_mm)
+        angular = opening.angular(self.optics, self.installed, orders)
         sites = synthesis.GREY if self.sensor.mono else synthesis.SITES
         return synthesis.mosaic(
             radiance, grid, lattice, angular=angular, weights=weights, origin_phase=origin, sites=sites
@@ -171,12 +181,13 @@ class MaskedCamera:
         rendering: Rendering,
         *,
         grid: Grid,
-        points_mm: NDArray[np.float64],
+        f_number: float,
         pose: TruePose | None,
         middle_t_s: float,
     ) -> Truth:
         n = self.optics.aperture_samples
-        views = synthesis.band_limited(rendering.radiance, grid)
+        points_mm = self.optics.aperture_points_mm(f_number)
+        views = synthesis.band_limited(self._opening(f_number).seen(rendering.radiance), grid)
         depth = None if rendering.depth_m is None else rendering.depth_m[grid.inner]
         installed, optics = self.installed, self.optics
         angular = optics.mask.frequency_per_mm * installed.distance_mm / optics.focal_length_mm
@@ -215,27 +226,76 @@ def reference_camera(
     law: str = "geometric",
     path: FlightPath | None = None,
     epoch_utc_s: float = 1_781_517_600.0,
+    real: bool = False,
 ) -> MaskedCamera:
-    """The camera of the demo and of the tests.
+    """The camera of the demo (`real`) and of the tests.
 
     `scale` is the sensor's side over 2776 × 3688. Under the geometric law the pitch stays 10 µm (a smaller chip); under
     `fd`, which counts bins on a chip, the chip stays 4.29 × 5.76 mm (larger pixels). `scene` is "terrain" (flown along
-    `path`, by default the path of the same seed), "bench", "white", or a folder of n × n views.
+    `path`, by default the path of the same seed), "bench", "white", or a folder of n × n views. A `real` one
+    has a round stop, detail beyond a slice's band on terrain, and a film printed 0.3 % too fine.
     """
     optics = reference_optics(law)
+    if real:
+        optics = replace(optics, mask=as_printed(optics.mask))
     shape = round(2776 * scale / 2) * 2, round(3688 * scale / 2) * 2
     sensor = SensorModel(shape, 0.01 if law == "geometric" else 5.76 / shape[1])
-    size_mm = shape[0] * sensor.pitch_mm, shape[1] * sensor.pitch_mm
-    camera = MaskedCamera(seed, WhiteCard(), optics, sensor, None, epoch_utc_s=epoch_utc_s)
-    finest = PASS * min(Grid.of(shape, camera.lattice).half_band)  # cycles/pixel
+    camera = MaskedCamera(seed, WhiteCard(), optics, sensor, None, epoch_utc_s=epoch_utc_s, real=real)
+    return _before(scene, camera, path)
+
+
+def as_printed(mask: Mask) -> Mask:
+    """The mask as a printer makes it that is 0.3 % off."""
+    return replace(mask, frequency_per_mm=mask.frequency_per_mm * PRINT_SCALE)
+
+
+EOS_450D = ("Canon", "Canon EOS 450D")
+
+
+def eos450d_camera(
+    seed: int,
+    mask: Mask,
+    *,
+    scene: str | Path = "terrain",
+    path: FlightPath | None = None,
+    epoch_utc_s: float = 1_781_517_600.0,
+    real: bool = False,
+) -> MaskedCamera:
+    """The thesis' Canon EOS 450D with a 50 mm lens and a printed mask 1.01 mm before its chip; DNG files of 24.5 MB.
+
+    The rays obey geometry, as in any camera; the profile's law is `fd`. The lens opens until the aperture is one period
+    of the mask wide. `scene`, `path` and `real` as in `reference_camera`. Raises ValueError for a mask whose carriers
+    lie too near together or too far apart to be simulated.
+    """
+    distance_mm, focal_length_mm = 1.01, 50.0
+    widest_mm = focal_length_mm / (mask.frequency_per_mm * distance_mm)
+    film = as_printed(mask) if real else mask
+    optics = Optics(focal_length_mm, focal_length_mm / widest_mm, widest_mm, film, distance_mm)
+    sensor = SensorModel((2856, 4290), 0.0051948051948, white=15319)
+    camera = MaskedCamera(seed, WhiteCard(), optics, sensor, None, epoch_utc_s=epoch_utc_s, name=EOS_450D, real=real)
+    return _before(scene, camera, path)
+
+
+def eos450d_f_number(camera: MaskedCamera) -> float:
+    """The stop at which that lens shows the mask's carriers: f/22, for the finest masks f/32."""
+    return 22.0 if camera.optics.f_number < 22 else 32.0
+
+
+def _before(scene: str | Path, camera: MaskedCamera, path: FlightPath | None) -> MaskedCamera:
+    """The camera before a scene: "terrain" (flown along `path`), "bench", "white", or a folder of views."""
+    optics, sensor, seed = camera.optics, camera.sensor, camera.seed
+    size_mm = sensor.shape[0] * sensor.pitch_mm, sensor.shape[1] * sensor.pitch_mm
+    finest = PASS * min(Grid.of(sensor.shape, camera.lattice).half_band)  # cycles/pixel
     if scene == "white":
         return camera
     if scene == "bench":
         return replace(camera, scene=boards(seed, optics, size_mm, sensor.pitch_mm, sensor.pitch_mm / finest))
     if scene == "terrain":
         flown = path or FlightPath(seed)
+        if camera.real:
+            finest = 0.45 / Grid.of(sensor.shape, camera.lattice, sharp=True).step  # what its grid holds
         period_m = finest_period_m(flown.height_m, sensor.pitch_mm, optics.focal_length_mm, finest)
-        return replace(camera, scene=TerrainScene.of(seed, period_m), path=flown)
+        return replace(camera, scene=TerrainScene.of(seed, period_m, sharp=camera.real), path=flown)
     views = RealViews.read(Path(scene), size_mm)
     return replace(camera, scene=views, optics=replace(optics, aperture_samples=len(views.views)))
 

@@ -95,8 +95,10 @@ class RayCamera:
 
     def __post_init__(self) -> None:
         """Raises ValueError for what no camera is."""
-        if self.finer < 2 or self.points_per_view < 1 or not 0 < self.mask_distance_mm < self.v_mm:
-            raise ValueError("a ray camera needs a grid finer than its pixels, stop points, and a mask behind its lens")
+        if self.finer < 2.5 or self.points_per_view < 1 or not 0 < self.mask_distance_mm < self.v_mm:
+            raise ValueError(
+                "a ray camera needs a grid 2.5 times finer than its pixels, stop points, and a mask behind its lens"
+            )
         if min(self.f_number, self.print_scale, self.level) <= 0 or min(self.shape) < 8:
             raise ValueError("f-number, print scale and level must be positive, and a frame 8 pixels high and wide")
 

@@ -59,3 +59,30 @@ def stop_points(
     keep = area > 0
     points = (np.stack([rows, columns], axis=1)[keep] + 0.5) / n - 0.5
     return StopPoints(points, area[keep] / area.sum(), view[keep])
+
+
+NODES = (-0.4, 0.0, 0.4)
+
+
+def node_points() -> NDArray[np.float64]:
+    """(9, 2) points (y, x) in shares of a stop's diameter, from which the light of every other point follows."""
+    return np.stack(np.meshgrid(NODES, NODES, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def between_nodes(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(J, 9): what the light of each node counts at points (J, 2), by quadratic interpolation along both axes.
+
+    Exact to 1 % of the finest detail where the picture moves by less than a quarter of its period over the stop.
+    """
+    along = np.stack([_quadratic(points[:, axis]) for axis in (0, 1)])
+    return np.asarray(np.einsum("pi,pj->pij", along[0], along[1]).reshape(len(points), -1))
+
+
+def _quadratic(at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(J, 3) Lagrange's polynomials of the nodes."""
+    n = np.array(NODES)
+    columns = [
+        (at - n[(i + 1) % 3]) * (at - n[(i + 2) % 3]) / ((n[i] - n[(i + 1) % 3]) * (n[i] - n[(i + 2) % 3]))
+        for i in range(3)
+    ]
+    return np.stack(columns, axis=1)

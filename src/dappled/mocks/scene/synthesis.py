@@ -26,6 +26,7 @@ FADE = 22  # of which so many fade
 Sites = tuple[tuple[tuple[int, int], int], ...]
 SITES: Sites = (((0, 0), 0), ((0, 1), 1), ((1, 0), 1), ((1, 1), 2))  # RGGB: (row, column) parity and channel
 GREY: Sites = tuple((parity, 1) for parity, _ in SITES)  # no colour filters: every pixel sees the same channel
+SHARPER = 2.5
 PASS, STOP = 0.82, 0.95  # the views' low-pass, as shares of half the carrier spacing
 WORKERS = 2
 
@@ -34,17 +35,19 @@ WORKERS = 2
 class Grid:
     """The coarse grid: sample (i, j) of `shape` lies at sensor row `step`·(i − MARGIN), column `step`·(j − MARGIN).
 
-    `half_band` (y, x) in cycles/pixel is half the carrier spacing: what one slice can carry.
+    `half_band` (y, x) in cycles/pixel is half the carrier spacing: what one slice can carry. `sharp`: detail finer than
+    that stays in the light behind the mask, as far as the grid holds it, and appears in other slices as in a camera.
     """
 
     frame: tuple[int, int]
     step: int
     shape: tuple[int, int]
     half_band: tuple[float, float]
+    sharp: bool = False
 
     @classmethod
-    def of(cls, frame: tuple[int, int], lattice: Lattice) -> Grid:
-        """The coarsest grid that holds a slice's band with a quarter to spare.
+    def of(cls, frame: tuple[int, int], lattice: Lattice, *, sharp: bool = False) -> Grid:
+        """The coarsest grid that holds a slice's band with a quarter to spare; a sharp one is `SHARPER` times finer.
 
         Raises ValueError where the carriers lie too far apart or too near for this way of making the frame.
         """
@@ -56,7 +59,9 @@ class Grid:
                 f"carriers {spacing[0]:.4f} × {spacing[1]:.4f} cycles/pixel apart can't be simulated: "
                 "they must be between 0.025 and 0.4"
             )
-        return cls(frame, step, (_length(frame[0], step), _length(frame[1], step)), half_band)
+        if sharp:
+            step = max(2, math.floor(step / SHARPER))
+        return cls(frame, step, (_length(frame[0], step), _length(frame[1], step)), half_band, sharp)
 
     @property
     def fine(self) -> tuple[int, int]:
@@ -97,8 +102,8 @@ def mosaic(
     """The masked frame (H, W) of views `radiance` (J, 3, h, w) on the grid, in the views' scale (DC weight 1).
 
     A Bayer mosaic unless `sites` say otherwise. `weights` are the carriers' real coefficients for DC and the upper half
-    of the orders, `angular` (K, J) the phases of each aperture point there, `origin_phase` (K,) the carriers' phase in
-    radians at pixel (0, 0).
+    of the orders, `angular` (K, J) what each aperture point counts there (phase and share), `origin_phase` (K,) the
+    carriers' phase in radians at pixel (0, 0).
     """
     orders = list(weights)
     real, imaginary = _angular_slices(radiance, angular)
@@ -167,9 +172,11 @@ class _Band:
     @classmethod
     def of(cls, grid: Grid, axis: int, carrier_bin: int, rest: float) -> _Band:
         n, fine = grid.shape[axis], grid.fine[axis]
-        reach = min(math.ceil(STOP * grid.half_band[axis] * fine) + 1, n // 2 - 1)
+        reach = n // 2 - 1
+        if not grid.sharp:
+            reach = min(math.ceil(STOP * grid.half_band[axis] * fine) + 1, reach)
         bins = np.arange(-reach, reach + 1)
-        response = grid.low_pass(axis, bins / fine - rest)
+        response = np.ones(len(bins)) if grid.sharp else grid.low_pass(axis, bins / fine - rest)
         odd = response * np.exp(2j * np.pi * (bins + carrier_bin) / fine)
         return cls(
             source=bins % n,
@@ -181,9 +188,8 @@ class _Band:
 def _angular_slices(
     radiance: NDArray[np.float32], angular: NDArray[np.complex128]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Real and imaginary part, (K, 3, h, w) each: the mean over aperture points of view times phase."""
-    phases = angular / angular.shape[1]
-    both = np.concatenate([phases.real, phases.imag]).astype(np.float32) @ radiance.reshape(len(radiance), -1)
+    """Real and imaginary part, (K, 3, h, w) each: the sum over aperture points of view times `angular`."""
+    both = np.concatenate([angular.real, angular.imag]).astype(np.float32) @ radiance.reshape(len(radiance), -1)
     halves = both.reshape(2, len(angular), *radiance.shape[1:])
     return halves[0], halves[1]
 

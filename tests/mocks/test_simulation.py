@@ -1,0 +1,53 @@
+"""Which camera is simulated: the settings' 450D with their mask, else the reference camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+
+import pytest
+import rawpy
+
+from dappled.config import profiles
+from dappled.config import settings as configuration
+from dappled.config.settings import Settings
+from dappled.mocks.scene.masked_camera import eos450d_camera, eos450d_f_number
+from dappled.mocks.simulation import SimulatedCamera, SimulationError, World
+
+
+def settings(camera: str, mask: str) -> Settings:
+    plain = configuration.load(None)
+    return replace(plain, camera=replace(plain.camera, profile=camera), mask=replace(plain.mask, profile=mask))
+
+
+@pytest.mark.parametrize(
+    ("camera", "mask", "wanted"),
+    [
+        ("auto", "", SimulatedCamera("reference-36mm", "reference-5x5")),
+        ("fujifilm-s5200", "mask-2", SimulatedCamera("reference-36mm", "reference-5x5")),
+        ("canon-eos-450d", "mask-3", SimulatedCamera("canon-eos-450d", "mask-3")),
+        ("canon-eos-450d", "", SimulatedCamera("canon-eos-450d", "mask-2")),
+        ("canon-eos-450d", "lenslet", SimulatedCamera("canon-eos-450d", "mask-2")),
+    ],
+)
+def test_the_camera_is_the_one_of_the_settings(camera: str, mask: str, wanted: SimulatedCamera) -> None:
+    assert SimulatedCamera.of(settings(camera, mask)) == wanted
+
+
+def test_a_mask_that_cannot_be_simulated_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "coarse.toml").write_text("frequency_per_mm = 0.5\n")
+    with pytest.raises(SimulationError, match=r"^mask\.profile '.*coarse\.toml' can't be simulated: carriers 0\.00"):
+        SimulatedCamera("canon-eos-450d", str(tmp_path / "coarse.toml")).on_a_bench(World())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mask", ["mask-1", "mask-2", "mask-5"])
+def test_its_file_is_a_450d_s(mask: str) -> None:
+    camera = eos450d_camera(1, profiles.mask(mask).mask, scene="white")
+    shot = camera.expose(0.0, 0, f_number=eos450d_f_number(camera))
+    with rawpy.imread(BytesIO(shot.file)) as raw:
+        shape = raw.raw_image_visible.shape
+    profile = profiles.camera_for_model("Canon EOS 450D")
+    assert profile is not None
+    assert shape in profile.shapes()
