@@ -2,12 +2,11 @@
 
 Each is a log-likelihood, so they can be added. Refocus contrast tolerates noise, and enlarges near objects by half a
 window. Photo-consistency keeps edges where they are, and needs clean views. Semi-global matching decides where both
-are weak. Disparity and error then come from the measurements alone: neighbours select the peak and do not move it.
+are weak. On clean views the middle one's edges then decide to which side the pixels at a jump of disparity belong.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,38 +15,71 @@ from scipy import ndimage
 
 from dappled.decode.depth import contrast as depth_contrast
 from dappled.decode.depth.depth_map import DepthMap, Search, Volume, box, confidence, judged, peaked, windowed
+from dappled.decode.depth.edges import sharpened
 from dappled.decode.depth.evidence import Evidence
+from dappled.decode.depth.photo_consistency import WINDOW, compared, differences
 from dappled.decode.lightfield import ViewStack
-from dappled.decode.lightfield.light_field import Image
 from dappled.workers import each
 
 _CLEAN, _NOISY = 2.0, 200.0  # contrast's share beside photo-consistency, by noise over texture and its square
-_MOST_CLEAN = 0.3  # with a larger share views are noisy, and contrast needs its whole window
+_NEGLIGIBLE = 0.3  # with a smaller share contrast only enlarges what is near
 _SMALL, _LARGE = 4.0, 30.0  # P1 and P2, in units of the log-likelihood
-_NEGLIGIBLE = 0.005  # a smaller share of contrast would not change the result
-_OUTLIER = 30.0  # variances: a view that differs by more sees something else
+_SMALL_CLEAN, _LARGE_CLEAN = 2.0, 8.0  # the same where views are clean: it has fewer samples
+_OUTLIER = 20.0  # variances: a view that differs by more sees something else
 _SAMPLE = 160  # px a side: as much of the middle tells how well views agree
-_NARROW = 5  # px: the window of contrast beside photo-consistency
+_NARROW = 5  # px: the window in which noisy views are compared
 _LEAST_VARIANCE = 1e-8
-_SMOOTH_PX = 0.6  # sigma: what linear interpolation does to a picture depends less on the fraction then
-_ARM_WINDOW = 3  # px
+_SPREAD_CLEAN = 0.055  # variance over information, measured on the seeds of benchmarks/depth.py
+_ASTRAY, _DRAWN = 0.5, 0.25  # of a step: a peak of another surface; how far selected peaks are off
+_PULL = 0.3  # of how far neighbours moved the peak
 
 
 def depth(evidence: Evidence, search: Search) -> DepthMap:
     """The depth map by all methods that the evidence allows: photo-consistency only of plain views."""
+    if evidence.white:
+        return _decided(_by_contrast(evidence, search), search, search.contrast_window)
+    disparities, stack = search.disparities(), evidence.stack
+    variance = _disagreement(stack, disparities, search.workers)
+    # Where noise is as strong as texture, one view can't be compared with another: contrast takes over.
+    noise = variance / max(_texture(stack), _LEAST_VARIANCE)
+    share = min(1.0, _CLEAN * noise + _NOISY * noise**2)
+    window = search.window or WINDOW
+    cost = differences(stack, disparities, limit=_OUTLIER * variance, window=window, workers=search.workers)
+    cost *= np.float32(1 / (4 * variance))  # a difference has twice the variance
+    if share < _NEGLIGIBLE:
+        return _of_clean(cost, stack, search, window)
+    contrast = _by_contrast(evidence, search)
+    # The evidence counted in variances of a guessed noise; now it is known how well views agree.
+    weight = np.float32(share / contrast.samples * _guessed(evidence) / variance)
+    both = np.subtract(np.multiply(contrast.likelihood, weight, out=contrast.likelihood), cost, out=cost)
+    samples = contrast.samples * box(_NARROW) ** 2
+    return _decided(_Seen(both, contrast.spread, samples), search, _NARROW, widen=True)
+
+
+def _of_clean(cost: Volume, stack: ViewStack, search: Search, window: int) -> DepthMap:
+    """By photo-consistency alone: the peak that neighbours select, and jumps of disparity at the picture's edges."""
     disparities = search.disparities()
-    seen = _by_contrast(evidence, search) if evidence.white else _by_both(evidence, search)
-    likelihood, samples = seen.likelihood, seen.samples
-    window = search.window if evidence.white else _NARROW
-    smooth = smoothed(-likelihood, small=_SMALL, large=_LARGE, workers=search.workers)
+    smooth = smoothed(cost, small=_SMALL_CLEAN, large=_LARGE_CLEAN, workers=search.workers)
     start = smooth.argmin(axis=0)
-    if not evidence.white:
-        likelihood, _ = windowed(likelihood, window)
-        samples *= box(window) ** 2
-    disparity, curvature = peaked(likelihood, disparities, start)
-    best = np.take_along_axis(likelihood, start[None], axis=0)[0]
-    sure = confidence(likelihood, best, samples)
-    return judged(disparity, curvature, sure, spread=seen.spread, window=window, method="combined")
+    np.negative(smooth, out=smooth)
+    np.negative(cost, out=cost)
+    selected, _ = peaked(smooth, disparities, start)
+    own, curvature = peaked(cost, disparities, start)
+    best = np.take_along_axis(cost, start[None], axis=0)[0]
+    sure = confidence(cost, best, compared(stack) / window**2)
+    # Where even the best disparity leaves more than noise (gloss, edges), its error is as much larger.
+    curvature /= np.maximum(best / (-0.5 * compared(stack)), 1)
+    # The selected peak is drawn towards the disparities that were tried, a pixel's own one has more noise.
+    drawn = (_DRAWN * search.step) ** 2
+    astray = own - selected
+    mixed = drawn * curvature / (drawn * curvature + np.float32(_SPREAD_CLEAN))
+    disparity = selected + np.where(np.abs(astray) < _ASTRAY * search.step, mixed, 0) * astray
+    found = judged(
+        disparity.astype(np.float32), curvature, sure, spread=_SPREAD_CLEAN, window=window, method="combined"
+    )
+    sigma = np.hypot(found.sigma, _PULL * np.abs(astray))
+    sharp, error = sharpened(found.disparity, sigma.astype(np.float32), stack.middle())
+    return replace(found, disparity=sharp, sigma=error)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,29 +91,22 @@ class _Seen:
     samples: float
 
 
+def _decided(seen: _Seen, search: Search, window: int, *, widen: bool = False) -> DepthMap:
+    """The map of the peaks that neighbours select. `widen`: each peak is that of a window."""
+    disparities = search.disparities()
+    smooth = smoothed(-seen.likelihood, small=_SMALL, large=_LARGE, workers=search.workers)
+    start = smooth.argmin(axis=0)
+    likelihood = windowed(seen.likelihood, window)[0] if widen else seen.likelihood
+    disparity, curvature = peaked(likelihood, disparities, start)
+    best = np.take_along_axis(likelihood, start[None], axis=0)[0]
+    sure = confidence(likelihood, best, seen.samples)
+    return judged(disparity, curvature, sure, spread=seen.spread, window=window, method="combined")
+
+
 def _by_contrast(evidence: Evidence, search: Search) -> _Seen:
     raw = depth_contrast.explained(evidence, search.disparities(), workers=search.workers)
-    likelihood, spread = windowed(raw, search.window)
-    return _Seen(likelihood, spread, float(box(search.window) ** 2))
-
-
-def _by_both(evidence: Evidence, search: Search) -> _Seen:
-    """Photo-consistency, and contrast with a share that depends on the noise of the views."""
-    disparities, stack = search.disparities(), evidence.stack
-    variance = _disagreement(stack, disparities, search.workers)
-    # Where noise is as strong as texture, one view can't be compared with another: contrast takes over.
-    noise = variance / max(_texture(stack), _LEAST_VARIANCE)
-    share = min(1.0, _CLEAN * noise + _NOISY * noise**2)
-    cost = differences(stack, disparities, limit=_OUTLIER * variance, workers=search.workers)
-    cost *= np.float32(-1 / (4 * variance))  # a difference has twice the variance
-    window = min(search.window, _NARROW) if share < _MOST_CLEAN else search.window
-    if share < _NEGLIGIBLE:
-        return _Seen(cost, windowed(np.ones((1, 1, 1), dtype=np.float32), window)[1], float(box(window) ** 2))
-    contrast = _by_contrast(evidence, replace(search, window=window))
-    # The evidence counted in variances of a guessed noise; now it is known how well views agree.
-    weight = np.float32(share / contrast.samples * _guessed(evidence) / variance)
-    cost += np.multiply(contrast.likelihood, weight, out=contrast.likelihood)
-    return _Seen(cost, contrast.spread, contrast.samples)
+    likelihood, spread = windowed(raw, search.contrast_window)
+    return _Seen(likelihood, spread, float(box(search.contrast_window) ** 2))
 
 
 def _guessed(evidence: Evidence) -> float:
@@ -104,68 +129,6 @@ def _disagreement(stack: ViewStack, disparities: NDArray[np.float64], workers: i
     sample = ViewStack(part, stack.row_steps, stack.column_steps)
     least = differences(sample, disparities, limit=np.inf, workers=workers).min(axis=0)
     return max(float(np.median(least)) / (2 * max(1, compared(stack))), _LEAST_VARIANCE)
-
-
-def differences(stack: ViewStack, disparities: NDArray[np.float64], *, limit: float, workers: int = 1) -> Image:
-    """float32 (D, h, w): squared difference of the views from the middle one, summed over the better arms.
-
-    At the right disparity the views of a point look like the middle one. Only the views beside, above and below it are
-    used. Behind an edge one side of them sees something else and the other side doesn't: of each pair of opposite arms
-    the better one counts, so near edges stay where they are.
-
-    Grey views; each squared difference counts up to `limit` at most. Missing arms do not count.
-    """
-    views = ndimage.gaussian_filter(stack.views, (0, 0, _SMOOTH_PX, _SMOOTH_PX))
-    v0, u0 = (int(np.argmin(np.abs(steps))) for steps in (stack.row_steps, stack.column_steps))
-    middle = views[v0, u0]
-    most = float(np.abs(disparities).max()) * stack.reach
-    pad = math.ceil(most) + 2
-    beside = np.pad(views[v0], ((0, 0), (0, 0), (pad, pad)), mode="edge")
-    above = np.ascontiguousarray(np.pad(views[:, u0], ((0, 0), (pad, pad), (0, 0)), mode="edge"))
-    arms = [
-        [(lines, axis, k, steps[k] - steps[at]) for k in range(len(steps)) if sign * (k - at) > 0]
-        for lines, axis, steps, at in ((beside, 1, stack.column_steps, u0), (above, 0, stack.row_steps, v0))
-        for sign in (-1, 1)
-    ]
-    out = np.zeros((len(disparities), *middle.shape), dtype=np.float32)
-
-    def one(number: int) -> None:
-        found = []
-        for arm in arms:
-            if not arm:
-                continue
-            total = np.zeros_like(middle)
-            for lines, axis, k, step in arm:
-                difference = _shifted(lines[k], disparities[number] * step + pad, axis, middle.shape[axis])
-                difference -= middle
-                difference *= difference
-                np.minimum(difference, np.float32(limit), out=difference)
-                total += difference
-            found.append(ndimage.uniform_filter(total, _ARM_WINDOW))
-        for a in range(0, len(found) - 1, 2):
-            out[number] += np.minimum(found[a], found[a + 1])
-        if len(found) % 2:
-            out[number] += found[-1]
-
-    each(one, range(len(disparities)), workers)
-    return out
-
-
-def compared(stack: ViewStack) -> int:
-    """How many views the better arms of each pair count together."""
-    return sum(len(steps) // 2 for steps in (stack.row_steps, stack.column_steps))
-
-
-def _shifted(image: Image, shift: float, axis: int, side: int) -> Image:
-    """`side` samples along an axis from `shift` on, linear between samples."""
-    whole = math.floor(shift)
-    share = np.float32(shift - whole)
-    here, there = slice(whole, whole + side), slice(whole + 1, whole + 1 + side)
-    a, b = (image[here], image[there]) if axis == 0 else (image[:, here], image[:, there])
-    made: Image = b - a
-    made *= share
-    made += a
-    return made
 
 
 def smoothed(cost: Volume, *, small: float, large: float, workers: int = 1) -> Volume:

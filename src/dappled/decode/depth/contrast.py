@@ -26,10 +26,10 @@ _LEAST_WEIGHT = 1e-3  # of the whole: frequencies at which nothing was measured
 def depth(evidence: Evidence, search: Search) -> DepthMap:
     """The depth map of the disparity whose picture explains most in a window around each pixel."""
     disparities = search.disparities()
-    likelihood, spread = windowed(explained(evidence, disparities, workers=search.workers), search.window)
+    likelihood, spread = windowed(explained(evidence, disparities, workers=search.workers), search.contrast_window)
     disparity, curvature = peaked(likelihood, disparities, likelihood.argmax(axis=0))
-    sure = confidence(likelihood, likelihood.max(axis=0), float(box(search.window) ** 2))
-    return judged(disparity, curvature, sure, spread=spread, window=search.window, method="contrast")
+    sure = confidence(likelihood, likelihood.max(axis=0), float(box(search.contrast_window) ** 2))
+    return judged(disparity, curvature, sure, spread=spread, window=search.contrast_window, method="contrast")
 
 
 def explained(evidence: Evidence, disparities: NDArray[np.float64], *, workers: int = 1) -> Volume:

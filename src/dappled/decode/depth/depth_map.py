@@ -20,6 +20,7 @@ _EDGE, _EDGE_SHARE = 0.0005, 0.0005  # px/view, and of the disparity
 _SEAM = 2.0  # of the disparities' spread under the window
 _LEAST_CONFIDENCE = 0.5
 _MOST_DISPARITIES = 400
+CONTRAST_WINDOW = 13  # px a side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,13 +50,13 @@ class DepthMap:
 class Search:
     """The disparities to try, from `low` to `high`, `step` apart, and the window (px a side) of each pixel's estimate.
 
-    Windows are boxes smoothed once more: their effective size is `window`.
+    `window` None: each method's own. Contrast's windows are boxes smoothed once more: their effective size is `window`.
     """
 
     low: float
     high: float
     step: float
-    window: int = 13
+    window: int | None = None
     workers: int = 1
 
     def __post_init__(self) -> None:
@@ -65,8 +66,13 @@ class Search:
         if (self.high - self.low) / self.step > _MOST_DISPARITIES:
             count = (self.high - self.low) / self.step
             raise DecodeError(f"{count:.0f} disparities are too many: narrow {self.low:g} to {self.high:g}")
-        if self.window < 3 or self.window % 2 == 0:
+        if self.window is not None and (self.window < 3 or self.window % 2 == 0):
             raise DecodeError(f"a window of {self.window} px can't be used: it must be odd, and 3 or more")
+
+    @property
+    def contrast_window(self) -> int:
+        """The window in which refocus contrast is summed, px."""
+        return self.window or CONTRAST_WINDOW
 
     def disparities(self) -> NDArray[np.float64]:
         """All of them, at least five, rising."""

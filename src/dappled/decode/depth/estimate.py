@@ -1,8 +1,7 @@
 """Estimate depth from views by one of several methods, each pixel with its uncertainty, or unknown.
 
-`contrast` asks which refocused picture explains the measurements best (bears noise), `gradient` solves a least-squares
-problem (fast for small disparities), `stereo` matches pairs of views with OpenCV (clean views), `combined` combines
-contrast, photo-consistency and neighbouring pixels.
+`combined` combines photo-consistency, contrast and neighbouring pixels; `contrast` asks which refocused picture
+explains the measurements best (bears noise); `stereo` matches pairs of views with OpenCV (clean views, to compare).
 """
 
 from __future__ import annotations
@@ -14,42 +13,53 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from dappled.decode.depth import combined, contrast, gradient, stereo
+from dappled.decode.depth import combined, contrast, stereo
 from dappled.decode.depth.depth_map import DepthMap, Search, peaked, windowed
-from dappled.decode.depth.evidence import Evidence
+from dappled.decode.depth.evidence import Evidence, of_views
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import ViewStack
 
 METHODS: Mapping[str, Callable[[Evidence, Search], DepthMap]] = {
     "combined": combined.depth,
     "contrast": contrast.depth,
-    "gradient": gradient.depth,
     "stereo": stereo.depth,
 }
-WINDOW = 13
-_FINEST, _MOST_LEVELS = 0.15, 64  # a step moves the outermost view by so much; no more disparities than these
+_FINEST, _FINEST_OF_VIEWS = 0.15, 0.15  # px: a step moves the outermost view by so much, of slices and of plain views
+_MOST_LEVELS = 64  # no more disparities than these
 _COARSE_SIDE = 160  # px: pictures are made smaller than this to look for the range
 _WIDEST = 4.0  # px/view
+_MARGIN = 0.1  # px/view beyond the range that was found
 _SURE = 0.6  # the share of pixels, those with most texture, that the range is read off
 
 
 def estimate(
-    evidence: Evidence, method: str = "combined", *, between: tuple[float, float] | None = None, window: int = WINDOW,
-    workers: int = 1,
+    evidence: Evidence, method: str = "combined", *, between: tuple[float, float] | None = None,
+    window: int | None = None, workers: int = 1,
 ) -> DepthMap:  # fmt: skip
     """The depth map by one of `METHODS`, at disparities `between` two (None: where a coarse search finds the scene).
 
     Raises DecodeError for an unknown method or a empty range.
     """
-    if method not in METHODS:
-        raise DecodeError(f"unknown depth method {method!r}; known are {', '.join(METHODS)}")
+    known_method(method)
+    if method == "combined" and evidence.made is not None:  # without noise views tell more than slices
+        evidence = of_views(evidence.made)
     low, high = between or disparity_range(evidence, workers=workers)
-    return METHODS[method](evidence, search(evidence.stack, low, high, window=window, workers=workers))
+    return METHODS[method](evidence, search(evidence, low, high, window=window, workers=workers))
 
 
-def search(stack: ViewStack, low: float, high: float, *, window: int = WINDOW, workers: int = 1) -> Search:
-    """Disparities fine enough for this stack's outermost views, unless they become too many."""
-    step = max(_FINEST / max(stack.reach, 1e-9), (high - low) / _MOST_LEVELS)
+def known_method(name: str) -> str:
+    """The name of a method of `METHODS`. Raises DecodeError for another one, and for one that was removed."""
+    if name == "gradient":
+        raise DecodeError("the depth method gradient was removed: choose combined, which is faster and more exact")
+    if name not in METHODS:
+        raise DecodeError(f"unknown depth method {name!r}; known are {', '.join(METHODS)}")
+    return name
+
+
+def search(evidence: Evidence, low: float, high: float, *, window: int | None = None, workers: int = 1) -> Search:
+    """Disparities fine enough for the outermost views, unless they become too many."""
+    finest = _FINEST if evidence.white else _FINEST_OF_VIEWS
+    step = max(finest / max(evidence.stack.reach, 1e-9), (high - low) / _MOST_LEVELS)
     return Search(low, high, step, window, workers)
 
 
@@ -72,7 +82,7 @@ def disparity_range(evidence: Evidence, *, workers: int = 1) -> tuple[float, flo
     widest = min(_WIDEST, 0.25 * width / max(stack.reach, 1e-9))
     looked = Search(-widest, widest, max(0.35 * factor / stack.reach, widest / 40), 9, workers)
     disparities = looked.disparities()
-    likelihood, _ = windowed(contrast.explained(coarse, disparities, workers=workers), looked.window)
+    likelihood, _ = windowed(contrast.explained(coarse, disparities, workers=workers), looked.contrast_window)
     margin = likelihood.max(axis=0) - likelihood.mean(axis=0)
     textured = margin >= np.quantile(margin, 1 - _SURE)
     edge = max(3, min(margin.shape) // 10)
@@ -81,5 +91,5 @@ def disparity_range(evidence: Evidence, *, workers: int = 1) -> tuple[float, flo
     best = ndimage.median_filter(peaks, 3)
     found = best[textured] if textured.any() else best.ravel()
     low, high = (float(x) for x in np.quantile(found, [0.002, 0.998]))
-    margin_px = 0.5 * (disparities[1] - disparities[0])
+    margin_px = 0.5 * (disparities[1] - disparities[0]) + _MARGIN
     return max(low - margin_px, -1.2 * widest), min(high + margin_px, 1.2 * widest)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import LightField, ViewStack
@@ -23,6 +24,9 @@ from dappled.decode.lightfield.light_field import Image, needs_parallax
 from dappled.decode.lightfield.views import finest_detail
 
 _LEAST_NOISE = 1e-9  # variance: float32
+_NOISE_FREE = 5e-3  # of the variance of a view's fine detail
+_UNMEASURED = 1e-6  # of the weight of what was measured best
+_DETAIL = 3.0  # px: sigma
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,13 +35,15 @@ class Evidence:
 
     `stack.views` are the views without any shrinking: unbiased, and noisier than the views made for display. `white`
     says that n is the frame's own white noise and each sample a measurement of its own; else it is a guess from the
-    views.
+    views. `made` are the views of a masked frame as they were made for display (grey), where the frame has next to no
+    noise and they were plainly inverted; else None.
     """
 
     stack: ViewStack
     images: NDArray[np.float32]
     weights: NDArray[np.float64]
     white: bool
+    made: ViewStack | None = None
 
     def lags(self) -> NDArray[np.float64]:
         """(2V−1, 2U−1) sums of W over pairs of views with the same separation."""
@@ -102,7 +108,20 @@ def of_light_field(field: LightField) -> Evidence:
         np.ascontiguousarray(images.reshape(shape), dtype=np.float32),
         weights,
         white=True,
+        made=_noise_free(stack.grey(), weights, field),
     )
+
+
+def _noise_free(made: ViewStack, weights: NDArray[np.float64], field: LightField) -> ViewStack | None:
+    """The views, where their noise is far below their texture; None for others, and for those of the joint model,
+    which are drawn to one disparity a patch."""
+    if field.attributes.get("views_model") == "joint":
+        return None
+    values = np.linalg.eigvalsh(weights)
+    noise = float(np.median(1 / values[values > _UNMEASURED * values[-1]]))
+    middle = made.middle()
+    texture = float(np.var(middle - ndimage.gaussian_filter(middle, _DETAIL)))
+    return made if noise < _NOISE_FREE * texture else None
 
 
 def view_noise(views: NDArray[np.float32]) -> float:

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.depth.depth_map import DepthMap, Map
-from dappled.decode.depth.estimate import WINDOW
+from dappled.decode.depth.depth_map import CONTRAST_WINDOW, DepthMap, Map
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import ViewStack
 
@@ -195,7 +194,9 @@ def fit_targets(
     return Ranging(float(gain), float(offset), f_number, source, sigma / float(gain), focal_length_mm)
 
 
-def target_shift(depth: DepthMap, stack: ViewStack, share: float = 0.25, window: int = WINDOW) -> tuple[float, float]:
+def target_shift(
+    depth: DepthMap, stack: ViewStack, share: float = 0.25, window: int = CONTRAST_WINDOW
+) -> tuple[float, float]:
     """The shift S of what fills the picture's middle (`share` of its height and width), and its standard error.
 
     The median, each pixel counting by its variance, with one free measurement a `window`. Raises DecodeError where less

@@ -51,7 +51,13 @@ def depth(evidence: Evidence, search: Search) -> DepthMap:
             sign = -math.copysign(1, steps[k])
             scale = abs(steps[k]) * enlarge
             ends = sorted((sign * search.low * scale, sign * search.high * scale))
-            shift = _matched(cv2, np.ascontiguousarray(pair[0]), np.ascontiguousarray(pair[1]), ends[0], ends[1])
+            shift = _matched(
+                cv2,
+                np.ascontiguousarray(pair[0]),
+                np.ascontiguousarray(pair[1]),
+                (ends[0], ends[1]),
+                search.window or _BLOCK,
+            )
             if axis == 0:
                 shift = shift.T
             found.append(sign * _reduced(shift, enlarge, middle.shape) / np.float32(scale))
@@ -98,8 +104,11 @@ def _prepared(cv2: Any, view: Image, enlarge: int, low: float, high: float) -> N
     return made
 
 
-def _matched(cv2: Any, left: NDArray[np.uint8], right: NDArray[np.uint8], low: float, high: float) -> Image:
+def _matched(
+    cv2: Any, left: NDArray[np.uint8], right: NDArray[np.uint8], between: tuple[float, float], block: int
+) -> Image:
     """How many pixels further left the points of the second picture lie, NaN where none was found."""
+    low, high = between
     first = math.floor(low) - 1
     count = -(-(math.ceil(high) + 2 - first) // _SIXTEENTHS) * _SIXTEENTHS
     if count > min(_WIDEST, left.shape[1] // 2):
@@ -107,11 +116,11 @@ def _matched(cv2: Any, left: NDArray[np.uint8], right: NDArray[np.uint8], low: f
             f"stereo matching over {count} px is too wide for views of {left.shape[1]} px: narrow the range"
         )
     matcher = cv2.StereoSGBM_create(
-        minDisparity=first, numDisparities=count, blockSize=_BLOCK, P1=8 * _BLOCK**2, P2=32 * _BLOCK**2,
+        minDisparity=first, numDisparities=count, blockSize=block, P1=8 * block**2, P2=32 * block**2,
         disp12MaxDiff=2, uniquenessRatio=5, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
     # The matcher finds nothing within `count` of the edge, so the picture is continued there.
-    pad = count + abs(first) + _BLOCK
+    pad = count + abs(first) + block
     wide = [cv2.copyMakeBorder(p, 0, 0, pad, pad, cv2.BORDER_REPLICATE) for p in (left, right)]
     found = matcher.compute(*wide)[:, pad:-pad]
     made: Image = np.where(found < first * _SIXTEENTHS, np.nan, found / _SIXTEENTHS).astype(np.float32)

@@ -4,6 +4,7 @@
 """
 
 from dappled.decode.geometry.pose import (
+    FrameGeometry,
     Gnss,
     Pose,
     Quaternion,
@@ -13,6 +14,7 @@ from dappled.decode.geometry.pose import (
     from_euler,
     hermite,
     hermite_doubt,
+    image_motion,
     metres_per_radian,
     multiply,
     norm,
@@ -21,11 +23,13 @@ from dappled.decode.geometry.pose import (
     slerp,
     slerp_doubt,
     turn_rad,
+    turn_rates,
+    turned,
     turned_by_heading,
 )
 
 __all__ = [
-    "Gnss", "Pose", "Quaternion", "Symmetric", "Vector3", "conjugate", "from_euler", "hermite", "hermite_doubt",
-    "metres_per_radian", "multiply", "norm", "normalised", "rotation_vector", "slerp", "slerp_doubt", "turn_rad",
-    "turned_by_heading",
+    "FrameGeometry", "Gnss", "Pose", "Quaternion", "Symmetric", "Vector3", "conjugate", "from_euler", "hermite",
+    "hermite_doubt", "image_motion", "metres_per_radian", "multiply", "norm", "normalised", "rotation_vector", "slerp",
+    "slerp_doubt", "turn_rad", "turn_rates", "turned", "turned_by_heading",
 ]  # fmt: skip

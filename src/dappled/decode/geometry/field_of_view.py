@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from dappled.decode.geometry.pose import Pose, Quaternion, Vector3
+from dappled.decode.geometry.pose import Pose, Quaternion, Vector3, turned
 
 EARTH_RADIUS_M = 6_371_000.0
 _SHALLOW = 0.05  # below 3° under the horizon the ground is too far for a flat one
@@ -28,7 +28,7 @@ def look(pose: Pose | None, mount: Sequence[float]) -> tuple[Quaternion | None, 
     """
     if pose is None or pose.attitude is None:
         return None, None
-    right, down, forward = (_turned(pose.attitude, (mount[at], mount[3 + at], mount[6 + at])) for at in range(3))
+    right, down, forward = (turned(pose.attitude, (mount[at], mount[3 + at], mount[6 + at])) for at in range(3))
     attitude = _quaternion((forward, right, down))
     known = (pose.latitude_rad, pose.longitude_rad, pose.altitude_msl_m, pose.height_above_home_m)
     latitude, longitude, altitude, height = known
@@ -43,18 +43,6 @@ def look(pose: Pose | None, mount: Sequence[float]) -> tuple[Quaternion | None, 
         latitude + north / EARTH_RADIUS_M,
         longitude + east / (EARTH_RADIUS_M * shrink),
         altitude - height,
-    )
-
-
-def _turned(q: Quaternion, v: Vector3) -> Vector3:
-    """v rotated by q (w, x, y, z)."""
-    w, x, y, z = q
-    vx, vy, vz = v
-    tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
-    return (
-        vx + w * tx + y * tz - z * ty,
-        vy + w * ty + z * tx - x * tz,
-        vz + w * tz + x * ty - y * tx,
     )
 
 

@@ -1,8 +1,9 @@
-"""The pose of the vehicle at an instant with its errors, interpolated by cubic Hermite (place) and slerp (attitude)."""
+"""The pose of the vehicle at an instant with its errors, interpolation of poses, and how a frame moves at a pose."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,6 +12,8 @@ Quaternion = tuple[float, float, float, float]
 Symmetric = tuple[float, float, float, float, float, float]  # a 3 × 3 matrix's upper triangle: xx, xy, xz, yy, yz, zz
 _WGS84_A_M = 6378137.0
 _WGS84_E2 = 6.69437999014e-3
+_SWAY_S = 0.06  # within less, a multicopter's turn rate is as good as a straight line
+_SHALLOW = 0.05  # below 3° under the horizon the ground is too far for a flat one
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +177,27 @@ def turn_rad(a: Quaternion, b: Quaternion) -> float:
     return 2 * math.atan2(math.hypot(*cross), abs(dot))
 
 
+def turn_rates(
+    ends: tuple[Quaternion, Quaternion], rates: tuple[Vector3 | None, Vector3 | None], span_s: float, share: float
+) -> Vector3:
+    """The body's turn rates (rad/s, about its own axes) at `share` of `span_s`: between those at its ends, where both
+    are known; else by the turn from one end to the other.
+
+    Where the ends are far apart, by the parabola through both that makes the turn between them: a sway may be slow at
+    both ends and fast in between.
+    """
+    a, b = rates
+    turn = rotation_vector(multiply(conjugate(ends[0]), ends[1]))
+    if a is None or b is None:
+        return turn[0] / span_s, turn[1] / span_s, turn[2] / span_s
+    bow = 6 * share * (1 - share) if span_s > _SWAY_S else 0.0
+    x, y, z = (
+        (1 - share) * one + share * other + bow * (whole / span_s - (one + other) / 2)
+        for one, other, whole in zip(a, b, turn, strict=True)
+    )
+    return x, y, z
+
+
 def metres_per_radian(latitude_rad: float, altitude_m: float) -> tuple[float, float]:
     """North and east metres for one radian of latitude and of longitude, on WGS 84."""
     curvature = 1 - _WGS84_E2 * math.sin(latitude_rad) ** 2
@@ -185,3 +209,64 @@ def metres_per_radian(latitude_rad: float, altitude_m: float) -> tuple[float, fl
 def norm(vector: Vector3) -> float:
     """Length."""
     return math.hypot(*vector)
+
+
+def turned(q: Quaternion, v: Vector3) -> Vector3:
+    """v rotated by q (w, x, y, z)."""
+    w, x, y, z = q
+    vx, vy, vz = v
+    tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
+    return (
+        vx + w * tx + y * tz - z * ty,
+        vy + w * ty + z * tx - x * tz,
+        vz + w * tz + x * ty - y * tx,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class FrameGeometry:
+    """A pinhole camera on a vehicle over flat ground.
+
+    `mount` are nine numbers row by row, camera axes (right, down, forward) to body axes; `side_mm` is (height, width)
+    of the sensor, `view_mm` the (row, column) pitch of a view; `height_m` is above the ground.
+    """
+
+    mount: Sequence[float]
+    focal_length_mm: float
+    side_mm: tuple[float, float]
+    view_mm: tuple[float, float]
+    height_m: float
+
+
+def image_motion(
+    camera: FrameGeometry, attitude: Quaternion, velocity_ned_m_s: Vector3, rates_rad_s: Vector3
+) -> tuple[float, float] | None:
+    """How fast still ground moves over the sensor, (down, right) in mm/s, of 3 × 3 places where it moves fastest in
+    pixels of a view.
+
+    `rates_rad_s` are the body's, about its own axes. Of a ground point at P in camera axes, with the camera's velocity
+    v and turn ω: dP/dt = −v − ω × P, and on the sensor x = f · X / Z. Where a place sees no ground (above 3° under the
+    horizon) only the turn moves it. None where no place sees ground.
+    """
+    body = [turned(conjugate(attitude), velocity_ned_m_s), rates_rad_s, turned(conjugate(attitude), (0.0, 0.0, 1.0))]
+    v, w, down = (_in_camera(camera.mount, one) for one in body)
+    f, fastest, most, seen = camera.focal_length_mm, (0.0, 0.0), -1.0, False
+    for row in (-0.5, 0.0, 0.5):
+        for column in (-0.5, 0.0, 0.5):
+            x, y = column * camera.side_mm[1] / f, row * camera.side_mm[0] / f
+            falls = x * down[0] + y * down[1] + down[2]  # of a ray with one unit ahead
+            near = 0.0  # 1 / Z
+            if falls > _SHALLOW * math.hypot(x, y, 1.0):
+                near, seen = falls / camera.height_m, True
+            ahead = -v[2] * near - (w[0] * y - w[1] * x)
+            right = -v[0] * near - (w[1] - w[2] * y) - x * ahead
+            below = -v[1] * near - (w[2] * x - w[0]) - y * ahead
+            if (pixels := math.hypot(below / camera.view_mm[0], right / camera.view_mm[1])) > most:
+                fastest, most = (below, right), pixels
+    return (f * fastest[0], f * fastest[1]) if seen else None
+
+
+def _in_camera(mount: Sequence[float], v: Vector3) -> Vector3:
+    """A vector in body axes, in camera axes."""
+    x, y, z = (sum(mount[3 * row + column] * v[row] for row in range(3)) for column in range(3))
+    return x, y, z

@@ -1,0 +1,44 @@
+"""Views are compared with the middle one in the directions that see the same thing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dappled.decode.depth.photo_consistency import compared, differences
+from dappled.decode.lightfield import ViewStack
+from dappled.decode.lightfield.light_field import centred
+from tests.decode.scenes import Board, paint
+
+DISPARITIES = np.linspace(-1, 1, 9)
+
+
+@pytest.mark.parametrize("shape", [(5, 5), (1, 2), (2, 1), (1, 5), (3, 2), (2, 2)])
+def test_views_differ_least_at_the_true_disparity(shape: tuple[int, int]) -> None:
+    stack, _ = paint([Board(0.5)], (48, 70), 5)
+    rows, columns = (slice((5 - n) // 2, (5 - n) // 2 + n) for n in shape)
+    views = np.ascontiguousarray(stack.views[rows, columns])
+    part = ViewStack(views, stack.row_steps[rows], stack.column_steps[columns])
+    cost = differences(part, DISPARITIES, limit=np.inf)
+    assert np.mean(DISPARITIES[cost.argmin(axis=0)][6:-6, 6:-6] == 0.5) > 0.9
+    assert compared(part) > 0
+
+
+def test_tiles_and_workers_make_no_difference() -> None:
+    stack, _ = paint([Board(0.3)], (70, 50), 3)
+    whole = differences(stack, DISPARITIES, limit=0.1)
+    np.testing.assert_array_equal(whole, differences(stack, DISPARITIES, limit=0.1, workers=2))
+    lower = ViewStack(np.ascontiguousarray(stack.views[:, :, 11:]), stack.row_steps, stack.column_steps)
+    np.testing.assert_allclose(whole[:, 20:], differences(lower, DISPARITIES, limit=0.1)[:, 9:], atol=1e-6)
+
+
+def test_the_better_half_of_the_arms_counts() -> None:
+    """What one side alone sees otherwise does no harm, and each view counts up to the limit."""
+    picture = np.random.default_rng(3).random((40, 40)).astype(np.float32)
+    stack = ViewStack(np.broadcast_to(picture, (3, 3, 40, 40)).copy(), centred(3), centred(3))
+    stack.views[1, 2] = 0
+    stack.views[0, 1] = 0
+    assert differences(stack, np.zeros(1), limit=1.0).max() < 1e-9
+    stack.views[1, 0] = 5
+    assert differences(stack, np.zeros(1), limit=0.25).max() == pytest.approx(0.25, rel=1e-4)
+    assert compared(stack) == 2
