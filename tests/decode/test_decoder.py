@@ -7,9 +7,11 @@ import pytest
 
 from dappled.decode.calibration.calibration import Calibration
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
-from dappled.decode.decoder import MaskDecoder
+from dappled.decode.decoder import DecodeReport, MaskDecoder
 from dappled.decode.errors import DecodeError
+from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.optics.carriers import Mask
+from tests.decode.ray_trials import print_costs_db
 from tests.decode.rays import (
     FOCAL_MM,
     FULL_F,
@@ -23,15 +25,17 @@ from tests.decode.rays import (
     psnr,
 )
 
+Decoded = tuple[LightField, DecodeReport]
 
-def _calibration(camera: Camera, noise: float = 0.0) -> Calibration:
+
+def _calibration(camera: Camera, noise: float = 0.0, design: Mask | None = None) -> Calibration:
     rng = np.random.default_rng(77)
     plane = camera.expose([(Texture.random(rng), 1.0)], STOPPED_F)
     plane = (plane + rng.normal(0, noise, plane.shape)).astype(np.float32)
     return calibrate(
         [CalibrationFrame(plane, FOCAL_MM, STOPPED_F)],
         sensor=SENSOR,
-        mask=camera.mask,
+        mask=design or camera.mask,
         law="geometric",
         mask_distance_mm=STATED_DISTANCE_MM,
     )
@@ -61,7 +65,7 @@ def test_a_smaller_aperture_never_gives_worse_views_than_its_one_image(stops: in
     assert psnr(field.views, truth) > psnr(np.broadcast_to(field.slices[0].real, truth.shape), truth) - 0.5
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_views_of_a_hidden_camera_meet_the_truth(seed: int) -> None:
     camera, scene = Camera.hidden(seed), _scene(seed)
     field, report = _decoder(_calibration(camera)).decode_reported(
@@ -82,22 +86,71 @@ def far_out() -> tuple[Camera, Calibration, Plane]:
     return camera, _calibration(camera), camera.expose(_scene(3))
 
 
-@pytest.mark.parametrize("placed", [False, True])
-@pytest.mark.parametrize("told", [0.67, 0.9, 1.0, 1.5])
-def test_an_f_number_told_wrong_costs_nothing_and_is_doubted(
-    far_out: tuple[Camera, Calibration, Plane], told: float, placed: bool
-) -> None:
-    """`placed`: the mask's distance is known, so that even a tenth is too much for an f-number."""
+@pytest.fixture(scope="module", params=[False, True], ids=["distance-unknown", "distance-known"])
+def told_right(
+    far_out: tuple[Camera, Calibration, Plane], request: pytest.FixtureRequest
+) -> tuple[bool, Calibration, Decoded]:
+    """Whether the mask's distance is known, so that even a tenth is too much for an f-number, the calibration, and what
+    comes of the frame with the f-number that it was taken with."""
     camera, known, plane = far_out
-    if placed:
+    if request.param:
         fits = tuple(replace(f, mask_distance_mm=camera.distance_mm, distance_fitted=True) for f in known.fits)
         known = replace(known, fits=fits)
-    field, report = _decoder(known).decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=told * FULL_F)
+    return request.param, known, _decoder(known).decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=FULL_F)
+
+
+@pytest.mark.parametrize("told", [0.67, pytest.param(0.9, marks=pytest.mark.slow), 1.0, 1.5])
+def test_an_f_number_told_wrong_costs_nothing_and_is_doubted(
+    far_out: tuple[Camera, Calibration, Plane], told_right: tuple[bool, Calibration, Decoded], told: float
+) -> None:
+    camera, _, plane = far_out
+    placed, known, right = told_right
+    field, report = right
+    if told != 1:
+        field, report = _decoder(known).decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=told * FULL_F)
     truth = camera.truth(_scene(3), field.grid, field.views.shape[2:4])
-    assert psnr(field.views, truth) > 40
+    assert field.attributes["views_model"] == right[0].attributes["views_model"]
+    assert psnr(field.views, truth) > max(40, psnr(right[0].views, truth) - 0.5)
     shown = FULL_F if placed else FULL_F * STATED_DISTANCE_MM / camera.distance_mm  # a distance is an aperture, too
     far = abs(np.log(told * FULL_F / shown)) > (0.08 if placed else 0.25)
     assert (f"its carriers show f/{shown:.2g}, told is f/{told * FULL_F:.3g}" in (report.doubt or "")) == far
+
+
+@pytest.mark.slow
+def test_a_print_s_scale_that_was_fitted_belongs_to_the_aperture() -> None:
+    """A film 4.5 % too coarse at a known distance, its frame's f-number told 5 % too small: together 9.5 %."""
+    camera = replace(Camera.hidden(3), mask=replace(MASK, frequency_per_mm=0.955 * MASK.frequency_per_mm))
+    plane, found = camera.expose(_scene(3)), _calibration(camera, design=MASK)
+    for scale in (0.955, 1.0):
+        fits = [
+            replace(f, mask_distance_mm=camera.distance_mm, distance_fitted=True, print_scale=scale) for f in found.fits
+        ]
+        decoder = _decoder(replace(found, fits=tuple(fits)))
+        _, report = decoder.decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=0.95 * FULL_F)
+        assert (report.doubt is None) == (scale < 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.99, 1.01])
+def test_a_print_one_percent_off_costs_the_views_less_than_a_decibel(scale: float) -> None:
+    design, printed = print_costs_db(scale, seed=3, beams=5)
+    assert design > printed - 1.0
+    assert printed > 36
+
+
+@pytest.mark.parametrize("told", [0.67, 1.33])
+def test_without_a_calibration_visible_carriers_tell_the_aperture(
+    far_out: tuple[Camera, Calibration, Plane], told: float
+) -> None:
+    camera, rng = far_out[0], np.random.default_rng(3)
+    plane = camera.expose(_scene(3), 2 * FULL_F)
+    plane = (plane + rng.normal(0, plane.mean() / 100, plane.shape)).astype(np.float32)
+    right, wrong = (
+        _decoder().decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=2 * n * FULL_F) for n in (1.0, told)
+    )
+    assert wrong[1].views_from == "frame"
+    truth = camera.truth(_scene(3), wrong[0].grid, wrong[0].views.shape[2:4], 2 * FULL_F)
+    assert psnr(wrong[0].views, truth) > max(30, psnr(right[0].views, truth) - 0.5)
 
 
 @pytest.mark.parametrize("told", [0.5, 2.0])
@@ -164,6 +217,7 @@ def test_a_diagonal_mask_decodes(stopped: tuple[Camera, Plane]) -> None:
     assert field.views.shape[:2] == (5, 5)
 
 
+@pytest.mark.slow
 def test_the_same_frame_gives_the_same_bytes_for_any_workers(stopped: tuple[Camera, Plane]) -> None:
     fields = [_decoder(workers=n).decode(stopped[1], focal_length_mm=FOCAL_MM, f_number=STOPPED_F) for n in (1, 1, 3)]
     assert len({field.slices.tobytes() for field in fields}) == 1

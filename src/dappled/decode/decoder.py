@@ -8,28 +8,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.calibration.calibration import Calibration
+from dappled.decode.calibration.calibration import Calibration, LatticeFit
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.aperture import (
     Aperture,
+    UsedAperture,
     angular_frequencies,
     at_corner,
     kappa,
-    origin_of,
-    relative_transfer,
+    own_transfer,
+    shown_aperture,
     transfer,
     used_aperture,
 )
-from dappled.decode.lightfield.frame_views import views_of
+from dappled.decode.lightfield.frame_views import TakenSlices, place_of, views_of
 from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.mask_place import MaskPlace, cycles_per_radian
 from dappled.decode.lightfield.views import Views
 from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Order, Sensor
+from dappled.decode.optics.visibility import order_strengths
 from dappled.decode.spectrum.peaks import (
     ALONE_NATS,
     STRONG,
@@ -52,8 +55,14 @@ _UNKNOWN: Mapping[str, Any] = {
     "transfers": None,
     "aperture": None,
     "aperture_doubt": None,
+    "f_number_shown": None,
+    "f_number_shown_sigma": None,
+    "views_doubt": None,
     "views_model": None,
+    "views_reason": "",
     "view_sigma": None,
+    "mask_place": None,
+    "mask_doubt": None,
 }
 _LEAST_THROUGH = 0.1  # of a carrier: where the aperture leaves less, the mask's transfer can't be measured
 
@@ -66,7 +75,8 @@ class DecodeReport:
     each (None: nothing there), `used` those that the slices were cut at. `carriers_from`: "measured" in this frame;
     "calibrated": predicted by the calibration, as too few were seen; "predicted": by the law alone; "found": an
     unknown lattice found in the frame. `views_from`: whose phases and transfer made the views. `noise_rms` is the
-    plane's white noise, 1.0 = sensor white. `aperture_doubt` says what is strange about the aperture that it shows.
+    plane's white noise, 1.0 = sensor white. `aperture_doubt` says what is strange about the aperture that it shows,
+    `views_doubt` about the views, `mask_doubt` how far the mask has moved since its calibration.
     """
 
     predicted: tuple[Carrier, ...]
@@ -76,6 +86,8 @@ class DecodeReport:
     views_from: ViewsFrom
     noise_rms: float
     aperture_doubt: str | None = None
+    views_doubt: str | None = None
+    mask_doubt: str | None = None
 
     @property
     def found(self) -> int:
@@ -84,9 +96,10 @@ class DecodeReport:
 
     @property
     def doubt(self) -> str | None:
-        """What is unusual about the measured carriers and the aperture, in a sentence; None where nothing is."""
+        """What is unusual about carriers, mask, aperture and views, in a sentence; None where nothing is."""
         place = doubt(self.used, self.predicted) if self.carriers_from == "measured" else None
-        return "; ".join(words for words in (place, self.aperture_doubt) if words) or None
+        words = (place, self.mask_doubt, self.aperture_doubt, self.views_doubt)
+        return "; ".join(one for one in words if one) or None
 
 
 def doubt(used: Sequence[Carrier], predicted: Sequence[Carrier]) -> str | None:
@@ -111,6 +124,7 @@ def light_field(
     shape: tuple[int, ...],
     report: DecodeReport,
     facts: Mapping[str, Any],
+    view_sigma: NDArray[np.float32] | None = None,
 ) -> LightField:
     """The light field, with the facts and the numbers and words of the report as its attributes."""
     rows = np.array([(c.ky, c.kx, c.fy, c.fx) for c in slices.carriers], dtype=np.float64)
@@ -123,7 +137,7 @@ def light_field(
         "carriers_found": report.found,
         "noise_rms": report.noise_rms,
     }
-    return LightField(slices.values, rows, views, offsets, slices.grid, attributes)
+    return LightField(slices.values, rows, views, offsets, slices.grid, attributes, view_sigma)
 
 
 class Decoder(Protocol):
@@ -142,17 +156,15 @@ class Decoder(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaskDecoder:
-    """Decodes frames from behind a printed mask.
-
-    The carriers are predicted by the calibration, or else by the law from `mask_distance_mm`. Where enough of them
-    are seen near the prediction, the frame's own lattice is used. `focal_sigma_mm` is the error of the focal length
-    (half of the EXIF rounding), which widens the search. `size` of the slices in bins of the padded transform;
-    None: as large as the spacing allows. Views need a calibration, or a frame that shows its carriers; else only the
-    slices are there, and `views` has the shape (0, 0, h, w). `colours` says that the planes are colour mosaics.
-    `taper` apodises the bands, see `slices.extract`. `at` is this frame's own lattice where a search has found it,
-    `ratio` the matrix, row by row, of the lattice found in a flight over the law's: a print scaled and turned.
-    Without `joint_views` the views are made quickly, each spatial frequency alike (see `views`): depth is computed from
-    slices and needs no better ones. `buffers` are reused from frame to frame.
+    """Decodes frames from behind a printed mask. The carriers are predicted by the calibration, or else by the law from
+    `mask_distance_mm`. Where enough of them are seen near the prediction, the frame's own lattice is used.
+    `focal_sigma_mm` is the error of the focal length (half of the EXIF rounding), which widens the search. `size` of
+    the slices in bins of the padded transform; None: as large as the spacing allows. Views need a calibration, or a
+    frame that shows its carriers; else only the slices are there, and `views` has the shape (0, 0, h, w). `colours`
+    says that the planes are colour mosaics. `taper` apodises the bands, see `slices.extract`. `at` is this frame's own
+    lattice where a search has found it, `ratio` the matrix, row by row, of the lattice found in a flight over the
+    law's: a print scaled and turned. Without `joint_views` the views are made quickly, each spatial frequency alike
+    (see `views`): depth is computed from slices and needs no better ones. `buffers` are reused from frame to frame.
     """
 
     sensor: Sensor
@@ -238,8 +250,17 @@ class MaskDecoder:
             )
         else:
             made, offsets, views_from, known = *no_views(slices), "none", _UNKNOWN
-        strange = known["aperture_doubt"]
-        report = DecodeReport(tuple(predicted), tuple(measured), tuple(used), carriers_from, views_from, noise, strange)
+        report = DecodeReport(
+            tuple(predicted),
+            tuple(measured),
+            tuple(used),
+            carriers_from,
+            views_from,
+            noise,
+            known["aperture_doubt"],
+            known["views_doubt"],
+            known["mask_doubt"] or self._mask_doubt(slices, lattice, focal_length_mm),
+        )
         facts: dict[str, Any] = {
             "law": self.law,
             "focal_length_mm": focal_length_mm,
@@ -250,9 +271,13 @@ class MaskDecoder:
             "level": spectrum.level,
             "band": list(size),
             "taper": self.taper,
-            **{name: value for name, value in known.items() if name != "aperture_doubt"},
+            **{name: value for name, value in known.items() if not name.endswith("_doubt")},
         }
-        return light_field(slices, made, offsets, shape=plane.shape, report=report, facts=facts), report
+        sigma = known["view_sigma"]
+        if sigma is not None:
+            facts["view_sigma"] = np.sqrt(np.mean(sigma**2, axis=(2, 3))).tolist()
+        field = light_field(slices, made, offsets, shape=plane.shape, report=report, facts=facts, view_sigma=sigma)
+        return field, report
 
     def transform(self, plane: Source, focal_length_mm: float) -> Spectrum:
         """The spectrum up to the largest frequency that slices and searches need at this focal length."""
@@ -325,6 +350,19 @@ class MaskDecoder:
             return self.calibration.nearest(focal_length_mm).mask_distance_mm
         return self.mask_distance_mm
 
+    def _mask_doubt(self, slices: Slices, lattice: Lattice, focal_length_mm: float) -> str | None:
+        """How far the frame's slices show the mask from where the calibration has it, in a sentence."""
+        if self.calibration is None:
+            return None
+        orders = [(c.ky, c.kx) for c in slices.carriers]
+        return self.calibration.mask_move(
+            slices.values,
+            orders,
+            focal_length_mm=focal_length_mm,
+            lattice=lattice,
+            samples_px=(float(slices.grid[0, 0]), float(slices.grid[1, 1])),
+        ).doubt(self.mask.frequency_per_mm)
+
     def views(
         self,
         slices: Slices,
@@ -341,74 +379,121 @@ class MaskDecoder:
         none = no_views(slices)
         if f_number is None:
             return *none, "none", _UNKNOWN
-        orders = [(c.ky, c.kx) for c in slices.carriers]
-        aperture = self.aperture or Aperture(self.mask.views_per_axis)
-        cycles = kappa(self.mask.frequency_per_mm, self._distance(focal_length_mm), focal_length_mm, f_number)
-        keep = np.ones(len(orders), dtype=bool)
-        strange: str | None = None
+        printed = self.mask.frequency_per_mm
         if self.calibration is not None:
-            known = self.calibration.nearest(focal_length_mm)
-            magnitudes = dict(zip(self.mask.half_orders(), known.transfer, strict=True))
-            origin = at_corner(known.origin, lattice, self.sensor.shape)
-            transfers = transfer(orders, [magnitudes[order] for order in orders], origin)
-            rotation = known.rotation_rad
-            width = used_aperture(
-                slices.values,
-                transfers,
-                orders,
-                nominal_kappa=cycles,
-                rotation_rad=rotation,
-                aperture=aperture,
-                distance_known=known.distance_fitted,
-            )
-            cycles, aperture, strange = width.kappa, width.aperture, width.doubt(f_number)
-            views_from: ViewsFrom = "calibration"
-        elif carriers_from == "measured":
-            rotation = turn_between(lattice, self.lattice_at(focal_length_mm))
-            through = aperture.transform(angular_frequencies(orders, cycles, rotation)).real
-            keep = np.abs(through) > _LEAST_THROUGH
-            if np.linalg.matrix_rank([order for order, usable in zip(orders, keep, strict=True) if usable]) < 2:
-                return *none, "none", _UNKNOWN
-            transfers = _own_transfer(slices.values, orders, through, keep)
-            views_from = "frame"
-        else:
-            return *none, "none", _UNKNOWN
-        keep &= np.abs(transfers) > 1e-3  # a carrier that the mask doesn't make carries no information
-        angular = angular_frequencies(orders, cycles, rotation)
+            printed *= self.calibration.nearest(focal_length_mm).print_scale
+        cycles = kappa(printed, self._distance(focal_length_mm), focal_length_mm, f_number)
         across, down = math.hypot(*self.sensor.column_mm), math.hypot(*self.sensor.row_mm)
-        kept = [c for c, usable in zip(slices.carriers, keep, strict=True) if usable]
-        made = views_of(
-            slices.values if keep.all() else slices.values[keep],
-            kept,
-            transfers[keep],
+        taken = TakenSlices(
+            slices.values,
+            slices.carriers,
+            np.ones(len(slices.carriers), dtype=np.complex128),
             kappa_cycles=cycles,
-            rotation_rad=rotation,
-            aperture=aperture,
+            rotation_rad=0.0,
+            aperture=self.aperture or Aperture(self.mask.views_per_axis),
             samples_px=(float(np.hypot(*slices.grid[:, 0])), float(np.hypot(*slices.grid[:, 1]))),
             row_over_column=down / across,
             noise_variance=noise_rms**2 * slices.band,
             colours=self.colours,
-            joint=self.joint_views and strange is None,  # the joint model trusts the aperture
         )
-        used = np.where(keep, transfers, 0)
-        rows = np.column_stack([angular, used.real, used.imag]).tolist()
+        width: UsedAperture | None = None
+        place: MaskPlace | None = None
+        if self.calibration is not None:
+            taken, width, place = self._calibrated(taken, lattice, self.calibration.nearest(focal_length_mm))
+            views_from: ViewsFrom = "calibration"
+        elif carriers_from == "measured":
+            rotation = turn_between(lattice, self.lattice_at(focal_length_mm))
+            width = shown_aperture(
+                slices.values,
+                self._designs(lattice, taken.orders, f_number),
+                taken.orders,
+                nominal_kappa=cycles,
+                rotation_rad=rotation,
+                aperture=taken.aperture,
+            )
+            taken = replace(taken, kappa_cycles=width.kappa, aperture=width.aperture)
+            through = taken.aperture.transform(angular_frequencies(taken.orders, width.kappa, rotation)).real
+            keep = np.abs(through) > _LEAST_THROUGH
+            if np.linalg.matrix_rank([order for order, usable in zip(taken.orders, keep, strict=True) if usable]) < 2:
+                return *none, "none", _UNKNOWN
+            transfers = own_transfer(slices.values, taken.orders, through, keep)
+            taken = replace(taken, transfers=np.where(keep, transfers, 0), rotation_rad=rotation)
+            views_from = "frame"
+        else:
+            return *none, "none", _UNKNOWN
+        shown, shown_sigma = self._shown(width, f_number * cycles, focal_length_mm)
+        fits = width is None or width.fits  # the joint model trusts the aperture
+        made = views_of(taken.used(), joint=self.joint_views and fits, workers=self.workers)
+        used = taken.used_transfers()
         facts = {
-            "transfers": rows,
-            "aperture": aperture.shape,
-            "aperture_doubt": strange,
+            "transfers": np.column_stack([taken.angular, used.real, used.imag]).tolist(),
+            "aperture": taken.aperture.shape,
+            "aperture_doubt": width.doubt(f_number) if width is not None else None,
+            "f_number_shown": shown,
+            "f_number_shown_sigma": shown_sigma,
+            "views_doubt": made.doubt,
             "views_model": made.model,
+            "views_reason": made.reason or ("" if fits else "its carriers agree with no aperture"),
             "view_sigma": made.sigma,
+            "mask_place": place.to_dict() if place is not None else None,
+            "mask_doubt": place.doubt(self.mask.frequency_per_mm) if place is not None else None,
         }
-        return made.views, aperture.offsets(), views_from, facts
+        return made.views, taken.aperture.offsets(), views_from, facts
 
+    def _designs(self, lattice: Lattice, orders: Sequence[Order], f_number: float) -> list[NDArray[np.float64]]:
+        """(K,) how strong each order is before the stop: as drawn, and less film, diffraction and pixels."""
+        made = order_strengths(
+            self.mask, self.sensor, lattice, mask_distance_mm=self.mask_distance_mm, f_number=f_number, orders=orders
+        )
+        drawn = np.array([1.0, *(one.pattern for one in made)])
+        left = np.array([1.0, *(one.film * one.diffraction * one.pixels for one in made)])
+        return [drawn, drawn * left]
 
-def _own_transfer(
-    slices: NDArray[np.complex64], orders: Sequence[Order], through: NDArray[np.float64], keep: NDArray[np.bool_]
-) -> NDArray[np.complex128]:
-    """T_k from the frame's own slices, lattice-linear, the aperture divided out."""
-    seen = relative_transfer(slices) / np.where(keep, through, 1.0)
-    used = keep.copy()
-    used[0] = False
-    origin, _ = origin_of([order for order, usable in zip(orders, used, strict=True) if usable], seen[used])
-    turns = transfer(orders, np.ones(len(orders)), origin)
-    return np.where(keep, (seen * np.conj(turns)).real, 0.0) * turns
+    def _calibrated(
+        self, taken: TakenSlices, lattice: Lattice, known: LatticeFit
+    ) -> tuple[TakenSlices, UsedAperture, MaskPlace | None]:
+        """The slices with a calibration's transfers, and the aperture that they show; with the joint model, where
+        they place the mask, and as a mask in its place would make them."""
+        magnitudes = dict(zip(self.mask.half_orders(), known.transfer, strict=True))
+        corner = at_corner(known.origin, lattice, self.sensor.shape)
+        transfers = transfer(taken.orders, [magnitudes[order] for order in taken.orders], corner)
+        taken = replace(taken, transfers=transfers, rotation_rad=known.rotation_rad)
+        width = self._width(taken, known)
+        found = replace(taken, kappa_cycles=width.kappa, aperture=width.aperture)
+        if not self.joint_views:
+            return found, width, None
+        turned = cycles_per_radian(lattice, self.sensor)
+        place = place_of(found.used(), turned, taken.samples_px)
+        if place is None or not place.moved:
+            return found, width, place
+        moved = replace(
+            taken,
+            values=place.undone(taken.values, taken.orders, turned, taken.samples_px),
+            transfers=transfers * transfer(taken.orders, np.ones(len(transfers)), place.periods),
+        )
+        again = self._width(moved, known)
+        if width.fits and not again.fits:
+            return found, width, None
+        return replace(moved, kappa_cycles=again.kappa, aperture=again.aperture), again, place
+
+    def _shown(
+        self, width: UsedAperture | None, turns: float, focal_length_mm: float
+    ) -> tuple[float | None, float | None]:
+        """The f-number that the carriers show and its standard error, from the told one times its κ. No error where the
+        mask's distance was stated: if that is wrong, so is the f-number."""
+        if width is None or not width.fitted or self.calibration is None:
+            return None, None
+        shown = turns / width.kappa
+        known = self.calibration.nearest(focal_length_mm).distance_fitted
+        return shown, shown * width.sigma / width.kappa if known else None
+
+    def _width(self, taken: TakenSlices, known: LatticeFit) -> UsedAperture:
+        return used_aperture(
+            taken.values,
+            taken.transfers,
+            taken.orders,
+            nominal_kappa=taken.kappa_cycles,
+            rotation_rad=taken.rotation_rad,
+            aperture=taken.aperture,
+            distance_known=known.distance_fitted,
+        )

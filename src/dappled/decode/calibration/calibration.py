@@ -1,4 +1,10 @@
-"""Calibrations: the measurements at each focal length, and the lattice at any focal length."""
+"""Calibrations: the measurements at each focal length, the lattice at any focal length, and whether the mask has moved.
+
+The mean of slice k over a frame is T_k·A_k of the frame's mean, A_k real: parallax and texture average out, and a stop
+that is its own mirror image has a real transform. A film that moved by δ periods since its calibration turns each mean
+by 2πk·δ; one that turned makes the phase of each slice run across the frame. Blocks of the frame say how far their own
+means scatter, so that texture is not taken for a move.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +16,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.calibration.swept_distance import SweptDistance
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
 
 _MOST_HARMONICS = 20  # as a mask's profile
+_BLOCKS = (6, 8)  # of a frame, whose scatter says how well a mean is known
+_SURE = 30.0  # chi², or log likelihood: clean frames reach 3
+_ALIKE = 1.0  # chi²: moves of a diagonal mask a quarter of a period apart differ by rounding alone
+_STEPS = 48  # of a period: how finely moves are tried, up to a quarter of a period
+_MOST_TURN, _TURNS = 0.007, 81  # radians to either side, and how many are tried
+_LEAST_PERIODS, _LEAST_TURN = 0.03, 3e-4  # smaller moves cost next to nothing
+_LEAST_TRANSFER = 1e-3  # a carrier that the mask doesn't make tells nothing
+_FLOOR = 1e-3  # of the mean: what the scene adds to the mean of a slice, however still its blocks are
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +39,8 @@ class LatticeFit:
     and signed, for each of the mask's half orders (DC first, 1.0), the aperture's own share divided out.
     `residual_bins` is the rms distance of the measured carriers from the lattice in bins of the padded transform,
     `phase_residual_rad` that of their phases from the origin's, `found` how many carriers of the half plane were seen;
-    `seen` are those, without the mean: (ky, kx, fy, fx, strength).
+    `seen` are those, without the mean: (ky, kx, fy, fx, strength). `print_scale` is the print's frequency over
+    its design's, 1 where it can't be told from the distance.
     """
 
     focal_length_mm: float
@@ -39,6 +55,30 @@ class LatticeFit:
     phase_residual_rad: float
     found: int
     seen: tuple[tuple[int, int, float, float, float], ...] = ()
+    print_scale: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class MaskMove:
+    """How far a mask lies from where its calibration has it: in periods (ky, kx), and radians; 0 where nothing shows.
+
+    A quarter of a period along each axis is the most that is told. A mask looks the same half a period off along
+    either, a diagonal one a quarter off along both: the least move of all that look alike is told.
+    """
+
+    periods: tuple[float, float]
+    turn_rad: float
+
+    def doubt(self, frequency_per_mm: float) -> str | None:
+        """The move in a sentence; None where there is none."""
+        found = []
+        if any(self.periods):
+            found.append(f"lies at least {1e3 * math.hypot(*self.periods) / frequency_per_mm:.0f} µm off")
+        if self.turn_rad:
+            found.append(f"is turned by {abs(math.degrees(self.turn_rad)):.2f}°")
+        if not found:
+            return None
+        return f"the mask {' and '.join(found)} since it was calibrated, which spoils views: calibrate again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +86,9 @@ class Calibration:
     """A camera and mask as fitted; one or more focal lengths, rising. `shape` is the frames'.
 
     `pupil_mm` is the distance of the exit pupil beyond the focal length, v(f) = f + pupil, under `geometric`; `verdict`
-    says which law explains the frames.
+    says which law explains the frames. `swept` is what their f-numbers say of the distance (None: nothing),
+    `focal_sigma_mm` the standard error of their focal lengths. `doubts` are sentences about the frames that the user
+    overrode: clipped pixels, a JPEG.
     """
 
     shape: tuple[int, int]
@@ -56,6 +98,16 @@ class Calibration:
     fits: tuple[LatticeFit, ...]
     pupil_mm: float = 0.0
     verdict: str = ""
+    swept: SweptDistance | None = None
+    focal_sigma_mm: float = 0.0
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def doubt(self) -> str | None:
+        """All that is doubtful about this calibration, in a sentence; None where nothing is."""
+        told = any(self.verdict in one for one in self.doubts)
+        neither = [self.verdict] if self.verdict.startswith("neither") and not told else []
+        return "; ".join([*neither, *self.doubts]) or None
 
     def nearest(self, focal_length_mm: float) -> LatticeFit:
         """The fit at the nearest focal length."""
@@ -75,6 +127,41 @@ class Calibration:
         (ay, ax), (by, bx) = self._law(focal_length_mm, distance) @ correction
         return Lattice((float(ay), float(ax)), (float(by), float(bx)))
 
+    def mask_move(
+        self,
+        slices: NDArray[np.complex64],
+        orders: Sequence[tuple[int, int]],
+        *,
+        focal_length_mm: float,
+        lattice: Lattice,
+        samples_px: tuple[float, float],
+    ) -> MaskMove:
+        """How far a frame's slices complex64 (K, h, w), DC first, show the mask from where it was calibrated.
+
+        `lattice` is where they were cut, `samples_px` how many pixels a slice's sample steps down and across. Where the
+        stop averages all carriers away (an even square stop at the mask's ideal aperture) nothing can be told.
+        """
+        none = MaskMove((0.0, 0.0), 0.0)
+        fit = self.nearest(focal_length_mm)
+        magnitudes = dict(zip(self.mask.half_orders(), fit.transfer, strict=True))
+        size = np.array([magnitudes[order] for order in orders])
+        known = np.abs(size) > _LEAST_TRANSFER
+        known[0] = False
+        if min(slices.shape[1:]) < 2 * max(_BLOCKS) or known.sum() < 2:
+            return none
+        sums, places = _block_sums(slices, samples_px)
+        whole = float(sums[:, 0].real.sum())
+        if not whole > 0:
+            return none
+        k = np.array(orders, dtype=np.float64)[known]
+        middle = (np.array(self.shape) - 1) / 2  # the origin's place; a slice's phase is that at pixel (0, 0)
+        transfers = size[known] * np.exp(2j * np.pi * k @ (np.array(fit.origin) - lattice.matrix() @ middle))
+        seen = sums[:, known] / whole / transfers  # (blocks, orders): each block's part of T_k·A_k / T_k
+        shares = sums[:, :1].real / whole
+        floor = (_FLOOR / np.abs(transfers)) ** 2
+        turn = _turn_of(seen, shares, k, floor, lattice=lattice, sensor=self.sensor, places=places)
+        return MaskMove(_shift(seen, shares, k, floor), turn)
+
     def _law(self, focal_length_mm: float, mask_distance_mm: float) -> NDArray[np.float64]:
         return LAWS[self.law](self.mask, self.sensor, mask_distance_mm, focal_length_mm + self.pupil_mm).matrix()
 
@@ -87,6 +174,9 @@ class Calibration:
             "law": self.law,
             "pupil_mm": self.pupil_mm,
             "verdict": self.verdict,
+            **({"swept": _swept_values(self.swept)} if self.swept is not None else {}),
+            "focal_sigma_mm": self.focal_sigma_mm,
+            "doubts": list(self.doubts),
             "mask": {
                 "frequency_per_mm": self.mask.frequency_per_mm,
                 "p": self.mask.p,
@@ -108,6 +198,7 @@ class Calibration:
                     "phase_residual_rad": f.phase_residual_rad,
                     "found": f.found,
                     "seen": [list(one) for one in f.seen],
+                    "print_scale": f.print_scale,
                 }
                 for f in self.fits
             ],
@@ -130,11 +221,15 @@ class Calibration:
                         "origin": _pair(entry["origin"]),
                         "transfer": tuple(float(m) for m in entry["transfer"]),
                         "seen": tuple(_carrier(one) for one in entry.get("seen", ())),
+                        "print_scale": float(entry.get("print_scale", 1.0)),
                     }
                 )
                 for entry in values["fits"]
             )
             law, pupil, verdict = values["law"], float(values.get("pupil_mm", 0.0)), str(values.get("verdict", ""))
+            swept = _swept_of(values["swept"]) if "swept" in values else None
+            focal_sigma = float(values.get("focal_sigma_mm", 0.0))
+            doubts = tuple(str(one) for one in values.get("doubts", ()))
             known_law = law in LAWS
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise DecodeError(f"the calibration is incomplete or wrong ({error}): calibrate again") from error
@@ -142,7 +237,69 @@ class Calibration:
             raise DecodeError(f"the calibration names the law {law!r}; known are {', '.join(LAWS)}")
         if not fits or any(len(f.transfer) != len(mask.half_orders()) for f in fits):
             raise DecodeError("the calibration's transfer doesn't fit its mask: calibrate again")
-        return cls((int(shape[0]), int(shape[1])), law, mask, sensor, fits, pupil, verdict)
+        return cls((int(shape[0]), int(shape[1])), law, mask, sensor, fits, pupil, verdict, swept, focal_sigma, doubts)
+
+
+def _block_sums(
+    slices: NDArray[np.complex64], samples_px: tuple[float, float]
+) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
+    """(blocks, K) sums under a Hann window, and (blocks, 2) places in pixels from the frame's middle."""
+    sides = slices.shape[1:]
+    edges = [np.linspace(0, side, n + 1).astype(int) for side, n in zip(sides, _BLOCKS, strict=True)]
+    windows = [np.hanning(side + 2)[1:-1] for side in sides]
+    weights = [
+        (window * (np.searchsorted(edge, np.arange(window.size), side="right") == np.arange(1, n + 1)[:, None]))
+        for window, edge, n in zip(windows, edges, _BLOCKS, strict=True)
+    ]
+    down, across = (weight.astype(np.complex64) for weight in weights)
+    summed = down @ (slices @ across.T)
+    middles = [(edge[1:] + edge[:-1] - side) / 2 * px for edge, side, px in zip(edges, sides, samples_px, strict=True)]
+    places = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(-1, 2)
+    return summed.reshape(len(slices), -1).T.astype(np.complex128), places
+
+
+def _shift(
+    seen: NDArray[np.complex128], shares: NDArray[np.float64], k: NDArray[np.float64], floor: NDArray[np.float64]
+) -> tuple[float, float]:
+    """The shift (periods of ky, kx) that makes all means real; 0, 0 where they are so already, within their scatter."""
+    means = seen.sum(axis=0)
+    variance = (np.abs(seen - shares * means) ** 2).sum(axis=0) / 2 + floor
+    axis = np.arange(-_STEPS // 4, _STEPS // 4 + 1) / _STEPS
+    tried = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    left = ((means * np.exp(-2j * np.pi * tried @ k.T)).imag ** 2 / variance).sum(axis=1)
+    alike = np.flatnonzero(left <= left.min() + _ALIKE)
+    best = int(alike[np.hypot(*tried[alike].T).argmin()])
+    y, x = (float(one) for one in tried[best])
+    if float((means.imag**2 / variance).sum()) - float(left[best]) < _SURE or math.hypot(y, x) < _LEAST_PERIODS:
+        return 0.0, 0.0
+    return y, x
+
+
+def _turn_of(
+    seen: NDArray[np.complex128],
+    shares: NDArray[np.float64],
+    k: NDArray[np.float64],
+    floor: NDArray[np.float64],
+    *,
+    lattice: Lattice,
+    sensor: Sensor,
+    places: NDArray[np.float64],
+) -> float:
+    """The turn about the frame's middle under which the blocks agree best; 0 where they agree without one."""
+    to_sensor = np.array([sensor.row_mm, sensor.column_mm])
+    per_mm = k @ lattice.matrix() @ np.linalg.inv(to_sensor).T
+    tried = np.linspace(-_MOST_TURN, _MOST_TURN, _TURNS)
+    scatter = []
+    for angle in tried:
+        c, s = math.cos(angle), math.sin(angle)
+        off = per_mm @ (np.array([[c, s], [-s, c]]) - np.eye(2)) @ to_sensor.T
+        turned = seen * np.exp(-2j * np.pi * places @ off.T)
+        left = (np.abs(turned - shares * turned.sum(axis=0)) ** 2).sum(axis=0) + floor
+        scatter.append(len(seen) * float(np.log(left).sum()))
+    best = int(np.argmin(scatter))
+    if scatter[_TURNS // 2] - scatter[best] < _SURE or abs(tried[best]) < _LEAST_TURN:
+        return 0.0
+    return float(tried[best])
 
 
 def _mask_of(values: Mapping[str, Any]) -> Mask:
@@ -164,6 +321,15 @@ def _sensor_of(values: Mapping[str, Any]) -> Sensor:
     height, width = _pair(values["shape"])
     picture = _sensor_of(values["picture"]) if "picture" in values else None
     return Sensor((int(height), int(width)), _pair(values["row_mm"]), _pair(values["column_mm"]), picture)
+
+
+def _swept_values(swept: SweptDistance) -> dict[str, Any]:
+    return {"scaled_mm": swept.scaled_mm, "sigma_mm": swept.sigma_mm, "stops": list(swept.stops)}
+
+
+def _swept_of(values: Mapping[str, Any]) -> SweptDistance:
+    stops = tuple(float(stop) for stop in values["stops"])
+    return SweptDistance(float(values["scaled_mm"]), float(values["sigma_mm"]), stops)
 
 
 def _carrier(values: Sequence[float]) -> tuple[int, int, float, float, float]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dappled.decode.calibration.calibration import Calibration, LatticeFit
 from dappled.decode.calibration.lattice_fit import FrameLattice, frame_lattice
 from dappled.decode.calibration.law_choice import PLAUSIBLE, judge, steps_bins
+from dappled.decode.calibration.swept_distance import swept_distance
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, at_centre, kappa, origin_of, transfer
 from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
@@ -28,11 +29,14 @@ _LEAST_THROUGH = 0.05  # of a carrier: where the stop leaves less, the mask's tr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationFrame:
-    """A stopped-down frame: its plane float32 (H, W), focal length and f-number."""
+    """A stopped-down frame: its plane float32 (H, W), focal length with its standard error, f-number,
+    and the narrowest stop of its lens (None: unknown)."""
 
     plane: NDArray[np.float32]
     focal_length_mm: float
     f_number: float
+    focal_sigma_mm: float = 0.0
+    narrowest_f: float | None = None
 
 
 def calibrate(
@@ -79,8 +83,17 @@ def from_lattices(
 ) -> Calibration:
     """`calibrate` from the lattices of the frames, which take little memory."""
     aperture = aperture or Aperture(mask.views_per_axis)
-    steps = [(shown.focal_length_mm, steps_bins(shown.lattice, sensor)) for shown in lattices]
-    verdict = judge(steps, sensor=sensor, mask=mask, stated_mm=mask_distance_mm, asked=law)
+    swept = swept_distance(lattices, sensor=sensor, mask=mask, stated_mm=mask_distance_mm)
+    focal_sigma = max(shown.focal_sigma_mm for shown in lattices)
+    verdict = judge(
+        _steps(lattices, sensor),
+        sensor=sensor,
+        mask=mask,
+        stated_mm=mask_distance_mm,
+        asked=law,
+        swept=swept,
+        focal_sigma_mm=focal_sigma,
+    )
     if choose_law and verdict.law is not None:
         law = verdict.law
     fitted = next(fit for fit in verdict.fits if fit.law == law)
@@ -91,6 +104,7 @@ def from_lattices(
         else sigma is not None and sigma <= _KNOWN * fitted.mask_distance_mm
     )
     pupil = fitted.pupil_mm or 0.0 if several else 0.0
+    print_scale = fitted.print_scale if several and law == "geometric" else 1.0
     fits = []
     for length in sorted({shown.focal_length_mm for shown in lattices}):
         seen = [
@@ -101,20 +115,34 @@ def from_lattices(
                 law,
                 stated_mm=mask_distance_mm,
                 known_mm=fitted.mask_distance_mm if several else None,
+                print_scale=print_scale,
                 aperture=aperture,
             )
             for shown in lattices
             if shown.focal_length_mm == length
         ]
         fits.append(_mean(seen))
-    return Calibration(sensor.shape, law, mask, sensor, tuple(fits), pupil, verdict.sentence)
+    doubts = tuple(shown.doubt for shown in lattices if shown.doubt is not None)
+    return Calibration(
+        sensor.shape, law, mask, sensor, tuple(fits), pupil, verdict.sentence, swept, focal_sigma, doubts
+    )
+
+
+def _steps(lattices: Sequence[FrameLattice], sensor: Sensor) -> list[tuple[float, tuple[float, float]]]:
+    """Focal lengths with the mean of their frames' steps: what EXIF rounds off is the same in all of these."""
+    found = []
+    for length in sorted({shown.focal_length_mm for shown in lattices}):
+        steps = [steps_bins(shown.lattice, sensor) for shown in lattices if shown.focal_length_mm == length]
+        rows, columns = np.mean(steps, axis=0)
+        found.append((length, (float(rows), float(columns))))
+    return found
 
 
 def lattice_of(
     frame: CalibrationFrame, sensor: Sensor, mask: Mask, law: str, mask_distance_mm: float, *, workers: int = 1
 ) -> FrameLattice:
     """The lattice that a frame shows. Raises DecodeError where it shows too few carriers."""
-    return frame_lattice(
+    shown = frame_lattice(
         frame.plane,
         focal_length_mm=frame.focal_length_mm,
         f_number=frame.f_number,
@@ -123,7 +151,9 @@ def lattice_of(
         law=law,
         mask_distance_mm=mask_distance_mm,
         workers=workers,
+        narrowest_f=frame.narrowest_f,
     )
+    return replace(shown, focal_sigma_mm=frame.focal_sigma_mm)
 
 
 def _fit_of(
@@ -134,16 +164,18 @@ def _fit_of(
     *,
     stated_mm: float,
     known_mm: float | None,
+    print_scale: float,
     aperture: Aperture,
 ) -> LatticeFit:
-    """`known_mm` is the distance that a law fitted to several focal lengths found; None: this one's own."""
+    """`known_mm` is the distance that a law fitted to several focal lengths found, None: this one's own; `print_scale`
+    the print's frequency over its design's that it found with it, 1 where it found none."""
     distance, fitted = (
         (known_mm, True)
         if known_mm is not None
         else _distance(shown.lattice, shown.focal_length_mm, sensor=sensor, mask=mask, law=law, stated_mm=stated_mm)
     )
     rotation = lattice_rotation(shown.lattice, sensor)
-    cycles = kappa(mask.frequency_per_mm, distance, shown.focal_length_mm, shown.f_number)
+    cycles = kappa(mask.frequency_per_mm * print_scale, distance, shown.focal_length_mm, shown.f_number)
     through = aperture.transform(angular_frequencies(shown.orders, cycles, rotation)).real
     seen = {(c.ky, c.kx) for c, _ in shown.found}
     usable = np.array([order in seen for order in shown.orders]) & (np.abs(through) >= _LEAST_THROUGH)
@@ -171,6 +203,7 @@ def _fit_of(
         phase_residual_rad=phase_residual,
         found=len(shown.found) + 1,
         seen=tuple((c.ky, c.kx, m.fy, m.fx, m.strength) for c, m in shown.found),
+        print_scale=print_scale,
     )
 
 

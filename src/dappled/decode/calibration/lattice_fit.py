@@ -9,16 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.calibration.law_search import LawOdds, search_laws
-from dappled.decode.errors import DecodeError
+from dappled.decode.errors import DecodeError, NoCarriers
 from dappled.decode.lightfield.aperture import relative_transfer
 from dappled.decode.optics import Carrier, Lattice, Mask, Order, Sensor
 from dappled.decode.spectrum import Spectrum
-from dappled.decode.spectrum.mask_lattice import MaskLattice
+from dappled.decode.spectrum.mask_lattice import MaskLattice, levels
 from dappled.decode.spectrum.peaks import Measured, fit, measure, residual_bins
 from dappled.decode.spectrum.slices import extract
 from dappled.decode.spectrum.transform import transform
 
 _ALIKE_BINS = 0.5  # rms from their lattice: peaks farther off belong to the scene
+_CLEAR = 6.5  # times the level around: noise moves a carrier so strong by less than a tenth of a bin
 _ENOUGH = 0.6  # of a mask's carriers: a prediction with so many peaks near it is the right one
 
 
@@ -26,7 +27,8 @@ _ENOUGH = 0.6  # of a mask's carriers: a prediction with so many peaks near it i
 class FrameLattice:
     """What one calibration frame shows: its lattice, the carriers seen, and each slice's factor on the mean's.
 
-    `relative` complex (K,) belongs to `orders`, DC first. `odds` is what the frame says of each law.
+    `relative` complex (K,) belongs to `orders`, DC first. `odds` is what the frame says of each law. `focal_sigma_mm`
+    is the standard error of its focal length. `doubt` says that its carriers are so weak that noise moves them.
     """
 
     focal_length_mm: float
@@ -37,6 +39,8 @@ class FrameLattice:
     orders: tuple[Order, ...]
     relative: NDArray[np.complex128]
     odds: tuple[LawOdds, ...] = ()
+    focal_sigma_mm: float = 0.0
+    doubt: str | None = None
 
 
 def frame_lattice(
@@ -49,8 +53,10 @@ def frame_lattice(
     law: str,
     mask_distance_mm: float,
     workers: int = 1,
+    narrowest_f: float | None = None,
 ) -> FrameLattice:
-    """Find the mask's carriers in a frame, near the prediction of either law. Raises DecodeError with the reason."""
+    """Find the mask's carriers in a frame, near the prediction of either law. Raises NoCarriers with the reason, which
+    says what a lens can do that ends at the stop `narrowest_f`."""
     if plane.shape != sensor.shape:
         raise DecodeError(f"the calibration frame is {plane.shape}, the camera's are {sensor.shape}")
     spectrum = transform(plane, workers=workers)
@@ -63,9 +69,10 @@ def frame_lattice(
         focal_length_mm=focal_length_mm,
         f_number=f_number,
         anywhere=True,
+        narrowest_f=narrowest_f,
     )
     if search.found is None:
-        raise DecodeError(search.reason)
+        raise NoCarriers(search.reason, expected=search.expected, focal_length_mm=focal_length_mm, f_number=f_number)
     lattice, found = _fitted(spectrum, search.found, mask)
     lattice = refine(spectrum, lattice, [(0, 0), *((c.ky, c.kx) for c, _ in found)], workers)
     residual = residual_bins(lattice.carriers([(c.ky, c.kx) for c, _ in found]), [m for _, m in found], spectrum)
@@ -80,6 +87,21 @@ def frame_lattice(
         tuple((c.ky, c.kx) for c in carriers),
         relative_transfer(values),
         search.odds,
+        doubt=_weak(spectrum, found, focal_length_mm, f_number),
+    )
+
+
+def _weak(
+    spectrum: Spectrum, found: Sequence[tuple[Carrier, Measured]], focal_length_mm: float, f_number: float
+) -> str | None:
+    """A sentence where the carriers that stand clear of the noise are too few to place a lattice."""
+    level = levels(spectrum, [c for c, _ in found])
+    clear = [(c.ky, c.kx) for (c, m), one in zip(found, level, strict=True) if m.strength > _CLEAR * one]
+    if len(clear) > 1 and np.linalg.matrix_rank(clear) == 2:
+        return None
+    return (
+        f"at {focal_length_mm:g} mm, f/{f_number:g} only {2 * len(clear)} carriers stand clear of the noise, so the "
+        "lattice may be off by a quarter of a bin: take a white frame at a smaller aperture, exposed well"
     )
 
 

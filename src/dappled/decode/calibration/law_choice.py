@@ -1,7 +1,8 @@
 """Choose the law that explains where a mask's carriers lie over focal lengths, and fit its constants; or neither.
 
 Each focal length gives two numbers: the lattice's steps along rows and columns, as lengths on the chip. Each law is
-fitted to them by least squares, and judged by its residual over all carriers, in bins of the frame's DFT.
+fitted to them by least squares, and judged by its residual over all carriers, in bins of the frame's DFT. What several
+f-numbers say of the distance (`swept_distance`) is one more number for `geometric`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
+from dappled.decode.calibration.swept_distance import SweptDistance
 from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
 
 EXPLAINED_BINS = 2.0  # rms: the residual that a law may leave (the thesis' own readings scatter by 0 to 2)
@@ -24,6 +26,7 @@ _DISTANCE_SIGMA = 0.1  # relative: how well a mask's distance is known before it
 _ANISOTROPY = 0.03  # of a print: more is another mask, or another law
 _DECISIVE = 0.5  # nats: a law asked for yields to a likelier one only beyond this
 _STEP_BINS = 0.02  # a lattice's step is known no better
+_CONTRADICTED = 4.0  # standard errors between the distance by focal lengths and that by f-numbers
 _FOR_PUPIL = 3  # focal lengths needed to fit a law's second constant, too
 
 
@@ -33,10 +36,11 @@ class LawFit:
 
     `anisotropy` is rows' scale over columns', less 1. `offset_bins` (rows, columns) is a constant beside `fd`'s 1/f,
     `pupil_mm` the distance of the exit pupil beyond the focal length under `geometric`, v(f) = f + pupil: None where
-    there are too few focal lengths to tell. `rms_bins` is the residual of the carriers, `explains` whether that, the
-    distance and the print are plausible. `print_scale` is the print's frequency over its design's. With one focal
-    length it is fitted for the stated distance, as the two can't be separated, and `print_scale_sigma` and
-    `distance_sigma_mm` are None. `deviation` is that of the print or the distance, in standard deviations.
+    there are too few focal lengths, and no several f-numbers, to tell. `rms_bins` is the residual of the carriers,
+    `explains` whether that, the distance and the print are plausible. `print_scale` is the print's frequency over its
+    design's. With one focal length and one f-number it is fitted for the stated distance, as the two can't be
+    separated, and `print_scale_sigma` and `distance_sigma_mm` are None. `deviation` is that of the print or the
+    distance, in standard deviations.
     """
 
     law: str
@@ -82,25 +86,32 @@ def judge(
     mask: Mask,
     stated_mm: float,
     asked: str,
+    swept: SweptDistance | None = None,
+    focal_sigma_mm: float = 0.0,
 ) -> LawVerdict:
-    """Fit all laws to focal lengths in mm with `steps_bins`. `asked` is chosen where the frames don't decide."""
+    """Fit all laws to focal lengths in mm with `steps_bins`. `asked` is chosen where the frames don't decide.
+
+    `swept` is what several f-numbers say of the distance, `focal_sigma_mm` the standard error of the focal lengths.
+    """
     lengths = np.array([length for length, _ in seen])
     steps = np.array([step for _, step in seen])
-    fits = tuple(
-        how(lengths, steps, sensor=sensor, mask=mask, stated_mm=stated_mm) for how in (_fit_fd, _fit_geometric)
+    fits = (
+        _fit_fd(lengths, steps, sensor=sensor, mask=mask, stated_mm=stated_mm),
+        _fit_geometric(
+            lengths, steps, sensor=sensor, mask=mask, stated_mm=stated_mm, swept=swept, focal_sigma_mm=focal_sigma_mm
+        ),
     )
     able = [fit for fit in fits if fit.explains]
     words = "; ".join(_words(fit) for fit in fits)
+    if swept is not None:
+        words += f"; the f-numbers alone say {swept.scaled_mm:.3f} ± {swept.sigma_mm:.3f} mm"
     if not able:
         return LawVerdict(fits, None, f"neither law explains these frames ({words}; stated are {stated_mm:g} mm)")
     if len(set(lengths.tolist())) < 2:
         best = max(able, key=lambda fit: (fit.nats + (_DECISIVE if fit.law == asked else 0.0), fit.law == asked))
         which = f"only {best.law} would do" if len(able) == 1 else f"both would do, {best.law} is taken"
-        return LawVerdict(
-            fits,
-            best.law,
-            f"{which}, as far as one focal length tells the laws, or scale and distance, apart ({words})",
-        )
+        apart = "the laws" if best.distance_sigma_mm is not None else "the laws, or scale and distance,"
+        return LawVerdict(fits, best.law, f"{which}, as far as one focal length tells {apart} apart ({words})")
     best = min(able, key=lambda fit: fit.rms_bins)
     return LawVerdict(fits, best.law, f"{best.law} explains these frames ({words})")
 
@@ -145,24 +156,46 @@ def _fit_fd(
 
 
 def _fit_geometric(
-    lengths_mm: NDArray[np.float64], steps: NDArray[np.float64], *, sensor: Sensor, mask: Mask, stated_mm: float
+    lengths_mm: NDArray[np.float64],
+    steps: NDArray[np.float64],
+    *,
+    sensor: Sensor,
+    mask: Mask,
+    stated_mm: float,
+    swept: SweptDistance | None,
+    focal_sigma_mm: float,
 ) -> LawFit:
     """step = scale · f_m · (1 − d/(f + pupil)), each axis with its own scale, because printing or gluing may have
     stretched it.
 
-    At one focal length scale and distance can't be told apart: the distance is the stated one, and the print's scale
-    takes up the rest. Two focal lengths give the distance, three the pupil too.
+    At one focal length and one f-number scale and distance can't be told apart: the distance is the stated one, and the
+    print's scale takes up the rest. Two focal lengths give the distance, three the pupil too; `swept`, which needs no
+    pupil, stands for one more. Residuals are in standard errors, with each focal length's own, which moves the steps
+    along rows and columns together, taken apart from each step's.
     """
     full = np.array([steps_bins(LAWS["geometric"](mask, sensor, 0.0, 1.0), sensor)])  # f_m itself
     several = len(set(lengths_mm.tolist()))
+    tell = several + (swept is not None)
     shortest = float(lengths_mm.min())
-    free = [0, 1, *([2] if several > 1 else []), *([3] if several >= _FOR_PUPIL else [])]  # rows, columns, d, pupil
+    with_pupil = several > 1 and tell >= _FOR_PUPIL
+    free = [0, 1, *([2] if tell > 1 else []), *([3] if with_pupil else [])]  # rows, columns, d, pupil
     base = np.array([1.0, 1.0, min(stated_mm, 0.98 * shortest), 0.0])
+    together = full * (stated_mm / lengths_mm**2 * focal_sigma_mm)[:, None]  # (focal lengths, axes), in bins
+    covariance = _STEP_BINS**2 * np.eye(2) + together[:, :, None] * together[:, None, :]
+    whitener = np.linalg.inv(np.linalg.cholesky(covariance))
 
-    def left(constants: NDArray[np.float64]) -> NDArray[np.float64]:
+    def off_bins(constants: NDArray[np.float64]) -> NDArray[np.float64]:
         rows, columns, distance, pupil = _with(base, free, constants)
         there = full * (1 - distance / (lengths_mm + pupil))[:, None] * np.array([rows, columns])
-        return np.asarray((steps - there).ravel())
+        return np.asarray(steps - there)
+
+    def left(constants: NDArray[np.float64]) -> NDArray[np.float64]:
+        off = np.einsum("nij,nj->ni", whitener, off_bins(constants)).ravel()
+        if swept is None:
+            return np.asarray(off)
+        rows, columns, distance, _ = _with(base, free, constants)
+        scaled = distance * math.sqrt(rows * columns)
+        return np.append(off, (scaled - swept.scaled_mm) / swept.sigma_mm)
 
     lowest = np.array([0.5, 0.5, 0.0, -0.9 * shortest])[free]
     highest = np.array([2.0, 2.0, 0.99 * shortest, 10 * shortest])[free]
@@ -172,7 +205,7 @@ def _fit_geometric(
     )
     rows, columns, distance, pupil = (float(value) for value in _with(base, free, found.x))
     residual = left(found.x)
-    rms = _rms(residual.reshape(steps.shape), mask)
+    rms = _rms(off_bins(found.x), mask)
     sigma = _sigmas(found.jac, residual, free)
     scale = math.sqrt(rows * columns)
     printed = abs(scale - 1) <= _PRINTED
@@ -181,13 +214,15 @@ def _fit_geometric(
         mask_distance_mm=distance,
         anisotropy=rows / columns - 1,
         offset_bins=None,
-        pupil_mm=pupil if several >= _FOR_PUPIL else None,
+        pupil_mm=pupil if with_pupil else None,
         rms_bins=rms,
-        explains=printed and _believed(distance, stated_mm, rms, rows / columns - 1),
+        explains=printed
+        and _believed(distance, stated_mm, rms, rows / columns - 1, sigma[2] if tell > 1 else 0.0)
+        and (swept is None or abs(float(residual[-1])) <= _CONTRADICTED),
         print_scale=scale,
-        print_scale_sigma=sigma[0] if several > 1 else None,
-        distance_sigma_mm=sigma[2] if several > 1 else None,
-        deviation=(scale - 1) / _PRINT_SIGMA if several == 1 else (distance / stated_mm - 1) / _DISTANCE_SIGMA,
+        print_scale_sigma=sigma[0] if tell > 1 else None,
+        distance_sigma_mm=sigma[2] if tell > 1 else None,
+        deviation=(scale - 1) / _PRINT_SIGMA if tell == 1 else (distance / stated_mm - 1) / _DISTANCE_SIGMA,
     )
 
 
@@ -198,9 +233,9 @@ def _with(base: NDArray[np.float64], free: Sequence[int], values: NDArray[np.flo
 
 
 def _sigmas(jacobian: NDArray[np.float64], residual: NDArray[np.float64], free: Sequence[int]) -> list[float]:
-    """Standard errors of (rows, columns, d, pupil), NaN where not free; steps are known to `_STEP_BINS`."""
+    """Standard errors of (rows, columns, d, pupil), NaN where not free; larger where residuals are than expected."""
     freedom = max(1, residual.size - len(free))
-    variance = max(_STEP_BINS**2, float((residual**2).sum()) / freedom)
+    variance = max(1.0, float((residual**2).sum()) / freedom)
     covariance = np.linalg.pinv(jacobian.T @ jacobian) * variance
     found = [math.nan] * 4
     for at, which in enumerate(free):
@@ -214,8 +249,10 @@ def _rms(left_bins: NDArray[np.float64], mask: Mask) -> float:
     return float(np.sqrt(np.mean((left_bins[:, None, :] * orders[None]) ** 2) * 2))
 
 
-def _believed(distance_mm: float, stated_mm: float, rms_bins: float, anisotropy: float) -> bool:
-    believable = abs(distance_mm / stated_mm - 1) <= PLAUSIBLE and abs(anisotropy) <= _ANISOTROPY
+def _believed(distance_mm: float, stated_mm: float, rms_bins: float, anisotropy: float, sigma_mm: float = 0.0) -> bool:
+    """Whether all that is plausible; a distance by up to two standard errors (as far as it can be known at all)."""
+    off = abs(distance_mm - stated_mm) - 2 * min(sigma_mm, stated_mm)
+    believable = off <= PLAUSIBLE * stated_mm and abs(anisotropy) <= _ANISOTROPY
     return believable and rms_bins <= EXPLAINED_BINS
 
 

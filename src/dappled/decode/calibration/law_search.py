@@ -7,19 +7,31 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics import LAWS, Carrier, Lattice, Mask, Sensor
-from dappled.decode.optics.visibility import OrderStrength, order_strengths
+from dappled.decode.optics.visibility import OrderStrength, order_strengths, under_stops
 from dappled.decode.spectrum import Spectrum
 from dappled.decode.spectrum.lattice import find_lattice
-from dappled.decode.spectrum.mask_lattice import MaskLattice, PeakList, find_mask_lattice, should_stand
+from dappled.decode.spectrum.mask_lattice import (
+    ABOVE_FLOOR,
+    MaskLattice,
+    PeakList,
+    asked_orders,
+    find_mask_lattice,
+    levels,
+    should_stand,
+)
 from dappled.decode.spectrum.peaks import ALONE_NATS, measure, residual_bins
 
 _ALIKE_BINS = 0.5  # rms from their lattice: peaks farther off belong to the scene
 _SCALE_OFF = {"geometric": 0.06, "fd": 0.35}  # relative: no print, and no distance, is farther off than that
 _SCENE = "a pattern of the scene (fence, woven cloth, halftone print, a screen)"
 _STANDS_NATS = 3.5  # above what is around: a peak that is more than noise
+_LACKING = 3  # orders missing, whatever the stop: fewer may be lost at its nulls
+_PLAIN = 0.01  # of the mean: a carrier so strong stands out in any white frame
+_THIRD = 2 ** (1 / 6)  # of a stop
 _ENOUGH = 0.6  # of a mask's carriers: a lattice found without a prediction needs so many
 
 
@@ -67,18 +79,22 @@ def search_laws(
     law: str,
     mask_distance_mm: float,
     focal_length_mm: float,
-    f_number: float,
+    f_number: float | None,
     anywhere: bool = False,
+    other_laws: bool = True,
+    narrowest_f: float | None = None,
 ) -> LawSearch:
     """Look for a mask's lattice in a whole spectrum near the prediction of each law; `law` wins a tie.
 
-    With `anywhere` a full mask that shows nearly all of its carriers is found away from every prediction, too.
+    Where the f-number is unknown (None), no order must stand, and any may. With `anywhere` a full mask that shows
+    nearly all of its carriers is found away from every prediction, too. Without `other_laws` only `law` is tried.
+    `narrowest_f` is the lens' narrowest stop, for the advice of the sentence.
     """
     peaks = PeakList.of(spectrum)
     odds: list[LawOdds] = []
     asked: list[list[OrderStrength]] = []
     sure: list[tuple[MaskLattice, str]] = []
-    for name in (law, *(other for other in LAWS if other != law)):
+    for name in (law, *(other for other in LAWS if other != law and other_laws)):
         predicted = LAWS[name](mask, sensor, mask_distance_mm, focal_length_mm)
         expected = order_strengths(mask, sensor, predicted, mask_distance_mm=mask_distance_mm, f_number=f_number)
         found = find_mask_lattice(peaks, predicted, expected)
@@ -86,13 +102,21 @@ def search_laws(
         odds.append(LawOdds(name, None if found is None else found.odds_nats))
         if found is not None and found.sure:
             sure.append((found, name))
-    expects, reason = unseen(
-        spectrum, asked, ideal_f_number=mask.frequency_per_mm * mask_distance_mm, f_number=f_number
+    advice = _advice(
+        mask, sensor, mask_distance_mm, LAWS[law](mask, sensor, mask_distance_mm, focal_length_mm), narrowest_f
     )
+    expects, reason = unseen(spectrum, asked, advice=advice, f_number=f_number)
     foreign: list[str] = []
     for lattice, name in sorted(sure, key=lambda one: -one[0].odds_nats):
-        there = order_strengths(mask, sensor, lattice.lattice, mask_distance_mm=mask_distance_mm, f_number=f_number)
-        wrong = not_this_mask(spectrum, lattice, there, most_scale=None if anywhere else _SCALE_OFF[name])
+        wrong = not_this_mask(
+            spectrum,
+            lattice,
+            sensor=sensor,
+            mask=mask,
+            mask_distance_mm=mask_distance_mm,
+            f_number=f_number,
+            most_scale=None if anywhere else _SCALE_OFF[name],
+        )
         if wrong is None:
             return LawSearch(tuple(odds), lattice, name, expects, "")
         foreign.append(wrong)
@@ -105,13 +129,20 @@ def search_laws(
 
 
 def not_this_mask(
-    spectrum: Spectrum, found: MaskLattice, expected: Sequence[OrderStrength], *, most_scale: float | None
+    spectrum: Spectrum,
+    found: MaskLattice,
+    *,
+    sensor: Sensor,
+    mask: Mask,
+    mask_distance_mm: float,
+    f_number: float | None,
+    most_scale: float | None = None,
 ) -> str | None:
     """Why a lattice can't be that of this mask, in a sentence; None where it may be.
 
-    `expected` are the strengths of the mask's half plane on the lattice found; `most_scale` is how far its size may be
-    off the prediction (None: not judged). A pattern of the scene that has the mask's own period can't be told from it,
-    however strong it is: a film of high contrast makes stronger carriers than its pattern.
+    `most_scale` is how far its size may be off the prediction (None: not judged). A pattern of the scene that has the
+    mask's own period can't be told from it, however strong it is: a film of high contrast makes stronger carriers than
+    its pattern.
     """
     off = found.scale - 1
     if most_scale is not None and abs(off) > most_scale:
@@ -122,9 +153,14 @@ def not_this_mask(
     halves = [one for one in measure(spectrum, between, 1.5, prominence_nats=ALONE_NATS) if one is not None]
     if len(halves) == 2 and min(one.strength for one in halves) > strongest:
         return "stronger peaks stand half-way between this mask's carriers: another mask, with periods twice as long"
+    if mask.pattern == "diagonal" and (more := _as_full(spectrum, found)) is not None:
+        return more
+    expected = order_strengths(mask, sensor, found.lattice, mask_distance_mm=mask_distance_mm, f_number=f_number)
+    orders = [one.order for one in expected]
+    stops = under_stops(mask, found.lattice, orders, mask_distance_mm=mask_distance_mm, f_number=f_number)
     stand = sorted(should_stand(spectrum, expected), key=lambda one: -one.least)
     if not stand:
-        return None
+        return _lacking(spectrum, found, expected, stops)
     seen = measure(spectrum, found.lattice.carriers([one.order for one in stand]), 1.5, prominence_nats=ALONE_NATS)
     gone = [_name(one) for one, peak in zip(stand, seen, strict=True) if peak is None]
     if seen[0] is None and len(gone) > 1:
@@ -132,33 +168,88 @@ def not_this_mask(
             f"peaks stand where some of this mask's carriers would, but none at {_some(gone)}, which should stand out "
             f"as well: another mask, or {_SCENE}"
         )
+    return _lacking(spectrum, found, expected, stops)
+
+
+def _as_full(spectrum: Spectrum, found: MaskLattice) -> str | None:
+    """A sentence where (0, 1) and (1, 0), which a diagonal mask has not, are both stronger than its innermost orders.
+
+    Neither comes of a film that is not linear: what that adds to a diagonal mask has an even sum of orders.
+    """
+    inner, outer = (
+        measure(spectrum, found.lattice.carriers(orders), 1.5, prominence_nats=ALONE_NATS)
+        for orders in ([(0, 1), (1, 0)], [(1, 1), (1, -1)])
+    )
+    diagonal = max((one.strength for one in outer if one is not None), default=0.0)
+    if all(one is not None and not one.suspect and one.strength > diagonal for one in inner):
+        return (
+            "the orders (0, 1) and (1, 0) stand out, which this diagonal mask doesn't make: a full mask of its period"
+        )
     return None
+
+
+def _lacking(
+    spectrum: Spectrum, found: MaskLattice, expected: Sequence[OrderStrength], stops: NDArray[np.float64]
+) -> str | None:
+    """The orders that are missing behind any stop that lets through as much as is seen of the others, in a sentence."""
+    there = [i for i, one in enumerate(expected) if one.on_sensor and one.most > 0]
+    orders = [expected[i].order for i in there]
+    looked = found.lattice.carriers(orders)
+    seen = measure(spectrum, looked, 1.5, prominence_nats=ALONE_NATS)
+    gone = np.array([one is None for one in seen])
+    if gone.sum() < _LACKING or gone.all():
+        return None
+    strength = np.array([0.0 if one is None else one.strength for one in seen])
+    level = np.array(levels(spectrum, [expected[i] for i in there]))
+    asked = stops[:, there]
+    gain = np.median(strength[~gone] / np.maximum(asked[:, ~gone], 1e-12), axis=1)
+    lacking = gone & (gain[:, None] * asked > ABOVE_FLOOR * level)
+    likeliest = lacking[lacking.sum(axis=1).argmin()]
+    if likeliest.sum() < _LACKING:
+        return None
+    names = _some([f"({ky}, {kx})" for (ky, kx), one in zip(orders, likeliest, strict=True) if one])
+    return (
+        f"peaks stand where some of this mask's carriers would, but none at {names}, which would stand out as well "
+        "behind any stop that shows the others: another mask"
+    )
 
 
 def missing(
     spectrum: Spectrum, lattice: Lattice, *, sensor: Sensor, mask: Mask, mask_distance_mm: float, f_number: float
 ) -> str | None:
-    """Why a calibration's lattice can't be this frame's, in a sentence: carriers should be seen on it and none is."""
+    """Why a calibration's lattice can't be this frame's, in a sentence: most of the carriers due on it are not there.
+
+    A peak or two near them may be the scene's.
+    """
     expected = order_strengths(mask, sensor, lattice, mask_distance_mm=mask_distance_mm, f_number=f_number)
     there = should_stand(spectrum, expected)
     if not _spans(there):
         return None
     seen = measure(spectrum, lattice.carriers([one.order for one in there]), 3.0)
-    if any(one is not None for one in seen):
+    stand = sum(one is not None for one in seen)
+    if 2 * stand > len(there):
         return None
+    which = "none does" if not stand else f"{len(there) - stand} of these {len(there)} don't"
     return (
         f"no carriers: {_some([_name(one) for one in there])} should stand out at f/{f_number:g} where the calibration "
-        "has them, and none does: check mask, camera, focal length, f-number and calibration"
+        f"has them, and {which}: check mask, camera, focal length, f-number and calibration"
     )
 
 
 def unseen(
-    spectrum: Spectrum, predictions: Sequence[Sequence[OrderStrength]], *, ideal_f_number: float, f_number: float
+    spectrum: Spectrum, predictions: Sequence[Sequence[OrderStrength]], *, advice: str, f_number: float | None
 ) -> tuple[bool, str]:
-    """(whether carriers must be visible, why no lattice is, in a sentence that names the orders).
+    """(whether carriers must be visible, why no lattice is, in a sentence that names the orders and ends in `advice`).
 
     `predictions` are one or more laws'; the sentence is about the one under which most should be seen.
     """
+    if f_number is None:
+        some = asked_orders(max(predictions, key=lambda one: sum(order.on_sensor for order in one)))
+        return False, (
+            "no carriers in this frame near the prediction of any law, and the f-number is unknown: "
+            f"{_some([_name(one) for one in some])} may stand or be averaged out over the stop, and where slices "
+            "are cut is not confirmed; give the f-number with --f-number"
+        )
     expected, above = max(
         ((list(one), should_stand(spectrum, one)) for one in predictions), key=lambda pair: len(pair[1])
     )
@@ -175,7 +266,30 @@ def unseen(
         )
     return False, (
         f"no carriers can be seen in this frame at f/{f_number:g}: {lost}. Calibrate on a white frame at a small "
-        f"aperture (f/{3 * ideal_f_number:.0f} or smaller for this mask; its ideal is f/{ideal_f_number:.1f})"
+        f"aperture ({advice})"
+    )
+
+
+def _advice(mask: Mask, sensor: Sensor, mask_distance_mm: float, lattice: Lattice, narrowest_f: float | None) -> str:
+    """At which f-number a white frame must show a mask's carriers, whatever the stop's shape, and what the lens can."""
+
+    def plain(f_number: float) -> list[OrderStrength]:
+        seen = order_strengths(mask, sensor, lattice, mask_distance_mm=mask_distance_mm, f_number=f_number)
+        return [one for one in seen if one.on_sensor and one.least > _PLAIN]
+
+    ideal = mask.frequency_per_mm * mask_distance_mm
+    tried = ideal * _THIRD ** np.arange(-6, 19)
+    needed = next((float(stop) for stop in tried if _spans(plain(float(stop)))), None)
+    if needed is None:
+        return f"this mask's carriers are weak at any; its ideal is f/{ideal:.1f}"
+    asks = f"f/{needed:.0f} or smaller for this mask; its ideal is f/{ideal:.1f}"
+    if narrowest_f is None or needed <= 1.03 * narrowest_f:
+        return asks
+    left = plain(narrowest_f)
+    there = f"only {_some([_name(one) for one in left])} can be counted on" if left else "no carrier can be counted on"
+    return (
+        f"{asks}, but the lens ends at f/{narrowest_f:g}, where {there}: put a smaller hole before the lens, or take a "
+        "coarser mask, see dappled mask design"
     )
 
 

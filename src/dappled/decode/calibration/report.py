@@ -52,7 +52,15 @@ def rows(found: Calibration, fit: LatticeFit, law: str, mask_distance_mm: float)
 def law_fits(found: Calibration, mask_distance_mm: float) -> tuple[LawFit, ...]:
     """Both laws, fitted to the calibration's measurements."""
     steps = [(fit.focal_length_mm, steps_bins(fit.lattice, found.sensor)) for fit in found.fits]
-    return judge(steps, sensor=found.sensor, mask=found.mask, stated_mm=mask_distance_mm, asked=found.law).fits
+    return judge(
+        steps,
+        sensor=found.sensor,
+        mask=found.mask,
+        stated_mm=mask_distance_mm,
+        asked=found.law,
+        swept=found.swept,
+        focal_sigma_mm=found.focal_sigma_mm,
+    ).fits
 
 
 def pupils_mm(found: Calibration, mask_distance_mm: float) -> list[tuple[float, float | None]]:
@@ -77,6 +85,9 @@ def as_values(found: Calibration, mask_distance_mm: float) -> dict[str, Any]:
             {
                 "law": fit.law,
                 "mask_distance_mm": fit.mask_distance_mm,
+                "mask_distance_sigma_mm": fit.distance_sigma_mm,
+                "print_scale": fit.print_scale,
+                "print_scale_sigma": fit.print_scale_sigma,
                 "anisotropy": fit.anisotropy,
                 "offset_bins": None if fit.offset_bins is None else list(fit.offset_bins),
                 "pupil_mm": fit.pupil_mm,

@@ -43,6 +43,10 @@ _FAR_NOMINAL, _FAR_UNKNOWN = 0.08, 0.25  # relative: κ farther from the nominal
 _TEXTURE = 1.5e-3  # of the mean: what the scene adds to the mean of a slice
 _EVIDENCE = 9.0  # squared deviations: less doesn't tell one shape from another (beams from filled cells never at κ = 1)
 SHAPES: tuple[Shape, ...] = ("beams", "filled", "round")
+_PRINTED = 0.04  # of a carrier: how well a design says the strength of a print's
+_GAINS = np.linspace(0.8, 1.25, 10)  # of all carriers of a print: its film's contrast
+_GAIN_SIGMA = 0.1
+_DRAWN = 0.01  # of the mean: a weaker order of the design says nothing
 _AGREEMENT = 6.0  # times their own error: means further from those of any aperture are not fitted
 
 
@@ -186,6 +190,18 @@ def origin_of(orders: Sequence[Order], phases: NDArray[np.complex128]) -> tuple[
     return (float(best[0]), float(best[1])), rms
 
 
+def own_transfer(
+    slices: NDArray[np.complex64], orders: Sequence[Order], through: NDArray[np.float64], keep: NDArray[np.bool_]
+) -> NDArray[np.complex128]:
+    """T_k from the frame's own slices, lattice-linear, the aperture divided out."""
+    seen = relative_transfer(slices) / np.where(keep, through, 1.0)
+    used = keep.copy()
+    used[0] = False
+    origin, _ = origin_of([order for order, usable in zip(orders, used, strict=True) if usable], seen[used])
+    turns = transfer(orders, np.ones(len(orders)), origin)
+    return np.where(keep, (seen * np.conj(turns)).real, 0.0) * turns
+
+
 @dataclass(frozen=True, slots=True)
 class UsedAperture:
     """κ in periods of the mask's fundamental, and its standard error; `fitted` False is the f-number's own.
@@ -201,11 +217,16 @@ class UsedAperture:
     aperture: Aperture
     share: float | None = None
 
+    @property
+    def fits(self) -> bool:
+        """Whether the carriers agree with an aperture, if not with the told one; also where they tell nothing."""
+        return self.share is None or not math.isnan(self.share)
+
     def doubt(self, f_number: float) -> str | None:
         """What is strange about the aperture of a frame at a told f-number, in a sentence; None where nothing is."""
         if self.share is None:
             return None
-        if math.isnan(self.share):
+        if not self.fits:
             return (
                 f"its carriers agree with no aperture near f/{f_number:.3g}, which the views take for right: check "
                 "f-number, calibration and clipping"
@@ -264,6 +285,63 @@ def used_aperture(
         return replace(nominal, share=math.nan)
     share = best.kappa / nominal_kappa
     return replace(best, share=share) if abs(math.log(share)) > far else best
+
+
+def shown_aperture(
+    slices: NDArray[np.complex64],
+    designs: Sequence[NDArray[np.float64]],
+    orders: Sequence[Order],
+    *,
+    nominal_kappa: float,
+    rotation_rad: float,
+    aperture: Aperture,
+) -> UsedAperture:
+    """`used_aperture` of a frame that shows its carriers, without a calibration: the design says how strong they are.
+
+    `designs` (K,) are strengths of the orders before the stop averages them, more than one where it is not known what
+    film, diffraction and pixels take; all may be weaker or stronger by the film's contrast. The nominal κ where the
+    orders are all of one size: then contrast and aperture can't be told apart.
+    """
+    nominal = UsedAperture(nominal_kappa, _NOMINAL_SIGMA * nominal_kappa, False, aperture)
+    means = mean_of_slices(slices)
+    drawn = np.min(np.abs(designs), axis=0) > _DRAWN
+    drawn[0] = False
+    wanted = [order for order, usable in zip(orders, drawn, strict=True) if usable]
+    sizes = {ky * ky + kx * kx for ky, kx in wanted}
+    if len(sizes) < 2 or np.linalg.matrix_rank(wanted) < 2 or not means[0].real > 0:
+        return nominal
+    relative = means[drawn] / means[0].real
+    origin, _ = origin_of(wanted, relative)
+    real = (relative * np.conj(transfer(wanted, np.ones(len(wanted)), origin))).real
+    steps = round(math.log(SEARCHED) / _STEP)
+    off = _STEP * np.arange(-steps, steps + 1)
+    prior = np.minimum(
+        (off / _NOMINAL_SIGMA) ** 2, (off / _WRONG_SIGMA) ** 2 + 2 * math.log(_WRONG_SIGMA / _NOMINAL_SIGMA / _WRONG)
+    )
+    angular = np.concatenate(
+        [angular_frequencies(wanted, float(kappa), rotation_rad) for kappa in nominal_kappa * np.exp(off)]
+    )
+    best, least, told = nominal, math.inf, math.inf
+    for shape in SHAPES:
+        there = Aperture(aperture.views, shape).transform(angular).real.reshape(len(off), -1)
+        for design, gain in itertools.product(designs, _GAINS):
+            error = np.hypot(_TEXTURE, _PRINTED * np.abs(real))
+            deviations = ((gain * design[drawn] * there - real) / error) ** 2
+            cost = deviations.sum(axis=1) + prior + (math.log(gain) / _GAIN_SIGMA) ** 2
+            told = min(told, float(cost[steps]))
+            at = int(np.argmin(cost))
+            if cost[at] + (_EVIDENCE if shape != SHAPES[0] else 0.0) >= least or at in (0, len(off) - 1):
+                continue
+            least = float(cost[at]) + (_EVIDENCE if shape != SHAPES[0] else 0.0)
+            agrees = float(deviations[at].mean()) <= _AGREEMENT**2
+            kappa = nominal_kappa * math.exp(off[at])
+            curvature = max(float(cost[at - 1] - 2 * cost[at] + cost[at + 1]), 1e-9)
+            sigma = kappa * _STEP * math.sqrt(2 / curvature)
+            best = UsedAperture(kappa, sigma, True, Aperture(aperture.views, shape)) if agrees else nominal
+            far = abs(off[at]) > _FAR_UNKNOWN  # a stated distance is part of it
+            best = replace(best, share=math.nan if not agrees else math.exp(off[at]) if far else None)
+    # Stopped far down, orders differ by film and print alone: then the told aperture is as good.
+    return best if told - least > _EVIDENCE or not best.fits else nominal
 
 
 def _fitted(

@@ -95,7 +95,7 @@ class ViewDifference:
 
 
 def difference(one: Image, other: Image, border: int) -> ViewDifference:
-    """The difference of two pictures (h, w), `border` px left out; PSNR inf where there is none."""
+    """The difference of two pictures (h, w) or (h, w, 3), `border` px left out; PSNR inf where there is none."""
     cut = (slice(border, -border or None),) * 2
     gap = (one - other)[cut].astype(np.float64)
     if gap.size == 0:

@@ -3,89 +3,179 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.array_types import Floats, Singles
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies
-from dappled.decode.lightfield.joint_views import SIDE, joint_views
+from dappled.decode.lightfield.joint_views import joint_views
+from dappled.decode.lightfield.mask_place import MaskPlace, mask_place
+from dappled.decode.lightfield.patch_model import FARTHEST, SIDE
 from dappled.decode.lightfield.slice_model import SliceModel
 from dappled.decode.lightfield.views import Views, chroma_noise, from_slices
-from dappled.decode.optics import Carrier
+from dappled.decode.optics import Carrier, Order
 
 ViewsModel = Literal["joint", "independent"]
 _REACH = 1.0  # samples of a slice from view to view: a carrier's order further, and parallax can't be told apart
-_WIDER = 2.0  # times that, where a frame's disparities are at the ends of the range
-_AT_THE_ENDS = 0.1  # of a frame
+_LEAST_TRANSFER = 1e-3
+_MOST_BEYOND = 0.1  # of a frame may be beyond the widest range
+_TOLD_BEYOND = 0.005  # of a frame is told
 _MOST_VIEWS = 5  # along an axis: with more, the outer ones move by more than a patch can tell, and nobody measured it
-_CLEAN = 5e-4  # of the mean: with less noise, and so without folded detail, inverting is better than modelling
+# Times the joint model's errors: where the noise leaves less, and so without folded detail, inverting is better.
+_CLEANER = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameViews:
-    """`views` float32 (V, U, h, w), by which model they were made, and the standard errors of views, rows of V × U, in
-    the plane's unit; None where the model tells none."""
+    """`views` float32 (V, U, h, w), by which model they were made, and their standard errors `sigma` float32
+    (V, U, m, n), see `JointViews`, in the plane's unit; None where the model tells none. `doubt` says in a sentence
+    what may be wrong with them, `reason` why the joint model did not make them: "" where it did, or was not asked to.
+    """
 
     views: Views
     model: ViewsModel
-    sigma: list[list[float]] | None
+    sigma: Singles | None
+    doubt: str | None = None
+    reason: str = ""
 
 
-def views_of(
-    slices: NDArray[np.complex64],
-    carriers: Sequence[Carrier],
-    transfers: NDArray[np.complex128],
-    *,
-    kappa_cycles: float,
-    rotation_rad: float,
-    aperture: Aperture,
-    samples_px: tuple[float, float],
-    row_over_column: float,
-    noise_variance: float,
-    colours: bool,
-    joint: bool,
-) -> FrameViews:
-    """The views of slices complex64 (K, h, w), DC first, cut at `carriers`; see `views.from_slices`.
+@dataclass(frozen=True, slots=True, eq=False)
+class TakenSlices:
+    """Slices complex64 (K, h, w), DC first, cut at `carriers`, and how they were taken (see `views.from_slices`).
 
     `samples_px` are the rows and columns of the sensor in a sample of a slice, `row_over_column` the height of a pixel
-    over its width. With `joint` views are made by the joint model, unless slices are smaller than a patch, there are
-    more views than it was measured with or fewer orders than views have, the frame has next to no noise, or disparities
-    are beyond the widest range.
+    over its width, `noise_variance` that of a slice's pixel.
     """
-    orders = [(c.ky, c.kx) for c in carriers]
-    plane_variance = noise_variance * samples_px[0] * samples_px[1]
-    clean = plane_variance < (_CLEAN * float(slices[0].real.mean())) ** 2
 
-    def independent() -> FrameViews:
-        made, _ = from_slices(
-            slices,
-            orders,
-            transfers,
-            kappa_cycles=kappa_cycles,
-            rotation_rad=rotation_rad,
-            aperture=aperture,
-            noise_variance=noise_variance,
-            colours=colours,
+    values: NDArray[np.complex64]
+    carriers: Sequence[Carrier]
+    transfers: NDArray[np.complex128]
+    kappa_cycles: float
+    rotation_rad: float
+    aperture: Aperture
+    samples_px: tuple[float, float]
+    row_over_column: float
+    noise_variance: float
+    colours: bool
+
+    def used_transfers(self) -> NDArray[np.complex128]:
+        """(K,) T_k, 0 where a slice carries no information: the mask doesn't make its carrier."""
+        return np.where(np.abs(self.transfers) > _LEAST_TRANSFER, self.transfers, 0)
+
+    def used(self) -> TakenSlices:
+        """The same without those."""
+        kept = self.used_transfers() != 0
+        if kept.all():
+            return self
+        carriers = [c for c, usable in zip(self.carriers, kept, strict=True) if usable]
+        return replace(self, values=self.values[kept], carriers=carriers, transfers=self.transfers[kept])
+
+    @property
+    def orders(self) -> list[Order]:
+        """(ky, kx) of each slice."""
+        return [(c.ky, c.kx) for c in self.carriers]
+
+    @property
+    def angular(self) -> Floats:
+        """(K, 2) cycles over the aperture."""
+        return angular_frequencies(self.orders, self.kappa_cycles, self.rotation_rad)
+
+    @property
+    def samples(self) -> tuple[float, float]:
+        """Rows and columns in a sample, both in columns of the sensor."""
+        return self.samples_px[0] * self.row_over_column, self.samples_px[1]
+
+    @property
+    def reach(self) -> float:
+        """The largest usual disparity in sensor columns over the aperture."""
+        return _REACH * self.aperture.views * self.samples_px[1]
+
+    def model(self) -> SliceModel:
+        """What the slices hold of a scene at one disparity."""
+        frequencies = np.array([(c.fy / self.row_over_column, c.fx) for c in self.carriers])
+        return SliceModel.of_half(self.orders, self.transfers, self.angular, frequencies, self.aperture)
+
+    def noise(self) -> Floats:
+        """(K,) variances of slice pixels, chroma included."""
+        white = np.full(len(self.values), self.noise_variance)
+        if not self.colours:
+            return white
+        return white + chroma_noise(self.values, self.transfers * self.aperture.transform(self.angular))
+
+
+def place_of(taken: TakenSlices, turned: Floats, steps_px: tuple[float, float]) -> MaskPlace | None:
+    """Where the slices place the mask (see `mask_place`); None where the joint model is not for them."""
+    if _unfit(len(taken.carriers), (taken.values.shape[1], taken.values.shape[2]), taken.aperture.views):
+        return None
+    return mask_place(
+        taken.values,
+        taken.model(),
+        samples_px=taken.samples,
+        noise=taken.noise(),
+        reach=taken.reach,
+        turned=turned,
+        steps_px=steps_px,
+    )
+
+
+def views_of(taken: TakenSlices, *, joint: bool, workers: int = 1) -> FrameViews:
+    """The views of slices.
+
+    With `joint` views are made by the joint model, unless slices are smaller than a patch, there are more views than it
+    was measured with or fewer orders than views have, disparities are beyond the widest range, or noise, with folded
+    detail that looks like it, is so little that inverting leaves less than the model's own errors.
+    """
+    alone, noise = from_slices(
+        taken.values,
+        taken.orders,
+        taken.transfers,
+        kappa_cycles=taken.kappa_cycles,
+        rotation_rad=taken.rotation_rad,
+        aperture=taken.aperture,
+        noise_variance=taken.noise_variance,
+        colours=taken.colours,
+    )
+    independent = FrameViews(alone, "independent", None)
+    if not joint:
+        return independent
+    if unfit := _unfit(len(taken.carriers), (taken.values.shape[1], taken.values.shape[2]), taken.aperture.views):
+        return replace(independent, reason=unfit)
+    found = joint_views(
+        taken.values,
+        taken.model(),
+        samples_px=taken.samples,
+        noise=taken.noise(),
+        reach=taken.reach,
+        workers=workers,
+    )
+    doubt = None
+    if found.beyond > _TOLD_BEYOND:
+        doubt = (
+            f"{found.beyond:.0%} of the picture is so near or far that neighbouring views differ there by more than "
+            f"{FARTHEST * taken.samples_px[1]:.0f} px of the sensor, and {taken.aperture.views} views can't tell by "
+            "how much: don't trust parallax there, focus on it, or stop down"
         )
-        return FrameViews(made, "independent", None)
+    if found.beyond > _MOST_BEYOND:  # inverting supposes no range
+        reason = f"{found.beyond:.0%} of the picture is nearer or farther than the model of the light field reaches"
+        return replace(independent, doubt=doubt, reason=reason)
+    total = float(np.mean(found.sigma**2))
+    if np.mean(noise) < _CLEANER**2 * total:
+        reason = "the frame has so little noise that the model of the light field would add errors"
+        return replace(independent, doubt=doubt, reason=reason)
+    return FrameViews(found.views, "joint", found.sigma, doubt)
 
-    few = len(orders) < (aperture.views**2 + 1) // 2
-    if not joint or clean or few or min(slices.shape[1:]) < SIDE or aperture.views > _MOST_VIEWS:
-        return independent()
-    angular = angular_frequencies(orders, kappa_cycles, rotation_rad)
-    variances = np.full(len(slices), noise_variance)
-    if colours:
-        variances += chroma_noise(slices, transfers * aperture.transform(angular))
-    frequencies = np.array([(c.fy / row_over_column, c.fx) for c in carriers])
-    model = SliceModel.of_half(orders, transfers, angular, frequencies, aperture)
-    samples = samples_px[0] * row_over_column, samples_px[1]
-    reach = _REACH * aperture.views * samples_px[1]
-    found = joint_views(slices, model, samples_px=samples, noise=variances, reach=reach)
-    if found.at_the_ends > _AT_THE_ENDS:
-        wider = joint_views(slices, model, samples_px=samples, noise=variances, reach=_WIDER * reach)
-        found = max(found, wider, key=lambda one: one.log_likelihood)
-        if found.at_the_ends > _AT_THE_ENDS:
-            return independent()  # it supposes no range
-    return FrameViews(found.views, "joint", found.sigma.tolist())
+
+def _unfit(orders: int, shape: tuple[int, int], views: int) -> str:
+    """Why the joint model is not for a frame of so many orders and views, with slices of this shape; "" where it is."""
+    if views > _MOST_VIEWS:
+        return (
+            f"{views} × {views} views are more than the {_MOST_VIEWS} × {_MOST_VIEWS} that the model was measured with"
+        )
+    if (needed := (views**2 + 1) // 2) > orders:
+        return f"the mask's {orders} usable carriers are fewer than the {needed} that the model needs"
+    if min(shape) < SIDE:
+        return f"slices of {shape[0]} × {shape[1]} px are smaller than a patch of {SIDE} px"
+    return ""

@@ -23,6 +23,13 @@ class Patches:
     side: int
 
     @property
+    def grid(self) -> tuple[int, int]:
+        """How many rows and columns of patches there are."""
+        half = self.side // 2
+        rows, columns = (len(range(half, side + self.side, half)) for side in self.shape)
+        return rows, columns
+
+    @property
     def corners(self) -> list[tuple[int, int]]:
         """Where each patch begins, in an image that is continued by one side at the top and the left."""
         half = self.side // 2

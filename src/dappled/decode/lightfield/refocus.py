@@ -9,7 +9,7 @@ from view to view are called disparity here, never α: an α that counts views w
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ from dappled.decode.lightfield.light_field import Image, ViewStack
 from dappled.workers import each
 
 _SHARPNESS_BOX = 5  # px: the side of the box that sharpness is averaged over, twice
+_TAPS, _KAISER = 16, 5.0
 _LEAST_WEIGHT = 1e-6  # of all views: a pixel that less is seen of is unknown
 
 
@@ -42,19 +43,21 @@ def shift_and_add(
 ) -> Image:
     """The picture focused on one disparity, float32 (h, w) or (h, w, 3): mean of L_vu(p + D·step) over views.
 
-    `weights` (V, U) are the views' shares of the aperture. Between pixels views are interpolated by cubic convolution
-    (Keys 1981). A pixel's mean is over the views that have it; pixels that none has are NaN.
+    `weights` (V, U) are the views' shares of the aperture. Between pixels views are interpolated by a sinc of 16 taps
+    under a Kaiser window: 59 dB at 0.7 of the finest detail that a view holds, where cubic convolution has 9 dB.
+    Towards the edges, where it would reach beyond a view, it is cubic convolution (Keys 1981). There a pixel's mean is
+    over the views that have it, and pixels that none has are NaN.
     """
     if not math.isfinite(disparity):
         raise DecodeError(f"a disparity of {disparity} is not a plane: give a finite one, in pixels from view to view")
     share = _checked(stack, weights)
     if stack.colour:
         made = np.stack(
-            [_summed(stack, stack.views[..., c], disparity, share, workers) for c in range(stack.views.shape[4])],
+            [_focused(stack, stack.views[..., c], disparity, share, workers) for c in range(stack.views.shape[4])],
             axis=-1,
         )
     else:
-        made = _summed(stack, stack.views, disparity, share, workers)
+        made = _focused(stack, stack.views, disparity, share, workers)
     return made
 
 
@@ -254,35 +257,43 @@ def _checked(stack: ViewStack, weights: NDArray[np.floating] | None) -> NDArray[
     return normal
 
 
-def _summed(
+def _focused(
     stack: ViewStack, views: NDArray[np.float32], disparity: float, share: NDArray[np.float64], workers: int
 ) -> Image:
-    """Columns are shifted view by view, rows once for each row of views: Σ_v shift_y(Σ_u shift_x(L_vu))."""
+    """One colour (h, w): by the sinc where all of it lies in all views, else by cubic convolution."""
+    total, seen = _summed(stack, views, _Shift(disparity, _sinc), share, workers)
+    whole = seen > 1 - _LEAST_WEIGHT
+    if whole.all():
+        return total
+    near, seen = _summed(stack, views, _Shift(disparity, _cubic), share, workers)
+    known = seen > _LEAST_WEIGHT
+    made: Image = np.where(known, near / np.where(known, seen, 1), np.float32(np.nan)).astype(np.float32)
+    return np.where(whole, total, made)
+
+
+def _summed(
+    stack: ViewStack, views: NDArray[np.float32], shift: _Shift, share: NDArray[np.float64], workers: int
+) -> tuple[Image, NDArray[np.float32]]:
+    """(sum, the share of views in it): columns are shifted view by view, rows once for each row of views,
+    Σ_v shift_y(Σ_u shift_x(L_vu))."""
     height, width = views.shape[2:]
     rows = np.zeros((len(stack.row_steps), height, width), dtype=np.float32)
     down = np.zeros((len(stack.row_steps), height))
     across = np.zeros((len(stack.column_steps), width))
     for u, step in enumerate(stack.column_steps):
-        across[u, slice(*_taps(disparity * step, width).span)] = 1
+        across[u, slice(*shift.taps(step, width).span)] = 1
 
     def one(v: int) -> None:
         line = np.zeros((height, width), dtype=np.float32)
         for u, step in enumerate(stack.column_steps):
             if share[v, u]:
-                _add_shifted(line, views[v, u], _taps(disparity * step, width), share[v, u], by_columns=True)
-        taps = _taps(disparity * stack.row_steps[v], height)
+                _add_shifted(line, views[v, u], shift.taps(step, width), share[v, u], by_columns=True)
+        taps = shift.taps(stack.row_steps[v], height)
         _add_shifted(rows[v], line, taps, 1.0, by_columns=False)
         down[v, slice(*taps.span)] = 1
 
     each(one, range(len(stack.row_steps)), workers)
-    seen = (down.T @ share @ across).astype(np.float32)
-    total: Image = rows.sum(axis=0)
-    if seen.min() > _LEAST_WEIGHT:
-        total /= seen
-        return total
-    known = seen > _LEAST_WEIGHT
-    made: Image = np.where(known, total / np.where(known, seen, 1), np.float32(np.nan)).astype(np.float32)
-    return made
+    return rows.sum(axis=0), (down.T @ share @ across).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,23 +305,43 @@ class _Taps:
     span: tuple[int, int]
 
 
-def _taps(shift: float, side: int) -> _Taps:
-    """Cubic convolution with a = −1/2 at a fractional shift; one tap at a whole one."""
-    whole = math.floor(shift)
-    t = shift - whole
-    if t < 1e-6 or t > 1 - 1e-6:
-        offsets: tuple[int, ...] = (round(shift),)
-        weights: tuple[float, ...] = (1.0,)
-    else:
-        offsets = tuple(whole + k for k in (-1, 0, 1, 2))
-        weights = (
-            ((-0.5 * t + 1) * t - 0.5) * t,
-            (1.5 * t - 2.5) * t * t + 1,
-            ((-1.5 * t + 2) * t + 0.5) * t,
-            (0.5 * t - 0.5) * t * t,
-        )
-    first, last = max(0, -offsets[0]), min(side, side - offsets[-1])
-    return _Taps(offsets, weights, (first, max(first, last)))
+@dataclass(frozen=True, slots=True)
+class _Shift:
+    """How views are moved: `disparity` times their steps, between pixels by the weights that `between` has for them."""
+
+    disparity: float
+    between: Callable[[float], tuple[float, ...]]
+
+    def taps(self, step: float, side: int) -> _Taps:
+        """The taps at a fractional shift; one tap at a whole one."""
+        shift = self.disparity * step
+        whole = math.floor(shift)
+        t = shift - whole
+        if t < 1e-6 or t > 1 - 1e-6:
+            offsets: tuple[int, ...] = (round(shift),)
+            weights: tuple[float, ...] = (1.0,)
+        else:
+            weights = self.between(t)
+            offsets = tuple(range(whole + 1 - len(weights) // 2, whole + 1 + len(weights) // 2))
+        first, last = max(0, -offsets[0]), min(side, side - offsets[-1])
+        return _Taps(offsets, weights, (first, max(first, last)))
+
+
+def _cubic(t: float) -> tuple[float, ...]:
+    """Cubic convolution with a = −1/2."""
+    return (
+        ((-0.5 * t + 1) * t - 0.5) * t,
+        (1.5 * t - 2.5) * t * t + 1,
+        ((-1.5 * t + 2) * t + 0.5) * t,
+        (0.5 * t - 0.5) * t * t,
+    )
+
+
+def _sinc(t: float) -> tuple[float, ...]:
+    """sin(πx)/πx of `_TAPS` taps under a Kaiser window; their sum is 1."""
+    away = t - np.arange(1 - _TAPS // 2, 1 + _TAPS // 2)
+    weights = np.sinc(away) * np.i0(_KAISER * np.sqrt(np.maximum(1 - (2 * away / _TAPS) ** 2, 0)))
+    return tuple((weights / weights.sum()).tolist())
 
 
 def _add_shifted(out: Image, image: Image, taps: _Taps, share: float, *, by_columns: bool) -> None:

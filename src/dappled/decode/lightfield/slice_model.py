@@ -65,9 +65,12 @@ class SliceModel:
 
     def seen(self, frequencies: Floats, disparities: Floats) -> Complexes:
         """(D, F, A) each band's own detail in the slices, of a scene of unit spectrum at each disparity."""
-        at = self.angular - disparities[:, None, None, None] * frequencies[:, None]
-        through = self.aperture.transform(at.reshape(-1, 2)).real.reshape(at.shape[:-1])
-        return np.asarray(self.transfers * through, dtype=np.complex64)
+        return np.asarray(self.transfers * self._through(self.angular, frequencies, disparities), dtype=np.complex64)
+
+    def _through(self, angular: Floats, frequencies: Floats, disparities: Floats) -> Floats:
+        """(D, F, n) W(ω − D·g) of the stop, for ω (n, 2) and g (F, 2)."""
+        at = angular - disparities[:, None, None, None] * frequencies[:, None]
+        return self.aperture.transform(at.reshape(-1, 2)).real.reshape(at.shape[:-1])
 
     def viewed(self, frequencies: Floats, disparities: Floats) -> Complexes:
         """(D, F, V·U) the same in the views. A view whose cell is closed sees what its middle would."""
@@ -87,8 +90,7 @@ class SliceModel:
             pairs = [(n, places.get((ky - step[0], kx - step[1]))) for (ky, kx), n in places.items()]
             to, source = np.array([(n, other) for n, other in pairs if other is not None]).T
             out = frequencies + np.array(step) @ lattice
-            at = self.angular[source] - disparities[:, None, None, None] * out[:, None]
-            through = self.aperture.transform(at.reshape(-1, 2)).real.reshape(at.shape[:-1])
+            through = self._through(self.angular[source], out, disparities)
             waves = self.transfers[source] * through / np.sqrt(len(disparities))
             found.append(Fold(to, out, waves.astype(np.complex64).transpose(1, 2, 0)))
         return found

@@ -22,6 +22,7 @@ Pattern = Literal["full", "diagonal"]
 Harmonics = Literal["linear", "octave"]
 Order = tuple[int, int]
 Window = Literal["box", "cell"]
+_TOO_CLOSE = "the carriers lie too close together to cut slices: check mask and focal length"
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,23 +120,29 @@ class Lattice:
     def slice_size(self, padded: tuple[int, int], window: Window = "box") -> tuple[int, int]:
         """(height, width) of a slice in bins of a transform of shape `padded`, as large as the spacing allows.
 
-        For "box" the largest rectangle that overlaps none of its neighbours on the lattice, for "cell" the smallest
-        one around the lattice's own cell (the points nearer to one carrier than to any other). Both sides have small
-        prime factors, and those of the box are even. Raises DecodeError where the carriers lie too close together.
+        For "box" the largest rectangle that overlaps none of its neighbours on the lattice and is no longer than the
+        lattice's own cell (the points nearer to one carrier than to any other), for "cell" the smallest one around that
+        cell. Both sides have small prime factors, and those of the box are even. Raises DecodeError where the carriers
+        lie too close together.
         """
+        corners = self._cell_corners() * np.array(padded)
+        if not len(corners):
+            raise DecodeError(_TOO_CLOSE)
+        highest, widest = (2 * float(abs(corners[:, axis]).max()) for axis in (0, 1))
         if window == "cell":
-            corners = self._cell_corners() * np.array(padded)
-            height, width = (2 * math.ceil(abs(corners[:, axis]).max()) + 1 for axis in (0, 1))
+            height, width = (2 * math.ceil(side / 2) + 1 for side in (highest, widest))
             return min(_fast_up(height), padded[0]), min(_fast_up(width), padded[1])
         orders = np.array([(a, b) for a, b in itertools.product(range(-3, 4), repeat=2) if (a, b) != (0, 0)])
         steps = [(y * padded[0], x * padded[1]) for y, x in orders @ self.matrix()]
         best = (0, 0)
         for height in {abs(dy) for dy, _ in steps if abs(dy) > 1}:
-            width = min((abs(dx) for dy, dx in steps if abs(dy) < height * (1 - 1e-9)), default=float(padded[1]))
-            if height * width > best[0] * best[1]:
-                best = (math.floor(height + 1e-6), math.floor(width + 1e-6))
+            between = min((abs(dx) for dy, dx in steps if abs(dy) < height * (1 - 1e-9)), default=math.inf)
+            # A lattice that is turned a little has room for strips as long as the spectrum between its rows.
+            high, wide = min(height, highest), min(between, widest)
+            if high * wide > best[0] * best[1]:
+                best = (math.floor(high + 1e-6), math.floor(wide + 1e-6))
         if min(best) < 2:
-            raise DecodeError("the carriers lie too close together to cut slices: check mask and focal length")
+            raise DecodeError(_TOO_CLOSE)
         return _fast_down(min(best[0], padded[0])), _fast_down(min(best[1], padded[1]))
 
     def _cell_corners(self) -> NDArray[np.float64]:
@@ -200,6 +207,12 @@ class Sensor:
     def size_mm(self) -> Vector:
         """(height, width) of the chip in mm, for an axis-aligned one."""
         return self.shape[0] * math.hypot(*self.row_mm), self.shape[1] * math.hypot(*self.column_mm)
+
+    def aperture_px(self, focal_length_mm: float | None, f_number: float | None) -> float | None:
+        """The lens' aperture f/N in columns of the sensor; None where focal length or f-number are unknown."""
+        if not (focal_length_mm and f_number):
+            return None
+        return focal_length_mm / f_number / math.hypot(*self.column_mm)
 
     def spread(self) -> Sensor:
         """The geometry of a staggered chip's plane once `plane.spread` has put it on twice as many columns."""

@@ -4,13 +4,14 @@ The amplitude of order k, as a share of the plane's mean, is the product of what
 keeps (its pixels' sinc; nothing beyond two pixels a period), what diffraction leaves on the way (Eq 30, at the order's
 own frequency, which is √2·k·f_m on a diagonal), the stop's average over κ·k cycles (sinc·sinc of a square one, jinc of
 a round one, with nulls and changes of sign), and what the sensor's pixels keep. A stop's shape is rarely known, and an
-f-number is rounded. So a strength is a range: over both shapes, and over `_ROUNDING` of the f-number.
+f-number is rounded. So a strength is a range: over both shapes, and over `_ROUNDING` of the f-number. Where it is
+unknown (a manual lens), any order may be averaged out, and none must stand.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,9 @@ from dappled.decode.optics.carriers import Lattice, Mask, Order, Sensor
 
 _ROUNDING = 0.12  # relative: an f-number given in third stops, and nulls where only their neighbourhood counts
 _WAVELENGTHS_MM = np.array([450e-6, 500e-6, 550e-6, 600e-6, 650e-6])
+_BLADES, _SIZES, _POINTS = (5, 6, 7, 8), 15, 24  # of the stops that are tried; points along a side
+_LITTLE_LOST = 2  # harmonics up to this one: no frame of one was refused for what film and diffraction take
+_ANY_F_NUMBER = (1.2, 64.0)  # where none is told
 _LOST = 0.15  # a factor below this is named as the cause why a carrier is not seen
 
 
@@ -74,30 +78,28 @@ def order_strengths(
     lattice: Lattice,
     *,
     mask_distance_mm: float,
-    f_number: float,
+    f_number: float | None,
     orders: Sequence[Order] | None = None,
 ) -> list[OrderStrength]:
-    """The predicted strength of a mask's orders at a lattice, by default the half plane's without the mean."""
+    """The predicted strength of a mask's orders at a lattice, by default the half plane's without the mean; of an
+    unknown f-number (None) at most as behind a pinhole, and at least nothing."""
     wanted = [order for order in (mask.half_orders() if orders is None else orders) if order != (0, 0)]
     k = np.array(wanted, dtype=np.float64).reshape(-1, 2)
     amplitudes = pattern_amplitudes(mask)
     pattern = np.array([abs(amplitudes.get(order, 0.0)) for order in wanted])
     on_film = k * mask.frequency_per_mm
-    per_mm = np.hypot(*on_film.T)
-    film = np.ones(len(k))
-    if mask.film_px_per_mm is not None:
-        drawn = np.abs(on_film).max(axis=1) <= mask.film_px_per_mm / 2 * (1 + 1e-9)
-        film = np.where(drawn, np.sinc(on_film / mask.film_px_per_mm).prod(axis=1), 0.0)
-    numbers = _WAVELENGTHS_MM * mask_distance_mm * per_mm[:, None] ** 2  # λ·d·f²
-    diffraction = np.sqrt((np.cos(np.pi * numbers) ** 2).mean(axis=1))
-    swept = mask.frequency_per_mm * mask_distance_mm / f_number * k  # κ·k cycles over the stop
-    stops = np.array(
-        [shape(swept * (1 + off)) for shape in (_round, _square) for off in np.linspace(-_ROUNDING, _ROUNDING, 9)]
-    )
+    film, diffraction = _on_the_way(mask, k, mask_distance_mm)
+    if f_number is None:
+        stop_least, stop_most = np.zeros(len(k)), np.ones(len(k))
+    else:
+        swept = mask.frequency_per_mm * mask_distance_mm / f_number * k  # κ·k cycles over the stop
+        stops = np.array(
+            [shape(swept * (1 + off)) for shape in (_round, _square) for off in np.linspace(-_ROUNDING, _ROUNDING, 9)]
+        )
+        stop_least, stop_most = np.abs(stops).min(axis=0), np.abs(stops).max(axis=0)
+        stop_least = np.where((stops.max(axis=0) > 0) & (stops.min(axis=0) < 0), 0.0, stop_least)  # a null in between
     frequencies = k @ lattice.matrix()
     pixels = np.abs(np.sinc(frequencies).prod(axis=1))
-    stop_least, stop_most = np.abs(stops).min(axis=0), np.abs(stops).max(axis=0)
-    stop_least = np.where((stops.max(axis=0) > 0) & (stops.min(axis=0) < 0), 0.0, stop_least)  # a null in between
     common = pattern * np.abs(film) * diffraction * pixels
     to_mm = np.linalg.inv(np.array([sensor.row_mm, sensor.column_mm])).T
     on_sensor = np.hypot(*(frequencies @ to_mm).T)
@@ -118,6 +120,43 @@ def order_strengths(
         )
         for i, order in enumerate(wanted)
     ]
+
+
+def _on_the_way(
+    mask: Mask, k: NDArray[np.float64], mask_distance_mm: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(K,) what the film keeps of each order, and what diffraction leaves of it between mask and sensor."""
+    on_film = k * mask.frequency_per_mm
+    film = np.ones(len(k))
+    if mask.film_px_per_mm is not None:
+        drawn = np.abs(on_film).max(axis=1) <= mask.film_px_per_mm / 2 * (1 + 1e-9)
+        film = np.where(drawn, np.sinc(on_film / mask.film_px_per_mm).prod(axis=1), 0.0)
+    numbers = _WAVELENGTHS_MM * mask_distance_mm * (on_film**2).sum(axis=1)[:, None]  # λ·d·f²
+    return film, np.asarray(np.sqrt((np.cos(np.pi * numbers) ** 2).mean(axis=1)))
+
+
+def under_stops(
+    mask: Mask, lattice: Lattice, orders: Sequence[Order], *, mask_distance_mm: float, f_number: float | None
+) -> NDArray[np.float64]:
+    """(stops, orders) how strong each order is behind stops of many shapes and sizes, as shares of the plane's mean.
+
+    Round and square ones, and polygons of 5 to 8 blades in two directions; each as the f-number has it, and up to a
+    third wider or narrower, as f-number and mask distance may be off; of any size where it is unknown (None). Each once
+    with nothing lost on film and to diffraction, once with what they take of higher harmonics: neither is known well.
+    """
+    k = np.array(orders, dtype=np.float64).reshape(-1, 2)
+    amplitudes = pattern_amplitudes(mask)
+    pattern = np.array([abs(amplitudes.get(order, 0.0)) for order in orders])
+    pixels = np.abs(np.sinc(k @ lattice.matrix()).prod(axis=1))
+    sizes = np.geomspace(0.7, 1.4, _SIZES)
+    if f_number is None:
+        f_number, sizes = 1.0, np.geomspace(1 / _ANY_F_NUMBER[1], 1 / _ANY_F_NUMBER[0], 4 * _SIZES)
+    swept = mask.frequency_per_mm * mask_distance_mm / f_number * k
+    shapes = [_round, _square, *(_polygon(blades, turn) for blades in _BLADES for turn in (0.0, 0.5))]
+    stops = np.array([np.abs(shape(swept * size)) for shape in shapes for size in sizes]) * pattern * pixels
+    film, diffraction = _on_the_way(mask, k, mask_distance_mm)
+    lost = np.where(np.abs(k).max(axis=1) > _LITTLE_LOST, np.abs(film) * diffraction, 1.0)
+    return np.concatenate([stops, stops * lost])
 
 
 def pattern_amplitudes(mask: Mask) -> dict[Order, float]:
@@ -152,6 +191,17 @@ def _drawable(mask: Mask, multiple: int) -> bool:
 def _round(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
     turns = np.pi * np.hypot(*cycles.T)
     return np.asarray(np.where(turns > 0, 2 * special.j1(turns) / np.where(turns > 0, turns, 1.0), 1.0))
+
+
+def _polygon(blades: int, turn: float) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """The transform of a regular polygon of the circle's diameter, turned by a share of a blade: a sum over points."""
+    axis = (np.arange(_POINTS) + 0.5) / _POINTS - 0.5
+    y, x = (side.ravel() for side in np.meshgrid(axis, axis, indexing="ij"))
+    edges = 2 * np.pi * (np.arange(blades) + turn) / blades
+    reach = 0.5 * math.cos(math.pi / blades)
+    inside = np.all(np.outer(np.sin(edges), y) + np.outer(np.cos(edges), x) <= reach, axis=0)
+    points = np.stack([y[inside], x[inside]])
+    return lambda cycles: np.asarray(np.abs(np.exp(2j * np.pi * cycles @ points).mean(axis=1)))
 
 
 def _square(cycles: NDArray[np.float64]) -> NDArray[np.float64]:

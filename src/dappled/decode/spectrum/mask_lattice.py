@@ -116,7 +116,7 @@ def asked_orders(expected: Sequence[OrderStrength]) -> list[OrderStrength]:
     return sorted((one for one in there if one.most > 0.003 * strongest), key=lambda one: -one.most)
 
 
-def levels(spectrum: Spectrum, expected: Sequence[OrderStrength]) -> list[float]:
+def levels(spectrum: Spectrum, expected: Sequence[OrderStrength | Carrier]) -> list[float]:
     """The level of the spectrum around each order, as a share of the mean: the median of 13 × 13 bins."""
     found = []
     pixels = spectrum.shape[0] * spectrum.shape[1]

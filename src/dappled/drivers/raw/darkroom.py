@@ -18,7 +18,7 @@ from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode import DecodeError
 from dappled.decode.calibration import Calibration
-from dappled.decode.calibration.law_search import LawSearch, missing, search_laws
+from dappled.decode.calibration.law_search import LawSearch
 from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
 from dappled.decode.depth import RANGING
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
@@ -28,9 +28,10 @@ from dappled.decode.spectrum import LinearRows, Plane
 from dappled.decode.spectrum import plane as planes
 from dappled.decode.spectrum.lineariser import check_shape, lineariser
 from dappled.decode.spectrum.plane import Places, coloured, find_defects, local_colours, mended, spread
-from dappled.decode.spectrum.transform import Source, transform
+from dappled.decode.spectrum.transform import Source
 from dappled.drivers.raw import calibration_files, reading
-from dappled.drivers.raw.raw_file import not_linear
+from dappled.drivers.raw.law_check import FrameLens, LawCheck, check_report
+from dappled.drivers.raw.raw_file import Exposure, exposure, not_linear
 from dappled.drivers.raw.reading import RawFile
 from dappled.drivers.raw.recipe import FILES, FOLDER, LawDecision, Recipe, of_flight
 from dappled.errors import DappledError
@@ -104,35 +105,44 @@ __all__ = [
     "DecodeResult",
     "LawDecision",
     "Recipe",
-    "at_found",
     "camera_name",
     "known_to",
     "of_flight",
-    "search_frame",
 ]
-
-
-OTHER_LATTICE = "the mask's carriers are not where the calibration has them: calibrate again"
-"""The doubt about a frame whose carriers were found elsewhere; it is decoded without the calibration."""
 
 
 @dataclass(frozen=True, slots=True)
 class DecodeResult:
     """A decoded frame, its report and raw file, and how many milliseconds each step took.
 
-    `search` is what the frame shows under all laws, where they were tried. `contradiction` says in a sentence that
-    carriers should be visible and are not; None where there is no such reason for doubt. `calibration_doubt` is what
-    the calibration itself was in doubt about, `not_linear` why the file's values may not follow the light.
+    `checked` is whether its carriers stand where slices are cut, where that was checked. `calibration_doubt` is what
+    the calibration itself was in doubt about, `exposed` how the file's values are, `not_linear` why they may not follow
+    the light.
     """
 
     light_field: LightField
     report: DecodeReport
     raw: RawFile
+    exposed: Exposure
     ms: dict[str, float] = field(default_factory=dict)
-    search: LawSearch | None = None
-    contradiction: str | None = None
+    checked: LawCheck | None = None
     calibration_doubt: str | None = None
     not_linear: tuple[str, ...] = ()
+
+    @property
+    def search(self) -> LawSearch | None:
+        """What the frame shows under all laws; None where they were not tried."""
+        return None if self.checked is None else self.checked.search
+
+    @property
+    def contradiction(self) -> str | None:
+        """Why carriers should be visible and are not, or stand elsewhere; None where there is no such reason."""
+        return None if self.checked is None else self.checked.contradiction
+
+    @property
+    def unsettled(self) -> str | None:
+        """What can't be told of the carriers, or is strange about those that are there; None where nothing is."""
+        return None if self.checked is None else self.checked.unsettled
 
     @property
     def observable(self) -> bool:
@@ -155,6 +165,7 @@ class Darkroom:
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
+        self._checks = recipe.try_laws or recipe.keep_law
         self._decoders: dict[tuple[tuple[int, int], str, bool], Decoder] = {}
         self._lineariser = FrameLineariser(recipe)
 
@@ -203,29 +214,19 @@ class Darkroom:
                 decoder = replace(decoder, joint_views=joint_views)
             focal_length_mm = focal_length_mm or raw.focal_length_mm
             f_number = f_number or raw.f_number
-            search, doubt = None, None
             with _timed(ms, "slices and views" if views else "slices"):
                 light_field, report = decoder.decode_reported(
                     plane, focal_length_mm=focal_length_mm, f_number=f_number, views=views
                 )
-                if self.recipe.try_laws and isinstance(decoder, MaskDecoder) and focal_length_mm and f_number:
-                    if report.carriers_from == "predicted":
-                        search = search_frame(decoder, plane, focal_length_mm, f_number)
-                        if search.found is not None:
-                            decoder = at_found(decoder, search)
-                            light_field, report = decoder.decode_reported(
-                                plane, focal_length_mm=focal_length_mm, f_number=f_number, views=views
-                            )
-                        doubt = search.reason if search.expected and search.found is None else None
-                    elif report.carriers_from == "calibrated" and report.found <= 1:
-                        doubt = missing_at(decoder, plane, focal_length_mm, f_number)
-                        search = search_frame(decoder, plane, focal_length_mm, f_number) if doubt else None
-                        if search is not None and search.found is not None:  # elsewhere than the calibration has it
-                            decoder = at_found(replace(decoder, calibration=None), search)
-                            light_field, report = decoder.decode_reported(
-                                plane, focal_length_mm=focal_length_mm, f_number=f_number, views=views
-                            )
-                            doubt = OTHER_LATTICE
+                checked: LawCheck | None = None
+                if self._checks and isinstance(decoder, MaskDecoder) and focal_length_mm:
+                    lens = FrameLens(focal_length_mm, f_number, self._narrowest_f(raw))
+                    checked = check_report(decoder, plane, report, lens, keep_law=self.recipe.keep_law)
+                    if checked.decoder is not decoder:
+                        decoder = checked.decoder
+                        light_field, report = decoder.decode_reported(
+                            plane, focal_length_mm=focal_length_mm, f_number=f_number, views=views
+                        )
                 if chroma is not None:
                     light_field = replace(
                         light_field, views=coloured(light_field.views, light_field.grid, chroma, plane.shape)
@@ -240,10 +241,13 @@ class Darkroom:
             "corrected_by": [name for name in ("dark", "white") if getattr(self.recipe, name)],
             **(self._ranging if views and not dropped else {}),
         }
-        bent = tuple(not_linear(raw)) if isinstance(decoder, MaskDecoder) else ()
-        made = DecodeResult(light_field, report, raw, ms, search, doubt, doubt_of(decoder), bent)
-        attributes["doubts"] = [words for words in (doubt, report.doubt, made.calibration_doubt, *bent) if words]
-        if self.recipe.try_laws and not made.observable:
+        with _timed(ms, "exposure"):
+            exposed = exposure(raw)
+        bent = tuple(not_linear(raw, exposed)) if isinstance(decoder, MaskDecoder) else ()
+        made = DecodeResult(light_field, report, raw, exposed, ms, checked, doubt_of(decoder), bent)
+        doubts = (made.contradiction, made.unsettled, report.doubt, made.calibration_doubt, *bent)
+        attributes["doubts"] = [words for words in doubts if words]
+        if self._checks and not made.observable:
             attributes["carriers_found"] = None
         return replace(made, light_field=replace(light_field, attributes=attributes))
 
@@ -317,6 +321,11 @@ class Darkroom:
             taper=recipe.taper,
         )
 
+    def _narrowest_f(self, raw: RawFile) -> float | None:
+        """The narrowest stop of the camera's lens, where its profile knows it."""
+        stops = self.camera(raw.camera_model or "").f_numbers
+        return None if stops is None else stops[1]
+
     @cached_property
     def _ranging(self) -> dict[str, Any]:
         """The attribute that leads from disparity to metres, where the calibration was made with targets too."""
@@ -327,41 +336,11 @@ class Darkroom:
         return calibration_files.load(Path(self.recipe.calibration))
 
 
-def search_frame(decoder: MaskDecoder, plane: Source, focal_length_mm: float, f_number: float) -> LawSearch:
-    """Search a frame for its mask's carriers near the prediction of every law."""
-    return search_laws(
-        transform(plane, workers=decoder.workers),
-        sensor=decoder.sensor,
-        mask=decoder.mask,
-        law=decoder.law,
-        mask_distance_mm=decoder.mask_distance_mm,
-        focal_length_mm=focal_length_mm,
-        f_number=f_number,
-    )
-
-
-def at_found(decoder: MaskDecoder, search: LawSearch) -> MaskDecoder:
-    """Return the decoder for the frame that a search found the lattice of, by the law that it obeys."""
-    assert search.found is not None
-    return replace(decoder, law=search.law or decoder.law, at=search.found.lattice)
-
-
-def missing_at(decoder: MaskDecoder, plane: Source, focal_length_mm: float, f_number: float) -> str | None:
-    """Why a calibration can't be this frame's, in a sentence; None where it may be."""
-    return missing(
-        transform(plane, workers=decoder.workers),
-        decoder.lattice_at(focal_length_mm),
-        sensor=decoder.sensor,
-        mask=decoder.mask,
-        mask_distance_mm=decoder.mask_distance_mm,
-        f_number=f_number,
-    )
-
-
 def doubt_of(decoder: Decoder) -> str | None:
-    """What a decoder's calibration was in doubt about, in a sentence: no law explains it. None for others."""
+    """What is doubtful about a decoder's calibration, in a sentence: no law explains it, or its frames were not linear.
+    None for others."""
     known = decoder.calibration if isinstance(decoder, MaskDecoder) else None
-    return None if known is None or not known.verdict.startswith("neither") else f"calibration: {known.verdict}"
+    return None if known is None or known.doubt is None else f"calibration: {known.doubt}"
 
 
 def known_to(decoder: MaskDecoder, focal_sigma_mm: float | None) -> MaskDecoder:

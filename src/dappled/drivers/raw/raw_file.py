@@ -26,6 +26,7 @@ Values = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32] | NDArray[
 
 MOST_CLIPPED = 0.01  # of all pixels
 WHITE_SHARE = 0.99  # of white: a pixel of so much light is clipped
+BLACK_SHARE = 0.004  # of white: a pixel of less light is black
 STEPS = 64
 _EVERY = 5  # odd, so that the colours of a mosaic take turns
 _EXIF_IFD = 0x8769
@@ -129,11 +130,12 @@ class RawFile:
 @dataclass(frozen=True, slots=True)
 class Exposure:
     """`histogram`: shares of the pixels in STEPS equal steps of the square root of the linear value, black to white.
-    `clipped_share` of them are white; `mean_share` is the mean as a share of white."""
+    `clipped_share` of them are white, `black_share` black; `mean_share` is the mean as a share of white."""
 
     histogram: tuple[float, ...]
     clipped_share: float
     mean_share: float
+    black_share: float
 
 
 def exposure(raw: RawFile, every: int = _EVERY) -> Exposure:
@@ -141,17 +143,19 @@ def exposure(raw: RawFile, every: int = _EVERY) -> Exposure:
     black = float(np.mean(raw.black))
     values = raw.mosaic[::every, ::every].astype(np.float32)
     share = (values - black) / (raw.white - black)
-    counts, _ = np.histogram(np.sqrt(np.clip(share, 0, 1)), STEPS, (0, 1))
+    steps = np.minimum(np.sqrt(np.clip(share, 0, 1)) * STEPS, STEPS - 1).astype(np.uint8)
+    counts = np.bincount(steps.ravel(), minlength=STEPS)
     shares = tuple(float(one) for one in counts / share.size)
-    return Exposure(shares, float(np.mean(share >= WHITE_SHARE)), float(np.mean(share)))
+    clipped, black = (float(np.mean(found)) for found in (share >= WHITE_SHARE, share < BLACK_SHARE))
+    return Exposure(shares, clipped, float(np.mean(share)), black)
 
 
-def not_linear(raw: RawFile) -> list[str]:
+def not_linear(raw: RawFile, exposed: Exposure) -> list[str]:
     """Return why a frame's values do not follow the light, in sentences; empty where nothing speaks against it."""
     found = []
     if raw.developed:
         found.append("it is a JPEG: its tones are not linear, which bends carriers and views; take raw files")
-    clipped = exposure(raw).clipped_share
+    clipped = exposed.clipped_share
     if clipped > MOST_CLIPPED:
         found.append(f"{clipped:.1%} of its pixels are clipped, which bends carriers and views: expose less")
     return found

@@ -49,7 +49,8 @@ class Recipe:
     `law` "" takes the camera's; a file is "" where there is none.
     `cfa` (as "BGGR", row by row), `black` and `white_level` are for files that don't contain them. `colour` makes
     views in red, green and blue; `taper`, 0 to 1, makes the bands of a printed mask's slices fall off softly.
-    With `try_laws` a frame without carriers at the prediction is searched near those of all laws. `decided` is what
+    With `try_laws` a frame without carriers at the prediction is searched near those of all laws, and decoded where
+    they stand; with `keep_law` it is only checked, and decoded by `law` (see `law_check`). `decided` is what
     such a search has decided for a whole flight: its law goes before `law` and a calibration.
     """
 
@@ -66,6 +67,7 @@ class Recipe:
     colour: bool = False
     taper: float = 0.0
     try_laws: bool = False
+    keep_law: bool = False
     decided: LawDecision | None = None
 
     def as_values(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dappled.decode.fingerprint import difference, fingerprint
+from dappled.decode.lightfield.light_field import difference, fingerprint
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,247 @@
+"""Find how far a mask lies from its calibrated place by the likelihood of a frame's slices.
+
+A mask moved by δ periods turns slice k by 2πk·δ, one turned by φ makes that phase run across the frame. The model of
+the light field (`patch_model`) gives the slices' covariance C(f) in a patch, so the log likelihood of its spectra y is
+
+    −Σ_f w_f Σ_ab conj(y_a) C⁻¹_ab y_b exp(2πi (k_a − k_b)·δ) = Re Σ_m c_m exp(2πi m·δ):
+
+a polynomial of few terms, m the differences of orders. Parallax tells δ even where the stop averages all carriers away
+(an even square stop at the mask's ideal aperture): slices of a shifted mask are those of views that change places.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.decode.array_types import Complexes, Floats
+from dappled.decode.lightfield.patch_model import (
+    KINDS,
+    SIDE,
+    USUAL,
+    FrameModel,
+    TexturePower,
+    likelihoods,
+    rests_of,
+    wholes_of,
+)
+from dappled.decode.lightfield.patches import Patches
+from dappled.decode.lightfield.slice_model import SliceModel
+from dappled.decode.optics import Lattice, Order, Sensor
+
+_MOST_PATCHES = 400  # those with the most texture
+_FEWEST = 12  # patches, for an answer at all
+_FAINT = 0.3  # of the mean texture: fainter patches are not scaled up to it, noise and all
+_STEPS = 48  # of a period: how finely moves are tried, up to half a period
+_MOST_TURN, _TURNS = 0.007, 81  # radians to either side, and how many are tried
+_ROUNDS = 8  # of Newton's method, from the best that was tried
+_LEAST_PERIODS, _LEAST_TURN = 0.03, 6e-4  # clean frames reach 0.017 periods and 3e-4 radians
+_SURE = 3.0  # standard deviations: patches that are more probable with the move, beyond half of all
+_LEAST_NATS = 3.0  # that the median patch must gain
+_LIKELY, _MANY_NATS = 2.0, 30.0  # or both of these: clean frames gain 14 nats at most, moved ones 33 and more
+_USUAL = [kind for kind in KINDS if kind.range == USUAL]
+_OVERLAP = 2.0  # patches that count as one measurement: they overlap by half
+
+
+@dataclass(frozen=True, slots=True)
+class MaskPlace:
+    """Where a frame's own slices place the mask, from where its calibration has it: `periods` (ky, kx) at the frame's
+    middle and `turn_rad`, 0 where the calibration's place explains the frame as well; and their standard errors."""
+
+    periods: tuple[float, float]
+    periods_sigma: tuple[float, float]
+    turn_rad: float
+    turn_sigma_rad: float
+
+    @property
+    def moved(self) -> bool:
+        """Whether it is anywhere else."""
+        return bool(any(self.periods) or self.turn_rad)
+
+    def undone(
+        self, slices: Complexes, orders: Sequence[Order], turned: Floats, steps_px: tuple[float, float]
+    ) -> Complexes:
+        """Slices as a mask without the turn would make them; `turned` and `steps_px` as in `mask_place`."""
+        if not self.turn_rad:
+            return slices
+        cycles = self.turn_rad * np.array(orders, dtype=np.float64) @ turned  # (K, 2) for each sensor pixel
+        down, across = (
+            np.exp(-2j * np.pi * np.outer(along, (np.arange(side) - (side - 1) / 2) * px)).astype(np.complex64)
+            for along, side, px in zip(cycles.T, slices.shape[1:], steps_px, strict=True)
+        )
+        return np.asarray(slices * down[:, :, None] * across[:, None, :])
+
+    def doubt(self, frequency_per_mm: float) -> str | None:
+        """The move in a sentence; None where there is none."""
+        found = []
+        if any(self.periods):
+            found.append(f"lies {1e3 * math.hypot(*self.periods) / frequency_per_mm:.0f} µm off")
+        if self.turn_rad:
+            found.append(f"is turned by {abs(math.degrees(self.turn_rad)):.2f}°")
+        if not found:
+            return None
+        return f"the mask {' and '.join(found)} since it was calibrated; views allow for it, but calibrate again"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for a light field's attributes."""
+        return {
+            "periods": list(self.periods),
+            "periods_sigma": list(self.periods_sigma),
+            "turn_rad": self.turn_rad,
+            "turn_sigma_rad": self.turn_sigma_rad,
+        }
+
+
+def cycles_per_radian(lattice: Lattice, sensor: Sensor) -> Floats:
+    """(2, 2) by how many cycles per sensor pixel (rows ky and kx) carriers move as the mask turns by a small angle."""
+    to_sensor = np.array([sensor.row_mm, sensor.column_mm])
+    quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    return np.asarray(lattice.matrix() @ np.linalg.inv(to_sensor).T @ quarter @ to_sensor.T)
+
+
+def mask_place(
+    slices: Complexes,
+    model: SliceModel,
+    *,
+    samples_px: tuple[float, float],
+    noise: Floats,
+    reach: float,
+    turned: Floats,
+    steps_px: tuple[float, float],
+) -> MaskPlace | None:
+    """The mask's place by slices complex64 (K, h, w), the half plane of `model`, DC first; None for too small ones.
+
+    `samples_px`, `noise` and `reach` as for `joint_views`. `turned` (2, 2) is by how many cycles per sensor pixel (rows
+    ky and kx) the carriers move for each radian of turn, `steps_px` by how many rows and columns of it a sample steps.
+    """
+    patches = Patches((slices.shape[1], slices.shape[2]), SIDE)
+    inner = np.flatnonzero(~patches.at_edges)
+    if len(inner) < _FEWEST:
+        return None
+    differences, terms, used = _terms(slices, model, patches, inner, samples_px=samples_px, noise=noise, reach=reach)
+    corners = np.array(patches.corners)[used] - SIDE
+    middles = corners + SIDE / 2 - np.array(slices.shape[1:]) / 2
+    return _Likelihood(differences, terms, (middles * np.array(steps_px)) @ turned.T).place()
+
+
+def _terms(
+    slices: Complexes,
+    model: SliceModel,
+    patches: Patches,
+    inner: NDArray[np.intp],
+    *,
+    samples_px: tuple[float, float],
+    noise: Floats,
+    reach: float,
+) -> tuple[NDArray[np.int64], NDArray[np.complex128], NDArray[np.intp]]:
+    """The differences m (M, 2) of orders, the terms c (N, M) of each patch, and which patches these are."""
+    cut = patches.cut(slices)[:, inner]
+    weights = patches.window**2
+    means = np.einsum("nyx,yx->n", cut[0].real, weights) / weights.sum()
+    cut -= (model.common()[: len(slices), None] * means).astype(np.complex64)[:, :, None, None]
+    contrast = np.einsum("nyx,yx->n", cut[0].real ** 2, weights)
+    best = np.sort(np.argsort(-contrast, kind="stable")[:_MOST_PATCHES])
+    spectra = patches.spectra(cut[:, best])
+    frame = FrameModel.of(patches, model, samples_px, np.concatenate([noise, noise[1:]]), reach)
+    power = np.maximum((np.abs(spectra[:, 0]) ** 2).mean(axis=1) - frame.noise[0], 0)
+    spectrum = TexturePower.of(power, frame.radius(frame.frequencies))
+    own = spectrum.at(frame.radius(frame.frequencies))
+    strength = (np.abs(spectra[1:, 0]) ** 2 / (own[1:, None] + frame.noise[0])).mean(axis=0)
+    spectra /= np.sqrt(np.maximum(strength, _FAINT)).astype(np.float32)  # no patch outvotes the others
+    rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means[best] ** 2))), _USUAL)
+    wholes = wholes_of(frame, own, rests, _USUAL)
+    whole = wholes[int(np.einsum("f,bfn->b", frame.weights, likelihoods(wholes, spectra)).argmax())]
+    inverse = np.linalg.inv(whole.astype(np.complex128)) * frame.weights[:, None, None]
+    apart = model.orders[:, None] - model.orders[None, :]
+    differences, place = np.unique(apart.reshape(-1, 2), axis=0, return_inverse=True)
+    place = place.reshape(apart.shape[:2])
+    terms = np.zeros((spectra.shape[2], len(differences)), dtype=np.complex128)
+    conjugate = spectra.conj()
+    for b in range(len(model.orders)):
+        column = inverse[:, :, b].astype(np.complex64)[:, :, None] * conjugate
+        products = np.einsum("fan,fn->na", column, spectra[:, b])
+        terms[:, place[:, b]] -= products  # for one b every a has a difference of its own
+    return differences, terms, inner[best]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Likelihood:
+    """Log likelihood of N patches over moves: `terms` (N, M) at `differences` (M, 2), and by how many periods `turned`
+    (N, 2) a turn of one radian moves the mask at each patch."""
+
+    differences: NDArray[np.int64]
+    terms: NDArray[np.complex128]
+    turned: Floats
+
+    def place(self) -> MaskPlace:
+        """The most probable place; what is not sure, or small, is 0."""
+        still = self._best(turns=np.zeros(1))
+        both = self._best(turns=np.linspace(-_MOST_TURN, _MOST_TURN, _TURNS))
+        found = still
+        if abs(both[2]) >= _LEAST_TURN and self._sure(both, still):
+            found = both
+            apart = np.array([0.0, 0.0, found[2]])
+        else:
+            apart = np.zeros(3)
+        if np.hypot(*found[:2]) < _LEAST_PERIODS or not self._sure(found, apart):
+            found = apart
+        sigma = self._sigma(found)
+        return MaskPlace(
+            (float(found[0]), float(found[1])), (float(sigma[0]), float(sigma[1])), float(found[2]), float(sigma[2])
+        )
+
+    def patches(self, move: Floats) -> Floats:
+        """(N,) log likelihoods at (ky, kx, radians)."""
+        return np.asarray(self._waves(move).real.sum(axis=1))
+
+    def _waves(self, move: Floats) -> NDArray[np.complex128]:
+        at = move[:2] + move[2] * self.turned
+        return np.asarray(self.terms * np.exp(2j * np.pi * at @ self.differences.T))
+
+    def _best(self, turns: Floats) -> Floats:
+        """The most probable move with one of these turns, or near it: (ky, kx, radians)."""
+        axis = np.arange(-_STEPS // 2, _STEPS // 2 + 1) / _STEPS
+        tried = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+        sums = np.stack([self._waves(np.array([0.0, 0.0, turn])).sum(axis=0) for turn in turns], axis=1)
+        found = (np.exp(2j * np.pi * tried @ self.differences.T) @ sums).real
+        shift, turn = np.unravel_index(int(found.argmax()), found.shape)
+        move = np.array([*tried[shift], turns[turn]])
+        free = slice(0, 3 if len(turns) > 1 else 2)
+        for _ in range(_ROUNDS):
+            gradient, curvature = self._slopes(move)
+            step = np.linalg.lstsq(curvature[free, free], gradient.sum(axis=0)[free], rcond=None)[0]
+            new = move.copy()
+            new[free] += step
+            if self.patches(new).sum() <= self.patches(move).sum():
+                break
+            move = new
+        return move
+
+    def _slopes(self, move: Floats) -> tuple[Floats, Floats]:
+        """(N, 3) gradients of the patches, and (3, 3) the sum's curvature, its sign turned."""
+        waves = self._waves(move)
+        along = np.stack(
+            [*np.broadcast_to(self.differences.T[:, None], (2, *waves.shape)), self.turned @ self.differences.T]
+        )
+        gradient = (2j * np.pi * waves * along).sum(axis=2).real.T
+        curvature = np.einsum("anm,bnm,nm->ab", along, along, waves.real) * (2 * np.pi) ** 2
+        return gradient, np.asarray(curvature)
+
+    def _sure(self, one: Floats, other: Floats) -> bool:
+        """Whether so many patches are more probable with one move than with another that it is no chance."""
+        gains = self.patches(one) - self.patches(other)
+        count = len(gains) / _OVERLAP
+        chance = (2 * float(np.mean(gains > 0)) - 1) * np.sqrt(count)
+        gain = float(np.median(gains))
+        return bool((chance > _SURE and gain > _LEAST_NATS) or (chance > _LIKELY and gain > _MANY_NATS))
+
+    def _sigma(self, move: Floats) -> Floats:
+        """(3,) standard errors, from the scatter of the patches' own gradients: whatever a likelihood's scale."""
+        gradient, curvature = self._slopes(move)
+        back = np.linalg.pinv(curvature)
+        return np.asarray(np.sqrt(np.maximum(np.diag(back @ (gradient.T @ gradient) @ back) * _OVERLAP, 0)))

@@ -1,0 +1,274 @@
+"""Model the spectra of patches of slices: the band's own detail over a range of disparities, and what else is there.
+
+What else: detail that folds in from beyond the band, what one view has alone, noise, and errors of the model itself.
+All are covariances of the slices at one spatial frequency, and the patches of a group share them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.decode.array_types import Complexes, Floats, Singles
+from dappled.decode.lightfield.patches import Patches
+from dappled.decode.lightfield.slice_model import Fold, SliceModel, folded
+
+SIDE = 24  # samples: a patch is wide against parallax, and small against things at one disparity
+STEP = SIDE // 2  # from one patch to the next
+FARTHEST = 2.0  # times the reach: nothing that moves farther is told from other things
+STILL = 1 / 16  # of the reach: hardly any parallax
+# Of |disparity|, in reaches: hardly any, the usual ones, far ones, and what is beyond all.
+RANGES = ((0.0, STILL), (0.0, 1.0), (1.0, FARTHEST), (FARTHEST, 4.0))
+USUAL = 1  # of the ranges
+
+
+@dataclass(frozen=True, slots=True)
+class PatchKind:
+    """What a patch may be: its disparities in one of `RANGES`; its detail beyond the band, times the spectrum continued
+    as a power law; what a view has alone (things hidden from others, parallax within a patch), of its power; and by how
+    many `nats` it must be more probable than others."""
+
+    range: int
+    beyond: float
+    alone: float
+    nats: float = 0.0
+
+
+_BEYOND = (0.1, 1.0, 4.0, 16.0, 64.0)
+_FAR_NATS = 12.0  # few things are beyond a range
+# Of detail that folds in where nothing moves: usual amounts, and those of few frequencies.
+_USUAL_AMOUNTS, _MORE, _SELDOM = (0.01, 1.0), (8.0, 64.0, 512.0), 0.05
+_LEAN, _MOST_LEAN_NATS = 4.0, 800.0  # of a patch, times the median patch
+_ALONE_NATS = 500.0  # edges between depths look like it, too
+# A patch with all its detail in the band, or without parallax, can be trusted further.
+KINDS: Sequence[PatchKind] = (
+    *(PatchKind(0, beyond, 1e-4) for beyond in (0.0, 1.0, 4.0, 16.0, 64.0)),
+    PatchKind(USUAL, 0.0, 0.03),
+    *(PatchKind(USUAL, beyond, 0.01) for beyond in _BEYOND),
+    PatchKind(USUAL, 1.0, 1.0, _ALONE_NATS),
+    *(PatchKind(far, beyond, 0.01, (far - USUAL) * _FAR_NATS) for far in (2, 3) for beyond in (0.1, 1.0, 4.0)),
+)
+LEAST_NOISE = 1e-12
+WITHIN = (-0.4, 0.0, 0.4)  # of the step from one disparity to the next: a patch is not flat
+_HYPOTHESES = 17  # disparities over a range
+_BEYOND_DISPARITIES, _STILL_DISPARITIES = 5, 3
+_INDEPENDENT = 0.5  # of a patch's samples are measurements of their own: patches overlap, windows correlate
+_ERROR = 5e-4  # of a slice's power: what no light field explains
+_MEAN_ERROR = 1e-3  # of a patch's mean: what a wrong aperture leaves in each slice
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DisparityRange:
+    """Disparities that a patch may have: `seen` (F, D, R, A) and `viewed` (F, D, R, V·U) of unit spectrum, R of them
+    within each of D steps."""
+
+    seen: Complexes
+    viewed: Complexes
+
+    @classmethod
+    def of(cls, model: SliceModel, frequencies: Floats, nearest: float, farthest: float) -> DisparityRange:
+        """From |disparity| `nearest` to `farthest`, in sensor columns over the aperture."""
+        both = np.linspace(-farthest, farthest, _HYPOTHESES)
+        disparities = both
+        if nearest:
+            one = np.linspace(nearest, farthest, _HYPOTHESES // 2 + 1)[1:]
+            disparities = np.concatenate([-one[::-1], one])
+        step = disparities[1] - disparities[0]
+        within = (disparities[:, None] + np.array(WITHIN) * step).ravel()
+        shape = (len(disparities), len(WITHIN), len(frequencies), -1)
+        return cls(
+            np.ascontiguousarray(model.seen(frequencies, within).reshape(shape).transpose(2, 0, 1, 3)),
+            np.ascontiguousarray(model.viewed(frequencies, within).reshape(shape).transpose(2, 0, 1, 3)),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameModel:
+    """What all groups of patches share. `frequencies` (F, 2) in cycles per sensor column; `per_bin` of a patch;
+    `weights` (F,) of a frequency in likelihoods; `ranges` of disparities; `folds` from beyond the band; `alone`
+    (A, V·U), how the slices hold what each view has alone; `noise` (A,)."""
+
+    model: SliceModel
+    frequencies: Floats
+    per_bin: float
+    weights: Singles
+    multiplicity: Floats
+    lowest: NDArray[np.bool_]
+    ranges: tuple[DisparityRange, ...]
+    folds: tuple[list[Fold], list[Fold]]
+    alone: Complexes
+    noise: Floats
+
+    @classmethod
+    def of(
+        cls, patches: Patches, model: SliceModel, samples_px: tuple[float, float], noise: Floats, reach: float
+    ) -> FrameModel:
+        bins = patches.bins
+        frequencies = bins / np.array(samples_px)
+        weights = _INDEPENDENT * patches.multiplicity / 2
+        weights[0] = 0  # the patch's mean was taken out
+        return cls(
+            model=model,
+            frequencies=frequencies,
+            per_bin=float(np.sqrt(samples_px[0] * samples_px[1])) * patches.side,
+            weights=weights.astype(np.float32),
+            multiplicity=patches.multiplicity,
+            lowest=np.abs(bins * patches.side).max(axis=1) < 1.5,
+            ranges=tuple(DisparityRange.of(model, frequencies, near * reach, far * reach) for near, far in RANGES),
+            folds=(
+                model.folds(frequencies, np.linspace(-STILL, STILL, _STILL_DISPARITIES) * reach),
+                model.folds(frequencies, np.linspace(-0.6, 0.6, _BEYOND_DISPARITIES) * reach),
+            ),
+            alone=model.alone(),
+            noise=noise,
+        )
+
+    def radius(self, frequencies: Floats) -> Floats:
+        """|f| in bins of a patch, of frequencies (..., 2)."""
+        return np.asarray(np.hypot(frequencies[..., 0], frequencies[..., 1]) * self.per_bin)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TexturePower:
+    """The power of texture over |f| in bins: `power` at 0, 1, 2 …, beyond the band a power law of `slope`."""
+
+    power: Floats
+    edge: int
+    slope: float
+
+    @classmethod
+    def of(cls, measured: Floats, radius: Floats) -> TexturePower:
+        """From the DC slice's mean power (F,), noise taken off."""
+        at = np.rint(radius).astype(int)
+        power = np.bincount(at, weights=measured) / np.maximum(np.bincount(at), 1)
+        power[0] = power[1]
+        power = np.maximum(power, power.max() * 1e-9 + LEAST_NOISE)
+        edge = SIDE // 2 - 1
+        inside = np.arange(2, edge + 1)
+        slope = float(np.polyfit(np.log(inside), np.log(power[inside]), 1)[0])
+        return cls(power, edge, min(slope, -1.0))
+
+    def at(self, radius: Floats) -> Floats:
+        """The power at |f| in bins."""
+        inside = np.interp(np.minimum(radius, self.edge), np.arange(len(self.power)), np.log(self.power))
+        return np.asarray(np.exp(inside) * (np.maximum(radius, self.edge) / self.edge) ** self.slope)
+
+
+def rests_of(
+    frame: FrameModel, spectrum: TexturePower, own: Floats, mean: float, kinds: Sequence[PatchKind] = KINDS
+) -> list[Complexes]:
+    """Covariances (F, A, A) of what is not the band's own detail, one of each kind of patch."""
+    size = len(frame.noise)
+    through = (np.abs(frame.ranges[USUAL].seen) ** 2).mean(axis=(1, 2, 3)) * own
+    plain = np.zeros((len(own), size, size), dtype=np.complex64)
+    each = frame.noise + LEAST_NOISE + _ERROR * through[:, None]
+    each = each + frame.lowest[:, None] * (_MEAN_ERROR * mean * SIDE) ** 2 * np.abs(frame.model.transfers) ** 2
+    plain[:, range(size), range(size)] = each
+    from_beyond = [folded(some, [spectrum.at(frame.radius(one.beyond)) for one in some], size) for some in frame.folds]
+    lonely = (frame.alone @ frame.alone.conj().T).astype(np.complex64) * own.astype(np.float32)[:, None, None]
+    return [
+        plain + np.float32(kind.beyond) * from_beyond[min(kind.range, 1)] + np.float32(kind.alone) * lonely
+        for kind in kinds
+    ]
+
+
+def detail_of(some: DisparityRange, own: Floats) -> Complexes:
+    """(F, A, A) covariance of the band's own detail, of all disparities of a range at once."""
+    flat = some.seen.reshape(len(own), -1, some.seen.shape[3]).transpose(0, 2, 1)
+    waves = flat * np.sqrt(own / flat.shape[2]).astype(np.float32)[:, None, None]
+    return np.asarray(waves @ waves.conj().transpose(0, 2, 1))
+
+
+def wholes_of(
+    frame: FrameModel, own: Floats, rests: list[Complexes], kinds: Sequence[PatchKind] = KINDS
+) -> list[Complexes]:
+    """Covariances (F, A, A) of slices, from those of the rest, one of each kind of patch."""
+    details = {number: detail_of(frame.ranges[number], own) for number in {kind.range for kind in kinds}}
+    # More detail beyond the band than usual: there is as much more in it.
+    return [
+        rest + np.float32(max(1.0, kind.beyond)) * details[kind.range] for rest, kind in zip(rests, kinds, strict=True)
+    ]
+
+
+def likelihoods(wholes: list[Complexes], spectra: Complexes) -> Singles:
+    """(B, F, N) log likelihoods of patches' frequencies whose slices have these covariances (F, A, A)."""
+    found = np.empty((len(wholes), spectra.shape[0], spectra.shape[2]), dtype=np.float32)
+    for whole, one in zip(wholes, found, strict=True):
+        lower = np.linalg.cholesky(whole.astype(np.complex128))
+        white = np.linalg.inv(lower).astype(np.complex64) @ spectra
+        volume = 2 * np.log(np.abs(np.diagonal(lower, axis1=1, axis2=2))).sum(axis=1)
+        one[...] = -(volume[:, None] + (white.real**2 + white.imag**2).sum(axis=1))
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LikelyKinds:
+    """The most probable kind (N,) of each patch `with_parallax` and `at_rest`, and by how many nats `gain` the latter
+    is more probable."""
+
+    with_parallax: NDArray[np.intp]
+    at_rest: NDArray[np.intp]
+    gain: Floats
+
+    @classmethod
+    def of(cls, frame: FrameModel, own: Floats, rests: list[Complexes], spectra: Complexes) -> LikelyKinds:
+        """Of patches (F, A, N) with these `rests_of` their group."""
+        found = likelihoods(wholes_of(frame, own, rests), spectra)
+        nats = np.einsum("f,bfn->bn", frame.weights, found) - np.array([[kind.nats] for kind in KINDS])
+        still = [number for number, kind in enumerate(KINDS) if kind.range == 0]
+        others = [number for number, kind in enumerate(KINDS) if kind.range != 0]
+        best = np.array(others)[nats[others].argmax(axis=0)]
+        at_rest = np.maximum(frame.weights @ _mean_of_odds(found[still]), at_rest_nats(frame, own, rests, spectra))
+        usual = [n for n, kind in enumerate(KINDS) if (kind.range, kind.nats) == (USUAL, 0)]
+        here = np.isin(best, usual)
+        gain = nats[still].max(axis=0) - nats[others].max(axis=0)
+        gain[here] = at_rest[here] - frame.weights @ _mean_of_odds(found[usual][:, :, here])
+        return cls(best, np.array(still)[nats[still].argmax(axis=0)], gain)
+
+    def chosen(self, lean: float) -> NDArray[np.intp]:
+        """(N,) the most probable of `KINDS`, where the frame as a whole leans to no parallax by some nats."""
+        made: NDArray[np.intp] = np.where(self.gain + lean > 0, self.at_rest, self.with_parallax)
+        return made
+
+
+def lean_of(gains: Floats) -> float:
+    """By how many nats a frame leans to no parallax, by the gains of all its patches: what holds for most of a frame
+    is more probable in each of its patches."""
+    return float(np.clip(_LEAN * np.median(gains), -_MOST_LEAN_NATS, _MOST_LEAN_NATS))
+
+
+def at_rest_nats(frame: FrameModel, own: Floats, rests: list[Complexes], spectra: Complexes) -> Floats:
+    """(N,) log likelihoods of patches (F, A, N) without parallax.
+
+    Each slice then holds what is common to all views, and detail that folds in, in an amount of its own at each
+    frequency: a straight edge has far more in one direction than in others, and looks like parallax where one amount
+    is for all.
+    """
+    common = frame.model.common()
+    seen = frame.ranges[0].seen
+    moved = (np.abs(seen - common.astype(np.complex64) * seen[..., :1]) ** 2).mean(axis=(1, 2)) * own[:, None]
+    moved[:, 0] = own
+    base, once = (np.einsum("faa->fa", rest.real) for rest in rests[:2])  # without detail beyond the band, and with it
+    varied = once - base + moved
+    found = np.zeros((len(_USUAL_AMOUNTS), spectra.shape[2]))
+    for number, turn in enumerate(common):
+        left = spectra[:, number] - (np.complex64(turn) * spectra[:, 0] if number else 0)
+        power = left.real**2 + left.imag**2
+        sizes = [(base + amount * varied)[:, number, None].astype(np.float32) for amount in (*_USUAL_AMOUNTS, *_MORE)]
+        nats = [-np.log(size) - power / size for size in sizes]
+        for usual in range(len(found)):
+            each = np.stack([nats[usual], *nats[len(found) :]])
+            found[usual] += frame.weights @ _mean_of_odds(each, 1 - _SELDOM)
+    return np.asarray(found.max(axis=0))
+
+
+def _mean_of_odds(nats: Singles, first: float | None = None) -> Singles:
+    """(F, N) log likelihoods where each frequency may be of any of some kinds (B, F, N): mostly of the first, if
+    `first` says how often."""
+    rest = len(nats) - 1
+    odds = np.full(rest + 1, 1 / (rest + 1)) if first is None else np.array([first] + [(1 - first) / rest] * rest)
+    top = nats.max(axis=0)
+    return np.asarray(top + np.log(np.tensordot(odds.astype(np.float32), np.exp(nats - top), axes=1)))
