@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import struct
+
 import pytest
 
-from dappled.drivers.mavlink import MavlinkMessage, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink, pack
 from dappled.mocks.autopilot.personality import CameraPort, CameraTriggers
 from dappled.refusals import LostTriggers
 from tests.daemon.camera_protocol.test_component import GCS, Rig
@@ -26,11 +28,24 @@ def hear(rig: Rig, messages: list[MavlinkMessage]) -> None:
         rig.hear(message, AUTOPILOT)
 
 
+def fly(rig: Rig, boot_s: float, seconds: float, *, at_hz: float = 10.0) -> None:
+    """Telemetry of an autopilot that was booted `boot_s` ago."""
+    for step in range(round(seconds * at_hz) + 1):
+        boot_ms = round((boot_s + step / at_hz) * 1e3)
+        rig.hear(mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0), AUTOPILOT)
+        rig.tick(1 / at_hz)
+
+
+def named(rig: Rig) -> list[tuple[int, int]]:
+    """The lost triggers that were told so far."""
+    return [(one.first, one.last) for one in rig.lost_triggers]
+
+
 @pytest.mark.parametrize("unix_us", [UNIX_US, 0])
 @pytest.mark.parametrize("own", [0, 1])
 def test_a_trigger_of_one_of_two_wired_cameras_is_one_shot_of_that_camera(own: int, unix_us: int) -> None:
     """ArduPilot reports both cameras at each trigger of one: three triggers were six shots."""
-    rig = rig_of(feedback_is_shot=True, cam_idx=own)
+    rig = rig_of(fires=False, cam_idx=own)
     autopilot = CameraTriggers(cameras=(CameraPort("wire"), CameraPort("wire")))
     for number in range(6):
         rig.clock.advance(1.0)
@@ -56,7 +71,7 @@ def test_the_last_trigger_of_an_earlier_minute_is_no_shot_when_another_camera_is
     for camera in (0, 1):
         autopilot.trigger(BOOT_US, camera=camera)
         autopilot.contact(BOOT_US, camera)
-    rig = rig_of(feedback_is_shot=True)
+    rig = rig_of(fires=False)
     later_us = BOOT_US + 60 * 10**6
     rig.hear(mavlink.MAVLink_attitude_message(later_us // 1000, 0, 0, 0, 0, 0, 0), AUTOPILOT)
     hear(rig, autopilot.trigger(later_us, camera=1) + autopilot.contact(later_us, 1))
@@ -67,7 +82,7 @@ def test_the_last_trigger_of_an_earlier_minute_is_no_shot_when_another_camera_is
 
 def test_a_pins_time_counts_as_now_after_it_has_wrapped() -> None:
     """ArduPilot counts it in 32 bits: 71.6 minutes after the boot it starts again."""
-    rig = rig_of(feedback_is_shot=True)
+    rig = rig_of(fires=False)
     autopilot = CameraTriggers(cameras=(CameraPort("wire", pin=True),))
     late_us = 2**32 + 5_000_000
     rig.hear(mavlink.MAVLink_attitude_message(late_us // 1000, 0, 0, 0, 0, 0, 0), AUTOPILOT)
@@ -110,7 +125,7 @@ def test_px4_that_fires_by_wire_and_commands_too_is_accepted_as_the_same_shot() 
 def test_two_wired_cameras_triggered_together_are_one_shot_of_ours_each_time(
     own: int, gap_s: float, order: tuple[int, int]
 ) -> None:
-    rig = rig_of(feedback_is_shot=True, cam_idx=own)
+    rig = rig_of(fires=False, cam_idx=own)
     autopilot = CameraTriggers(cameras=(CameraPort("wire", pin=True), CameraPort("wire", pin=True)))
     for number in range(6):
         rig.clock.advance(gap_s)
@@ -128,7 +143,7 @@ def test_what_another_camera_repeats_before_any_clock_is_known_is_no_shot(unix_u
     autopilot = CameraTriggers(cameras=(CameraPort("wire"), CameraPort("wire")))
     for number in range(5):
         autopilot.trigger(BOOT_US + number * 10**6, unix_us and unix_us + number * 10**6, camera=0)
-    rig = rig_of(feedback_is_shot=True)
+    rig = rig_of(fires=False)
     for number in range(60, 63):
         rig.clock.advance(1)
         hear(rig, autopilot.trigger(BOOT_US + number * 10**6, unix_us and unix_us + number * 10**6, camera=1))
@@ -140,19 +155,18 @@ def test_what_another_camera_repeats_before_any_clock_is_known_is_no_shot(unix_u
 
 
 def test_an_autopilot_without_time_that_starts_again_begins_its_numbers_again() -> None:
-    """The first of its messages is lost: the second may be a repeated one and is told, the third is a shot."""
-    rig = rig_of(feedback_is_shot=True)
-    for missed in (0, 1):
+    """The first of its messages is lost: the second may be a repeated one and is told with it, the third is a shot."""
+    rig = rig_of(fires=False)
+    for missed, boot_s in ((0, 300.0), (1, 3.0)):
         autopilot = CameraTriggers(cameras=(CameraPort("wire"),))
-        rig.hear(mavlink.MAVLink_attitude_message(BOOT_US // 1000, 0, 0, 0, 0, 0, 0), AUTOPILOT)
+        fly(rig, boot_s, 1.0)
         for number in range(3):
             rig.clock.advance(1)
             messages = autopilot.trigger(BOOT_US + number * 10**6)
             hear(rig, messages if number >= missed else [])
-        rig.hear(mavlink.MAVLink_attitude_message(BOOT_US // 1000 + 60_000, 0, 0, 0, 0, 0, 0), AUTOPILOT)
     rig.tick(4)
     assert len(rig.fired) == 4
-    assert [(one.first, one.last) for one in rig.lost_triggers] == [(2, 2)]
+    assert named(rig) == [(1, 2)]
 
 
 @pytest.mark.parametrize("personality", ["ardupilot", "px4"])
@@ -212,8 +226,7 @@ def test_each_trigger_that_was_lost_on_the_link_is_named(
         hear(rig, [m for m in messages if number not in lost or (what != "all" and m.get_type() != what)])
     rig.tick(3)
     said += "".join(m.text for m in rig.of("STATUSTEXT"))
-    named = {number for one in rig.lost_triggers for number in range(one.first, one.last + 1)}
-    assert named == set(lost)
+    assert {number for first, last in named(rig) for number in range(first, last + 1)} == set(lost)
     assert len(rig.fired) == 12 - len(lost)
     assert sum(one.count for one in rig.lost_triggers) == len(lost)
     assert ("lost: the autopilot's trigger" in said) == bool(lost)
@@ -242,9 +255,228 @@ def test_messages_that_are_lost_out_of_order_or_start_again_are_no_lost_triggers
     for number in (0, 1, 3, 2, 4, 5):
         rig.tick(0.5)
         hear(rig, sent[number])
-    rig.hear(mavlink.MAVLink_attitude_message(300_000, 0, 0, 0, 0, 0, 0), AUTOPILOT)
-    rig.hear(mavlink.MAVLink_attitude_message(1000, 0, 0, 0, 0, 0, 0), AUTOPILOT)
-    rig.tick(1.0)
+    fly(rig, 300.0, 1.0)
+    fly(rig, 1.0, 1.0)
     hear(rig, CameraTriggers().trigger(10**6, UNIX_US + 20 * 10**6))
     rig.tick(5)
     assert (rig.lost_triggers, len(rig.fired)) == ([], 7)
+
+
+def asked(number: int) -> MavlinkMessage:
+    """ArduPilot's request to CAM1."""
+    return mavlink.MAVLink_command_long_message(1, 100, 2000, 0, 0, 0, 1, number, 0, 0, 0)
+
+
+@pytest.mark.parametrize("next_number", [266, 267, 900, 65_000])
+def test_a_jump_of_however_many_numbers_is_told_as_lost(next_number: int) -> None:
+    """52 s without a link at 5 Hz: 256 lost, and the books agreed."""
+    rig = rig_of(capacity=1000)
+    for number in (*range(1, 11), next_number):
+        rig.clock.advance(1)
+        hear(rig, [asked(number)])
+    rig.tick(3)
+    assert named(rig) == [(11, next_number - 1)]
+    (lost,) = rig.lost_triggers
+    assert LostTriggers.of_text(lost.text()) == lost
+    assert ("or its counter was set" in lost.where) == (next_number > 266)
+
+
+def test_one_wrong_number_between_right_ones_is_no_loss() -> None:
+    rig = rig_of(capacity=1000)
+    for number in (*range(1, 11), 5000, 11, 12, 13):
+        rig.clock.advance(0.5)
+        hear(rig, [asked(number)])
+    rig.tick(3)
+    assert named(rig) == []
+
+
+def test_a_number_that_comes_late_over_a_second_link_is_not_part_of_a_jump() -> None:
+    rig = rig_of(capacity=1000)
+    for number in (1, 2, 500, 498, 499):
+        rig.clock.advance(0.2)
+        hear(rig, [asked(number)])
+    rig.tick(3)
+    assert named(rig) == [(3, 497)]
+
+
+def test_losses_of_the_last_seconds_are_told_when_the_flight_ends() -> None:
+    rig = rig_of(capacity=1000)
+    for number in (9, 10, 14):
+        rig.clock.advance(0.5)
+        hear(rig, [asked(number)])
+    rig.tick(0.1)
+    assert named(rig) == []
+    rig.component.finish()
+    rig.component.finish()
+    assert named(rig) == [(11, 13)]
+    assert any("triggers 11 to 13" in m.text for m in rig.of("STATUSTEXT"))
+
+
+def test_losses_around_a_restart_of_the_autopilot_are_told() -> None:
+    """Those that were still waited for, and the first ones after it: it counts from 1 again."""
+    rig = rig_of(capacity=1000)
+    fly(rig, 300.0, 0.5)
+    for number in (9, 10, 14):
+        rig.clock.advance(0.1)
+        hear(rig, [asked(number)])
+    fly(rig, 2.0, 0.7)
+    rig.clock.advance(1)
+    hear(rig, [asked(3)])
+    rig.tick(3)
+    assert named(rig)[0] == (11, 13)
+    assert {number for first, last in named(rig)[1:] for number in range(first, last + 1)} >= {1, 2}
+
+
+def test_a_trigger_between_a_restart_and_its_proof_is_not_forgotten() -> None:
+    rig = rig_of(capacity=100)
+    fly(rig, 300.0, 0.5)
+    first, second = CameraTriggers(), CameraTriggers()
+    for number in range(4):
+        rig.tick(1)
+        hear(rig, first.trigger(BOOT_US + number * 10**6, UNIX_US + number * 10**6))
+    fly(rig, 1.0, 0.2)
+    hear(rig, second.trigger(10**6, UNIX_US + 20 * 10**6))
+    fly(rig, 1.4, 0.8)
+    hear(rig, second.trigger(3 * 10**6, UNIX_US + 22 * 10**6))
+    rig.tick(4)
+    assert (named(rig), len(rig.fired)) == ([], 6)
+
+
+@pytest.mark.parametrize("trusted", [True, False])
+@pytest.mark.parametrize("late_s", [6.0, 290.0, -4000.0])
+def test_a_packet_with_another_time_is_no_restart(late_s: float, trusted: bool) -> None:
+    """A late copy on a slow second link, a wrong time, or anybody's packet on an unsigned link: the books stay, and
+    an exposure is a shot."""
+    rig = rig_of(fires=False, capacity=100)
+    autopilot = CameraTriggers(cameras=(CameraPort("wire", pin=True),))
+    for number in range(8):
+        fly(rig, 300.0 + number, 0.9)
+        if number == 5:
+            continue
+        rig.trusted = trusted
+        for copy in range(1 if trusted else 20):
+            old_ms = round((300.0 + number - late_s) * 1e3) + copy * 50
+            rig.hear(mavlink.MAVLink_attitude_message(old_ms, 0, 0, 0, 0, 0, 0), AUTOPILOT)
+            rig.clock.advance(0 if trusted else 0.05)
+        rig.trusted = True
+        at_us = round((300.9 + number) * 1e6)
+        hear(rig, autopilot.trigger(at_us) + autopilot.contact(at_us))
+        if number == 4:
+            autopilot.trigger(at_us)
+    rig.tick(4)
+    assert len(rig.fired) == 7
+    assert (named(rig), rig.autopilot.restarts) == ([(6, 6)], 0)
+
+
+def test_old_packets_alone_are_no_restart_when_the_fast_link_has_died() -> None:
+    rig = rig_of(fires=False, capacity=100)
+    fly(rig, 300.0, 1.0)
+    fly(rig, 294.0, 8.0)
+    assert rig.autopilot.restarts == 0
+    fly(rig, 2.0, 0.8)
+    assert rig.autopilot.restarts == 1
+
+
+@pytest.mark.parametrize("on_gimbal", [True, False])
+def test_a_gimbals_attitude_is_requested_where_the_camera_hangs_on_it_until_it_comes(on_gimbal: bool) -> None:
+    """ArduPilot sends 285 to a companion's port only on request."""
+    rig = rig_of(on_gimbal=on_gimbal)
+
+    def wanted() -> set[int]:
+        return {round(m.param1) for m in rig.of("COMMAND_LONG") if m.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
+
+    number = mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS
+    assert (number in wanted()) == on_gimbal
+    assert mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION in wanted()
+    for step in range(100):
+        status = mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, step * 50, 0, [1, 0, 0, 0], 0, 0, 0, 0)
+        rig.hear(status, (1, 154))
+    rig.tick(5)
+    assert number not in wanted()
+    rig.tick(5)
+    assert (number in wanted()) == on_gimbal
+
+
+def test_a_request_for_the_time_is_for_the_autopilot_alone() -> None:
+    """One for all components was forwarded to the ground station's radio."""
+    rig = rig_of()
+    (request,) = rig.of("TIMESYNC")
+    packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=100)
+    raw = pack(request, packer, version_1=False)
+    assert raw[10:-2] == struct.pack("<qqBB", 0, request.ts1, 1, 1)
+    heard, old_heard = PacketParser()(raw), PacketParser()(pack(request, packer, version_1=True))
+    assert heard is not None
+    assert (heard.get_type(), heard.tc1, heard.ts1) == ("TIMESYNC", 0, request.ts1)
+    assert old_heard is not None
+    assert (old_heard.ts1, len(old_heard.get_payload())) == (request.ts1, 16)
+
+
+def test_a_request_for_the_time_is_the_same_where_the_dialect_has_its_target(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the fields of the extension in pymavlink the packing raised, and the link's task failed."""
+    (request,) = rig_of().of("TIMESYNC")
+    packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=100)
+    monkeypatch.setattr(mavlink.MAVLink_timesync_message, "unpacker", struct.Struct("<qqBB"))
+    assert pack(request, packer, version_1=False)[10:-2] == struct.pack("<qqBB", 0, request.ts1, 1, 1)
+    assert pack(request, packer, version_1=True)[6:-2] == struct.pack("<qq", 0, request.ts1)
+
+
+def px4_rig(**options: object) -> Rig:
+    rig = Rig(capacity=100, **options)  # type: ignore[arg-type]  # as the rig takes them
+    rig.hear(mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3), AUTOPILOT)
+    rig.tick(4)
+    return rig
+
+
+@pytest.mark.parametrize(("sender", "after_s"), [(AUTOPILOT, 600.0), ((9, 1), 1.0)])
+def test_old_shots_without_a_number_and_those_of_others_cover_no_loss(sender: tuple[int, int], after_s: float) -> None:
+    """Items of a mission, or another vehicle's, became shots; then triggers were lost, and the books balanced."""
+    rig, px4 = px4_rig(), CameraTriggers("px4")
+    hear(rig, px4.trigger(BOOT_US))
+    for number in range(3):
+        rig.tick(3.0)
+        seven = (0, 0, 1, number + 50, 0, 0, 0)
+        asked = mavlink.MAVLink_command_long_message(1, 100, mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, *seven)
+        rig.hear(asked, sender)
+    assert len(rig.fired) == 4
+    rig.tick(after_s)
+    for number in range(4):
+        rig.tick(1.0)
+        messages = px4.trigger(BOOT_US + number * 10**6)
+        hear(rig, messages if number == 3 else [])
+    rig.tick(5)
+    assert sum(one.count for one in rig.lost_triggers) == 3
+
+
+def test_a_shot_that_could_not_be_fired_is_not_told_as_a_lost_trigger(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, px4 = px4_rig(fires=False), CameraTriggers("px4", (CameraPort("wire"),))
+
+    def fails(shot: object) -> None:
+        raise OSError("the disk is gone")
+
+    for number in range(4):
+        rig.tick(1.0)
+        messages = px4.trigger(BOOT_US + number * 10**6)
+        if number != 2:
+            hear(rig, messages)
+            continue
+        with monkeypatch.context() as broken:
+            broken.setattr(rig.sink, "fire", fails)
+            with pytest.raises(OSError, match="the disk is gone"):
+                hear(rig, messages)
+    rig.tick(5)
+    assert rig.lost_triggers == []
+
+
+def test_a_list_of_photographs_that_always_asks_for_the_first_one_ends() -> None:
+    """MAVSDK through ArduPilot: p2 = 0 without end, 60 times in 30 s."""
+    rig = rig_of()
+    told: list[int] = []
+    for _ in range(6):
+        assert rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 263, 0.0) == mavlink.MAV_RESULT_ACCEPTED
+        rig.tick(0.5)
+        told += [m.image_index for m in rig.of("CAMERA_IMAGE_CAPTURED")]
+    assert told == [0, 1, 0, 2, 0, 3, 0, 4, 0, 0]
+    rig.tick(11)
+    assert rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 263, 0.0) == mavlink.MAV_RESULT_ACCEPTED
+    rig.tick(0.5)
+    assert [m.image_index for m in rig.of("CAMERA_IMAGE_CAPTURED")] == [0]

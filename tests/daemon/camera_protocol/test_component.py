@@ -53,11 +53,11 @@ class Rig:
     def __init__(
         self,
         *,
-        feedback_is_shot: bool = False,
         capacity: int = 8,
         earlier: EarlierOutcomes | None = None,
         cam_idx: int = 0,
         fires: bool = True,
+        on_gimbal: bool = False,
     ) -> None:
         self.body = Body()
         self.decode = "on"
@@ -66,13 +66,15 @@ class Rig:
         self.copies = 1
         self.trusted = True
         self.sent: list[MavlinkMessage] = []
+        self.sent_on: list[int | None] = []  # None: on all links
+        self.without: list[int | None] = []
         self.lost_triggers: list[LostTriggers] = []
         self.well, self.critical = True, False
         self.clock = RecordedClock(10**18, 10**18 - 10**9)
         self.sink = FakeSink()
         self.shutter = Shutter(self.sink, self.clock, next_index=5, capacity=capacity, fires=fires)
         parameters = Parameters(self.body, (self,))
-        self.autopilot = OwnAutopilot(self, self.clock)
+        self.autopilot = OwnAutopilot(self, self.clock, on_gimbal=on_gimbal)
         self.component = Component(
             self,
             self.autopilot,
@@ -81,7 +83,6 @@ class Rig:
             parameters,
             model=self,
             earlier=earlier or NothingEarlier(),
-            feedback_is_shot=feedback_is_shot,
             cam_idx=cam_idx,
         )
 
@@ -116,8 +117,10 @@ class Rig:
         assert name == "LF_DECODE"
         self.decode = value
 
-    def send(self, message: MavlinkMessage, link: int | None = None) -> bool:
+    def send(self, message: MavlinkMessage, link: int | None = None, *, without: int | None = None) -> bool:
         self.sent.append(message)
+        self.sent_on.append(link)
+        self.without.append(without)
         return True
 
     def of(self, kind: str) -> list[MavlinkMessage]:
@@ -467,7 +470,7 @@ def test_an_unsigned_heartbeat_does_not_decide_whose_camera_this_is(late_s: floa
 
 @pytest.mark.parametrize("counts", [True, False])
 def test_feedback_is_a_shot_only_where_the_autopilot_fires(counts: bool) -> None:
-    rig = Rig(feedback_is_shot=counts)
+    rig = Rig(fires=not counts)
     rig.tick(4)
     feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
     rig.hear(feedback, AUTOPILOT)
@@ -476,8 +479,8 @@ def test_feedback_is_a_shot_only_where_the_autopilot_fires(counts: bool) -> None
 
 
 def test_the_echo_of_an_order_is_no_wish_and_the_next_trigger_is_one() -> None:
-    rig = Rig(feedback_is_shot=True)
-    rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), AUTOPILOT)
+    rig = Rig()
+    rig.hear(mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3), AUTOPILOT)
     rig.tick(4)
     fire = mavlink.MAVLink_command_long_message(0, 0, mavlink.MAV_CMD_DO_DIGICAM_CONTROL, 0, 0, 0, 0, 0, 1, 0, 0)
     feedback = mavlink.MAVLink_camera_feedback_message(1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
@@ -488,12 +491,14 @@ def test_the_echo_of_an_order_is_no_wish_and_the_next_trigger_is_one() -> None:
             rig.hear(message, AUTOPILOT)
         rig.clock.advance(0.5)
     assert rig.fired == []
-    rig.hear(mavlink.MAVLink_camera_trigger_message(9, 9), AUTOPILOT)
+    rig.hear(mavlink.MAVLink_camera_trigger_message(9, 2), AUTOPILOT)
     assert rig.fired == [5]
     rig.autopilot.command(mavlink.MAV_CMD_DO_DIGICAM_CONTROL, (0, 0, 0, 0, 1))
     rig.clock.advance(2.1)
-    rig.hear(mavlink.MAVLink_camera_trigger_message(10, 10), AUTOPILOT)
+    rig.hear(mavlink.MAVLink_camera_trigger_message(10, 3), AUTOPILOT)
     assert rig.fired == [5, 6]
+    rig.tick(3)
+    assert rig.lost_triggers == []
 
 
 def test_zoom_and_focus_by_hand_are_refused_in_words() -> None:

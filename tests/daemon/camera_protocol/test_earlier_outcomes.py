@@ -109,7 +109,7 @@ def test_a_report_that_no_link_takes_is_made_later(tmp_path: Path, monkeypatch: 
     after, rig = restarted(tmp_path, 60)
     rig.tick(4)
     with monkeypatch.context() as down:
-        down.setattr(rig, "send", lambda message, link=None: False)
+        down.setattr(rig, "send", lambda message, link=None, without=(): False)
         hear_out(rig, 1)
     assert [index for index, _, _ in reported(hear_out(rig, 2))] == [1, 2, 3, 4]
     after.close()

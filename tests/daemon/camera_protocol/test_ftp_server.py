@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import struct
+import time
+from collections import deque
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pymavlink import mavftp
 
 from dappled.daemon.camera_protocol.ftp_server import FtpServer
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
@@ -151,3 +155,48 @@ def test_no_bytes_crash_it_or_make_it_hold_more(payloads: list[bytes]) -> None:
     for payload in payloads:
         assert len(client.send(payload)) <= 32
     assert len(client.server._sessions) <= 8
+
+
+class Link:
+    """What pymavlink's client takes for a connection: packets go to a server and its answers come back. Answers whose
+    number is in `lost` do not arrive."""
+
+    source_system, source_component = 255, 190
+
+    def __init__(self, server: FtpServer, lost: set[int]) -> None:
+        self.server, self.lost, self.number = server, lost, 0
+        self.waiting: deque[MavlinkMessage] = deque()
+        self.packer = mavlink.MAVLink(None, srcSystem=self.source_system, srcComponent=self.source_component)
+        self.mav = self
+
+    def file_transfer_protocol_send(self, network: int, system: int, component: int, payload: bytearray) -> None:
+        message = mavlink.MAVLink_file_transfer_protocol_message(network, system, component, list(payload))
+        heard: MavlinkMessage = mavlink.MAVLink(None).decode(bytearray(message.pack(self.packer)))
+        for reply in self.server.answer(heard, time.monotonic_ns()):
+            self.number += 1
+            if self.number not in self.lost:
+                back = reply.pack(mavlink.MAVLink(None, srcSystem=system, srcComponent=component))
+                self.waiting.append(mavlink.MAVLink(None).decode(bytearray(back)))
+
+    def recv_match(self, **_: object) -> MavlinkMessage | None:
+        if self.waiting:
+            return self.waiting.popleft()
+        time.sleep(0.002)  # as a connection waits for packets
+        return None
+
+
+@pytest.mark.parametrize("lost", [set(), {2, 9, 10, 30}])
+def test_pymavlink_s_client_reads_a_file(tmp_path: Path, lost: set[int]) -> None:
+    """Listing, checksum, and the whole file in bursts, also where answers are lost."""
+    link = Link(FtpServer(Files()), set())
+    client = mavftp.MAVFTP(link, 1, 100)
+    client.ftp_settings.retry_time = client.ftp_settings.read_retry_time = 0.2
+    client.ftp_settings.idle_detection_time = 1.0
+    assert client.cmd_list(["/"]).error_code == 0
+    assert [(one.name, one.size_b) for one in client.list_result] == [("camera.xml", len(DATA))]
+    assert client.cmd_crc(["camera.xml"]).error_code == 0
+    link.lost = {link.number + one for one in lost}
+    assert client.cmd_get(["camera.xml", str(tmp_path / "got.xml")]).error_code == 0
+    assert client.process_ftp_reply("OpenFileRO", timeout=20).error_code == 0
+    assert (tmp_path / "got.xml").read_bytes() == DATA
+    assert link.number > len(DATA) / 239

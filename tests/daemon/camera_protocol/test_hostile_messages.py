@@ -305,7 +305,9 @@ def test_a_client_that_dies_in_the_middle_of_a_packet_leaves_the_camera_to_the_n
         assert camera.failures() == 0
 
 
-@pytest.mark.parametrize("seconds", [3, pytest.param(60, marks=[pytest.mark.slow, pytest.mark.timeout(180)])])
+@pytest.mark.parametrize(
+    "seconds", [3, pytest.param(60, marks=[pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(180)])]
+)
 def test_five_thousand_messages_a_second_drown_no_wish_and_fill_no_memory(seconds: int) -> None:
     with Camera() as camera, Peer(camera.links.port(0)) as gcs:
         gcs.heartbeat()

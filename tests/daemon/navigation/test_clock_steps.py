@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import random
+from dataclasses import replace
 
 import pytest
 
@@ -22,8 +24,8 @@ LATENCY = BodyLatency(0.0, 1.0, "latency")
 class Vehicle:
     """Flies north at 10 m/s. Its telemetry comes at 10 Hz after 3 ms; it answers TIMESYNC at 5 Hz after 4 ms."""
 
-    def __init__(self, *, answers: bool = True) -> None:
-        self.telemetry, self.answers, self.number = Telemetry(), answers, 0
+    def __init__(self, *, answers: bool = True, rules: int = clocks.TAGGING_RULES) -> None:
+        self.telemetry, self.answers, self.number = Telemetry(rules=rules), answers, 0
 
     def feed(self, utc_ns: int, message: MavlinkMessage, component: int = 1) -> None:
         message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=component))
@@ -55,6 +57,38 @@ class Vehicle:
         assert pose.position_sigma_m is not None
         truth_rad = math.radians(LATITUDE_DEG) + SPEED_M_S * t_s / NORTH_M
         return better.source, pose, abs(pose.latitude_rad - truth_rad) * NORTH_M / pose.position_sigma_m
+
+
+@pytest.mark.parametrize("by_s", [0.12, 0.4, 1.5])
+def test_a_step_ahead_without_answers_to_timesync_is_seen_as_well(by_s: float) -> None:
+    """Telemetry that comes all at once sooner: an exposure before it was placed by it, some metres off, in no doubt."""
+    vehicle = Vehicle(answers=False)
+    vehicle.fly(BootTime(drift=20e-6, jumps=((20.05, by_s),)), 0, 30)
+    for t_s in (10.0, 15.37, 19.0, 19.85, 21.0, 22.5, 29.3):
+        source, pose, sigmas = vehicle.locate(t_s)
+        assert (pose.source, "in doubt" in source, sigmas < 1.2) == ("interpolated", False, True), t_s
+    source, pose, sigmas = vehicle.locate(20.07)
+    assert (pose.source, "in doubt" in source, sigmas < 1.2) == ("nearest", True, True)
+    assert "stepped by -" in str(vehicle.telemetry.clock_problem(START_NS + 30 * 10**9))
+
+
+@pytest.mark.parametrize("late_s", [0.05, 0.3, 2.0])
+def test_telemetry_that_was_late_for_a_while_is_no_step(late_s: float) -> None:
+    """A link stalls and then brings everything at once; before that, at the start, it was buffered."""
+    vehicle, boot = Vehicle(answers=False), BootTime(drift=20e-6)
+    rng = random.Random(5)  # noqa: S311  a simulation
+    receive = vehicle.feed
+    stalls_s = ((0.0, late_s), (10.0, 10.0 + late_s), (14.0, 14.0 + late_s / 3))
+
+    def late(utc_ns: int, message: MavlinkMessage, component: int = 1) -> None:
+        t_s = (utc_ns - START_NS) / 1e9
+        until_s = max([end for begin, end in stalls_s if begin <= t_s < end], default=t_s)
+        receive(START_NS + round((until_s + rng.expovariate(1 / 0.004)) * 1e9), message, component)
+
+    vehicle.feed = late  # type: ignore[method-assign]  # the link between
+    vehicle.fly(boot, 0, 30)
+    assert vehicle.telemetry.clock_problem(START_NS + 30 * 10**9) is None
+    assert vehicle.locate(25.0)[2] < 1.2
 
 
 @pytest.mark.parametrize("by_s", [0.12, 0.4, -0.12, -0.4, 1.5])
@@ -144,3 +178,88 @@ def test_packets_that_all_come_later_widen_the_clock_of_arrivals() -> None:
     assert after is not None
     assert before.sigma_ns < 6 * MS
     assert 300 * MS <= after.sigma_ns < 310 * MS
+
+
+def test_a_hot_shoe_beside_steps_has_a_pose_as_wide_as_the_largest() -> None:
+    """Its time is exact, but the samples around it may be from before or after a step: errors were up to 17 sigma."""
+    boot = BootTime(drift=0.0, jumps=((14.05, 0.3), (20.05, 0.4)))
+    vehicle = Vehicle()
+    vehicle.fly(boot, 0, 20)
+    contact = mavlink.MAVLink_camera_feedback_message(boot.ns(20.01) // 1000, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1)
+    vehicle.feed(START_NS + 20_012 * MS, contact)
+    vehicle.fly(boot, 20, 25)
+    trigger = clocks.TriggerMessage("CAMERA_FEEDBACK", 1, START_NS + 20_012 * MS, LATENCY)
+    exposure = replace(clocks.mid_exposure(START_NS + 20_012 * MS, LATENCY, None), trigger=trigger)
+    better, pose = vehicle.telemetry.locate(exposure)
+    assert better.source.startswith("hot shoe (CAMERA_FEEDBACK); in doubt: the autopilot's clock stepped 2 times")
+    assert pose.position_sigma_m is not None
+    assert pose.position_sigma_m >= 0.4 * SPEED_M_S
+
+
+@pytest.mark.parametrize(("gap_s", "by_s"), [(11, 0.3), (11, 15.0), (60, -0.3), (100, -0.3)])
+def test_a_step_in_a_silence_of_timesync_is_seen(gap_s: float, by_s: float) -> None:
+    """A simulator that was halted. Nothing was compared: poses were 0.3 and 15 s wrong with a sigma of 7 and 30 ms."""
+    boot = BootTime(drift=0.0, jumps=((30.0, by_s),))
+    vehicle = Vehicle()
+    vehicle.fly(boot, 0, 20)
+    vehicle.fly(boot, 20 + gap_s, 30 + gap_s)
+    for t_s in (15.0, 22.0 + gap_s + max(0.0, -by_s), 29.0 + gap_s):
+        source, pose, sigmas = vehicle.locate(t_s)
+        assert (pose.source, "in doubt" in source) == ("interpolated", False), t_s
+        assert sigmas < 1, t_s
+    for t_s in (20.5, 25.0, 19.5 + gap_s):  # also more than ten seconds from the first answer after the step
+        better, pose = vehicle.telemetry.locate(clocks.mid_exposure(START_NS + round(t_s * 1e9), LATENCY, None))
+        assert pose.source != "interpolated", t_s
+        assert f"in doubt: the autopilot's clock stepped by {abs(by_s):.3f} s" in better.source, t_s
+
+
+def test_beside_steps_no_shot_gets_the_next_ones_contact() -> None:
+    """Tagged 2.2 s late at one shot a second: the time was 1 s wrong, the pose interpolated, 10 m off with 2 cm."""
+    boot = BootTime(drift=0.0, jumps=((30.0, 0.3), (35.0, -0.3)))
+    vehicle = Vehicle()
+    for at in range(10, 50):
+        vehicle.fly(boot, at, at + 0.4)
+        contact = mavlink.MAVLink_camera_feedback_message(
+            boot.ns(at + 0.36) // 1000, 0, 0, at, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1
+        )
+        vehicle.feed(START_NS + at * 10**9 + 370 * MS, contact)
+        vehicle.fly(boot, at + 0.4, at + 1)
+    for at in range(20, 46):
+        called_ns, truth_ns = START_NS + at * 10**9 + 300 * MS, START_NS + at * 10**9 + 360 * MS
+        better, pose = vehicle.telemetry.locate(clocks.mid_exposure(called_ns, BodyLatency(60.0, 15.0, "body"), None))
+        assert abs(better.utc_ns - truth_ns) < 100 * MS, at
+        assert pose.boot_us is not None
+        assert pose.source != "interpolated" or abs(pose.boot_us * 1000 - boot.ns(at + 0.36)) < 5 * MS, at
+
+
+@pytest.mark.parametrize("boot_ns", [-(2**63), -(2**62), -(10**9), 2**62, 2**63 - 10**9])
+def test_an_absurd_answer_to_timesync_is_none(boot_ns: int) -> None:
+    """Before the first position: sums of such times do not fit 64 bits, and no frame had a tag for two minutes."""
+    vehicle = Vehicle()
+    vehicle.feed(START_NS, mavlink.MAVLink_system_time_message(0, 5))
+    for step in range(5):
+        sent_ns = START_NS + step * 200 * MS
+        vehicle.feed(sent_ns, mavlink.MAVLink_timesync_message(0, sent_ns), component=100)
+        vehicle.feed(sent_ns + 4 * MS, mavlink.MAVLink_timesync_message(boot_ns + step * 200 * MS, sent_ns))
+    assert vehicle.telemetry.pose_at(START_NS + 10**9, 0.0).source == "none"
+    assert vehicle.telemetry.utc_correction() is None
+    assert vehicle.telemetry.boot_clock() is None
+
+
+@pytest.mark.parametrize("rules", [1, 2])
+def test_odometry_changes_nothing_in_old_flights(rules: int) -> None:
+    """They were pruned at packets that counted then; a window that reaches back further would lose others."""
+    found = []
+    for kind in (mavlink.MAVLink_odometry_message, None):
+        vehicle = Vehicle(rules=rules)
+        vehicle.fly(BootTime(drift=0.0), 0, 20)
+        vehicle.number = 200  # before the packet at which old samples are forgotten next
+        vehicle.fly(BootTime(drift=0.0), 20, 20.1)
+        vehicle.number = 1000
+        if kind is not None:
+            fixed = (1, 1, 12, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0)
+            vehicle.feed(START_NS + 300 * 10**9, kind(*fixed, [math.nan] * 21, [math.nan] * 21))
+        vehicle.number = 1001
+        found.append(vehicle.telemetry.pose_at(START_NS + 15 * 10**9, 0.0, upto_packet=1000))
+    assert found[0] == found[1]
+    assert found[0].source == "interpolated"

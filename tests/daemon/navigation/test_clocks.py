@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from dappled.daemon.navigation import BodyLatency, BootClock, CameraClock, ExposureTime, Telemetry, clocks
-from dappled.daemon.navigation.clocks import Feedback, camera_time, exposure_from_camera, mid_exposure
+from dappled.daemon.navigation.clocks import TriggerMessage, camera_time, exposure_from_camera, mid_exposure
+from dappled.daemon.navigation.samples import Feedback
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath
@@ -20,9 +21,9 @@ CLOCK = BootClock("timesync", 0, START_NS, 0.0, 0.3 * MS)
 EXPECTED = mid_exposure(START_NS + 10**9, BodyLatency(60.0, 10.0, "latency"), 0.002)
 
 
-def event(after_call_ms: float, number: int = 0) -> Feedback:
+def event(after_call_ms: float, number: int = 0, image: int = 0) -> Feedback:
     boot_ns = 10**9 + round(after_call_ms * MS)
-    return Feedback(number, START_NS + boot_ns, boot_ns, "CAMERA_FEEDBACK")
+    return Feedback(number, START_NS + boot_ns, boot_ns, "CAMERA_FEEDBACK", image)
 
 
 def test_the_contact_is_taken_and_half_the_exposure_added() -> None:
@@ -43,9 +44,21 @@ def test_the_word_for_a_mere_wish_is_not_taken(after_call_ms: float) -> None:
 
 def test_what_is_far_off_or_of_two_minds_is_not_taken() -> None:
     assert clocks.choose_feedback([event(152)], EXPECTED, CLOCK) is None
-    assert clocks.choose_feedback([event(50), event(71, 1)], EXPECTED, CLOCK) is None
+    assert clocks.choose_feedback([event(50), event(71, 1, image=1)], EXPECTED, CLOCK) is None
     assert clocks.choose_feedback([event(55), event(55, 1)], EXPECTED, CLOCK) == event(55)  # the same, on a second link
     assert clocks.choose_feedback([event(55)], ExposureTime(EXPECTED.utc_ns, 10 * MS, "given"), CLOCK) is None
+
+
+@pytest.mark.parametrize("contact_ms", [45, 58, 75])
+def test_a_contact_that_bounces_is_its_first_one_by_the_rules_of_new_flights(contact_ms: int) -> None:
+    """The second one was taken where it was nearer to the expected time: 15 ms wrong with a sigma of 1 ms."""
+    bounced = [event(contact_ms + 15, 0, 7), event(contact_ms, 1, 7), event(contact_ms + 31, 2, 7)]
+    assert clocks.choose_feedback(bounced, EXPECTED, CLOCK) == bounced[1]
+    trigger = TriggerMessage("CAMERA_FEEDBACK", 7, START_NS + 10**9 + 60 * MS, BodyLatency(60.0, 10.0, "latency"))
+    repeated = event(contact_ms - 500, 3, 7)  # another camera's report repeated the contact before, with this number
+    assert clocks.own_feedback([*bounced, repeated], trigger) == bounced[1]
+    assert clocks.own_feedback(bounced, trigger, rules=2) == bounced[2]
+    assert clocks.choose_feedback([event(48, 0, 7), event(63, 1, 7)], EXPECTED, CLOCK, rules=2) == event(63, 1, 7)
 
 
 @pytest.mark.parametrize("latency_ms", [-25, 0, 25])
@@ -58,6 +71,23 @@ def test_at_five_a_second_a_lost_contact_is_not_replaced_by_the_next_shots(laten
     assert clocks.choose_feedback([before, own, after], expected, CLOCK) == own
     doubled = event(60 + latency_ms, 3)
     assert clocks.choose_feedback([before, own, doubled, after], expected, CLOCK) == own
+
+
+@pytest.mark.parametrize("sigma_ms", [21, 30, 60])
+@pytest.mark.parametrize("spacing_ms", [200, 250])
+def test_a_wide_clock_takes_no_other_shots_contact(sigma_ms: int, spacing_ms: int) -> None:
+    """The own contact could not be told from the call, and was left out: the next shot's was then the nearest."""
+    expected = mid_exposure(START_NS + 10**9, BodyLatency(60.0, 30.0, "latency"), 0.002)
+    wide = BootClock("arrival", 0, START_NS, 0.0, sigma_ms * MS)
+    contacts = [event(60 + spacing_ms * number, number, number) for number in range(5)]
+    assert clocks.choose_feedback(contacts, expected, wide) is None
+    assert (sigma_ms, spacing_ms) != (21, 200) or clocks.choose_feedback(contacts, expected, wide, rules=2)
+
+
+def test_by_a_clock_in_doubt_no_contact_is_chosen() -> None:
+    stepped = BootClock("timesync", 0, START_NS, 0.0, 0.3 * MS, "the autopilot's clock stepped by 0.300 s")
+    assert clocks.choose_feedback([event(55)], EXPECTED, stepped) is None
+    assert clocks.choose_feedback([event(55)], EXPECTED, stepped, rules=2) == event(55)
 
 
 def made(message: MavlinkMessage, component: int = 1) -> MavlinkMessage:

@@ -118,10 +118,14 @@ def test_an_old_word_of_the_receiver_is_none() -> None:
 
 
 def test_the_autopilots_own_attitude_accuracy_counts() -> None:
-    told, silent, configured = Link(), Link(), Link(attitude_sigma_rad=0.02)
+    told, silent, configured, px4 = Link(), Link(), Link(attitude_sigma_rad=0.02), Link(attitude_sigma_rad=0.02)
+    poses = [math.nan] * 15 + [0.0004, 0, 0, 0.0004, 0, 0.0008]
     covariance = [0.0001, 0, 0, 0, 0.0001, 0, 0, 0, 0.0007]
     for step in range(STEPS):
-        for link in (told, silent, configured):
+        odometry = (step * 100_000, 1, 12, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0)
+        px4.send(step / 10, mavlink.MAVLink_odometry_message(*odometry, poses, [math.nan] * 21))
+        silent.send(step / 10, mavlink.MAVLink_odometry_message(*odometry, [math.nan] * 21, [math.nan] * 21))
+        for link in (told, silent, configured, px4):
             link.vehicle(step / 10)
         boot_us = step * 100_000 + 50_000
         told.send(
@@ -133,9 +137,42 @@ def test_the_autopilots_own_attitude_accuracy_counts() -> None:
     assert silent.pose(2.0).attitude_sigma_rad is None
     assert silent.pose(2.0).attitude_covariance_rad2 is None
     assert configured.pose(2.0).attitude_sigma_rad == pytest.approx(0.02)
+    assert px4.pose(2.0).attitude_sigma_rad == pytest.approx(0.04)
     found = configured.pose(2.0).attitude_covariance_rad2
     assert found is not None
     assert math.sqrt(found[0] + found[3] + found[5]) == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(
+    ("roll", "pitch", "yaw", "sigma_rad"),
+    [(1e-6, 1e-6, 7e-6, 0.02), (4e-4, 4e-4, 8e-4, 0.04), (0, 0, 9e-4, 0.02), (-1e-6, 9e-4, 9e-4, 0.02)],
+    ids=["narrow", "wide", "yaw alone", "negative"],
+)
+def test_a_filters_own_variances_never_narrow_what_the_user_states(
+    roll: float, pitch: float, yaw: float, sigma_rad: float
+) -> None:
+    """The user measured 0.02 rad. A filter doesn't know of its compass's error, and half-given variances are none."""
+    odometry, attitudes = Link(attitude_sigma_rad=0.02), Link(attitude_sigma_rad=0.02)
+    poses = [math.nan] * 15 + [roll, 0, 0, pitch, 0, yaw]
+    for step in range(STEPS):
+        fixed = (step * 100_000, 1, 12, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0)
+        odometry.send(step / 10, mavlink.MAVLink_odometry_message(*fixed, poses, [math.nan] * 21))
+        odometry.vehicle(step / 10)
+        covariance = [roll, 0, 0, 0, pitch, 0, 0, 0, yaw]
+        message = mavlink.MAVLink_attitude_quaternion_cov_message(step * 100_000, [1.0, 0, 0, 0], 0, 0, 0, covariance)
+        attitudes.send(step / 10, message)
+        attitudes.vehicle(step / 10 + 0.05)
+    for link in (odometry, attitudes):
+        assert link.pose(2.0).attitude_sigma_rad == pytest.approx(sigma_rad, rel=1e-3)
+
+
+def test_an_infinite_variance_is_not_given() -> None:
+    link = Link(attitude_sigma_rad=0.02)
+    for step in range(STEPS):
+        covariance = [1e-4, 0, 0, 0, 1e-4, 0, 0, 0, math.inf]
+        message = mavlink.MAVLink_attitude_quaternion_cov_message(step * 100_000, [1.0, 0, 0, 0], 0, 0, 0, covariance)
+        link.send(step / 10, message)
+    assert link.pose(2.0).attitude_sigma_rad == pytest.approx(0.02)
 
 
 def gimbal(t_s: float, flags: int, boot_s: float = 0.0) -> MavlinkMessage:

@@ -321,3 +321,68 @@ def test_a_flood_of_one_kind_keeps_the_newest_and_the_rest_of_the_history() -> N
     assert len(telemetry._history._receiver) <= MOST_SAMPLES
     assert telemetry._history._receiver[-1].number == number
     assert telemetry.pose_at(START_NS + 4 * 10**9, 0).source == "interpolated"
+
+
+NAN, FAR = math.nan, 2**31 - 1
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        mavlink.MAVLink_global_position_int_message(0, FAR, FAR, FAR, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_global_position_int_message(0, 900_000_001, 10**8, 0, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_global_position_int_message(0, -900_000_001, 10**8, 0, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_global_position_int_message(0, 4 * 10**8, -1_800_000_001, 0, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_global_position_int_message(0, 4 * 10**8, 10**8, -FAR, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_attitude_message(0, NAN, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_attitude_message(0, 0, math.inf, 0, 0, 0, 0),
+        mavlink.MAVLink_attitude_quaternion_message(0, 1, 0, NAN, 0, 0, 0, 0),
+        mavlink.MAVLink_attitude_quaternion_cov_message(0, [1, 0, 0, NAN], 0, 0, 0, [0] * 9),
+    ],
+    ids=lambda message: message.get_type(),
+)
+def test_an_impossible_message_is_no_pose_and_is_counted(message: MavlinkMessage) -> None:
+    """A position of 2147483647 (MAVLink's unknown) among good ones gave a pose at 131 degrees, without a doubt."""
+    packets = recording(FlightPath(3), 4.0)
+    stamp_us = START_NS // 1000 + 2_050_000
+    boot_ms = BOOT.ns(2.05) // 10**6
+    if hasattr(message, "time_boot_ms"):
+        message.time_boot_ms = boot_ms
+    else:
+        message.time_usec = boot_ms * 1000
+    with_it = numbered([*((stamp, one) for _, stamp, one in packets), (stamp_us + 600, made(message))])
+    good, telemetry = fed(packets), fed(with_it)
+    at_ns = START_NS + 2_070_000_000
+    pose, expected = telemetry.pose_at(at_ns, 0.0), good.pose_at(at_ns, 0.0)
+    assert pose.source == "interpolated"
+    assert (pose.latitude_rad, pose.longitude_rad, pose.attitude) == (
+        expected.latitude_rad,
+        expected.longitude_rad,
+        expected.attitude,
+    )
+    assert (telemetry.statistics().impossible, good.statistics().impossible) == (1, 0)
+    assert telemetry.impossible(at_ns) is not None
+    assert telemetry.impossible(at_ns + 70 * 10**9) is None
+
+
+def test_an_answer_to_timesync_that_can_t_be_true_is_counted() -> None:
+    telemetry = fed(recording(FlightPath(3), 2.0, timesync=False))
+    now_us, number = START_NS // 1000 + 2_100_000, 10_000
+    for time_ns in (-1, 2**62 + 5):
+        telemetry.feed(number, now_us, made(mavlink.MAVLink_timesync_message(0, now_us * 1000), component=100))
+        telemetry.feed(number + 1, now_us + 900, made(mavlink.MAVLink_timesync_message(time_ns, now_us * 1000)))
+        now_us, number = now_us + 10_000, number + 2
+    assert telemetry.statistics().impossible == 2
+
+
+def test_a_flight_of_older_rules_keeps_the_poses_that_it_was_tagged_with() -> None:
+    packets = recording(FlightPath(3), 4.0)
+    wrong = mavlink.MAVLink_global_position_int_message(BOOT.ns(2.05) // 10**6, FAR, FAR, 0, 0, 0, 0, 0, 0)
+    packets = numbered([*((stamp, one) for _, stamp, one in packets), (START_NS // 1000 + 2_050_600, made(wrong))])
+    places = {}
+    for rules in (3, 4):
+        telemetry = Telemetry(rules=rules)
+        for packet in packets:
+            telemetry.feed(*packet)
+        places[rules] = telemetry.pose_at(START_NS + 2_070_000_000, 0.0).latitude_rad
+    assert places[3] != places[4]

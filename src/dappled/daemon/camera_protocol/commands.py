@@ -24,6 +24,7 @@ AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 OLD_IMAGES = 256
 SHORTEST_NS = 100_000_000  # 10 Hz: nothing here changes faster
 LONGEST_US = 3.6e9
+LISTING_NS = 10 * 10**9
 _SEQUENCES = 16
 _ZOOM_STEP, _ZOOM_RANGE, _ZOOM_FOCAL_LENGTH, _ZOOM_WIDTH = 0, 2, 3, 4
 
@@ -77,11 +78,13 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class CommandAnswer:
-    """The result of a command, messages that follow the acknowledgement, and text for the pilot."""
+    """The result of a command, messages that follow the acknowledgement, and text for the pilot. `new_shot`: it became
+    a shot of its own, and is no message more of a known one."""
 
     result: int
     then: tuple[MavlinkMessage, ...] = ()
     words: str | None = None
+    new_shot: bool = False
 
 
 _NOT_OURS = CommandAnswer(DENIED)  # a broadcast to a camera that something else fires: it is left alone, unanswered
@@ -134,7 +137,9 @@ class CameraCommands:
         self._shutter, self._clock, self._status, self._parameters = shutter, clock, status, parameters
         self._intervals = intervals
         self._steps = RecentRequests()
-        self._next_images: dict[str, int] = {}  # by source: the next image for a request without an index
+        self._next_images: dict[
+            tuple[str, bool], tuple[int, int]
+        ] = {}  # (source, as image 0): the next one, when asked
         self.wanted_images: deque[tuple[int, int]] = deque()
 
     def answer(self, command: Command) -> CommandAnswer:
@@ -207,17 +212,25 @@ class CameraCommands:
 
     def _old_image(self, command: Command, place: int) -> CommandAnswer:
         """How a past shot ended. MAVSDK leaves the index out (NaN) when it lists photographs from before it connected:
-        each such request gets the next image, from the first on."""
+        each such request gets the next image, from the first on. Through ArduPilot it asks for image 0 again and again:
+        from its second request within 10 s on it gets the next image as well."""
         count = self._shutter.statistics().next_index
         if len(self.wanted_images) >= OLD_IMAGES:
             return CommandAnswer(REJECTED, words=f"{OLD_IMAGES} past images are already being looked up: ask again")
-        if math.isfinite(command.parameters[place - 1]):
-            index = command.integer(place)
-        else:
-            index = self._next_images.pop(command.source, 0) % max(count, 1)
-            self._next_images[command.source] = index + 1
+        given = math.isfinite(command.parameters[place - 1])
+        index = command.integer(place)
+        if index == 0:
+            now_ns = self._clock.monotonic_ns()
+            following, asked_ns = self._next_images.pop((command.source, given), (0, now_ns))
+            following = 0 if given and now_ns - asked_ns > LISTING_NS else following % max(count, 1)
+            self._next_images[command.source, given] = following + 1, now_ns
             if len(self._next_images) > _SEQUENCES:
                 self._next_images.pop(next(iter(self._next_images)))
+            if given and following:
+                self.wanted_images.append((following, command.link))
+            index = 0 if given else following
+        else:
+            self._next_images.pop((command.source, True), None)  # it asks for others: that is no list of image 0 alone
         if not 0 <= index < count:
             return CommandAnswer(DENIED, words=f"no image {index}: there are {count}")
         self.wanted_images.append((index, command.link))
@@ -333,6 +346,6 @@ _COMMANDS: dict[int, Callable[[CameraCommands, Command], CommandAnswer]] = {
 def _decided(decision: ShotDecision) -> CommandAnswer:
     """The answer to a capture request. ACCEPTED means that the shot will be attempted, DENIED that none ever will."""
     if decision.accepted:
-        return CommandAnswer(ACCEPTED)
+        return CommandAnswer(ACCEPTED, new_shot=decision.outcome == "shot")
     result = DENIED if decision.reason == CANNOT_FIRE else REJECTED
     return CommandAnswer(result, words=f"no photo: {decision.reason}")

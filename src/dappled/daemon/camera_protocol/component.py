@@ -24,23 +24,112 @@ from dappled.daemon.camera_protocol.commands import (
 )
 from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
 from dappled.daemon.camera_protocol.ftp_server import FtpServer
-from dappled.daemon.camera_protocol.own_autopilot import Links, OwnAutopilot
+from dappled.daemon.camera_protocol.own_autopilot import LISTEN_NS, Links, OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import ParameterReply, Parameters, ParameterServer
 from dappled.daemon.health.status_text import GroundStations, PilotMessages
 from dappled.daemon.pipeline.repeats import CaptureRequest, PacketDedup
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
 
+PROOF_NS = 500_000_000
+_STEADY_NS = 300_000_000  # telemetry is requested at 50 Hz
+_ON_ITS_WAY_NS = 100_000_000  # what came so soon after a report may have been sent before it
+_HEARTBEATS, _HEARTBEATS_NS = 256, 5 * 10**9
+_REPORTS = 256
 HEARTBEAT_NS = 10**9
 STATUS_NS = 100_000_000
 _OLD_IMAGES_A_TICK = 2
 _IMAGES = 2**16  # img_idx has 16 bits
 
 
-class Component:
-    """One camera on all links.
+class ReportRoutes:
+    """On which links a report is sent, so that each station has it once where one autopilot is heard on two of them.
 
-    `feedback_is_shot`: the autopilot fires the camera, and each CAMERA_FEEDBACK about its camera `cam_idx` is a shot.
+    An autopilot forwards what it gets on one port to its radio and to its other ports; or not, which can't be asked. No
+    packet of our own shows it: ArduPilot returns no heartbeat to a port on which it has heard the sender. The proof
+    is the heartbeats of others. If every one that came over a port came over the other port too, as the same packet,
+    whoever can be reached over the first port can be over the other: the first port gets no report. A heartbeat that
+    came over one port alone is a station that may only be there, and both ports get it. So does a port where nobody but
+    the autopilot was heard. If the other port falls silent around a report for `_STEADY_NS` (the cable is out, or the
+    autopilot's telemetry is slower than requested), it is sent on the first port after all: a station that has it twice
+    is better than one that never has it. With three ports or more all get every report. Times are monotonic; all
+    methods may be called from any thread.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._ports: dict[
+            int, tuple[int, int]
+        ] = {}  # link: since when the autopilot is heard steadily there; last time
+        self._heartbeats: dict[int, dict[tuple[int, int, int], int]] = {}  # link: packets, and when they came
+        self._waiting: dict[int, tuple[int, int, int, MavlinkMessage]] = {}  # image: sent, on, not on, the report
+        self._ended = False
+
+    def autopilot_heard(self, link: int, now_ns: int) -> None:
+        """The autopilot of our system was heard on a link."""
+        with self._lock:
+            since_ns, last_ns = self._ports.get(link, (now_ns, now_ns))
+            self._ports[link] = (since_ns if now_ns - last_ns <= _STEADY_NS else now_ns), now_ns
+
+    def heartbeat(self, message: MavlinkMessage, link: int, now_ns: int) -> None:
+        """A heartbeat of another component than our own autopilot."""
+        with self._lock:
+            known = self._heartbeats.setdefault(link, {})
+            known[message.get_srcSystem(), message.get_srcComponent(), message.get_seq()] = now_ns
+            if len(known) > _HEARTBEATS:
+                known.pop(next(iter(known)))
+
+    def without(self, report: MavlinkMessage, now_ns: int) -> int | None:
+        """The port that this report is not sent on; None: it is sent on all links."""
+        with self._lock:
+            heard = {link: last_ns for link, (_, last_ns) in self._ports.items() if now_ns - last_ns <= LISTEN_NS}
+            ports = sorted(heard, key=lambda link: -heard[link])
+            if len(ports) != 2 or self._ended:
+                return None
+            for port, other in (ports, ports[::-1]):
+                if self._reaches_all_of(port, other, now_ns):
+                    self._waiting[report.image_index] = now_ns, port, other, report
+                    return other
+            return None
+
+    def _reaches_all_of(self, port: int, other: int, now_ns: int) -> bool:
+        """Whether every heartbeat that came over `other` came over `port` too. The last one may still come."""
+        there = self._heartbeats.get(port, {})
+        proven: set[tuple[int, int]] = set()
+        for packet, heard_ns in self._heartbeats.get(other, {}).items():
+            if now_ns - heard_ns > _HEARTBEATS_NS:
+                continue
+            sender, copy_ns = packet[:2], there.get(packet)
+            if copy_ns is not None and abs(copy_ns - heard_ns) <= LISTEN_NS:
+                proven.add(sender)
+            elif sender not in proven or now_ns - heard_ns > HEARTBEAT_NS // 2:
+                return False
+        return bool(proven)
+
+    def taken(self, image: int) -> None:
+        """This report needs no other port any more."""
+        with self._lock:
+            self._waiting.pop(image, None)
+
+    def unproven(self, now_ns: int, *, ended: bool = False) -> list[tuple[int, MavlinkMessage]]:
+        """(link, report) of those whose port has been silent since: to be sent, again and again until one is `taken`.
+        `ended`: nothing is waited for, and later reports are sent on all links."""
+        with self._lock:
+            self._ended = self._ended or ended
+            for image, (sent_ns, port, _, _) in list(self._waiting.items()):
+                since_ns, last_ns = self._ports[port]
+                if since_ns <= sent_ns and last_ns > sent_ns + _ON_ITS_WAY_NS:
+                    del self._waiting[image]
+            while len(self._waiting) > _REPORTS:
+                self._waiting.pop(next(iter(self._waiting)))
+            due = [one for one in self._waiting.values() if ended or now_ns - one[0] >= PROOF_NS]
+        return [(other, report) for _, _, other, report in due]
+
+
+class Component:
+    """One camera on all links. `cam_idx` is its number at the autopilot.
+
+    Where the shutter doesn't fire the camera, each CAMERA_FEEDBACK about it is a shot.
     """
 
     def __init__(
@@ -53,13 +142,12 @@ class Component:
         *,
         model: CameraModel,
         earlier: EarlierOutcomes,
-        feedback_is_shot: bool = False,
         cam_idx: int = 0,
     ) -> None:
         self._links, self._autopilot, self._identity = links, autopilot, autopilot.identity
         self._shutter, self._clock = shutter, clock
         self._model, self._earlier = model, earlier
-        self._feedback_is_shot, self._cam_idx = feedback_is_shot or not shutter.fires, cam_idx
+        self._cam_idx = cam_idx
         self._last_feedback: int | None = None
         self._restarts = autopilot.restarts
         self._stamps: deque[int] = deque(maxlen=64)
@@ -68,7 +156,7 @@ class Component:
         self._commands = CameraCommands(shutter, clock, self._status, parameters, self._intervals)
         self._parameters = ParameterServer(parameters)
         self._files = FtpServer(self._status)
-        self._dedup = PacketDedup()
+        self._dedup, self._routes = PacketDedup(), ReportRoutes()
         self._lines, self._stations = PilotMessages(), GroundStations()
         self._results: deque[tuple[Command, int]] = deque(maxlen=64)
         self._heartbeat_due_ns = self._status_due_ns = 0
@@ -96,8 +184,11 @@ class Component:
         message = packet.message
         if packet.sent or message.get_srcSystem() == 0:
             return
-        if (message.get_srcSystem(), message.get_srcComponent()) == (self._links.system_id, self._links.component_id):
-            return  # our own packet, received over another link
+        source = message.get_srcSystem(), message.get_srcComponent()
+        if source == (self._links.system_id, self._links.component_id):
+            return  # our own, forwarded to another link
+        if packet.trusted and source == (self._identity.system_id, 1):
+            self._routes.autopilot_heard(packet.link, self._clock.monotonic_ns())
         handler = _HANDLERS.get(message.get_type())
         if handler is not None and packet.trusted:
             handler(self, packet)
@@ -108,7 +199,9 @@ class Component:
                 now_ns = self._clock.monotonic_ns()
                 self._identity.heard(message, packet.link, now_ns)
                 self._stations.heard(message, now_ns)
-        elif message.get_srcSystem() == self._identity.system_id:
+                if source != (self._identity.system_id, 1):
+                    self._routes.heartbeat(message, packet.link, now_ns)
+        elif packet.trusted and message.get_srcSystem() == self._identity.system_id:
             self._autopilot.heard(message)
 
     def _command(self, packet: Packet) -> None:
@@ -118,9 +211,9 @@ class Component:
         if self._is_duplicate(packet):
             self._acknowledge_again(command)
             return
-        self._count_trigger(command)
         echo = self._commands.fires(command) and self._autopilot.is_echo(packet, str(command.name))
         answer = CommandAnswer(ACCEPTED) if echo else self._commands.answer(command)
+        self._count_trigger(command, new=answer.new_shot)
         if not command.broadcast or answer.result == ACCEPTED:  # a broadcast is never refused
             self._acknowledge(command, answer.result)
             self._results.append((command, answer.result))
@@ -131,12 +224,17 @@ class Component:
         if answer.result not in (ACCEPTED, UNSUPPORTED):
             self.state_changed()  # a ground station's button waits for the status
 
-    def _count_trigger(self, command: Command) -> None:
-        """ArduPilot numbers its requests as its CAMERA_FEEDBACK; PX4 numbers those to each camera on their own."""
-        if not command.of_autopilot or command.name != mavlink.MAV_CMD_IMAGE_START_CAPTURE:
+    def _count_trigger(self, command: Command, *, new: bool) -> None:
+        """ArduPilot numbers its requests as its CAMERA_FEEDBACK; PX4 numbers those to each camera on their own.
+
+        `new`: the command became a shot of its own."""
+        if not command.of_autopilot or command.system != self._identity.system_id:
             return
         if not self._identity.is_ardupilot():
-            self._autopilot.numbers["CAMERA_TRIGGER"].unnumbered()
+            if new:
+                self._autopilot.numbers["CAMERA_TRIGGER"].unnumbered(self._clock.monotonic_ns())
+        elif command.name != mavlink.MAV_CMD_IMAGE_START_CAPTURE:
+            return
         elif command.integer(3, 1) == 1 and (number := command.integer(4)) > 0:
             self._autopilot.numbers["CAMERA_FEEDBACK"].heard(number, self._clock.monotonic_ns(), self._here)
 
@@ -169,19 +267,19 @@ class Component:
         name = message.get_type()
         if message.get_srcSystem() != self._identity.system_id or self._is_duplicate(packet):
             return
+        sequence = message.seq if name == "CAMERA_TRIGGER" else message.img_idx
+        numbers, now_ns = self._autopilot.numbers[name], self._clock.monotonic_ns()
         if name == "CAMERA_FEEDBACK":
             ours = self._is_trigger(message)
-            if ours and not self._feedback_is_shot:
-                now_ns = self._clock.monotonic_ns()
-                self._autopilot.numbers[name].reported(message.img_idx, now_ns, self._here)
-            if not (ours and self._feedback_is_shot):
+            if ours and self._shutter.fires:
+                numbers.reported(sequence, now_ns, self._here)
+            if not ours or self._shutter.fires:
                 return  # the hot shoe's time of a known shot: telemetry uses it
         if self._autopilot.is_echo(packet, name):
+            numbers.heard(sequence, now_ns, self._here)
             return
-        source = f"mavlink:{message.get_srcSystem()}/{message.get_srcComponent()}"
-        sequence = message.seq if name == "CAMERA_TRIGGER" else message.img_idx
         request = CaptureRequest(
-            source,
+            f"mavlink:{message.get_srcSystem()}/{message.get_srcComponent()}",
             name,
             sequence,
             0,
@@ -189,17 +287,20 @@ class Component:
             acknowledged=False,
             time_us=int(message.time_usec),
             autopilot=True,
-            happened=name == "CAMERA_FEEDBACK" or not self._shutter.fires,
+            happened=not self._shutter.fires,
         )
-        numbers = self._autopilot.numbers[name]
-        numbers.heard(sequence, self._clock.monotonic_ns(), self._here)
-        decision = self._shutter.request(request)
+        known = False
+        try:
+            decision = self._shutter.request(request)
+            known = decision.outcome == "duplicate"
+        finally:  # a shot that could not be fired is in the books as failed, and not lost
+            numbers.heard(sequence, now_ns, self._here, known=known)
         if not decision.accepted:
             self.say(f"no photo: {decision.reason}")
             self.state_changed()
 
     def _is_trigger(self, feedback: MavlinkMessage) -> bool:
-        """Whether a CAMERA_FEEDBACK reports a trigger of our camera.
+        """Whether a CAMERA_FEEDBACK reports a trigger of our camera, and not another one's again.
 
         ArduPilot sends one for each of its cameras at every trigger or contact of one. The others repeat their last
         time, or have neither time nor number. Without a time, or before the autopilot's clock is known, a number that
@@ -225,7 +326,7 @@ class Component:
             why = "reported more than 5 s late"
         elif stale is None and known is None and image > 1:
             why = "the first report heard, without a time that is known: perhaps another camera's"
-        if why and self._feedback_is_shot:
+        if why and not self._shutter.fires:
             numbers = self._autopilot.numbers["CAMERA_FEEDBACK"]
             numbers.late(image, self._clock.monotonic_ns(), lambda: f"{why}, {self._here()}")
         return newer if stale is None else not stale
@@ -266,8 +367,14 @@ class Component:
     # what goes out
 
     def announce(self, captured: Captured) -> bool:
-        """Report a shot that ended, its frame safe or lost, on all links, once. False where no link took it."""
-        taken = self._links.send(image_captured(captured, self._status.boot_ms()))
+        """Report a shot that ended, its frame safe or lost, once to each receiver (see `ReportRoutes`). False where no
+        link took it."""
+        report = image_captured(captured, self._status.boot_ms())
+        without = self._routes.without(report, self._clock.monotonic_ns())
+        taken = self._links.send(report, without=without)
+        if not taken and without is not None:
+            self._routes.taken(captured.index)
+            taken = self._links.send(report)
         self.state_changed()
         return taken
 
@@ -308,9 +415,7 @@ class Component:
                 )
             )
         self._autopilot.ask()
-        for lost in self._autopilot.lost_triggers():
-            self._model.lost(lost)
-            self.say(f"lost: the autopilot's {lost.text()}", mavlink.MAV_SEVERITY_ERROR)
+        self._tell_lost_triggers()
         if (counts := self._shutter.statistics()) != self._reported:
             self._reported = counts
             self._status_wanted.set()
@@ -318,6 +423,7 @@ class Component:
             self._status_wanted.clear()
             self._status_due_ns = now_ns + STATUS_NS
             self._links.send(self._status.status())
+        self._send_unproven_reports(now_ns)
         for number in self._intervals.due(now_ns):
             self._links.send(self._status.about(number))
         for link, reply in self._parameters.settled(now_ns):
@@ -325,6 +431,21 @@ class Component:
         self._send_old_images()
         if self._stations.listening(now_ns):
             self._send_earlier_outcomes(now_ns)
+
+    def finish(self) -> None:
+        """The flight ends: tell what would have been waited for."""
+        self._tell_lost_triggers(at_once=True)
+        self._send_unproven_reports(self._clock.monotonic_ns(), ended=True)
+
+    def _send_unproven_reports(self, now_ns: int, *, ended: bool = False) -> None:
+        for link, report in self._routes.unproven(now_ns, ended=ended):
+            if self._links.send(report, link):
+                self._routes.taken(report.image_index)
+
+    def _tell_lost_triggers(self, *, at_once: bool = False) -> None:
+        for lost in self._autopilot.lost_triggers(at_once=at_once):
+            self._model.lost(lost)
+            self.say(f"lost: the autopilot's {lost.text()}", mavlink.MAV_SEVERITY_ERROR)
 
     def _send_reply(self, reply: ParameterReply, link: int) -> None:
         for message in reply.messages:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import struct
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from dappled.clock import Clock
+from dappled.daemon.navigation.samples import EPOCH_US, WRAP_US
 from dappled.daemon.pipeline.repeats import AutopilotCommands
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
 from dappled.refusals import LostTriggers
@@ -15,19 +18,22 @@ from dappled.refusals import LostTriggers
 TIMESYNC_NS = 200_000_000
 STREAMS_NS = 5 * 10**9
 STALE_US = 5_000_000  # a slow radio is seconds behind
-EPOCH_US = 10**15  # 2001: a time above is UTC, one below counts since boot
+CONFIRM_NS = 500_000_000  # as long as navigation asks for
+STEADY_NS = 10 * 10**9
+_BOOTED_US = 10_000_000  # an autopilot that was not heard since shows no more after its start; a fast simulator a bit
 LATE_NS = 2_500_000_000
 MOST_LOST = 256
-_WRAP_US = 2**32
+_COVERS_NS = 60 * 10**9  # how long ago a shot without a number may be the one of a number that is missing
+_TIMESYNC = struct.Struct("<qqBB")
 STREAMS = (  # message, interval in microseconds
     (mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 20_000),
     (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, 20_000),
     (mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, 200_000),
     (mavlink.MAVLINK_MSG_ID_SYSTEM_TIME, 1_000_000),
 )
+GIMBAL_STREAM = (mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS, 50_000)
 LISTEN_NS = 3 * 10**9
 ALONE_NS = 1_200_000_000  # heartbeats come every second: a second autopilot would have shown by now
-_WANTED = frozenset(message_id for message_id, _ in STREAMS)
 
 
 class Links(Protocol):
@@ -36,7 +42,7 @@ class Links(Protocol):
     system_id: int
     component_id: int
 
-    def send(self, message: MavlinkMessage, link: int | None = None) -> bool: ...
+    def send(self, message: MavlinkMessage, link: int | None = None, *, without: int | None = None) -> bool: ...
 
 
 class SystemIdentity:
@@ -107,157 +113,280 @@ class SystemIdentity:
         return None if link is None else (self.system_id, link)
 
 
-class AutopilotRequests:
-    """Requests for the time at 5 Hz and, every five seconds, for streams that arrived at less than half their rate."""
+class TargetedTimesync(mavlink.MAVLink_timesync_message):  # type: ignore[misc]  # pymavlink has no types
+    """A TIMESYNC for one component: an autopilot would forward one for all to the ground station's radio.
 
-    def __init__(self) -> None:
-        self._heard: dict[int, int] = {}
+    Dialects may lack the two fields, an extension of version 2: they are packed here. Receivers without them ignore
+    them.
+    """
+
+    def __init__(self, ts1: int, system: int) -> None:
+        super().__init__(0, ts1)
+        self._target = system, 1
+
+    def pack(self, mav: mavlink.MAVLink, force_mavlink1: bool = False) -> bytes:
+        """See pymavlink."""
+        whole = _TIMESYNC.pack(self.tc1, self.ts1, *self._target)
+        payload = whole[:16] if force_mavlink1 else whole
+        return bytes(self._pack(mav, self.crc_extra, payload, force_mavlink1=force_mavlink1))
+
+
+class AutopilotRequests:
+    """Requests for the time at 5 Hz and, every five seconds, for streams that arrived at less than half their rate.
+
+    `streams` are (message, interval in microseconds).
+    """
+
+    def __init__(self, streams: Sequence[tuple[int, int]] = STREAMS) -> None:
+        self._streams = streams
+        self._heard: dict[int, int] = dict.fromkeys((message_id for message_id, _ in streams), 0)
         self._time_due_ns = self._streams_due_ns = 0
 
     def heard(self, message_id: int) -> None:
         """Count a message of our autopilot."""
-        if message_id in _WANTED:
-            self._heard[message_id] = self._heard.get(message_id, 0) + 1
+        if message_id in self._heard:
+            self._heard[message_id] += 1
 
     def due(self, system: int, now_ns: int, utc_ns: int) -> Iterator[MavlinkMessage]:
         """The requests that are due by now."""
         if now_ns >= self._time_due_ns:
             self._time_due_ns = now_ns + TIMESYNC_NS
-            yield mavlink.MAVLink_timesync_message(0, utc_ns)
+            yield TargetedTimesync(utc_ns, system)
         if now_ns >= self._streams_due_ns:
             self._streams_due_ns = now_ns + STREAMS_NS
-            heard, self._heard = self._heard, {}
-            for message_id, interval_us in STREAMS:
-                if heard.get(message_id, 0) < STREAMS_NS / (interval_us * 1e3) / 2:
+            heard, self._heard = self._heard, dict.fromkeys(self._heard, 0)
+            for message_id, interval_us in self._streams:
+                if heard[message_id] < STREAMS_NS / (interval_us * 1e3) / 2:
                     yield mavlink.MAVLink_command_long_message(
                         system, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, message_id, interval_us, 0, 0, 0, 0, 0
                     )
+
+
+class _ShownClock:
+    """One clock of the autopilot, as its last messages showed it. Clock times are microseconds, ours nanoseconds.
+
+    A time that is not where the clock should be by now counts when the messages have kept to it for `CONFIRM_NS`. One
+    that is far behind, but later than an autopilot could show that has started again meanwhile, counts after
+    `STEADY_NS`: so long a slow second link may bring old packets alone.
+    """
+
+    def __init__(self) -> None:
+        self._shown: tuple[int, int] | None = None
+        self._doubted: tuple[int, int] | None = None
+        self._first: tuple[int, int] = 0, 0  # of those in doubt
+
+    def heard(self, time_us: int, now_ns: int) -> int | None:
+        """Take a time. Where the clock has certainly gone back by now: since when."""
+        shown = self._shown
+        if shown is None or shown[0] - STALE_US <= time_us <= _runs_to(shown, now_ns) + STALE_US:
+            self._shown, self._doubted = (time_us, now_ns), None
+            return None
+        if self._doubted is None or abs(time_us - _runs_to(self._doubted, now_ns)) > STALE_US:
+            self._first = time_us, now_ns
+        self._doubted = time_us, now_ns
+        first_us, since_ns = self._first
+        certain = time_us > shown[0] or first_us <= (since_ns - shown[1]) // 1000 + _BOOTED_US
+        if now_ns - since_ns < (CONFIRM_NS if certain else STEADY_NS):
+            return None
+        self._shown, self._doubted = self._doubted, None
+        return since_ns if time_us < shown[0] else None
+
+    def is_about(self, time_us: int, now_ns: int) -> bool | None:
+        """Whether a time is within `STALE_US` of now, perhaps one of 32 bits; None where the clock is not known."""
+        if self._shown is None:
+            return None
+        for seen in (self._shown, self._doubted):
+            if seen is not None:
+                age_us = _runs_to(seen, now_ns) - time_us
+                if time_us < WRAP_US:
+                    age_us = (age_us + WRAP_US // 2) % WRAP_US - WRAP_US // 2
+                if abs(age_us) <= STALE_US:
+                    return True
+        return False
+
+
+def _runs_to(seen: tuple[int, int], now_ns: int) -> int:
+    """What a clock shows now."""
+    return seen[0] + (now_ns - seen[1]) // 1000
 
 
 class AutopilotNow:
     """What the autopilot's clocks show now, to `STALE_US`: the last times it sent, plus what has passed since."""
 
     def __init__(self) -> None:
-        self._boot: tuple[int, int] | None = None  # its microseconds, our nanoseconds
-        self._utc: tuple[int, int] | None = None
+        self._boot, self._utc = _ShownClock(), _ShownClock()
 
-    def heard(self, message: MavlinkMessage, now_ns: int) -> bool:
-        """Take a message of the autopilot; whether it has started again. Times are monotonic."""
-        boot_ms = getattr(message, "time_boot_ms", 0)
-        restarted = False
-        if boot_ms > 0:
-            restarted = self._boot is not None and boot_ms * 1000 < self._boot[0] - STALE_US
-            self._boot = boot_ms * 1000, now_ns
+    def heard(self, message: MavlinkMessage, now_ns: int) -> int | None:
+        """Take a message of the autopilot; since when it has started again, where that is certain by now. Times are
+        monotonic."""
         if message.get_type() == "SYSTEM_TIME" and message.time_unix_usec >= EPOCH_US:
-            self._utc = int(message.time_unix_usec), now_ns
-        return restarted
+            self._utc.heard(int(message.time_unix_usec), now_ns)
+        boot_ms = getattr(message, "time_boot_ms", 0)
+        return self._boot.heard(boot_ms * 1000, now_ns) if boot_ms > 0 else None
 
     def is_stale(self, time_us: int, now_ns: int) -> bool | None:
         """See `OwnAutopilot.is_stale`."""
-        shown = self._utc if time_us >= EPOCH_US else self._boot
-        if shown is None:
-            return None
-        age_us = shown[0] + (now_ns - shown[1]) // 1000 - time_us
-        if time_us < _WRAP_US:
-            age_us = (age_us + _WRAP_US // 2) % _WRAP_US - _WRAP_US // 2
-        return abs(age_us) > STALE_US
+        about_now = (self._utc if time_us >= EPOCH_US else self._boot).is_about(time_us, now_ns)
+        return None if about_now is None else not about_now
+
+
+@dataclass(frozen=True, slots=True)
+class _Jump:
+    """Numbers from `first` to `last` that were passed over at once."""
+
+    first: int
+    last: int
+    due_ns: int
+    where: str
 
 
 class TriggerNumbers:
     """Which of the autopilot's triggers became no request here, by the numbers that it gives them.
 
-    A number that is passed over is waited for `LATE_NS`: a second link may bring it. Times are monotonic. A jump of
-    more than `MOST_LOST` numbers is a counter that was set, not a loss. All methods may be called from any thread.
+    A number that is passed over is waited for `LATE_NS`: a second link may bring it, or a message without a number may
+    have become its shot. Times are monotonic. A jump of more than `MOST_LOST` numbers is told as one: nobody can say
+    whether they were lost or the counter was set. If the numbers go back into the jump, a wrong number was heard, and
+    nothing is told. All methods may be called from any thread.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._heard: deque[int] = deque(maxlen=MOST_LOST)
+        self._heard_ns = 0
         self._top: int | None = None
         self._missing: dict[int, tuple[int, str]] = {}  # when it counts as lost, and where that was noticed
-        self._unnumbered = 0  # requests without a number since the last one with one
+        self._jumps: list[_Jump] = []
+        self._over: list[LostTriggers] = []  # of before a restart
+        # when messages without a number became shots whose number is not known
+        self._unnumbered: deque[int] = deque(maxlen=MOST_LOST)
 
-    def heard(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
-        """A request, or a shot's own message, with this number has come."""
+    def heard(self, number: int, now_ns: int, where: Callable[[], str], *, known: bool = False) -> None:
+        """A request, or a shot's own message, with this number has come. `known`: another message made its shot."""
         with self._lock:
-            self._reach(number, now_ns, where)
+            if number not in self._heard:
+                self._reach(number, now_ns, where)
+                if not known and not self._missing:
+                    self._unnumbered.clear()
+                elif known and self._unnumbered:
+                    self._unnumbered.pop()
             self._heard.append(number)
+            self._heard_ns = now_ns
             self._missing.pop(number, None)
-            self._unnumbered = 0
 
     def late(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
         """A trigger is reported too late to be a shot: it is lost, unless its own message still comes."""
         with self._lock:
-            if number not in self._heard:
-                self._reach(number, now_ns, where)
-                self._missing[number] = now_ns + LATE_NS, where()
+            self._miss(number, now_ns, where)
 
     def reported(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
         """The autopilot reports a trigger that it has requested. Ignored where it requests none here."""
         with self._lock:
-            if self._heard and number not in self._heard and number not in self._missing:
-                self._reach(number, now_ns, where)
-                self._missing[number] = now_ns + LATE_NS, where()
+            if self._heard and number not in self._missing:
+                self._miss(number, now_ns, where)
 
-    def unnumbered(self) -> None:
-        """One of the other messages of a trigger has come: PX4 sends one for each camera after the numbered one."""
+    def unnumbered(self, now_ns: int) -> None:
+        """A message without a number became a shot: PX4 sends one to each camera after the one with the number."""
         with self._lock:
-            self._unnumbered += 1
+            self._unnumbered.append(now_ns)
 
-    def lost(self, now_ns: int) -> list[LostTriggers]:
-        """Those that have not come in time, each told once."""
+    def lost(self, now_ns: int, *, at_once: bool = False) -> list[LostTriggers]:
+        """Those that have not come in time, each told once; `at_once`: those that are waited for too."""
         with self._lock:
-            over = sorted(number for number, (due_ns, _) in self._missing.items() if due_ns <= now_ns)
-            places = [(number, self._missing.pop(number)[1]) for number in over]
-            self._heard.extend(over)  # ArduPilot repeats its last report with each one of another camera
+            found, self._over = [*self._over, *self._take(now_ns, at_once=at_once)], []
+        return found
+
+    def restart(self, since_ns: int) -> None:
+        """The autopilot has started again at about this time, and counts from 1 (PX4 from 0)."""
+        with self._lock:
+            self._over += self._take(since_ns, at_once=True)
+            last = self._heard[-1] if self._heard and self._heard_ns > since_ns else None
+            self._heard.clear()
+            self._unnumbered.clear()
+            self._top = 0 if last is None else last
+            if last is not None:
+                self._heard.append(last)
+
+    def _take(self, now_ns: int, *, at_once: bool) -> list[LostTriggers]:
+        """Those that are lost by now, which are waited for no longer."""
+        over = sorted(number for number, (due_ns, _) in self._missing.items() if at_once or due_ns <= now_ns)
+        first_ns = min((self._missing[number][0] for number in over), default=now_ns) - LATE_NS - _COVERS_NS
+        while self._unnumbered and self._unnumbered[0] < first_ns:
+            self._unnumbered.popleft()
+        places = [(number, self._missing.pop(number)[1]) for number in over]
+        self._heard.extend(over)  # ArduPilot repeats its last report with each one of another camera
+        while places and self._unnumbered:
+            self._unnumbered.popleft()
+            places.pop(0)
         found: list[LostTriggers] = []
         for number, where in places:
             if found and found[-1].last == number - 1 and found[-1].where == where:
                 found[-1] = LostTriggers(found[-1].first, number, where)
             else:
                 found.append(LostTriggers(number, number, where))
-        return found
+        jumps = [jump for jump in self._jumps if at_once or jump.due_ns <= now_ns]
+        self._jumps = [jump for jump in self._jumps if jump not in jumps]
+        return found + [LostTriggers(jump.first, jump.last, jump.where) for jump in jumps]
 
-    def restart(self) -> None:
-        """The autopilot has started again, and counts from 1."""
-        with self._lock:
-            self._heard.clear()
-            self._missing.clear()
-            self._top, self._unnumbered = None, 0
+    def _miss(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
+        if number not in self._heard:
+            self._reach(number, now_ns, where)
+            self._missing[number] = now_ns + LATE_NS, where()
 
     def _reach(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
         top = self._top
-        if top is not None and top + 1 < number <= top + MOST_LOST:
-            here, requested = where(), max(0, self._unnumbered - 1)  # one of them belongs to the last number heard
-            self._missing |= dict.fromkeys(range(top + 1 + requested, number), (now_ns + LATE_NS, here))
-        if top is None or number > top or number < top - MOST_LOST:
+        if top is None:
+            self._top = number
+            return
+        if number > top + MOST_LOST:
+            words = f"{where()}, or its counter was set"
+            self._jumps.append(_Jump(top + 1, number - 1, now_ns + LATE_NS, words))
+        elif number > top + 1:
+            self._missing |= dict.fromkeys(range(top + 1, number), (now_ns + LATE_NS, where()))
+        elif number < top - MOST_LOST:
+            self._jumps = [jump for jump in self._jumps if not jump.first <= number <= jump.last]
+        elif number < top:
+            self._jumps = [part for jump in self._jumps for part in _without(jump, number)]
+        if number > top or number < top - MOST_LOST:
             self._top = number
 
 
-class OwnAutopilot:
-    """The autopilot of the system that the camera belongs to, on the link that it was last heard on."""
+def _without(jump: _Jump, number: int) -> list[_Jump]:
+    """What is left of a jump where one of its numbers has come late."""
+    if not jump.first <= number <= jump.last:
+        return [jump]
+    parts = replace(jump, last=number - 1), replace(jump, first=number + 1)
+    return [part for part in parts if part.first <= part.last]
 
-    def __init__(self, links: Links, clock: Clock) -> None:
+
+class OwnAutopilot:
+    """The autopilot of the system that the camera belongs to, on the link that it was last heard on.
+
+    `on_gimbal`: the camera needs the gimbal's attitude, which ArduPilot sends to a companion's port only on request.
+    """
+
+    def __init__(self, links: Links, clock: Clock, *, on_gimbal: bool = False) -> None:
         self._links, self._clock = links, clock
         self.identity = SystemIdentity(links.system_id, clock.monotonic_ns())
         self._commands = AutopilotCommands()
-        self._requests = AutopilotRequests()
+        self._requests = AutopilotRequests((*STREAMS, GIMBAL_STREAM) if on_gimbal else STREAMS)
         self._now = AutopilotNow()
         self.numbers = {"CAMERA_FEEDBACK": TriggerNumbers(), "CAMERA_TRIGGER": TriggerNumbers()}
         self.restarts = 0  # of the autopilot, so far: its numbers begin again
 
     def heard(self, message: MavlinkMessage) -> None:
-        """Take a message of its system."""
+        """Take a message of its system that can be trusted."""
         self._requests.heard(message.get_msgId())
-        if message.get_srcComponent() == 1 and self._now.heard(message, self._clock.monotonic_ns()):
+        since_ns = self._now.heard(message, self._clock.monotonic_ns()) if message.get_srcComponent() == 1 else None
+        if since_ns is not None:
             self.restarts += 1
             for numbers in self.numbers.values():
-                numbers.restart()
+                numbers.restart(since_ns)
 
-    def lost_triggers(self) -> list[LostTriggers]:
-        """Triggers of the autopilot that became no request here, each told once."""
+    def lost_triggers(self, *, at_once: bool = False) -> list[LostTriggers]:
+        """Triggers of the autopilot that became no request here, each told once; `at_once`: without waiting for those
+        that may be late."""
         now_ns = self._clock.monotonic_ns()
-        return [one for numbers in self.numbers.values() for one in numbers.lost(now_ns)]
+        return [one for numbers in self.numbers.values() for one in numbers.lost(now_ns, at_once=at_once)]
 
     def is_stale(self, time_us: int) -> bool | None:
         """Whether a time of the autopilot's, in microseconds since boot (perhaps of 32 bits) or of UTC, is not about

@@ -1,4 +1,4 @@
-"""Relate the clocks of this machine, the autopilot and the camera: when a frame was exposed, and whether UTC is known.
+"""Relate the clocks of this machine, the autopilot and the camera: when a frame was exposed.
 
 The expected time is the trigger call's plus the body's latency. The autopilot's hot-shoe feedback replaces it; the
 camera's own clock stands in where the trigger call is unknown. Pure functions of what was observed, so a replay gets
@@ -10,9 +10,6 @@ nothing exposes before that.
 
 Where the autopilot fires the body, its message comes before we know of the shot. Such a shot has the time of the
 message that created it (`TriggerMessage`). No other message is considered, and no call of ours is compared with it.
-
-Where this machine's UTC can't be believed, the autopilot's satellites give the correction (`UtcLearner`). Stamps
-already written stay as they are; the correction is recorded beside them.
 """
 
 from __future__ import annotations
@@ -22,11 +19,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Literal, Protocol, Self
+from typing import Literal, Self
 
 import numpy as np
 
 from dappled.config.settings import CameraSettings
+from dappled.daemon.navigation.samples import Feedback, UtcCorrection, UtcNotes
 from dappled.decode.array_types import Floats
 from dappled.flight import Shot
 
@@ -34,20 +32,20 @@ log = logging.getLogger(__name__)
 
 LATENCY_SOURCE = "trigger call + body latency"
 REQUEST_SOURCE = "wish + body latency"
-TAGGING_RULES = 2  # recorded with each flight. 1: those of flights that were recorded without a number
+TAGGING_RULES = 4  # recorded with each flight. 1: those of flights that were recorded without a number
+_UTC_BETTER = 2
+_UTC_AGREES_NS = 10**9  # clocks that differ by less are not reported
 _REACH_1_NS = 50_000_000
 CAMERA_SOURCE = "camera clock (EXIF)"
 CONTACT_SIGMA_NS = 1_000_000  # interrupt and contact bounce; the best bodies were measured at 0.56 ms
-EPOCH_US = 10**15  # 2001; no autopilot has been running for that long
 DRIFT_SIGMA = 50e-6  # crystals of autopilots: some tens of ppm between two machines
-_UTC_BETTER = 2
-_UTC_AGREES_NS = 10**9  # clocks that differ by less are not reported
 _UNSEEN_NS = 10**9  # how late a trigger call may be, where not even the file's arrival bounds it
 _REACH_SIGMAS = 4
 _REACH_NS = 10_000_000  # with the default 30 ms in all 130 ms: at 5 Hz the next shot's contact is farther away
 _AFTER_CALL_NS = 3_000_000
 _HEARD_NS = 300_000_000
 _OWN_NS = 2_500_000_000  # a message that a slow link repeats is the same until then
+_BOUNCE_NS = 100_000_000  # no body here takes two photographs within this time
 _CAMERA_SHOTS_KEPT = 256
 _CAMERA_SHOTS_LEAST = 3
 _PRIOR = np.diag([0.0, 1 / (DRIFT_SIGMA * 1e9) ** 2])  # of level (ns) and slope (ns/s)
@@ -202,9 +200,11 @@ def from_timesync(answers: Sequence[TimesyncAnswer]) -> BootClock | None:
     if len(answers) < 3:
         return None
     reference = answers[-1]
-    delay = np.array([answer.delay_ns for answer in answers], dtype=np.float64)
-    x = np.array([answer.boot_ns - reference.boot_ns for answer in answers], dtype=np.float64) / 1e9
-    y = np.array([answer.offset_ns - reference.offset_ns for answer in answers], dtype=np.float64)
+    times = np.array([(answer.sent_utc_ns, answer.received_utc_ns, answer.boot_ns) for answer in answers])
+    sent, received, boot = times.T  # 64 bits: a sum of two times is right until 2116
+    delay = (received - sent).astype(np.float64)
+    x = (boot - reference.boot_ns).astype(np.float64) / 1e9
+    y = ((sent + received) // 2 - boot - reference.offset_ns).astype(np.float64)
     half = (delay - delay.min()) / 2
     weight = 1 / (max(_TIMESYNC_FLOOR_NS, float(np.sort(half)[len(half) // 4])) ** 2 + half**2)
     freedom = len(answers) - 2
@@ -230,16 +230,17 @@ def from_few(answers: Sequence[TimesyncAnswer]) -> BootClock:
     return BootClock("timesync", best.boot_ns, best.offset_ns, 0.0, sigma_ns)
 
 
-def step_ns(answers: Sequence[TimesyncAnswer], new: TimesyncAnswer) -> int | None:
+def step_ns(answers: Sequence[TimesyncAnswer], new: TimesyncAnswer, rules: int = TAGGING_RULES) -> int | None:
     """By how much UTC − boot time has changed since the last of `answers`, where a steady clock can't give `new`; else
     None.
 
     An answer is wrong by at most half its round trip, so two differ by at most half of both, plus what crystals and
-    a machine clock under correction (0.06 %) can drift in between. Answers of the last ten seconds count.
+    a machine clock under correction (0.06 %) can drift in between. Answers of the last ten seconds count, and the
+    last one however old it is: an autopilot that was stopped for a while steps in its silence.
     """
     for old in reversed(answers):
         apart_ns = new.stamp_ns - old.stamp_ns
-        if apart_ns > _STEP_LOOK_NS:
+        if apart_ns > _STEP_LOOK_NS and (rules < 3 or old is not answers[-1]):
             break
         most_ns = (old.delay_ns + new.delay_ns) / 2 + _STEADY * apart_ns + _STEP_FLOOR_NS
         if abs(new.offset_ns - old.offset_ns) > most_ns:
@@ -273,22 +274,6 @@ def from_arrivals(arrivals: Sequence[tuple[int, int]], rules: int = TAGGING_RULE
     return BootClock("arrival", arrivals[-1][0], offsets[0], 0.0, sigma_ns)
 
 
-@dataclass(frozen=True, slots=True)
-class Feedback:
-    """One message: its time since boot. `number` is its packet's in the log, `image` the autopilot's number of it.
-
-    `contact`: it is the time of a contact in the hot shoe. False: it may be that of the command to fire.
-    """
-
-    number: int
-    stamp_ns: int
-    boot_ns: int
-    kind: str
-    image: int = 0
-    contact: bool = True
-    time_us: int = 0  # as it was sent
-
-
 def reach_ns(exposure: ExposureTime, rules: int = TAGGING_RULES) -> int:
     """How far from its expected time an exposure may be."""
     return _REACH_SIGMAS * exposure.sigma_ns + (_REACH_NS if rules > 1 else _REACH_1_NS)
@@ -301,40 +286,61 @@ def choose_feedback(
 
     It is the one nearest to when the exposure was expected to begin, within 4 σ + 10 ms of that (σ of the body and of
     the clocks), and after the trigger call. None also where two are so near that either may be it (half the nearer
-    one's distance + 5 ms): a wrong time would be worse than a wide one.
+    one's distance + 5 ms): a wrong time would be worse than a wide one. A contact that closes again is one contact.
+
+    Contacts that the clocks can't tell from the trigger call are not chosen, but compete: without them the next shot's
+    would be the nearest. By a clock in doubt none is chosen.
     """
-    if exposure.called_utc_ns is None:
+    if exposure.called_utc_ns is None or (rules > 2 and clock.doubt):
         return None
     within_ns = reach_ns(exposure, rules) + _REACH_SIGMAS * clock.sigma_ns
     expected_ns = clock.boot_ns(exposure.utc_ns - exposure.half_ns)
     # command and contact can be told apart no better than the clocks agree
-    earliest_ns = clock.boot_ns(exposure.called_utc_ns) + max(_AFTER_CALL_NS, 3 * clock.sigma_ns)
+    called_ns = clock.boot_ns(exposure.called_utc_ns)
+    earliest_ns = called_ns + max(_AFTER_CALL_NS, 3 * clock.sigma_ns)
+    told = _contacts(events, earliest_ns, expected_ns + within_ns, rules)
+    if rules > 2:
+        since_ns = called_ns + _AFTER_CALL_NS - 3 * clock.sigma_ns
+        told += [one for one in events if one.contact and since_ns <= one.boot_ns < earliest_ns]
     near = sorted(
         (abs(event.boot_ns - expected_ns), event.number, event)
-        for event in events
-        if event.contact and event.boot_ns >= earliest_ns and abs(event.boot_ns - expected_ns) <= within_ns
+        for event in told
+        if abs(event.boot_ns - expected_ns) <= within_ns
     )
     if not near:
         return None
     doubtful_ns = near[0][0] * 1.5 + 5_000_000
     if any(distance <= doubtful_ns and event.boot_ns != near[0][2].boot_ns for distance, _, event in near[1:]):
         return None
-    return near[0][2]
+    return near[0][2] if near[0][2].boot_ns >= earliest_ns else None
 
 
-def own_feedback(events: Sequence[Feedback], trigger: TriggerMessage) -> Feedback | None:
+def _contacts(events: Sequence[Feedback], earliest_ns: float, latest_ns: float, rules: int) -> list[Feedback]:
+    """The contacts between two times since boot. Where one is reported again as it bounces, only its first."""
+    bounce_ns = _BOUNCE_NS if rules > 2 else 0
+    near = [one for one in events if one.contact and earliest_ns <= one.boot_ns <= latest_ns]
+    return [
+        one
+        for one in near
+        if not any(other.image == one.image and 0 < one.boot_ns - other.boot_ns <= bounce_ns for other in near)
+    ]
+
+
+def own_feedback(events: Sequence[Feedback], trigger: TriggerMessage, rules: int = TAGGING_RULES) -> Feedback | None:
     """The message that created a shot, among those of the log; None where it had no time that can be used.
 
     The last time with its number: while ArduPilot waits for a contact, another camera's report repeats the number of
-    the new trigger with the time of the contact before.
+    the new trigger with the time of the contact before. Of a contact that bounces, the first one.
     """
-    mine = [
+    mine = sorted(
         (event.boot_ns, event.number, event)
         for event in events
         if (event.kind, event.image) == (trigger.kind, trigger.number)
         and abs(event.stamp_ns - trigger.heard_utc_ns) < _OWN_NS
-    ]
-    return max(mine)[2] if mine else None
+    )
+    if rules < 3:
+        return mine[-1][2] if mine else None
+    return next((event for boot_ns, _, event in mine if mine[-1][0] - boot_ns <= _BOUNCE_NS), None)
 
 
 def unseen(exposure: ExposureTime) -> ExposureTime:
@@ -438,19 +444,11 @@ def camera_time(taken: str | None) -> tuple[int, int] | None:
     return seconds * 10**9 + int(digits.ljust(9, "0") or 0), 10 ** (9 - len(digits))
 
 
-@dataclass(frozen=True, slots=True)
-class UtcCorrection:
-    """What to add to this machine's UTC to get the autopilot's (from its satellites), ± 1 σ."""
-
-    correction_ns: int
-    sigma_ns: int
-    source: str
-
-
-class UtcNotes(Protocol):
-    """Where a correction is recorded; see `flight.recording.Recording`."""
-
-    def learn_utc(self, correction_ns: int, sigma_ns: int, source: str) -> None: ...
+def in_doubt(exposure: ExposureTime, clock: BootClock | None) -> ExposureTime:
+    """The exposure with the doubt of the clock that places it."""
+    if clock is None or not clock.doubt:
+        return exposure
+    return replace(exposure, source=f"{exposure.source}; in doubt: {clock.doubt}")
 
 
 class UtcLearner:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 from dappled.clock import Clock
 from dappled.daemon.live_settings import LiveSettings
@@ -20,16 +20,24 @@ from dappled.daemon.navigation.clocks import (
     TAGGING_RULES,
     BootClock,
     ExposureTime,
-    UtcCorrection,
     UtcLearner,
     by_trigger,
     choose_feedback,
+    in_doubt,
     own_feedback,
     reach_ns,
     refine,
     unseen,
 )
-from dappled.daemon.navigation.samples import HALF_MS_NS, Around, AttitudeSample, Counts, PositionSample
+from dappled.daemon.navigation.samples import (
+    HALF_MS_NS,
+    Around,
+    AttitudeSample,
+    Counts,
+    PositionSample,
+    TelemetryStatistics,
+    UtcCorrection,
+)
 from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, USED_MESSAGES, VehicleHistory
 from dappled.decode.geometry import (
     Gnss,
@@ -44,6 +52,7 @@ from dappled.decode.geometry import (
     slerp,
     slerp_doubt,
     turn_rad,
+    turn_rates,
     turned_by_heading,
 )
 from dappled.drivers.mavlink import MavlinkMessage, Packet
@@ -51,26 +60,14 @@ from dappled.flight import LedgerReader, Recording
 
 HISTORY_NS = TIMESYNC_WINDOW_NS + 60 * 10**9
 AHEAD_NS = 10**9  # a body's latency and half an exposure; an exposure further ahead is not waited for
+RATES_GAP_NS, TURN_GAP_NS = 150_000_000, 60_000_000  # a multicopter sways within more; without rates in the messages
 _VEHICLES = "vehicles"  # the ledger's fact: [number of the first packet, system id] of each vehicle followed
 _HINT_NS = 50_000_000  # a new fit while one frame waits changes the clock by less
 _PRUNE_EVERY = 256
-_STEP_SHOWN_NS = 60 * 10**9
+_SHOWN_NS = 60 * 10**9
 _LOOK_S = 0.005
 # A single-frequency receiver under open sky, where it reports a dilution only; GPS_FIX_TYPE → metres for each unit.
 METRES_PER_DOP = {2: 2.5, 3: 2.5, 4: 1.0, 5: 0.3, 6: 0.02, 7: 0.02, 8: 0.05}
-
-
-@dataclass(frozen=True, slots=True)
-class TelemetryStatistics:
-    """What was fed so far."""
-
-    packets: int
-    positions: int
-    attitudes: int
-    reboots: int
-    out_of_order: int
-    feedbacks: int = 0
-    gimbals: int = 0
 
 
 class Telemetry:
@@ -78,8 +75,8 @@ class Telemetry:
 
     `vehicles` are (packet number, system id) in order, as a recorded flight followed them. `component_id` is our own
     (see AutopilotTime), `cam_idx` our camera's number in CAMERA_FEEDBACK. `attitude_sigma_rad` is how well the
-    autopilot knows its attitude, where it doesn't say; 0 is not known. `rules`
-    are those of the flight (`TAGGING_RULES`). All methods may be called from any thread.
+    autopilot knows its attitude, where it doesn't say; 0 is not known. `rules` are those of the flight
+    (`TAGGING_RULES`). All methods may be called from any thread.
     """
 
     def __init__(
@@ -108,10 +105,11 @@ class Telemetry:
                         system_id, self._component_id, self._counts, cam_idx=self._cam_idx, rules=self._rules
                     )
             self._packets = number + 1
-            if message.get_type() not in USED_MESSAGES:
+            kind = message.get_type()
+            if kind not in USED_MESSAGES or (kind == "ODOMETRY" and self._rules < 3):
                 return
             self._history.feed(number, stamp_us * 1000, message)
-            if number >= self._prune_at:  # by packets that a replay decodes as well
+            if number >= self._prune_at:  # by packets that the flight used as well
                 self._prune_at = number + _PRUNE_EVERY
                 self._history.prune(stamp_us * 1000 - HISTORY_NS)
 
@@ -167,24 +165,34 @@ class Telemetry:
             limit = self._packets if upto_packet is None else upto_packet
             clock = self._history.clock(limit, exposure.utc_ns)
             events = self._history.feedbacks(limit, exposure.utc_ns)
-        trigger = exposure.trigger if self._rules > 1 else None
-        event = None
+        rules, event = self._rules, None
+        trigger = exposure.trigger if rules > 1 else None
         if clock is not None:
-            event = own_feedback(events, trigger) if trigger else choose_feedback(events, exposure, clock, self._rules)
+            event = own_feedback(events, trigger, rules) if trigger else choose_feedback(events, exposure, clock, rules)
         if clock is None or event is None:
             exposure = unseen(exposure) if trigger else exposure
             pose = self.pose_at(exposure.utc_ns, exposure.sigma_ns, upto_packet=limit)
-            return _in_doubt(exposure, clock), pose
+            return in_doubt(exposure, clock), pose
         sigma_ns = CONTACT_SIGMA_NS
         if trigger:
             better, boot_ns, sigma_ns = by_trigger(exposure, trigger, event, clock)
         else:
             better, boot_ns = refine(exposure, event, clock)
-        pose = self.pose_at(better.utc_ns, sigma_ns, upto_packet=limit, boot_ns=boot_ns)
-        return _in_doubt(better, clock), pose
+        if rules > 2 and not clock.doubt:  # the better time may be next to a step, where the expected one was not
+            with self._lock:
+                clock = self._history.clock(limit, better.utc_ns) or clock
+        by = clock if rules > 2 else None
+        pose = self.pose_at(better.utc_ns, sigma_ns, upto_packet=limit, boot_ns=boot_ns, clock=by)
+        return in_doubt(better, clock), pose
 
     def pose_at(
-        self, utc_ns: int, utc_sigma_ns: float, *, upto_packet: int | None = None, boot_ns: int | None = None
+        self,
+        utc_ns: int,
+        utc_sigma_ns: float,
+        *,
+        upto_packet: int | None = None,
+        boot_ns: int | None = None,
+        clock: BootClock | None = None,
     ) -> Pose:
         """The pose at mid-exposure, UTC ± one sigma (nanoseconds), from the packets below `upto_packet` (all so far).
 
@@ -192,29 +200,49 @@ class Telemetry:
         sample up to 10 s away is used, marked "nearest", with its age in the sigma; else what is missing is None, and
         without a position the source is "none". See `pose_around`.
 
-        `boot_ns`, where given, is the same instant on the autopilot's own clock; sigma is then of that.
+        `boot_ns`, where given, is the instant on the autopilot's own clock; sigma is then of that. `clock` is the one
+        that placed it.
         """
         with self._lock:
             limit = self._packets if upto_packet is None else upto_packet
-            clock = self._history.clock(limit, utc_ns)
+            clock = clock or self._history.clock(limit, utc_ns)
             if clock is None:
                 return unknown_pose(utc_ns, limit)
             if boot_ns is None:
                 boot_ns, sigma_ns = clock.boot_ns(utc_ns), (utc_sigma_ns**2 + clock.sigma_ns**2) ** 0.5
-            else:
-                sigma_ns = utc_sigma_ns
+            else:  # where the clock stepped, the samples around that time may not be those of the exposure
+                sigma_ns = math.hypot(utc_sigma_ns, clock.sigma_ns if clock.doubt and self._rules > 2 else 0.0)
             at = self._history.around(utc_ns, boot_ns, sigma_ns, limit, placed=not clock.doubt)
         return pose_around(at, packets=limit, attitude_sigma_rad=self._attitude_sigma_rad, rules=self._rules)
+
+    def rates(self, pose: Pose) -> Vector3 | None:
+        """The body's turn rates at a pose, rad/s about its own axes, from the packets that the pose was made from; None
+        where attitudes are missing, or too far apart to say how it turned between them."""
+        boot_ns = (pose.boot_us or 0) * 1000
+        with self._lock:
+            found = self._history.around(pose.utc_ns, boot_ns, 0.0, pose.telemetry_packets).attitudes
+        if pose.boot_us is None or len(found) != 2:
+            return None
+        a, b = found
+        span_ns, rates = b.boot_ns - a.boot_ns, (a.rates_rad_s, b.rates_rad_s)
+        if span_ns > (TURN_GAP_NS if None in rates else RATES_GAP_NS):
+            return None
+        return turn_rates((a.attitude, b.attitude), rates, span_ns / 1e9, (boot_ns - a.boot_ns) / span_ns)
 
     def clock_problem(self, utc_ns: int) -> str | None:
         """A sentence where the autopilot's clock has stepped in the last minute."""
         with self._lock:
             last, unsteady = self._history.time.last_step(), self._history.time.is_unsteady()
-        if last is None or last.step_ns is None or utc_ns - last.since_ns > _STEP_SHOWN_NS:
+        if last is None or last.step_ns is None or utc_ns - last.since_ns > _SHOWN_NS:
             return None
         if unsteady:
             return "the autopilot's clock does not run steadily: poses are in doubt"
         return f"the autopilot's clock stepped by {last.step_ns / 1e9:+.3f} s: poses next to that are in doubt"
+
+    def impossible(self, utc_ns: int) -> str | None:
+        """A sentence where messages of the last minute could not be true."""
+        recent = self._counts.impossible and utc_ns - self._counts.impossible_ns <= _SHOWN_NS
+        return "the autopilot sends impossible positions, attitudes or times: they are not used" if recent else None
 
     def utc_correction(self) -> UtcCorrection | None:
         """This machine's UTC against that of the autopilot's satellites; None while either is unknown."""
@@ -236,8 +264,9 @@ class Telemetry:
                 counts.attitudes,
                 history.time.reboots,
                 counts.out_of_order,
-                counts.feedbacks,
-                history.gimbals.seen,
+                feedbacks=counts.feedbacks,
+                gimbals=history.gimbals.seen,
+                impossible=counts.impossible,
             )
 
 
@@ -293,6 +322,10 @@ class Navigation:
             self._clock.wait(self._never, _LOOK_S)
         return self.telemetry.locate(exposure)
 
+    def rates(self, pose: Pose) -> Vector3 | None:
+        """See PoseSource."""
+        return self.telemetry.rates(pose)
+
     def pose_now(self) -> Pose:
         """The vehicle's pose at this moment."""
         return self.telemetry.pose_at(self._clock.utc_ns(), 0.0)
@@ -303,21 +336,14 @@ def recorded_vehicles(ledger: LedgerReader) -> list[tuple[int, int]]:
     return [(packet, system_id) for packet, system_id in ledger.facts().get(_VEHICLES, [])]
 
 
-def first_position_utc_ns(packets: Iterable[tuple[int, int, MavlinkMessage]]) -> int | None:
-    """When the first known position of a log arrived (its stamp), from (number, stamp_us, message), or None."""
-    for _, stamp_us, message in packets:
-        if message.get_type() == "GLOBAL_POSITION_INT" and (message.lat or message.lon):
-            return stamp_us * 1000
-    return None
-
-
 def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, rules: int = TAGGING_RULES) -> Pose:
     """The pose at an instant, from `packets` packets.
 
     Position: cubic Hermite with the reported velocities. Attitude and gimbal: slerp. With one sample only, that one,
     marked "nearest". Sigmas: time (exposure and clocks) × speed and × turn rate, with the age of a single sample; the
     uncertainty of the interpolation; the receiver's accuracy (without one the position's sigmas are None); the
-    attitude's own, as the autopilot reports it, else `attitude_sigma_rad` (without either the attitude's are None).
+    attitude's own, as the autopilot reports it or `attitude_sigma_rad`, the larger (without either the attitude's are
+    None).
     """
     sigma_s = math.hypot(at.sigma_ns, HALF_MS_NS / math.sqrt(3)) / 1e9
     attitude, attitude_sigma, attitude_covariance = _attitude(at, sigma_s, attitude_sigma_rad, rules)
@@ -360,13 +386,6 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, ru
         position_covariance_m2=covariance,
         age_ms=age_s * 1e3,
     )
-
-
-def _in_doubt(exposure: ExposureTime, clock: BootClock | None) -> ExposureTime:
-    """The exposure with the doubt of the clock that places it."""
-    if clock is None or not clock.doubt:
-        return exposure
-    return replace(exposure, source=f"{exposure.source}; in doubt: {clock.doubt}")
 
 
 def unknown_pose(utc_ns: int, packets: int) -> Pose:
@@ -432,6 +451,8 @@ def _attitude(
         return None, None, None
     found, doubt = attitude_at(samples, at.boot_ns)
     reported_rad = max((sample.sigma_rad for sample in samples if sample.sigma_rad is not None), default=own_rad)
+    if rules > 2:  # a filter doesn't know of its compass's error, the user may
+        reported_rad = max(reported_rad, own_rad)
     if reported_rad <= 0 and rules > 1:
         return found, None, None  # the error of the interpolation alone says nothing about the autopilot's own
     rates = max((s.rates_rad_s for s in samples if s.rates_rad_s is not None), key=norm, default=None)

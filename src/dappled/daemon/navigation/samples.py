@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
-from dappled.daemon.navigation.clocks import EPOCH_US
 from dappled.decode.geometry import Gnss, Quaternion, Vector3, from_euler, normalised
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
@@ -20,8 +20,12 @@ GIMBAL_COMPONENTS = frozenset({1, 154, 171, 172, 173, 174, 175})  # an autopilot
 _EARTH = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
 _VEHICLE = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
 _LOCK = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK
-_WRAP_US = 2**32
+EPOCH_US = 10**15  # 2001: a time above is UTC, one below counts since boot
+WRAP_US = 2**32  # ArduPilot counts the microseconds of its feedback pin in 32 bits
 NEAREST_NS = 10 * 10**9
+_HIGHEST_MM = 10**8
+_ARRIVED_NS, _ARRIVED_FEW, _ARRIVED_MOST = 5 * 10**9, 10, 1024
+_SOONER_NS, _SOONER_SHARE = 60_000_000, 5.0
 MOST_SAMPLES = 2**16  # of one kind: three minutes at 360 Hz, more than any autopilot sends
 
 
@@ -100,6 +104,23 @@ class GimbalSample:
     kind: str
 
 
+@dataclass(frozen=True, slots=True)
+class Feedback:
+    """One CAMERA_FEEDBACK or CAMERA_TRIGGER: its time since boot. `number` is its packet's in the log,
+    `image` the autopilot's number of it.
+
+    `contact`: it is the time of a contact in the hot shoe. False: it may be that of the command to fire.
+    """
+
+    number: int
+    stamp_ns: int
+    boot_ns: int
+    kind: str
+    image: int = 0
+    contact: bool = True
+    time_us: int = 0  # as it was sent
+
+
 @dataclass(slots=True)
 class Counts:
     """How much of all vehicles was used so far, and how much came out of order."""
@@ -108,6 +129,27 @@ class Counts:
     attitudes: int = 0
     feedbacks: int = 0
     out_of_order: int = 0
+    impossible: int = 0
+    impossible_ns: int = 0  # the last one's stamp
+
+    def refuse(self, stamp_ns: int) -> None:
+        """Count one that can't be true."""
+        self.impossible += 1
+        self.impossible_ns = stamp_ns
+
+
+@dataclass(frozen=True, slots=True)
+class TelemetryStatistics:
+    """What was fed so far. `impossible` were not used: they can't be true."""
+
+    packets: int
+    positions: int
+    attitudes: int
+    reboots: int
+    out_of_order: int
+    feedbacks: int = 0
+    gimbals: int = 0
+    impossible: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +193,22 @@ def boot_ns(message: MavlinkMessage) -> int:
     return int(message.time_boot_ms) * 10**6 + HALF_MS_NS
 
 
+def is_impossible(message: MavlinkMessage) -> bool:
+    """Whether a position or an attitude can't be true: off the globe (as MAVLink's 2147483647 for unknown), higher or
+    lower than 100 km, or not finite."""
+    kind = message.get_type()
+    if kind == "GLOBAL_POSITION_INT":
+        heights = abs(message.alt), abs(message.relative_alt)
+        return bool(abs(message.lat) > 90 * 10**7 or abs(message.lon) > 180 * 10**7 or max(heights) > _HIGHEST_MM)
+    if kind == "ATTITUDE":
+        values: Iterable[float] = (message.roll, message.pitch, message.yaw)
+    elif kind == "ATTITUDE_QUATERNION":
+        values = (message.q1, message.q2, message.q3, message.q4)
+    else:
+        values = message.q
+    return not all(map(math.isfinite, values))
+
+
 def position(number: int, stamp_ns: int, message: MavlinkMessage) -> PositionSample | None:
     """A GLOBAL_POSITION_INT; None while the autopilot has no position."""
     if message.lat == 0 and message.lon == 0:
@@ -167,8 +225,16 @@ def position(number: int, stamp_ns: int, message: MavlinkMessage) -> PositionSam
     )
 
 
-def attitude(number: int, stamp_ns: int, message: MavlinkMessage) -> AttitudeSample | None:
-    """An attitude message; None while the autopilot has no attitude (NaN or zeros)."""
+def first_position_utc_ns(packets: Iterable[tuple[int, int, MavlinkMessage]]) -> int | None:
+    """When the first known position of a log arrived (its stamp), from (number, stamp_us, message), or None."""
+    for _, stamp_us, message in packets:
+        if message.get_type() == "GLOBAL_POSITION_INT" and (message.lat or message.lon) and not is_impossible(message):
+            return stamp_us * 1000
+    return None
+
+
+def attitude(number: int, stamp_ns: int, message: MavlinkMessage, rules: int) -> AttitudeSample | None:
+    """An attitude message, by the flight's `TAGGING_RULES`; None while the autopilot has no attitude (NaN or zeros)."""
     kind, sigma_rad = message.get_type(), None
     if kind == "ATTITUDE":
         turned = from_euler(message.roll, message.pitch, message.yaw)
@@ -176,8 +242,10 @@ def attitude(number: int, stamp_ns: int, message: MavlinkMessage) -> AttitudeSam
         turned = (message.q1, message.q2, message.q3, message.q4)
     else:
         turned = tuple(message.q)
-        variance = message.covariance[0] + message.covariance[4] + message.covariance[8]
-        sigma_rad = math.sqrt(variance) if variance > 0 else None  # NaN: not known
+        variances = [message.covariance[place] for place in (0, 4, 8)]
+        sigma_rad = _whole_sigma(variances)
+        if rules < 3:
+            sigma_rad = math.sqrt(sum(variances)) if sum(variances) > 0 else None  # NaN: not known
     try:
         turned = normalised(*turned)
     except ValueError:
@@ -185,6 +253,18 @@ def attitude(number: int, stamp_ns: int, message: MavlinkMessage) -> AttitudeSam
     rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
     known = all(math.isfinite(rate) for rate in rates)
     return AttitudeSample(number, stamp_ns, boot_ns(message), turned, rates if known else None, sigma_rad)
+
+
+def attitude_sigma_rad(message: MavlinkMessage) -> float | None:
+    """How well the autopilot knows its attitude, from the variances of an ODOMETRY (PX4's estimator); None where they
+    are not given."""
+    return _whole_sigma([message.pose_covariance[place] for place in (15, 18, 20)])  # of a 6 × 6 triangle
+
+
+def _whole_sigma(variances: Sequence[float]) -> float | None:
+    """1 σ of the whole rotation from the variances of its three axes; None where any of them is not given."""
+    known = all(math.isfinite(one) and one > 0 for one in variances)
+    return math.sqrt(sum(variances)) if known else None
 
 
 def gnss(number: int, stamp_ns: int, message: MavlinkMessage) -> GnssSample:
@@ -218,6 +298,25 @@ def gimbal(number: int, stamp_ns: int, message: MavlinkMessage, epoch: int = 0) 
     return GimbalSample(number, stamp_ns, boot_ns(message), message.get_srcComponent(), epoch, turned, follows, kind)
 
 
+def next_gimbal(
+    before: GimbalSample | None, number: int, stamp_ns: int, message: MavlinkMessage
+) -> GimbalSample | None:
+    """A gimbal's attitude that follows `before`; None for one that isn't valid, another gimbal's or a late copy.
+
+    MOUNT_ORIENTATION counts until the gimbal sends the modern message; an older time is that of one that restarted.
+    """
+    sample = gimbal(number, stamp_ns, message, before.epoch if before else 0)
+    if sample is None or before is None:
+        return sample
+    if sample.kind != "MOUNT_ORIENTATION" and before.kind == "MOUNT_ORIENTATION":
+        return replace(sample, epoch=before.epoch + 1)
+    if (before.component, before.kind) != (sample.component, sample.kind):
+        return None
+    if sample.boot_ns < before.boot_ns - NEAREST_NS:
+        return replace(sample, epoch=before.epoch + 1)
+    return sample if sample.boot_ns > before.boot_ns else None
+
+
 def _scaled(value: int, unknown: int, parts: int) -> float | None:
     """A field in parts of its unit; 0 and the highest value stand for unknown."""
     return value / parts if 0 < value < unknown else None
@@ -237,8 +336,8 @@ def feedback_boot_ns(
         return None
     if time_us >= EPOCH_US:
         return None if unix_minus_boot_ns is None else time_us * 1000 - unix_minus_boot_ns
-    if unwrap and message.get_type() == "CAMERA_FEEDBACK" and time_us < _WRAP_US:
-        time_us += max(0, round((now_boot_ns // 1000 - time_us) / _WRAP_US)) * _WRAP_US
+    if unwrap and message.get_type() == "CAMERA_FEEDBACK" and time_us < WRAP_US:
+        time_us += max(0, round((now_boot_ns // 1000 - time_us) / WRAP_US)) * WRAP_US
     return time_us * 1000
 
 
@@ -252,3 +351,52 @@ def keep(history: list[N], sample: N) -> None:
 def prune(history: list[N], before_ns: int) -> None:
     """Forget what came before."""
     del history[: bisect_left(history, before_ns, key=lambda sample: sample.stamp_ns)]
+
+
+class ArrivalSteps:
+    """How long after its own time each message arrived in the last five seconds: for autopilots without TIMESYNC."""
+
+    def __init__(self) -> None:
+        self._known: deque[tuple[int, int]] = deque(maxlen=_ARRIVED_MOST)  # stamp, stamp - boot time
+        self._least_ns = 0  # of all of them, or less
+
+    def sooner_ns(self, stamp_ns: int, boot_ns: int) -> int | None:
+        """Take a message. By how much sooner it came than any other, where only a step of the autopilot's clock
+        explains it: by 60 ms + five times what half of the others were apart."""
+        while self._known and self._known[0][0] < stamp_ns - _ARRIVED_NS:
+            self._known.popleft()
+        offset_ns, by_ns = stamp_ns - boot_ns, None
+        if len(self._known) >= _ARRIVED_FEW and offset_ns < self._least_ns - _SOONER_NS:
+            others = sorted(one for _, one in self._known)
+            early_ns = others[0] - offset_ns
+            if early_ns > _SOONER_NS + _SOONER_SHARE * (others[len(others) // 2] - others[0]):
+                by_ns = early_ns
+                self._known.clear()
+        if not self._known or offset_ns < self._least_ns:
+            self._least_ns = offset_ns
+        self._known.append((stamp_ns, offset_ns))
+        return by_ns
+
+    @property
+    def last_ns(self) -> int:
+        """When the last one arrived; 0: none did."""
+        return self._known[-1][0] if self._known else 0
+
+    def forget(self) -> None:
+        """The autopilot has started again."""
+        self._known.clear()
+
+
+@dataclass(frozen=True, slots=True)
+class UtcCorrection:
+    """What to add to this machine's UTC to get the autopilot's (from its satellites), ± 1 σ."""
+
+    correction_ns: int
+    sigma_ns: int
+    source: str
+
+
+class UtcNotes(Protocol):
+    """Where a correction is recorded; see `flight.recording.Recording`."""
+
+    def learn_utc(self, correction_ns: int, sigma_ns: int, source: str) -> None: ...

@@ -12,10 +12,8 @@ from dataclasses import replace
 
 from dappled.daemon.navigation import samples as telemetry_samples
 from dappled.daemon.navigation.clocks import (
-    EPOCH_US,
     TAGGING_RULES,
     BootClock,
-    Feedback,
     TimesyncAnswer,
     from_arrivals,
     from_few,
@@ -23,13 +21,16 @@ from dappled.daemon.navigation.clocks import (
     step_ns,
 )
 from dappled.daemon.navigation.samples import (
+    EPOCH_US,
     GIMBAL_COMPONENTS,
     HALF_MS_NS,
     NEAREST_NS,
     Around,
+    ArrivalSteps,
     AttitudeSample,
     Counts,
     Epoch,
+    Feedback,
     GimbalSample,
     GnssSample,
     N,
@@ -55,9 +56,43 @@ _REQUESTS_KEPT = 64
 _UNSTEADY_NS = 10 * 10**9  # two steps within this time: the clock does not run steadily
 _FEW = 3
 _ANSWERS_COME_NS = 10**9
+_SILENT_NS = 10 * 10**9  # an autopilot that has answered within this time shows its steps by its answers
+_LOOKED_AT = 64  # answers: more than come in the ten seconds that `step_ns` looks back
 _REPEATS = 64
+_MOST_BOOT_NS = 2**62  # differences of such times fit 64 bits
 _AUTOPILOT = 1
-_FitKey = tuple[str | int, ...]  # what a fit was made from: its kind, the boot's first packet, the last packets
+_FitKey = tuple[str | int, ...]  # what a fit was made from: its kind, the epoch's first packet, the last packets
+
+
+def between(history: Sequence[N], first: int, limit: int) -> Sequence[N]:
+    """Those of the packets first <= number < limit."""
+    return history[place_of(history, first) : place_of(history, limit)]
+
+
+def place_of(history: Sequence[Numbered], number: int) -> int:
+    """Where packet `number` would stand."""
+    return bisect_left(history, number, key=lambda sample: sample.number)
+
+
+def latest(history: Sequence[N], window_ns: int) -> Sequence[N]:
+    """Those that arrived in the last `window_ns` before the last one."""
+    if not history:
+        return history
+    since = history[-1].stamp_ns - window_ns
+    return history[bisect_left(history, since, key=lambda sample: sample.stamp_ns) :]
+
+
+def around_instant(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[S, ...]:
+    """The two samples around an instant, not more than `gap_ns` apart; or the nearest one, if it is near enough; or
+    none. `boot_ns` of the history must rise."""
+    at = bisect_left(history, boot_ns, key=lambda sample: sample.boot_ns)
+    sides = tuple(history[max(0, at - 1) : at + 1])
+    if len(sides) == 2 and sides[1].boot_ns - sides[0].boot_ns <= gap_ns:
+        return sides
+    nearest = min(sides, key=lambda sample: abs(sample.boot_ns - boot_ns), default=None)
+    if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS:
+        return ()
+    return (nearest,)
 
 
 class AutopilotTime:
@@ -77,11 +112,12 @@ class AutopilotTime:
         self._answers: list[TimesyncAnswer] = []
         self._requests: dict[int, int] = {}
         self._epochs = [Epoch(0, 0, 0)]
+        self._arrivals = ArrivalSteps()
         self._back_since_ns: int | None = None
         self._fitted: tuple[_FitKey | None, BootClock | None] = (None, None)
         self.now_boot_ns: int | None = None
         self.unix_minus_boot_ns: int | None = None
-        self.reboots = self.steps = 0
+        self.reboots = 0
 
     def believe(self, number: int, stamp_ns: int, boot_ns: int) -> bool:
         """Whether a packet's time since boot is plausible.
@@ -97,21 +133,29 @@ class AutopilotTime:
             self._epochs.append(Epoch(number, self._back_since_ns, self._back_since_ns))
             self.reboots += 1
             self._requests.clear()
+            self._arrivals.forget()
             self.unix_minus_boot_ns = None
             self.now_boot_ns = boot_ns
         self._back_since_ns = None
         self.now_boot_ns = boot_ns if self.now_boot_ns is None else max(self.now_boot_ns, boot_ns)
+        if self._rules > 3 and not (self._answers and stamp_ns - self._answers[-1].stamp_ns < _SILENT_NS):
+            before_ns = self._arrivals.last_ns
+            by_ns = self._arrivals.sooner_ns(stamp_ns, boot_ns)
+            if by_ns is not None:
+                self._epochs.append(Epoch(number, before_ns, stamp_ns, -by_ns))
         return True
 
     def first(self, limit: int) -> int:
         """The packet number at which the epoch began that was current below `limit`."""
-        return self._epoch(limit).number
+        return self._epochs[self._place(limit)].number
 
     def span(self, limit: int, utc_ns: int) -> tuple[int, int]:
         """The packets of an instant's epoch, as known below `limit`: from the first to before the second."""
-        at = self._place(limit, utc_ns)
-        later = self._epochs[at + 1 : at + 2]
-        return self._epochs[at].number, min([limit, *(one.number for one in later)])
+        return self._packets_of(self._place(limit, utc_ns), limit)
+
+    def _packets_of(self, at: int, limit: int) -> tuple[int, int]:
+        """The packets below `limit` of one epoch: from the first to before the second."""
+        return self._epochs[at].number, min([limit, *(one.number for one in self._epochs[at + 1 : at + 2])])
 
     def is_past(self, utc_ns: int) -> bool:
         """Whether an instant was before the present epoch: nothing that arrives can say more about it."""
@@ -141,9 +185,6 @@ class AutopilotTime:
             at -= 1
         return at
 
-    def _epoch(self, limit: int) -> Epoch:
-        return self._epochs[self._place(limit)]
-
     def _steps_near(self, utc_ns: int, end: int) -> list[int]:
         """The sizes of the steps around an instant, among the first `end` epochs."""
         return [
@@ -157,28 +198,29 @@ class AutopilotTime:
         if message.time_unix_usec > EPOCH_US and message.time_boot_ms > 0:
             self.unix_minus_boot_ns = message.time_unix_usec * 1000 - (message.time_boot_ms * 10**6 + HALF_MS_NS)
 
-    def timesync(self, number: int, stamp_ns: int, message: MavlinkMessage, *, from_autopilot: bool) -> None:
-        """Take a TIMESYNC, request or answer."""
+    def timesync(self, number: int, stamp_ns: int, message: MavlinkMessage, *, from_autopilot: bool) -> bool:
+        """Take a TIMESYNC, request or answer. Whether it is an answer to us that can't be true."""
         if message.tc1 == 0:
             if message.get_srcComponent() == self._component_id and 0 <= stamp_ns - message.ts1 < 10**9:
                 self._requests[message.ts1] = stamp_ns
                 if len(self._requests) > _REQUESTS_KEPT:
                     self._requests.pop(next(iter(self._requests)))
-            return
+            return False
         if message.ts1 not in self._requests or not from_autopilot:
-            return
+            return False
         answer = TimesyncAnswer(number, message.ts1, stamp_ns, message.tc1)
-        if answer.delay_ns < 0:
-            return
+        least = 0 if self._rules > 2 else -_MOST_BOOT_NS
+        if answer.delay_ns < 0 or not least < message.tc1 < _MOST_BOOT_NS:
+            return True
         if self.now_boot_ns is not None and message.tc1 < self.now_boot_ns - REBOOT_BACK_NS:
-            return  # from before or after a reboot that the telemetry has yet to show
+            return False  # from before or after a reboot that the telemetry has yet to show
         del self._requests[message.ts1]  # the same answer on a second link is not a second observation
-        known = _between(self._answers, self._epochs[-1].number, number)
-        by_ns = step_ns(known, answer) if self._rules > 1 else None
+        known = between(self._answers[-_LOOKED_AT:], self._epochs[-1].number, number)
+        by_ns = step_ns(known, answer, self._rules) if self._rules > 1 else None
         if by_ns is not None:
             self._epochs.append(Epoch(number, known[-1].stamp_ns, stamp_ns, by_ns))
-            self.steps += 1
         self._answers.append(answer)
+        return False
 
     def clock(self, limit: int, histories: Sequence[Sequence[Sample]], utc_ns: int | None = None) -> BootClock | None:
         """The autopilot's clock against ours at an instant (now), from the packets below `limit`; None while unknown.
@@ -195,7 +237,7 @@ class AutopilotTime:
         between = at > 0 and epoch.step_ns is not None and utc_ns < epoch.since_ns
         if not between and len(near) < 2:
             return found
-        widest_ns = max(near)
+        widest_ns = max([*near, abs(epoch.step_ns or 0) if between else 0])
         doubt = f"the autopilot's clock stepped by {widest_ns / 1e9:.3f} s"
         if len(near) > 1:
             doubt = f"the autopilot's clock stepped {len(near)} times, by up to {widest_ns / 1e9:.3f} s"
@@ -203,19 +245,17 @@ class AutopilotTime:
 
     def _epoch_clock(self, at: int, limit: int, histories: Sequence[Sequence[Sample]]) -> BootClock | None:
         """The clock by the packets of one epoch alone."""
-        epoch = self._epochs[at]
-        first = epoch.number
-        limit = min([limit, *(one.number for one in self._epochs[at + 1 : at + 2])])
-        answers = _between(self._answers, first, limit)
+        first, limit = self._packets_of(at, limit)
+        answers = between(self._answers, first, limit)
         if answers:
-            few = len(answers) < _FEW and epoch.step_ns is not None
+            few = len(answers) < _FEW and self._epochs[at].step_ns is not None
             by_timesync: _FitKey = ("timesync", first, answers[-1].number)
             clock = self._fit(
-                by_timesync, lambda: from_few(answers) if few else from_timesync(_last(answers, TIMESYNC_WINDOW_NS))
+                by_timesync, lambda: from_few(answers) if few else from_timesync(latest(answers, TIMESYNC_WINDOW_NS))
             )
             if clock is not None:
                 return clock
-        tails = [_last(_between(one, first, limit), ARRIVAL_WINDOW_NS) for one in histories]
+        tails = [latest(between(one, first, limit), ARRIVAL_WINDOW_NS) for one in histories]
         key: _FitKey = ("arrival", first, *(tail[-1].number for tail in tails if tail))
         return self._fit(
             key, lambda: from_arrivals([(one.boot_ns, one.stamp_ns) for tail in tails for one in tail], self._rules)
@@ -238,7 +278,7 @@ class AutopilotTime:
 
 
 class Gimbals:
-    """Attitudes of the first gimbal heard. MOUNT_ORIENTATION counts until it sends the modern message."""
+    """Attitudes of the first gimbal heard."""
 
     def __init__(self, rules: int = TAGGING_RULES) -> None:
         self._rules = rules
@@ -246,25 +286,13 @@ class Gimbals:
         self.seen = 0
 
     def feed(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
-        """Take a packet of the vehicle's system. A sample with an older time is a late copy, or a gimbal that
-        restarted."""
+        """Take a packet of the vehicle's system."""
         if message.get_srcComponent() not in GIMBAL_COMPONENTS:
             return
-        before = self._samples[-1] if self._samples else None
-        sample = telemetry_samples.gimbal(number, stamp_ns, message, before.epoch if before else 0)
-        if sample is None:
-            return
-        if before is not None:
-            modern = sample.kind != "MOUNT_ORIENTATION" and before.kind == "MOUNT_ORIENTATION"
-            same = (before.component, before.kind) == (sample.component, sample.kind)
-            restarted = sample.boot_ns < before.boot_ns - NEAREST_NS
-            if not (modern or (same and (restarted or sample.boot_ns > before.boot_ns))):
-                return
-            if modern or restarted:
-                sample = telemetry_samples.gimbal(number, stamp_ns, message, before.epoch + 1)
-                assert sample is not None
-        self.seen += 1
-        keep(self._samples, sample)
+        sample = telemetry_samples.next_gimbal(self._samples[-1] if self._samples else None, number, stamp_ns, message)
+        if sample is not None:
+            self.seen += 1
+            keep(self._samples, sample)
 
     def around(self, utc_ns: int, boot_ns: int, first: int, limit: int) -> tuple[tuple[GimbalSample, ...], int]:
         """The samples around an instant from the packets below `limit`, and the instant on the gimbal's clock.
@@ -272,18 +300,18 @@ class Gimbals:
         `boot_ns` is the instant on the autopilot's clock, which began at packet `first`. A gimbal's clock need not be
         the autopilot's.
         """
-        known = _between(self._samples, 0, limit)
+        known = between(self._samples, 0, limit)
         if not known:
             return (), boot_ns
         if known[-1].component == _AUTOPILOT:
-            known = _between(known, first, limit)
+            known = between(known, first, limit)
         samples = [sample for sample in known if sample.epoch == known[-1].epoch]
         if samples and samples[0].component != _AUTOPILOT:
-            arrivals = [(one.boot_ns, one.stamp_ns) for one in _last(samples, ARRIVAL_WINDOW_NS)]
+            arrivals = [(one.boot_ns, one.stamp_ns) for one in latest(samples, ARRIVAL_WINDOW_NS)]
             clock = from_arrivals(arrivals, self._rules)
             assert clock is not None
             boot_ns = clock.boot_ns(utc_ns)
-        return _around(samples, boot_ns, gap_ns=GIMBAL_GAP_NS), boot_ns
+        return around_instant(samples, boot_ns, gap_ns=GIMBAL_GAP_NS), boot_ns
 
     def prune(self, before_ns: int) -> None:
         """Forget what came before."""
@@ -313,6 +341,7 @@ class VehicleHistory:
         self._attitudes: list[AttitudeSample] = []
         self._receiver: list[GnssSample] = []
         self._feedbacks: list[Feedback] = []
+        self._attitude_sigma: tuple[float | None, int] = (None, 0)  # as the autopilot told it, and when
 
     def feed(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         """Take a packet whose message is one of `USED_MESSAGES`. A packet of another vehicle changes nothing."""
@@ -333,7 +362,7 @@ class VehicleHistory:
 
     def feedbacks(self, limit: int, utc_ns: int) -> Sequence[Feedback]:
         """Messages about the hot shoe, from the packets below `limit` of the epoch of an instant."""
-        return _between(self._feedbacks, *self.time.span(limit, utc_ns))
+        return between(self._feedbacks, *self.time.span(limit, utc_ns))
 
     def reached(self, boot_ns: int) -> bool:
         """Whether samples from after this instant have arrived. Attitude counts only if some arrived in the last five
@@ -347,7 +376,7 @@ class VehicleHistory:
     def around(self, utc_ns: int, boot_ns: int, sigma_ns: float, limit: int, *, placed: bool = True) -> Around:
         """The samples around an instant (`boot_ns` ± σ on the autopilot's clock), from the packets below `limit`."""
         first, limit = self.time.span(limit, utc_ns)
-        receiver = _between(self._receiver, first, limit)
+        receiver = between(self._receiver, first, limit)
         nearest = min(receiver, key=lambda sample: abs(sample.stamp_ns - utc_ns), default=None)
         if nearest is not None and abs(nearest.stamp_ns - utc_ns) > NEAREST_NS:
             nearest = None
@@ -356,8 +385,8 @@ class VehicleHistory:
             utc_ns,
             boot_ns,
             sigma_ns,
-            _around(_between(self._positions, first, limit), boot_ns, gap_ns=POSITION_GAP_NS),
-            _around(_between(self._attitudes, first, limit), boot_ns, gap_ns=ATTITUDE_GAP_NS),
+            around_instant(between(self._positions, first, limit), boot_ns, gap_ns=POSITION_GAP_NS),
+            around_instant(between(self._attitudes, first, limit), boot_ns, gap_ns=ATTITUDE_GAP_NS),
             nearest,
             gimbals,
             gimbal_boot_ns,
@@ -365,16 +394,25 @@ class VehicleHistory:
         )
 
     def _position(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
-        sample = telemetry_samples.position(number, stamp_ns, message)
+        sample = None if self._refuses(stamp_ns, message) else telemetry_samples.position(number, stamp_ns, message)
         if sample is not None and self._believed(sample, message, self._positions):
             self.counts.positions += 1
             keep(self._positions, sample)
 
     def _attitude(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
-        sample = telemetry_samples.attitude(number, stamp_ns, message)
+        if self._refuses(stamp_ns, message):
+            return
+        sample = telemetry_samples.attitude(number, stamp_ns, message, self._rules)
+        told_rad, told_ns = self._attitude_sigma
+        if sample is not None and sample.sigma_rad is None and stamp_ns - told_ns <= _ALIVE_NS:
+            sample = replace(sample, sigma_rad=told_rad)
         if sample is not None and self._believed(sample, message, self._attitudes):
             self.counts.attitudes += 1
             keep(self._attitudes, sample)
+
+    def _odometry(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
+        if self._rules > 2 and self._ours(message):
+            self._attitude_sigma = telemetry_samples.attitude_sigma_rad(message), stamp_ns
 
     def _gnss(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if self._ours(message):
@@ -389,7 +427,8 @@ class VehicleHistory:
             self.time.system_time(message)
 
     def _timesync(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
-        self.time.timesync(number, stamp_ns, message, from_autopilot=self._ours(message))
+        if self.time.timesync(number, stamp_ns, message, from_autopilot=self._ours(message)):
+            self.counts.refuse(stamp_ns)
 
     def _feedback(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         """ArduPilot reports every camera at each trigger of one: only our camera's message counts."""
@@ -411,6 +450,14 @@ class VehicleHistory:
         self.counts.feedbacks += 1
         contact = older or (by_pin and time_us < EPOCH_US)
         keep(self._feedbacks, Feedback(number, stamp_ns, boot_ns, message.get_type(), image, contact, time_us))
+
+    def _refuses(self, stamp_ns: int, message: MavlinkMessage) -> bool:
+        """Whether it can't be true. Our own vehicle's are counted."""
+        if self._rules < 4 or not telemetry_samples.is_impossible(message):
+            return False
+        if message.get_srcComponent() == 1 and message.get_srcSystem() == self.system_id:
+            self.counts.refuse(stamp_ns)
+        return True
 
     def _ours(self, message: MavlinkMessage) -> bool:
         if message.get_srcComponent() != 1:
@@ -440,6 +487,7 @@ _HANDLERS: dict[str, Callable[[VehicleHistory, int, int, MavlinkMessage], None]]
     "ATTITUDE_QUATERNION": VehicleHistory._attitude,
     "ATTITUDE_QUATERNION_COV": VehicleHistory._attitude,
     "ATTITUDE": VehicleHistory._attitude,
+    "ODOMETRY": VehicleHistory._odometry,
     "GPS_RAW_INT": VehicleHistory._gnss,
     "GIMBAL_DEVICE_ATTITUDE_STATUS": VehicleHistory._gimbal,
     "MOUNT_ORIENTATION": VehicleHistory._gimbal,
@@ -449,34 +497,3 @@ _HANDLERS: dict[str, Callable[[VehicleHistory, int, int, MavlinkMessage], None]]
     "CAMERA_TRIGGER": VehicleHistory._feedback,
 }
 USED_MESSAGES = frozenset(_HANDLERS)
-
-
-def _between(history: Sequence[N], first: int, limit: int) -> Sequence[N]:
-    """Those of the packets first <= number < limit."""
-    return history[_place(history, first) : _place(history, limit)]
-
-
-def _place(history: Sequence[Numbered], number: int) -> int:
-    """Where packet `number` would stand."""
-    return bisect_left(history, number, key=lambda sample: sample.number)
-
-
-def _last(history: Sequence[N], window_ns: int) -> Sequence[N]:
-    """Those that arrived in the last `window_ns` before the last one."""
-    if not history:
-        return history
-    since = history[-1].stamp_ns - window_ns
-    return history[bisect_left(history, since, key=lambda sample: sample.stamp_ns) :]
-
-
-def _around(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[S, ...]:
-    """The two samples around an instant, not more than `gap_ns` apart; or the nearest one, if it is near enough; or
-    none. `boot_ns` of the history must rise."""
-    at = bisect_left(history, boot_ns, key=lambda sample: sample.boot_ns)
-    sides = tuple(history[max(0, at - 1) : at + 1])
-    if len(sides) == 2 and sides[1].boot_ns - sides[0].boot_ns <= gap_ns:
-        return sides
-    nearest = min(sides, key=lambda sample: abs(sample.boot_ns - boot_ns), default=None)
-    if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS:
-        return ()
-    return (nearest,)

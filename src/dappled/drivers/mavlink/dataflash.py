@@ -1,7 +1,7 @@
 """Read ArduPilot's own log (DataFlash, .bin) as the MAVLink packets that a telemetry link would have carried.
 
 Positions are POS with the velocities of XKF1 or NKF1, attitudes ATT, the receiver GPS and GPA. UTC comes from the
-receiver's time; of all its messages the one that was logged with the least delay counts.
+receiver's time (`log_packets.log_clock`).
 """
 
 from __future__ import annotations
@@ -18,34 +18,27 @@ from pymavlink import DFReader
 
 from dappled.decode.array_types import Floats
 from dappled.decode.geometry import from_euler
-from dappled.drivers.mavlink.links import MavlinkMessage, mavlink, pack
-from dappled.errors import DappledError, first_line
+from dappled.drivers.mavlink import log_packets
+from dappled.drivers.mavlink.log_packets import FIX_3D, AutopilotLogError, LogClock, ReceiverFix, Timed
+from dappled.errors import first_line
 
-MAGIC = b"\xa3\x95\x80\x80"
 _USED = ["POS", "ATT", "GPS", "GPA", "XKF1", "NKF1"]
 _GPS_EPOCH_US = 315_964_800 * 10**6
 _LEAP_US = 18 * 10**6  # since 2017; no older log is of use here
 _WEEK_US = 7 * 86400 * 10**6
-_FIX_3D = 3
-_UNKNOWN_16 = 2**16 - 1
 _GAP_US = 1_000_000  # a velocity further away is not that of a position
 
 
-class DataFlashError(DappledError):
-    """An autopilot's log can't be used; one sentence."""
+class DataFlashError(AutopilotLogError):
+    """A log of ArduPilot can't be used; one sentence."""
 
 
 def packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
     """(running number, stamp in µs UTC, packet), in the order of time. Raises DataFlashError."""
     rows = _rows(path)
-    offset_us = _utc_offset_us(path, rows["GPS"])
-    messages = sorted([*_positions(path, rows), *_attitudes(rows), *_receiver(rows, offset_us)], key=lambda one: one[0])
-    packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-    for number, (boot_us, message) in enumerate(messages):
-        yield number, boot_us + offset_us, pack(message, packer, version_1=False)
-
-
-_Timed = tuple[int, MavlinkMessage]
+    clock = _clock(path, rows["GPS"])
+    messages = [*_positions(path, rows), *_attitudes(rows), *_receiver(rows, clock)]
+    yield from log_packets.packets(messages, clock)
 
 
 def _rows(path: Path) -> dict[str, list[Any]]:
@@ -67,19 +60,20 @@ def _rows(path: Path) -> dict[str, list[Any]]:
     return rows
 
 
-def _utc_offset_us(path: Path, receiver: list[Any]) -> int:
-    """UTC minus time since boot, from the receiver's fixes. Raises DataFlashError without one."""
-    offsets = [
-        _GPS_EPOCH_US + row.GWk * _WEEK_US + row.GMS * 1000 - _LEAP_US - row.TimeUS
-        for row in receiver
-        if row.Status >= _FIX_3D and row.GWk > 0
-    ]
-    if not offsets:
+def _clock(path: Path, receiver: list[Any]) -> LogClock:
+    """The autopilot's clock by the receiver's fixes. Raises DataFlashError without one."""
+    fixes = [row for row in receiver if row.Status >= FIX_3D and row.GWk > 0]
+    if not fixes:
         raise DataFlashError(f"{path} holds no fix of a satellite receiver: its time in UTC is not known")
-    return int(max(offsets))
+    boots_us = np.array([row.TimeUS for row in fixes], dtype=np.int64)
+    gps_us = np.array([row.GWk * _WEEK_US + row.GMS * 1000 for row in fixes], dtype=np.int64)
+    try:
+        return log_packets.log_clock(boots_us, _GPS_EPOCH_US + gps_us - _LEAP_US - boots_us)
+    except AutopilotLogError as error:
+        raise DataFlashError(f"{path}: {error}") from None
 
 
-def _positions(path: Path, rows: dict[str, list[Any]]) -> Iterator[_Timed]:
+def _positions(path: Path, rows: dict[str, list[Any]]) -> Iterator[Timed]:
     moving = rows["XKF1"] or rows["NKF1"]
     if not rows["POS"] or not moving:
         raise DataFlashError(
@@ -90,45 +84,36 @@ def _positions(path: Path, rows: dict[str, list[Any]]) -> Iterator[_Timed]:
     for row in rows["POS"]:
         if np.abs(times - row.TimeUS).min() > _GAP_US:
             continue
-        vx, vy, vz = (round(float(np.interp(row.TimeUS, times, speed)) * 100) for speed in velocities)
-        places = round(row.Lat * 1e7), round(row.Lng * 1e7), round(row.Alt * 1e3), round(row.RelHomeAlt * 1e3)
-        yield (
-            int(row.TimeUS),
-            mavlink.MAVLink_global_position_int_message(int(row.TimeUS) // 1000, *places, vx, vy, vz, _UNKNOWN_16),
-        )
+        north, east, down = (float(np.interp(row.TimeUS, times, speed)) for speed in velocities)
+        place = row.Lat, row.Lng, row.Alt
+        yield log_packets.position(int(row.TimeUS), place, row.RelHomeAlt, (north, east, down))
 
 
-def _attitudes(rows: dict[str, list[Any]]) -> Iterator[_Timed]:
+def _attitudes(rows: dict[str, list[Any]]) -> Iterator[Timed]:
     for row in rows["ATT"]:
-        turned = from_euler(*np.radians([row.Roll, row.Pitch, row.Yaw]).tolist())
-        unknown = (float("nan"),) * 3
-        yield (
-            int(row.TimeUS),
-            mavlink.MAVLink_attitude_quaternion_message(int(row.TimeUS) // 1000, *turned, *unknown),
-        )
+        yield log_packets.attitude(int(row.TimeUS), from_euler(*np.radians([row.Roll, row.Pitch, row.Yaw]).tolist()))
 
 
-def _receiver(rows: dict[str, list[Any]], offset_us: int) -> Iterator[_Timed]:
+def _receiver(rows: dict[str, list[Any]], clock: LogClock) -> Iterator[Timed]:
     accuracies = rows["GPA"]
     times = _column(accuracies, "TimeUS")
     for row in rows["GPS"]:
         at = int(row.TimeUS)
         quality = accuracies[int(np.abs(times - at).argmin())] if accuracies else None
-        of_mm = (
-            [0, 0, 0]
-            if quality is None
-            else [round(1000 * value) for value in (quality.HAcc, quality.VAcc, quality.SAcc)]
-        )
-        dilution = _UNKNOWN_16 if quality is None else round(quality.VDop * 100)
-        places = round(row.Lat * 1e7), round(row.Lng * 1e7), round(row.Alt * 1e3)
-        yield (
-            at,
-            mavlink.MAVLink_gps_raw_int_message(
-                at, int(row.Status), *places, round(row.HDop * 100), dilution, _UNKNOWN_16, _UNKNOWN_16, int(row.NSats),
-                0, *of_mm,
+        yield from log_packets.receiver(
+            ReceiverFix(
+                at,
+                int(row.Status),
+                row.Lat,
+                row.Lng,
+                row.Alt,
+                int(row.NSats),
+                row.HDop,
+                None if quality is None else quality.VDop,
+                None if quality is None else (quality.HAcc, quality.VAcc, quality.SAcc),
             ),
-        )  # fmt: skip
-        yield at, mavlink.MAVLink_system_time_message(at + offset_us, at // 1000)
+            clock,
+        )
 
 
 def _column(rows: list[Any], name: str) -> Floats:

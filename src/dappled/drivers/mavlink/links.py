@@ -291,10 +291,13 @@ class PacketSender:
         """Send from now on."""
         self._log = packet_log
 
-    def send(self, message: MavlinkMessage, link: int | None = None) -> bool:
-        """Send on one link, or on all. False where no link took it. Never blocks, never raises for a lost link."""
+    def send(self, message: MavlinkMessage, link: int | None = None, *, without: int | None = None) -> bool:
+        """Send on one link, or on all, perhaps `without` one. False where no link took it. Never blocks, never raises
+        for a lost link."""
         taken = False
         for each in self._links if link is None else self._links[link : link + 1]:
+            if each.number == without:
+                continue
             with self.order:
                 taken = self._send_on(each, message) or taken
         return taken

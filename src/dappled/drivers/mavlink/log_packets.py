@@ -1,0 +1,116 @@
+"""Make the MAVLink packets that a telemetry link would have carried, from what an autopilot's own log holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.decode.array_types import Floats
+from dappled.decode.geometry import Quaternion, Vector3
+from dappled.drivers.mavlink.links import MavlinkMessage, mavlink, pack
+from dappled.errors import DappledError
+
+FIX_3D = 3
+_UNKNOWN_16 = 2**16 - 1
+_LATEST_US = 500_000  # a receiver's message is logged within that time, all but always
+_AGREEING = 0.75  # share of a receiver's messages that must give one time
+_DRIFT = 1e-4  # of an autopilot's clock, at most
+
+Timed = tuple[int, MavlinkMessage]  # µs since boot
+
+
+class AutopilotLogError(DappledError):
+    """An autopilot's log can't be used; one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReceiverFix:
+    """What the receiver said at one time. `accuracy_m` is horizontal and vertical (m) and of the speed (m/s)."""
+
+    boot_us: int
+    fix_type: int
+    latitude_deg: float
+    longitude_deg: float
+    altitude_msl_m: float
+    satellites: int
+    hdop: float
+    vdop: float | None
+    accuracy: tuple[float, float, float] | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogClock:
+    """UTC minus time since boot, `offsets_us` (n,), at `boots_us` (n,), which increase."""
+
+    boots_us: Floats
+    offsets_us: Floats
+
+    def utc_us(self, boot_us: int) -> int:
+        """A time since boot in UTC."""
+        begins = self.offsets_us[0]  # small numbers keep their digits
+        return boot_us + int(begins) + round(float(np.interp(boot_us, self.boots_us, self.offsets_us - begins)))
+
+
+def log_clock(boots_us: NDArray[np.int64], offsets_us: NDArray[np.int64]) -> LogClock:
+    """The clock by a receiver's messages, (n,) each: when they were logged, and UTC minus that.
+
+    A message is logged some time after it holds, so of messages near each other the largest offset is the truest. What
+    another message nearby says counts less by what the two clocks may have drifted apart meanwhile. Messages that are
+    half a second away from what most say are left out (a receiver that doesn't know the leap seconds yet, or a damaged
+    message). Raises AutopilotLogError where more than a quarter are.
+    """
+    away = np.abs(offsets_us - int(np.median(offsets_us)))
+    good = away < _LATEST_US
+    if good.mean() < _AGREEING:
+        raise AutopilotLogError(
+            f"the receiver's time in UTC changes by {float(away.max()) / 1e6:.1f} s within the log, so the time of a "
+            "frame is not certain: give the ground station's .tlog"
+        )
+    order = np.argsort(boots_us[good], kind="stable")
+    times, offsets = boots_us[good][order].astype(np.float64), offsets_us[good][order]
+    begins = int(offsets[0])
+    rising = _DRIFT * times
+    values = (offsets - begins).astype(np.float64)
+    since = np.maximum.accumulate(values + rising) - rising
+    until = np.maximum.accumulate((values - rising)[::-1])[::-1] + rising
+    return LogClock(times, np.maximum(since, until) + begins)
+
+
+def packets(messages: Iterable[Timed], clock: LogClock) -> Iterator[tuple[int, int, bytes]]:
+    """(running number, stamp in µs UTC, packet), in the order of time."""
+    packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    for number, (boot_us, message) in enumerate(sorted(messages, key=lambda one: one[0])):
+        yield number, clock.utc_us(boot_us), pack(message, packer, version_1=False)
+
+
+def position(boot_us: int, place: tuple[float, float, float], above_home_m: float, velocity_ned_m_s: Vector3) -> Timed:
+    """A GLOBAL_POSITION_INT. `place`: latitude and longitude (degrees), height above mean sea level (m)."""
+    latitude_deg, longitude_deg, altitude_m = place
+    whole = round(latitude_deg * 1e7), round(longitude_deg * 1e7), round(altitude_m * 1e3), round(above_home_m * 1e3)
+    speeds = (round(speed * 100) for speed in velocity_ned_m_s)
+    return boot_us, mavlink.MAVLink_global_position_int_message(boot_us // 1000, *whole, *speeds, _UNKNOWN_16)
+
+
+def attitude(boot_us: int, turned: Quaternion) -> Timed:
+    """An ATTITUDE_QUATERNION without rates."""
+    unknown = (float("nan"),) * 3
+    return boot_us, mavlink.MAVLink_attitude_quaternion_message(boot_us // 1000, *turned, *unknown)
+
+
+def receiver(fix: ReceiverFix, clock: LogClock) -> Iterator[Timed]:
+    """A GPS_RAW_INT and a SYSTEM_TIME."""
+    at = fix.boot_us
+    of_mm = [0, 0, 0] if fix.accuracy is None else [round(1000 * value) for value in fix.accuracy]
+    vertical = _UNKNOWN_16 if fix.vdop is None else round(fix.vdop * 100)
+    places = round(fix.latitude_deg * 1e7), round(fix.longitude_deg * 1e7), round(fix.altitude_msl_m * 1e3)
+    yield (
+        at,
+        mavlink.MAVLink_gps_raw_int_message(
+            at, fix.fix_type, *places, round(fix.hdop * 100), vertical, _UNKNOWN_16, _UNKNOWN_16, fix.satellites,
+            0, *of_mm,
+        ),
+    )  # fmt: skip
+    yield at, mavlink.MAVLink_system_time_message(clock.utc_us(at), at // 1000)

@@ -1,0 +1,100 @@
+"""What real autopilots do, line by line, and the tests in which the simulated ones do it.
+
+The lines are those of a note on ArduCopter 4.7-dev in software in the loop, flown against dappled. Matrix: the cells of
+`benchmarks/autopilots.py` with this fault or wiring, which `test_autopilot_matrix.py` flies.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.benchmarks import program
+
+TESTS = Path(__file__).parents[2]
+PROTOCOL, NAVIGATION = "daemon/camera_protocol/test_autopilots.py", "daemon/navigation/test_owned_triggers.py"
+COMPONENT, MOCK = "daemon/camera_protocol/test_component.py", "mocks/autopilot/test_personality.py"
+STEPS, FORWARDED = "daemon/navigation/test_clock_steps.py", "daemon/pipeline/test_forwarded.py"
+ROUTES = "daemon/camera_protocol/test_report_routes.py"
+FACTS: dict[str, tuple[tuple[str, str], ...]] = {
+    "CAMERA_FEEDBACK is sent for every camera at every trigger; a time of 0 is no time": (
+        (PROTOCOL, "test_a_trigger_of_one_of_two_wired_cameras_is_one_shot_of_that_camera"),
+        (NAVIGATION, "test_another_cameras_contact_and_a_time_of_zero_are_no_times"),
+        ("matrix", "ArduPilot, CAM2 of two, servo, pin"),
+    ),
+    "A pin's time has 32 bits and wraps every 71.6 minutes": (
+        (PROTOCOL, "test_a_pins_time_counts_as_now_after_it_has_wrapped"),
+        (NAVIGATION, "test_each_shot_has_its_own_time"),
+        ("matrix", "pin wraps"),
+    ),
+    "The pin listens once ArduPilot itself has triggered": (
+        (MOCK, "test_a_pin_sleeps_until_the_autopilot_has_triggered_its_camera"),
+        ("matrix", "reboots"),
+    ),
+    "The feedback that creates a shot comes before the shot, which owns its stamp": (
+        (NAVIGATION, "test_each_shot_has_its_own_time"),
+        (NAVIGATION, "test_a_shot_without_a_contact_has_no_other_shots_time"),
+        ("matrix", "ArduPilot, servo, pin"),
+    ),
+    "An exposure that has happened can't be refused": (
+        (PROTOCOL, "test_exposures_that_happened_are_never_refused_and_requests_to_fire_are_denied"),
+    ),
+    "Broadcasts are forwarded and executed: one request, two messages of two senders": (
+        (PROTOCOL, "test_a_broadcast_through_the_component_is_one_shot_and_one_refusal"),
+        (FORWARDED, "test_requests_and_shots_are_the_same_number"),
+        (FORWARDED, "test_an_interval_that_the_autopilot_runs_too_is_one_interval"),
+        (MOCK, "test_a_broadcast_is_executed_and_one_to_a_camera_is_not"),
+        ("matrix", "stations broadcast"),
+    ),
+    "Indices count ArduPilot's own triggers: a gap is a lost trigger": (
+        (PROTOCOL, "test_each_trigger_that_was_lost_on_the_link_is_named"),
+        ("matrix", "link down"),
+        ("matrix", "one packet of ten lost"),
+    ),
+    "The simulator's clock stalls, jumps and runs fast": (
+        (STEPS, "test_a_pose_next_to_a_step_is_in_doubt_and_those_around_it_are_right"),
+        (STEPS, "test_a_clock_that_runs_fast_gives_no_confident_pose"),
+        ("matrix", "clock steps"),
+        ("matrix", "late files, clock steps"),
+        ("matrix", "silence, clock steps"),
+        ("matrix", "clock 2 % fast"),
+    ),
+    "ATTITUDE has an error of its own: without a stated sigma it is unknown, not 0": (
+        ("daemon/navigation/test_pose_quality.py", "test_the_autopilots_own_attitude_accuracy_counts"),
+        ("matrix", "none"),
+    ),
+    "285 is sent to a companion's port only on request": (
+        (MOCK, "test_a_gimbals_attitude_is_sent_on_request_alone"),
+        (PROTOCOL, "test_a_gimbals_attitude_is_requested_where_the_camera_hangs_on_it_until_it_comes"),
+        ("daemon/health/test_record.py", "test_a_gimbal_that_is_not_heard_is_a_problem_where_the_camera_is_on_it"),
+    ),
+    "MAVSDK's list_photos through ArduPilot asks for image 0 without end": (
+        (PROTOCOL, "test_a_list_of_photographs_that_always_asks_for_the_first_one_ends"),
+    ),
+    "An untargeted TIMESYNC is forwarded to the radio; a camera on two ports is heard twice": (
+        (PROTOCOL, "test_a_request_for_the_time_is_for_the_autopilot_alone"),
+        (ROUTES, "test_a_report_is_sent_on_one_port_where_both_lead_to_the_same_stations"),
+        (ROUTES, "test_no_report_is_lost_and_none_comes_twice_without_need"),
+        ("matrix", "two ports"),
+    ),
+    "ArduPilot arms without a camera: text and the heartbeat's state tell the pilot": (
+        (COMPONENT, "test_heartbeats_time_requests_and_streams_come_in_time_and_none_while_faulted"),
+        ("system/test_mavlink_flights.py", "test_a_pilot_is_told_of_a_camera_that_went_and_came_back"),
+    ),
+    "Peers of 2026: MAVProxy's camera module": (("system/test_mavlink_peers.py", "test_mavproxys_camera_module"),),
+}
+
+
+@pytest.mark.parametrize("fact", FACTS)
+def test_each_fact_has_its_tests(fact: str) -> None:
+    world = program("autopilot_cell")
+    flown = {name for cell in program("autopilots").cells() for name in (cell.wiring, cell.fault)}
+    assert FACTS[fact]
+    for place, name in FACTS[fact]:
+        if place == "matrix":
+            assert name in flown
+            assert name in (*world.WIRINGS, *world.FAULTS)
+        else:
+            text = (TESTS / place).read_text("utf-8")
+            assert f"def {name}(" in text
