@@ -15,7 +15,7 @@ import os
 import queue
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from dappled.errors import DappledError
 
@@ -127,7 +127,20 @@ class Deferred:
 
 
 SettingName = Literal[
-    "focal_length", "aperture", "shutter_speed", "iso", "image_format", "capture_target", "battery", "free_shots"
+    "focal_length",
+    "aperture",
+    "shutter_speed",
+    "iso",
+    "image_format",
+    "capture_target",
+    "battery",
+    "free_shots",
+    "exposure_mode",
+    "focus_mode",
+    "drive_mode",
+    "white_balance",
+    "auto_power_off",
+    "mirror_lockup",
 ]
 
 
@@ -204,6 +217,26 @@ class Camera(ShutterTrigger, Arrivals, BodySettings, Identified, Protocol):
 
     def stop(self) -> None:
         """Close the camera within two seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class LivePicture:
+    """A JPEG of what the lens sees now, and when it was read."""
+
+    jpeg: bytes
+    monotonic_ns: int
+
+
+@runtime_checkable
+class LiveView(Protocol):
+    """A camera that can show what its lens sees before it is fired. A driver may have it."""
+
+    def look(self) -> LivePicture | None:
+        """Ask for a picture, and return the newest one, at most 2 s old; None while none has come. Returns at once.
+
+        Shots go first. The camera ends live view before a shot, and when nobody has asked for 3 s. Raises CameraError
+        where the body has none, or can't show it now.
+        """
 
 
 class QueuedCamera:

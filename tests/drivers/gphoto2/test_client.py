@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import signal
 import subprocess
@@ -10,13 +11,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 from dappled.drivers import usb_bus
 from dappled.drivers.camera import Arrival, CameraError, Companion, Fired, ShotFailed, StateChanged
@@ -86,6 +88,16 @@ def running(camera: GPhoto2Camera) -> Iterator[GPhoto2Camera]:
         camera.stop()
 
 
+@pytest.mark.parametrize(("f_number", "shown"), [(None, "2.8"), (14.8, "16"), (22.0, "22"), (59.2, "32")])
+def test_the_simulated_lens_is_set_to_the_stop_of_its_pictures(f_number: float | None, shown: str) -> None:
+    with (
+        SimulatedBody.start(BodyOptions(picture="pattern:1000:dng", f_number=f_number)) as body,
+        running(open_camera({"port": body.port})) as camera,
+    ):
+        until_state(camera, "ready")
+        assert {one.name: one.value for one in camera.settings()}["aperture"] == shown
+
+
 class TestContractToTheCard(CameraContract):
     @pytest.fixture
     def rig(self, make: Make) -> Iterator[Rig]:
@@ -123,6 +135,29 @@ def test_identity_is_what_the_body_says(make: Make, body: SimulatedBody) -> None
     assert ready.identity is not None
     assert (ready.identity.make, ready.identity.model) == ("Canon Inc.", "Canon EOS 450D")
     assert (ready.identity.serial, ready.identity.port) == ("0830412345", body.port)
+
+
+def test_live_view_comes_through_the_library_and_a_shot_ends_it(ready: Make, body: SimulatedBody) -> None:
+    camera = ready(timeouts={"answer_s": 30.0})
+
+    def picture(unlike: bytes = b"") -> bytes:
+        deadline_s = time.monotonic() + 30
+        while time.monotonic() < deadline_s:
+            now = None
+            with suppress(CameraError):  # off while a shot is at the camera
+                now = camera.look()
+            if now is not None and now.jpeg != unlike:
+                return now.jpeg
+            time.sleep(0.01)
+        raise AssertionError("no picture")
+
+    first = picture()
+    with Image.open(io.BytesIO(first)) as shown:
+        assert shown.size == (480, 320)
+    assert picture(unlike=first) != first  # each look is a new one
+    camera.fire(1)
+    assert arrived(camera, 1)
+    assert picture(unlike=first)
 
 
 def test_a_file_on_the_card_keeps_its_name_and_stays_until_released(ready: Make, body: SimulatedBody) -> None:

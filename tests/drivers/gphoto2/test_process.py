@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -35,6 +36,7 @@ from dappled.drivers.gphoto2.protocol import (
     LostError,
     RefusedError,
     SessionError,
+    SettingTurned,
 )
 from dappled.drivers.gphoto2.settings import GPhoto2Settings
 from dappled.testing import content, of_shots
@@ -61,6 +63,7 @@ class FakeCamera:
     triggered: int = 0
     opened: int = 0
     closed: int = 0
+    looking: bool = False
 
     def open(self, _settings: GPhoto2Settings, _before: str | None) -> FakeCamera:
         self._stumble("open")
@@ -68,6 +71,7 @@ class FakeCamera:
         return self
 
     def trigger(self) -> None:
+        assert not self.looking  # live view ends before a shot
         self._stumble("trigger")
         self.triggered += 1
 
@@ -101,6 +105,14 @@ class FakeCamera:
     def change(self, name: SettingName, value: str) -> None:
         self._stumble("change")
         self.shown = tuple(replace(each, value=value) if each.name == name else each for each in self.shown)
+
+    def preview(self) -> Blob:
+        self._stumble("preview")
+        self.looking = True
+        return Blob.of(b"a picture")
+
+    def end_preview(self) -> None:
+        self.looking = False
 
     def close(self) -> None:
         self.closed += 1
@@ -171,6 +183,49 @@ def states(events: list[CameraEvent]) -> list[tuple[str, str]]:
 
 def arrivals(events: list[CameraEvent]) -> list[Arrival]:
     return [event for event in events if isinstance(event, Arrival)]
+
+
+def looked(harness: Harness, seconds: float = 0.0) -> list[str]:
+    """What became of a look: "picture", or the reason why there is none."""
+    harness.channel.send({"do": "look"})
+    harness.clock.advance(seconds)
+    assert harness.loop.step()
+    answers = []
+    while (message := harness.channel.receive(0.0)) is not None:
+        if message.body["is"] == "live":
+            answers.append(message.body.get("refused", "picture"))
+        for fd in message.fds:
+            assert os.pread(fd, 100, 0) == b"a picture"
+            os.close(fd)
+    return answers
+
+
+def test_live_view_shows_a_picture_for_each_look_and_ends_when_nobody_looks(ready: Harness) -> None:
+    assert looked(ready) == ["picture"]
+    assert looked(ready, 2.9) == ["picture"]
+    ready.turn(2.9)
+    assert ready.camera.looking
+    ready.turn(0.2)
+    assert not ready.camera.looking
+
+
+def test_a_shot_ends_live_view_before_it_fires_and_none_is_read_meanwhile(ready: Harness) -> None:
+    assert looked(ready) == ["picture"]
+    ready.fire(1)
+    assert looked(ready) == ["live view is off while a shot is at the camera"]
+    assert ready.camera.triggered == 1  # in the step of its command; the camera asserts that live view was off
+    assert looked(ready) == ["live view is off while a shot is at the camera"]
+    ready.camera.adds(on_card(1))
+    ready.camera.coming.append(CaptureComplete())
+    ready.turn()
+    assert looked(ready) == ["picture"]
+
+
+def test_a_body_without_live_view_says_so_and_one_that_is_lost_comes_back(ready: Harness) -> None:
+    ready.camera.errors["preview"] = [RefusedError("this body has no live view"), LostError("gone")]
+    assert looked(ready) == ["this body has no live view"]
+    assert looked(ready) == ["gone"]
+    assert [state for state, _ in states(ready.turn(1.0))][-1] == "ready"
 
 
 def test_absent_camera_is_looked_for_until_it_comes(harness: Harness) -> None:
@@ -431,6 +486,17 @@ def test_settings_are_read_at_the_start_and_after_a_change(harness: Harness) -> 
     harness.channel.send({"do": "change", "name": "iso", "value": "200"})
     told = [event for event in harness.turn() if isinstance(event, SettingsChanged)]
     assert [(event.settings[0].value, event.refused) for event in told] == [("200", "")]
+
+
+def test_a_dial_that_is_turned_is_read_at_once(harness: Harness) -> None:
+    """Between shots: the body announces it. Without, it would be seen after the next file."""
+    harness.camera.shown = (Setting("exposure_mode", "Manual"),)
+    harness.turn()
+    harness.camera.shown = (Setting("exposure_mode", "AV"),)
+    assert not [event for event in harness.turn() if isinstance(event, SettingsChanged)]
+    harness.camera.coming.append(SettingTurned())
+    told = [event for event in harness.turn() if isinstance(event, SettingsChanged)]
+    assert [event.settings for event in told] == [harness.camera.shown]
 
 
 def test_a_refused_setting_is_reported(ready: Harness) -> None:

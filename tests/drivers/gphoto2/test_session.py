@@ -1,4 +1,4 @@
-"""What the simulated bodies don't do: files without bytes, very long names."""
+"""What the simulated bodies don't do: files without bytes, very long names; and which settings are read when."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import gphoto2 as gp
 import pytest
 
-from dappled.drivers.gphoto2.protocol import CameraFile, RefusedError
+from dappled.drivers.gphoto2.protocol import CameraFile, RefusedError, SettingTurned
 from dappled.drivers.gphoto2.session import GPhoto2Session
 
 FOLDER = "/store/DCIM/100CANON"
@@ -28,13 +28,41 @@ class Told:
 
 
 @dataclass
+class Widget:
+    value: str
+    choices: tuple[str, ...] = ()
+    kind: int = gp.GP_WIDGET_RADIO
+
+    def get_value(self) -> str:
+        return self.value
+
+    def get_type(self) -> int:
+        return self.kind
+
+    def get_readonly(self) -> int:
+        return 0
+
+    def get_choices(self) -> tuple[str, ...]:
+        return self.choices
+
+
+@dataclass
 class FakeLibrary:
     """The part of `gphoto2.Camera` that reading a file needs."""
 
     card: dict[str, bytes] = field(default_factory=dict)
+    widgets: dict[str, Widget] = field(default_factory=dict)
+    asked: list[str] = field(default_factory=list)
+    coming: list[tuple[int, str]] = field(default_factory=list)
 
     def get_single_config(self, name: str) -> Any:
-        raise gp.GPhoto2Error(gp.GP_ERROR_BAD_PARAMETERS)
+        if name not in self.widgets:
+            raise gp.GPhoto2Error(gp.GP_ERROR_BAD_PARAMETERS)
+        self.asked.append(name)
+        return self.widgets[name]
+
+    def wait_for_event(self, _timeout_ms: int) -> tuple[int, Any]:
+        return self.coming.pop(0) if self.coming else (gp.GP_EVENT_TIMEOUT, None)
 
     def file_get_info(self, folder: str, name: str) -> Told:
         return Told(Info(len(self.card[name])))
@@ -70,3 +98,36 @@ def test_a_file_is_read_in_pieces_whatever_it_is_called(
     assert os.pread(fetched.blob.fd, fetched.blob.size + 1, 0) == library.card[name]
     assert fetched.taken_s == 1_700_000_000
     fetched.blob.close()
+
+
+CUSTOM = "d4,4,1,20,2,101,1,0,10f,1,0,3,2c,3,50e,1,0,511,1,0,60f,1,{},4,38,4,701,1,0,"
+
+
+def test_what_changes_rarely_is_read_again_only_after_a_change(library: FakeLibrary, session: GPhoto2Session) -> None:
+    library.widgets = {
+        "iso": Widget("100", ("100", "200")),
+        "autoexposuremode": Widget("Manual", ("Manual", "AV")),
+        "autopoweroff": Widget("30", kind=gp.GP_WIDGET_TEXT),
+        "customfuncex": Widget(CUSTOM.format(0), kind=gp.GP_WIDGET_TEXT),
+    }
+    read = {one.name: (one.value, one.choices) for one in session.settings()}
+    assert read["auto_power_off"] == ("30", ("0", "30"))
+    assert read["mirror_lockup"] == ("off", ())
+    library.asked.clear()
+    session.settings()
+    assert library.asked == ["iso"]  # each read is a transaction that a shot would wait for
+    told = 'PTP Property d105 changed, "autoexposuremode" to "{}"'
+    library.coming = [(gp.GP_EVENT_UNKNOWN, told.format("Manual"))]  # reading it makes such an event
+    assert session.news() == []
+    library.coming = [(gp.GP_EVENT_UNKNOWN, told.format("AV")), (gp.GP_EVENT_UNKNOWN, told.format("AV"))]
+    library.widgets["autoexposuremode"] = Widget("AV", ("Manual", "AV"))
+    assert session.news() == [SettingTurned()]
+    assert ("exposure_mode", "AV") in [(one.name, one.value) for one in session.settings()]
+
+
+@pytest.mark.parametrize(("text", "value"), [(CUSTOM.format(1), "on"), (CUSTOM.format(0), "off"), ("bad length", None)])
+def test_mirror_lock_up_is_one_of_canon_s_custom_functions(
+    library: FakeLibrary, session: GPhoto2Session, text: str, value: str | None
+) -> None:
+    library.widgets = {"customfuncex": Widget(text, kind=gp.GP_WIDGET_TEXT)}
+    assert [one.value for one in session.settings()] == ([] if value is None else [value])

@@ -17,7 +17,7 @@ from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.replay import RecordedShot, ReplayCamera
 from dappled.drivers.wired import composed, folder, fujifilm, matching
 from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
-from dappled.drivers.wired.shutter_line import GpioLine, OutsideLine
+from dappled.drivers.wired.shutter_line import GpioLine, HalfPressedLine, OutsideLine
 from dappled.drivers.wired.sources import FolderSource, FoundFile, StorageSource
 from dappled.mocks import simulated
 from dappled.mocks.body.body import pattern
@@ -395,6 +395,33 @@ def test_another_card_than_before_the_flight_is_as_strange_as_any(flight: Flight
     flight.old(1)
     flight.body.plug()
     flight.brings_nothing()
+
+
+def test_the_half_press_leads_and_is_no_part_of_the_latency(body: FinePix) -> None:
+    """The exposure's time is counted from the shutter's own contact."""
+    pressed: list[tuple[str, int]] = []
+
+    class Noted(OutsideLine):
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def press(self) -> None:
+            pressed.append((self.name, time.monotonic_ns()))
+
+        def let_go(self) -> None:
+            pressed.append((f"{self.name} open", time.monotonic_ns()))
+
+    both = HalfPressedLine(Noted("full"), Noted("half"), 0.1)
+    camera = ComposedCamera(WHO, both, None, replace(FAST, follows="it follows"))
+    camera.start()
+    until_state(camera, "ready")
+    camera.fire(1)
+    fired = until(camera, lambda event: isinstance(event, Fired))[-1]
+    assert isinstance(fired, Fired)
+    until_state(camera, "ready")
+    camera.stop()
+    assert [name for name, _ in pressed] == ["half", "full", "full open", "half open"]
+    assert pressed[0][1] + 90_000_000 < fired.called_monotonic_ns <= pressed[1][1]
 
 
 class BadLine:

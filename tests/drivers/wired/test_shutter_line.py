@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from gpiod.line import Value
 
 from dappled.drivers.camera import CameraError
-from dappled.drivers.wired.shutter_line import GpioLine, OutsideLine, UsesAutopilot, hold_s, parse_line
+from dappled.drivers.wired.shutter_line import (
+    GpioLine,
+    HalfPressedLine,
+    OutsideLine,
+    UsesAutopilot,
+    hold_s,
+    parse_line,
+    shutter,
+)
 from tests.simulated.finepix import Contact, FinePix
 
 
@@ -104,6 +113,47 @@ def test_an_order_that_can_t_be_given_is_told() -> None:
     line.use_autopilot(lambda number, parameters: "no autopilot was heard")
     with pytest.raises(CameraError, match="no autopilot was heard"):
         line.press()
+
+
+def test_half_way_comes_before_the_shutter_and_is_let_go_after_it() -> None:
+    told: list[tuple[float, ...]] = []
+    refuse: list[int] = []
+
+    def order(number: int, parameters: Sequence[float]) -> str | None:
+        told.append(tuple(parameters))
+        return "it is refused" if parameters[0] in refuse and parameters[1] else None
+
+    line = shutter({"shutter": "relay:0", "half_press": "relay:1", "half_press_ms": 300})
+    assert isinstance(line, HalfPressedLine)
+    assert line.lead_s == 0.3
+    line.use_autopilot(order)
+    line.open()
+    line.prepare()
+    line.press()
+    line.let_go()
+    assert told == [(1, 1), (0, 1), (0, 0), (1, 0)]
+    told.clear()
+    refuse.append(0)
+    line.prepare()
+    with pytest.raises(CameraError, match="it is refused"):
+        line.press()
+    assert told == [(1, 1), (0, 1), (1, 0)]  # not left pressed
+    line.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"shutter": "outside", "half_press": "relay:1"}, "fired from here"),
+        ({"shutter": "relay:0", "half_press": "autopilot"}, "a line of its own"),
+        ({"shutter": "relay:0", "half_press": "relay:x"}, "half_press = 'relay:x' is not"),
+        ({"shutter": "relay:0", "half_press": 7}, "must be text"),
+        ({"shutter": "relay:0", "half_press": "relay:1", "half_press_ms": 0}, "half_press_ms"),
+    ],
+)
+def test_a_half_press_that_cant_be_is_a_sentence(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(CameraError, match=words):
+        shutter(options)
 
 
 def test_outside_is_fired_by_others() -> None:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import os
 import subprocess
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from dappled.clock import Clock, SystemClock
@@ -25,6 +26,7 @@ from dappled.drivers.camera import (
     Companion,
     Fired,
     Identity,
+    LivePicture,
     QueuedCamera,
     Setting,
     SettingName,
@@ -50,6 +52,7 @@ _PING_S = 1.0
 _STOP_S = 1.2
 _KILL_S = 0.6
 _SPAWN_S = 1.0
+_LIVE_S = 2.0
 
 Spawn = Callable[[GPhoto2Settings, Carryover], tuple["subprocess.Popen[bytes]", ProcessChannel]]
 
@@ -67,6 +70,16 @@ def spawn_process(settings: GPhoto2Settings, carryover: Carryover) -> tuple[subp
         json.dumps(carryover.to_json()),
         environment=NO_HOME,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Live:
+    """Live view: when a picture was asked for that has not come, when the last answer came, and what it was."""
+
+    asked_ns: int | None = None
+    heard_ns: int = 0
+    picture: LivePicture | None = None
+    refused: str = ""
 
 
 class GPhoto2Camera(QueuedCamera):
@@ -91,6 +104,7 @@ class GPhoto2Camera(QueuedCamera):
         self._process: subprocess.Popen[bytes] | None = None
         self._pending: dict[int, int | None] = {}  # shots that the process has, in order: when it fired each
         self._carryover = Carryover()  # used by the supervising thread alone
+        self._live = _Live()  # guarded by the lock
         self._identity: Identity | None = None
         self._known_settings: tuple[Setting, ...] = ()
 
@@ -136,6 +150,23 @@ class GPhoto2Camera(QueuedCamera):
                 self._channel.send({"do": "change", "name": name, "value": value})
             except ChannelError as error:
                 raise CameraError(f"{name} was not set: {error}") from None
+
+    def look(self) -> LivePicture | None:
+        """See LiveView: a message to the process, where none is on its way."""
+        with self._lock:
+            if self._channel is None:
+                raise CameraError("the camera's process is not running: there is no live view now")
+            now_ns, live = self._clock.monotonic_ns(), self._live
+            if live.asked_ns is None or now_ns - live.asked_ns > _LIVE_S * 1e9:
+                try:
+                    self._channel.send({"do": "look"})
+                except ChannelError as error:
+                    raise CameraError(f"there is no live view now: {error}") from None
+                live = self._live = replace(live, asked_ns=now_ns)
+            fresh = now_ns - live.heard_ns <= _LIVE_S * 1e9
+            if live.refused and fresh:
+                raise CameraError(live.refused)
+            return live.picture if fresh else None
 
     def release(self, arrival: Arrival | Companion) -> None:
         """Delete the file from the card where the settings say so."""
@@ -208,6 +239,8 @@ class GPhoto2Camera(QueuedCamera):
                     heard_ns = now_ns
                     if message.lost:
                         self._lose_file(message)
+                    elif message.body.get("is") == "live":
+                        self._show(message)
                     elif message.body.get("is") != "pong":
                         self._pass_on(message_event(message))
                 elif channel.starved:
@@ -233,6 +266,15 @@ class GPhoto2Camera(QueuedCamera):
         except CameraError as error:
             return f" ({error})"
         return ", the camera's USB port reset"
+
+    def _show(self, message: ChannelMessage) -> None:
+        """Take in a picture of the viewfinder, or why there is none."""
+        now_ns, picture = self._clock.monotonic_ns(), None
+        for fd in message.fds:
+            picture = LivePicture(os.pread(fd, message.body["size"], 0), now_ns)
+            os.close(fd)
+        with self._lock:
+            self._live = _Live(None, now_ns, picture, message.body.get("refused", ""))
 
     def _lose_file(self, message: ChannelMessage) -> None:
         """Fail the shot whose file could not be received, alone."""

@@ -4,8 +4,9 @@ libgphoto2 blocks for seconds, with the GIL held, when a camera goes silent. In 
 and the parent can always kill it.
 
 Commands: {"do": "fire", "shot": n}, {"do": "delete", "folder", "name"}, {"do": "change", "name", "value"},
-{"do": "ping"}, {"do": "stop"}. Answers are the camera's events (`messages`) and {"is": "pong"}. One shot is at the
-camera at a time; further ones wait in order.
+{"do": "look"} (through the viewfinder), {"do": "ping"}, {"do": "stop"}. Answers are the camera's events (`messages`),
+{"is": "live"} with a JPEG or a reason, and {"is": "pong"}. One shot is at the camera at a time; further ones wait in
+order.
 """
 
 from __future__ import annotations
@@ -33,10 +34,12 @@ from dappled.drivers.gphoto2.protocol import (
     RefusedError,
     Session,
     SessionError,
+    SettingTurned,
 )
 from dappled.drivers.gphoto2.session import open_session
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
 from dappled.drivers.gphoto2.state import CameraState
+from dappled.drivers.gphoto2.viewfinder import Viewfinder
 
 _POLL_BUSY_S = 0.005
 _POLL_IDLE_S = 0.3
@@ -61,6 +64,7 @@ class CameraLoop:
         self._clock = clock or SystemClock()
         self._sender = EventSender(channel)
         self._state = CameraState(settings.timeouts, carryover or Carryover())
+        self._viewfinder = Viewfinder(channel)
         self._session: Session | None = None
         self._open_at_ns = 0
 
@@ -114,6 +118,8 @@ class CameraLoop:
                 self._delete(CameraFile(folder, name))
             case {"do": "change", "name": str(name), "value": str(value)}:
                 self._change(cast(SettingName, name), value)
+            case {"do": "look"}:
+                self._viewfinder.ask()
             case {"do": "ping"}:
                 self._sender.pong()
             case {"do": "stop"}:
@@ -164,7 +170,10 @@ class CameraLoop:
             self._open()
         session = self._session
         if session is None:
+            self._viewfinder.refuse(self._sender.reason or "the camera is still being opened")
             return
+        if self._state.is_busy:
+            self._viewfinder.end(session)
         if self._state.begin_next(self._now_ns()):
             self._send_state("busy")
         if self._state.trigger_due(self._now_ns()):
@@ -183,6 +192,8 @@ class CameraLoop:
         if self._state.settings_due(self._now_ns()):
             self._sender.send(*self._state.settings_read(session.settings(), self._now_ns()))
         self._send_state("busy" if self._state.is_busy else "ready")
+        if not self._state.is_busy:
+            self._viewfinder.turn(session, self._now_ns())
 
     def _open(self) -> None:
         if self._sender.state is None:
@@ -206,6 +217,7 @@ class CameraLoop:
         if self._session is not None:
             self._session.close()
             self._session = None
+        self._viewfinder.lost(reason)
         self._open_at_ns = self._now_ns() + round(_REOPEN_S * 1e9)
         self._sender.send(*self._state.lost(reason, self._now_ns(), keeps_files=keeps_files))
         self._send_state("faulted", reason)
@@ -233,6 +245,8 @@ class CameraLoop:
                     self._state.announced(file)
                 case CaptureComplete():
                     self._state.completed(self._now_ns())
+                case SettingTurned():
+                    self._state.setting_turned(self._now_ns())
 
     def _fetch(self, session: Session) -> None:
         """Fetch the files that wait, until one can't be had; then send what waited too long for its pair."""

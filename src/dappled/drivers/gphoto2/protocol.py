@@ -68,7 +68,12 @@ class CaptureComplete:
     """The camera has finished a capture."""
 
 
-CameraNews = FileAdded | CaptureComplete
+@dataclass(frozen=True, slots=True)
+class SettingTurned:
+    """A setting of the camera has another value than was read: a hand has turned a dial."""
+
+
+CameraNews = FileAdded | CaptureComplete | SettingTurned
 
 
 class Session(Protocol):
@@ -108,6 +113,12 @@ class Session(Protocol):
 
     def change(self, name: SettingName, value: str) -> None:
         """Change a setting. Raises BusyError, RefusedError, LostError."""
+
+    def preview(self) -> Blob:
+        """Read a JPEG of what the lens sees; live view is on after that. Raises BusyError, RefusedError, LostError."""
+
+    def end_preview(self) -> None:
+        """End live view. Raises LostError."""
 
     def close(self) -> None:
         """End the session; never raises."""

@@ -8,7 +8,8 @@ from __future__ import annotations
 import contextlib
 import mmap
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import gphoto2 as gp
@@ -26,6 +27,7 @@ from dappled.drivers.gphoto2.protocol import (
     LostError,
     RefusedError,
     SessionError,
+    SettingTurned,
 )
 from dappled.drivers.gphoto2.settings import CaptureTarget, GPhoto2Settings
 
@@ -53,8 +55,24 @@ _WIDGETS: dict[SettingName, tuple[str, ...]] = {
     "capture_target": ("capturetarget",),
     "battery": ("batterylevel",),
     "free_shots": ("availableshots",),
+    "exposure_mode": ("autoexposuremode", "expprogram"),
+    "focus_mode": ("focusmode", "focusmode2"),
+    "drive_mode": ("drivemode", "capturemode"),
+    "white_balance": ("whitebalance",),
+    "auto_power_off": ("autopoweroff",),
+    "mirror_lockup": ("customfuncex",),
 }
 """libgphoto2's names of each setting; makers differ."""
+_TURNED = frozenset(_WIDGETS) - {"battery", "free_shots", "capture_target"}
+"""What a hand changes, between shots too: the body announces it."""
+_RARELY = _TURNED - {"focal_length", "aperture", "shutter_speed", "iso", "image_format"}
+"""Read at opening, and when the body announces a change, so that reading the rest after each shot stays short."""
+_MODES = 24
+"""More exposure modes than one body has. Where a body names none, a dial or a switch decides, and libgphoto2 lists the
+41 modes of all bodies, or the one in force."""
+_CHANGED = re.compile(r'PTP Property \w+ changed, "(\w+)" to "(.*)"')
+_MIRROR_LOCKUP = re.compile(r"(?:^|,)60f,1,(\d+)(?:,|$)")
+"""Canon's custom function 0x60f within "customfuncex": number, one value, the value (indilib/indi-3rdparty, 804)."""
 
 
 def open_session(settings: GPhoto2Settings, before: str | None = None) -> GPhoto2Session:
@@ -157,6 +175,7 @@ class GPhoto2Session:
             port=port,
         )
         self._in_pieces = True
+        self._read: dict[SettingName, Setting | None] = {}
         self.keeps_files = not (_set_target(camera, target) and target == "ram")
 
     def trigger(self) -> None:
@@ -178,6 +197,8 @@ class GPhoto2Session:
                     news.append(FileAdded(CameraFile(data.folder, data.name)))
                 elif kind == gp.GP_EVENT_CAPTURE_COMPLETE:
                     news.append(CaptureComplete())
+                elif kind == gp.GP_EVENT_UNKNOWN and self._turned(str(data)):
+                    news.append(SettingTurned())
         except gp.GPhoto2Error as error:
             if not news:
                 raise LostError(_sentence(error, "report what happens")) from error
@@ -279,15 +300,57 @@ class GPhoto2Session:
             raise LostError(_sentence(error, "list its card")) from error
         return frozenset(file for file in found if not file.in_memory)
 
+    def _turned(self, event: str) -> bool:
+        """Whether an event says that a setting has another value than the one that was read. Reading makes events, too:
+        these repeat what was read."""
+        found = _CHANGED.search(event)
+        name = found and next((name for name in _TURNED if found[1] in _WIDGETS[name]), None)
+        if not found or name is None or name not in self._read:
+            return False
+        known, now = self._read[name], _value(name, found[2])
+        if now is None or (known is not None and known.value == now):
+            return False
+        del self._read[name]
+        return True
+
     def settings(self) -> tuple[Setting, ...]:
-        """Read all settings that the camera has."""
-        return _read_settings(self._camera)
+        """Read all settings that the camera has; of those that change rarely what is known."""
+        wanted = [name for name in _WIDGETS if name not in _RARELY or name not in self._read]
+        self._read |= _read_settings(self._camera, wanted)
+        return tuple(one for name in _WIDGETS if (one := self._read[name]) is not None)
 
     def change(self, name: SettingName, value: str) -> None:
         """Change a setting."""
+        self._read.pop(name, None)
         _change_setting(self._camera, name, value)
         if name == "capture_target":
             self.keeps_files = "ram" not in value.lower()
+
+    def preview(self) -> Blob:
+        """Read a JPEG of the viewfinder, which switches live view on."""
+        try:
+            held = self._camera.capture_preview()
+        except gp.GPhoto2Error as error:
+            if error.code == gp.GP_ERROR_NOT_SUPPORTED:
+                raise RefusedError("this body has no live view") from error
+            raise _translated(error, "show its viewfinder") from error
+        with memoryview(held.get_data_and_size()) as view:
+            fd = os.memfd_create("viewfinder", os.MFD_CLOEXEC)
+            offset = 0
+            while offset < len(view):
+                offset += os.pwrite(fd, view[offset:], offset)
+            return Blob(fd, len(view))
+
+    def end_preview(self) -> None:
+        """Switch live view off, where the body has a setting for that; others end it with the next shot."""
+        try:
+            widget = _widget(self._camera, ("viewfinder", "eosviewfinder"))
+            if widget is not None:
+                widget.set_value(0)
+                self._camera.set_single_config(widget.get_name(), widget)
+        except gp.GPhoto2Error as error:
+            if error.code in _LOST:
+                raise LostError(_sentence(error, "end live view")) from error
 
     def close(self) -> None:
         """End the session."""
@@ -311,13 +374,12 @@ def _close(camera: Any) -> None:
 # --- settings
 
 
-def _read_settings(camera: Any) -> tuple[Setting, ...]:
-    """Read each setting by the first of its names that the body has. Raises LostError."""
+def _read_settings(camera: Any, wanted: Iterable[SettingName]) -> dict[SettingName, Setting | None]:
+    """Read each setting by the first of its names that the body has, None without any. Raises LostError."""
     try:
-        found = [_read_setting(camera, name, widgets) for name, widgets in _WIDGETS.items()]
+        return {name: _read_setting(camera, name, _WIDGETS[name]) for name in wanted}
     except gp.GPhoto2Error as error:
         raise LostError(_sentence(error, "report its settings")) from error
-    return tuple(each for each in found if each is not None)
 
 
 def _change_setting(camera: Any, name: SettingName, value: str) -> None:
@@ -360,8 +422,25 @@ def _read_setting(camera: Any, name: SettingName, widgets: tuple[str, ...]) -> S
     widget = _widget(camera, widgets)
     if widget is None:
         return None
+    value = _value(name, str(widget.get_value()))
+    if value is None:
+        return None
+    if name == "auto_power_off":  # seconds, as text: 0 is never
+        return Setting(name, value, () if widget.get_readonly() else ("0", value)[: 1 + (value != "0")])
     settable = widget.get_type() in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU) and not widget.get_readonly()
-    return Setting(name, str(widget.get_value()), tuple(widget.get_choices()) if settable else ())
+    choices = tuple(widget.get_choices()) if settable else ()
+    if name in ("exposure_mode", "focus_mode") and not 1 < len(choices) <= _MODES:
+        choices = ()
+    return Setting(name, value, choices)
+
+
+def _value(name: SettingName, text: str) -> str | None:
+    """A widget's value as the setting's; None where it says nothing. Mirror lock-up is one of the custom functions, and
+    only read: bodies have refused to shoot after these had been written."""
+    if name != "mirror_lockup":
+        return text
+    found = _MIRROR_LOCKUP.search(text)
+    return None if found is None else "off" if found[1] == "0" else "on"
 
 
 def _widget(camera: Any, names: tuple[str, ...]) -> Any:

@@ -295,8 +295,13 @@ class CameraState:
 
     # --- settings
 
+    def setting_turned(self, now_ns: int) -> None:
+        """The body announced that a setting was changed: read them as soon as no shot is at the camera."""
+        self._settings_due_ns = now_ns
+
     def settings_due(self, now_ns: int) -> bool:
-        """Whether the settings are to be read now: after opening and after each file, with no shot at the camera."""
+        """Whether the settings are to be read now, with no shot at the camera: after opening, each file, and a change
+        at the body."""
         return self._settings_due_ns is not None and now_ns >= self._settings_due_ns and self.current is None
 
     def settings_read(self, found: tuple[Setting, ...], now_ns: int) -> list[CameraEvent]:

@@ -24,7 +24,7 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.drivers.wired.file_watch import FileWatch
-from dappled.drivers.wired.shutter_line import CommandSender, OutsideLine, ShutterLine, UsesAutopilot
+from dappled.drivers.wired.shutter_line import CommandSender, HalfPressedLine, OutsideLine, ShutterLine, UsesAutopilot
 from dappled.drivers.wired.sources import FileSource
 from dappled.workers import Loop
 
@@ -207,8 +207,14 @@ class ComposedCamera(PlainCamera):
     def _fire_one(self, shot: int) -> bool:
         """Press, hold and release the line for a shot. Returns False when stopping."""
         self.report(StateChanged("busy", "", self._clock.monotonic_ns(), self._identity))
+        problem = ""
+        if isinstance(self._line, HalfPressedLine):
+            problem = self._tried(self._line.prepare)
+            if not problem and self._stopping.wait(self._line.lead_s):
+                self._tried(self._line.let_go)
+                return False
         called_ns = self._clock.monotonic_ns()
-        problem = self._tried(self._line.press)
+        problem = problem or self._tried(self._line.press)
         returned_ns = self._clock.monotonic_ns()
         if problem:
             self._end(shot, ShotFailed(shot, problem, self._clock.monotonic_ns()))

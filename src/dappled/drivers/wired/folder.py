@@ -13,10 +13,10 @@ from typing import Any
 
 from dappled.drivers.camera import CameraError, Identity, check_options, seconds_option, text_option
 from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
-from dappled.drivers.wired.shutter_line import hold_s, parse_line
+from dappled.drivers.wired.shutter_line import hold_s, shutter
 from dappled.drivers.wired.sources import FolderSource
 
-_KNOWN = ("shutter", "pickup", "timeouts", "model", "hold_ms")
+_KNOWN = ("shutter", "pickup", "timeouts", "model", "hold_ms", "half_press", "half_press_ms")
 
 
 def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
@@ -30,6 +30,4 @@ def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
         raise CameraError(f"camera.pickup = {folder!r} is not a folder: make it, or correct the path")
     identity = Identity("folder", text_option(settings, "model") or path.name, "", str(path))
     composed = ComposedSettings(file_s=seconds_option(settings, "file_s", 30.0), hold_s=hold_s(settings))
-    return ComposedCamera(
-        identity, parse_line(text_option(settings, "shutter") or "outside"), FolderSource(path), composed
-    )
+    return ComposedCamera(identity, shutter(settings, "outside"), FolderSource(path), composed)

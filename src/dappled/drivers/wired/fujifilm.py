@@ -16,11 +16,12 @@ from typing import Any
 from dappled.drivers.camera import CameraError, Identity, check_options, seconds_option, text_option
 from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.ptp_source import PtpSource
-from dappled.drivers.wired.shutter_line import KINDS, hold_s, parse_line
+from dappled.drivers.wired.shutter_line import KINDS, hold_s
+from dappled.drivers.wired.shutter_line import shutter as shutter_line
 from dappled.drivers.wired.sources import FileSource, FolderSource, parse_source
 
 BRING = "bring it with `dappled flight pickup` after landing"
-_KNOWN = ("shutter", "pickup", "timeouts", "model", "hold_ms")
+_KNOWN = ("shutter", "pickup", "timeouts", "model", "hold_ms", "half_press", "half_press_ms")
 _SLOW_POLL_S = 2.0
 
 
@@ -40,7 +41,7 @@ def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
         hold_s=hold_s(settings),
         poll_s=_SLOW_POLL_S if isinstance(source, PtpSource) else 0.2,
     )
-    return ComposedCamera(identity, parse_line(shutter), source, composed)
+    return ComposedCamera(identity, shutter_line(settings), source, composed)
 
 
 def _follows(pickup: str, source: FileSource | None) -> str | None:

@@ -14,9 +14,10 @@ from typing import Any, Protocol, runtime_checkable
 import gpiod
 from gpiod.line import Direction, Value
 
-from dappled.drivers.camera import CameraError
+from dappled.drivers.camera import CameraError, text_option
 
 HOLD_S = 0.2
+HALF_PRESS_S = 0.5
 DO_SET_RELAY, DO_SET_SERVO, DO_DIGICAM_CONTROL = 181, 183, 203  # MAV_CMD
 KINDS = "gpio:CHIP:LINE, servo:OUTPUT:PRESSED:RELEASED, relay:NUMBER, autopilot, outside"
 
@@ -167,13 +168,75 @@ class OutsideLine:
         """See ShutterLine."""
 
 
-def parse_line(text: str) -> ShutterLine:
-    """Return the line that a setting names. Raises CameraError."""
+class HalfPressedLine:
+    """A shutter with a second line for its half-press, on which the body focuses and meters before the shot.
+
+    Both contacts stay closed during the exposure, as a remote's button closes them. `lead_s` is how long the first one
+    is held before the shutter is pressed.
+    """
+
+    def __init__(self, full: ShutterLine, half: ShutterLine, lead_s: float) -> None:
+        self._full, self._half, self.lead_s = full, half, lead_s
+
+    def use_autopilot(self, send: CommandSender) -> None:
+        """See UsesAutopilot."""
+        for line in (self._full, self._half):
+            if isinstance(line, UsesAutopilot):
+                line.use_autopilot(send)
+
+    def open(self) -> None:
+        """See ShutterLine."""
+        self._half.open()
+        self._full.open()
+
+    def prepare(self) -> None:
+        """Press half-way. Raises CameraError."""
+        self._half.press()
+
+    def press(self) -> None:
+        """See ShutterLine."""
+        try:
+            self._full.press()
+        except CameraError:
+            self._half.let_go()
+            raise
+
+    def let_go(self) -> None:
+        """See ShutterLine: both, the shutter first."""
+        self._full.let_go()
+        self._half.let_go()
+
+    def close(self) -> None:
+        """See ShutterLine."""
+        try:
+            self._full.close()
+        finally:
+            self._half.close()
+
+
+def shutter(options: Mapping[str, Any], default: str = "") -> ShutterLine:
+    """The shutter that a driver's options name (`default` without one), with its half-press where they name one. Raises
+    CameraError."""
+    full = parse_line(text_option(options, "shutter") or default)
+    half = text_option(options, "half_press")
+    lead_s = _milliseconds(options, "half_press_ms", HALF_PRESS_S)
+    if not half:
+        return full
+    if isinstance(full, OutsideLine) or half.split(":")[0] not in ("gpio", "servo", "relay"):
+        raise CameraError(
+            f"camera.options.half_press = {half!r} needs a line of its own (gpio, servo or relay), and a shutter "
+            "that is fired from here"
+        )
+    return HalfPressedLine(full, parse_line(half, "camera.options.half_press"), lead_s)
+
+
+def parse_line(text: str, key: str = "camera.shutter") -> ShutterLine:
+    """Return the line that a setting (`key`) names. Raises CameraError."""
     kind, *parts = text.split(":")
     try:
         return _LINES[kind](parts)
     except (KeyError, ValueError, IndexError):
-        raise CameraError(f"camera.shutter = {text!r} is not a shutter line; the kinds are {KINDS}") from None
+        raise CameraError(f"{key} = {text!r} is not a shutter line; the kinds are {KINDS}") from None
 
 
 def _gpio(parts: list[str]) -> ShutterLine:
@@ -216,7 +279,11 @@ _LINES: Mapping[str, Callable[[list[str]], ShutterLine]] = {
 
 def hold_s(options: Mapping[str, Any]) -> float:
     """Return how long the shutter is pressed, from a driver's options. Raises CameraError."""
-    value = options.get("hold_ms", HOLD_S * 1e3)
+    return _milliseconds(options, "hold_ms", HOLD_S)
+
+
+def _milliseconds(options: Mapping[str, Any], name: str, default_s: float) -> float:
+    value = options.get(name, default_s * 1e3)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 1 <= value <= 10_000:
-        raise CameraError(f"camera.options.hold_ms must be 1 to 10000 ms, not {value!r}")
+        raise CameraError(f"camera.options.{name} must be 1 to 10000 ms, not {value!r}")
     return value / 1e3
