@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled.clock import RecordedClock, SystemClock
+from dappled.config.settings import PoseSettings
 from dappled.daemon.navigation import BodyLatency, ExposureTime
 from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
 from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcessError
@@ -20,7 +21,8 @@ from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
-from dappled.decode.geometry import Pose
+from dappled.daemon.pipeline.verdicts import Judge, PictureFacts
+from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.camera import (
     Arrival,
     Blob,
@@ -127,6 +129,7 @@ class FakeDecoder:
         self.seen: list[str] = []
         self.seen_facts: dict[str, Any] = {}
         self.decision: LawDecision | None = None
+        self.picture: PictureFacts | None = None
 
     def decode(
         self, path: str, focal_length_mm: float | None, f_number: float | None, *, index: int, look: bool = False
@@ -140,7 +143,7 @@ class FakeDecoder:
         unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
         decision, self.decision = self.decision, None
         made = DecodedFrame(body, "0" * 64, arrays, [[0.0] * 4], "calibrated", 1, 1, "geometric", unit, b"", (0, 0))
-        return replace(made, seen=self.seen_facts, decision=decision)
+        return replace(made, seen=self.seen_facts, decision=decision, picture=self.picture)
 
 
 @dataclass
@@ -249,6 +252,9 @@ class NoPoses:
     def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
         return exposure, no_pose(exposure.utc_ns)
 
+    def rates(self, pose: Pose) -> Vector3 | None:
+        return None
+
 
 def eventually(condition: Callable[[], object], what: str) -> None:
     until = time.monotonic() + 20
@@ -295,6 +301,7 @@ def rig(
             lambda pending: made[0].shots.append(pending),  # noqa: PLW0108  # a test may take the list away
         ),
         decode_queue=queue_,
+        judge=Judge(PoseSettings().mount, on_gimbal=False),
     )
     now_ns = clock.utc_ns()  # it stands still, so that a slow machine makes no new request of a retry
     steady = RecordedClock(now_ns, now_ns - clock.monotonic_ns())

@@ -155,7 +155,7 @@ def test_a_simulated_daemon_has_no_circle_of_references(tmp_path: Path, sockets:
         given,
         record=replace(given.record, directory=str(tmp_path / "flights"), min_free_mb=0),
         publish=replace(given.publish, slices=f"ipc://{sockets}/s"),
-        decode=replace(given.decode, depth="gradient", depth_to_autopilot=True),
+        decode=replace(given.decode, depth="contrast", depth_to_autopilot=True),
         console=replace(given.console, bind="127.0.0.1:0"),
     )
     with Simulation(World(), given, tmp_path) as settings:
@@ -174,7 +174,7 @@ def test_nor_has_one_whose_camera_the_autopilot_fires(tmp_path: Path, sockets: P
                 given.camera, profile="reference-36mm", driver="folder", pickup=str(tmp_path), shutter="autopilot"
             ),
             mask=replace(given.mask, profile="reference-5x5"),
-            decode=replace(given.decode, depth="gradient", depth_to_autopilot=True),
+            decode=replace(given.decode, depth="contrast", depth_to_autopilot=True),
             console=replace(given.console, bind="127.0.0.1:0"),
             mavlink=replace(given.mavlink, url=("udpin:127.0.0.1:0",)),
             record=replace(given.record, directory=str(tmp_path / "flights"), min_free_mb=0),

@@ -32,7 +32,7 @@ from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import AGAIN_NS, PeriodicTask, Service
 from dappled.drivers.camera import CameraError, Identity, Setting, SettingsChanged, StateChanged
 from dappled.errors import DappledError
-from dappled.flight import FlightError, LedgerReader, Recording, layout
+from dappled.flight import FlightError, LedgerReader, Recording, flight_report, layout
 from dappled.flight.checks import flight_check
 from tests.daemon.fakes import CallingObserver, FakeCamera, eventually, good
 from tests.daemon.test_settings_check import MASK, calibration
@@ -88,6 +88,19 @@ def test_a_wish_goes_to_the_end_and_can_be_looked_up_in_the_next_flight(camera: 
     assert (found.ok, found.url) == (True, "frames/000000.dng")
     assert after.request(CaptureRequest("test", "console", 1)).index == 1
     after.stop()
+
+
+def test_triggers_lost_in_the_last_seconds_of_a_flight_are_in_its_ledger(
+    camera: FakeCamera, settings: Settings
+) -> None:
+    """They wait 2.5 s for a second link; the flight ended before, and the counts agreed."""
+    service = started(settings, [])
+    numbers = service._component._autopilot.numbers["CAMERA_FEEDBACK"]
+    for number in (10, 14):
+        numbers.heard(number, service._clock.monotonic_ns(), lambda: "noticed here")
+    service.stop()
+    assert "lost trigger: triggers 11 to 13 noticed here" in told(service.folder)
+    assert not flight_report.balance(service.folder).balanced
 
 
 def test_an_old_flight_that_was_moved_away_is_unknown(camera: FakeCamera, settings: Settings) -> None:

@@ -21,12 +21,14 @@ from dappled.clock import Clock, SystemClock
 from dappled.config import settings as configuration
 from dappled.config.schema import ConfigError
 from dappled.config.settings import Settings
+from dappled.daemon.body_plan import BodyPlan
 from dappled.daemon.camera_protocol.camera_status import ReportedCamera
 from dappled.daemon.camera_protocol.component import Component
 from dappled.daemon.camera_protocol.earlier_outcomes import IndexedOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.console import process as console_process
+from dappled.daemon.console.live_view import CameraLook
 from dappled.daemon.console.process import Console
 from dappled.daemon.console.requests import ConsoleRequests
 from dappled.daemon.flight_control import DecodingParameter, FlightControl
@@ -47,6 +49,7 @@ from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
+from dappled.daemon.pipeline.verdicts import Judge
 from dappled.daemon.shot_events import ShotEvents
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.answers import Answers
@@ -124,7 +127,8 @@ class Service:
             self._build(camera, names, recipe)
             if listener:  # before the publisher, so that it ends after it: the pages are told how the flight ended
                 self.console_url = listener.url
-                requests = ConsoleRequests(self._shutter, self._parameters, self._logbook, self._clock)
+                look = CameraLook(camera, self._shutter, self._clock)
+                requests = ConsoleRequests(self._shutter, self._parameters, look, self._logbook, self._clock)
                 self._console = console_process.start(
                     listener, settings, stack, recipe=recipe, requests=requests, clock=self._clock
                 )
@@ -184,10 +188,11 @@ class Service:
             capacity=settings.camera.max_pending,
             fires=not settings.camera.fired_outside,
         )
-        autopilot = OwnAutopilot(sender, clock)
+        autopilot = OwnAutopilot(sender, clock, on_gimbal=settings.pose.on_gimbal)
         if isinstance(camera, UsesAutopilot):
             camera.use_autopilot(autopilot.command)
-        self._parameters = self._settable(camera, names, decodes=recipe is not None)
+        self._body = BodyPlan(settings.body, settings.camera.capture_target, camera, clock)
+        self._parameters = self._settable(self._body, names, decodes=recipe is not None)
         self._component = Component(
             sender,
             autopilot,
@@ -196,7 +201,6 @@ class Service:
             self._parameters,
             model=self._control,
             earlier=IndexedOutcomes(recording.index),
-            feedback_is_shot=settings.mavlink.feedback_is_shot,
             cam_idx=settings.mavlink.cam_idx,
         )
         self._decoder = None if recipe is None else DecodeProcess(recipe, clock=clock)
@@ -234,6 +238,7 @@ class Service:
             names=names,
             observer=self._events,
             decode_queue=settings.decode.queue,
+            judge=Judge(settings.pose.mount, on_gimbal=settings.pose.on_gimbal),
             preview_interval_s=settings.publish.preview_interval_s,
         )
         self._answers = Answers(writer, self._decoder, shots)
@@ -241,11 +246,11 @@ class Service:
         self._vital: tuple[HasThreads, ...] = (self._pipeline, self._links, self._shutter, *driver)
         self._tasks = self._periodic_tasks()
 
-    def _settable(self, camera: Camera, names: Names, *, decodes: bool) -> Parameters:
+    def _settable(self, body: BodyPlan, names: Names, *, decodes: bool) -> Parameters:
         """What a ground station may set: the body's settings, decoding in flight, the next flight's mask and law."""
         decoding = DecodingParameter(self._shots, self._writer, decodes=decodes)
         recipe = RecipeParameters(names, self._after, self._settings, self._shutter, self._writer)
-        return Parameters(camera, (decoding, recipe))
+        return Parameters(body, (decoding, recipe))
 
     def _start_parts(self, names: Names, stack: ExitStack) -> None:
         """Start the last stage first, so that each item finds its receiver. A part that fails is stopped too."""
@@ -274,6 +279,7 @@ class Service:
             _remove_empty(self._recording)
 
     def _publish_end(self) -> None:
+        self._component.finish()
         self._shutter.settle_refusals(all_of_them=True)
         try:
             self._writer.write_later()
@@ -299,6 +305,7 @@ class Service:
         """The tasks of the working loop, in order, and what each does. Without the loop there is no heartbeat."""
         tasks: dict[PeriodicTask, Callable[[], object]] = {
             PeriodicTask("events"): self._writer.write_later,
+            PeriodicTask("body"): self._follow_body,
             PeriodicTask("resources", every_ns=HEALTH_NS): self._control.look,
             PeriodicTask("health", every_ns=HEALTH_NS): self._publish_health,
         }
@@ -329,6 +336,12 @@ class Service:
     def _tick(self) -> None:
         self._component.tick(healthy=self.healthy())
 
+    def _follow_body(self) -> None:
+        """Compare what has come from the camera with the plan; here, so that no frame waits for that."""
+        while self._events.of_body:
+            if drift := self._body.take(self._events.of_body.popleft()):
+                self._logbook.add(drift, "warning")
+
     def _follow_vehicle(self) -> None:
         self._navigation.belongs_to(self._component.vehicle)
 
@@ -354,6 +367,7 @@ class Service:
             self._component.doubt(),
             navigation.utc.doubt(),
             navigation.telemetry.clock_problem(self._clock.utc_ns()),
+            navigation.telemetry.impossible(self._clock.utc_ns()),
             self._events.doubt,
             self._control.shortage,
         )
@@ -371,12 +385,18 @@ class Service:
             folder=self.folder,
             clock=navigation.telemetry.boot_clock(),
             vehicle=navigation.pose_now(),
-            decoding=DecodingState(self._decoder is not None, self._pipeline.decode_failures, self._events.misfit),
+            decoding=DecodingState(
+                self._decoder is not None,
+                self._pipeline.decode_failures,
+                self._events.misfit,
+                self._pipeline.verdicts,
+            ),
             utc_known=navigation.utc.known,
             dead_threads=[name for part in (*self._vital, *viewers) for name in part.dead_threads()],
             doubts=[text for text in (*doubts, *(task.problem for task in self._tasks)) if text],
             parameters=[asdict(one) for one in self._parameters.all()],
             frame_bytes=self._writer.frame_bytes,
+            body=self._body.report(),
         )
 
     # what others may look at, and ask for
@@ -449,8 +469,7 @@ def _signing(settings: Settings, clock: Clock) -> Signing | None:
         raise ConfigError(
             f'[mavlink] keys names {len(keys)} files for {links} links; name one for each link ("" for none), or one'
         )
-    each = keys * links if len(keys) == 1 else keys or ("",) * links
-    files = [Path(key) if key else None for key in each]
+    files = [Path(key) if key else None for key in settings.mavlink.link_keys]
     time_file = Path(settings.record.directory) / SIGNING_TIME_FILE
     return open_signing(files, time_file, clock, cast(Unsigned, settings.mavlink.unsigned))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 
 from dappled.daemon.camera_protocol.camera_status import ReportedCamera, captured_shot
 from dappled.daemon.camera_protocol.component import Component
@@ -16,9 +17,10 @@ from dappled.drivers.mavlink import mavlink
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
-from dappled.flight import Recording
+from dappled.flight import Recording, Tag
 
 log = logging.getLogger(__name__)
+_OF_BODY = 1000  # the working loop takes them fifty times a second
 
 
 class ShotEvents(Observer):
@@ -26,6 +28,7 @@ class ShotEvents(Observer):
 
     `outside` is called last. `doubt` is a sentence where the camera will soon stop working, `misfit` one where the
     calibration of `recipe` is not for this camera; "" where it is, or nothing is known of the camera.
+    `of_body` is what the plan of the body is compared with, in order; the working loop takes it.
     """
 
     def __init__(
@@ -46,6 +49,7 @@ class ShotEvents(Observer):
         self._depth, self._recipe, self._outside = depth, recipe, outside
         self.misfit = ""
         self.doubt: str | None = None
+        self.of_body: deque[StateChanged | SettingsChanged | Tag] = deque(maxlen=_OF_BODY)
 
     def settled(self, index: int, ok: bool) -> None:
         """See Observer."""
@@ -64,6 +68,8 @@ class ShotEvents(Observer):
             before_mm, now_mm = zoomed
             text = f"image {pending.shot.index} was zoomed from {before_mm:g} to {now_mm:g} mm: is it calibrated?"
             self._component.say(text)
+        if pending.tag is not None:
+            self.of_body.append(pending.tag)
         self._outside.tagged(pending)
 
     def finished(self, pending: PendingShot) -> None:
@@ -80,6 +86,7 @@ class ShotEvents(Observer):
             reason = f": {change.reason}" if change.reason else ""
             calm = change.state in ("ready", "starting")
             self._logbook.add(f"camera {change.state}{reason}", "info" if calm else "warning")
+        self.of_body.append(change)
         self._component.state_changed()
         if change.identity is not None and self._camera.identify(change.identity):
             self._record_camera(change.identity)
@@ -89,6 +96,7 @@ class ShotEvents(Observer):
     def settings_changed(self, change: SettingsChanged) -> None:
         """See Observer."""
         self.doubt = battery_doubt(change.settings)
+        self.of_body.append(change)
         if change.refused:
             self._logbook.add(f"the camera refused a setting: {change.refused}", "warning")
         self._component.settings_changed(change.refused)

@@ -128,6 +128,7 @@ def test_one_address_has_its_share(port: int, crowd: Crowd) -> None:
     assert asked(port, "127.0.0.9") == 200
 
 
+@pytest.mark.slow
 def test_a_page_that_does_not_read_is_let_go(port: int, crowd: Crowd) -> None:
     """It comes to read only after the server has given it up: then the stream has an end."""
     held = crowd(connection.PER_ADDRESS, ENDLESS)

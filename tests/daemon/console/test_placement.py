@@ -12,6 +12,7 @@ from PIL import Image
 
 from dappled.daemon.console import placement
 from dappled.daemon.console.placement import BackgroundError, oriented_frame
+from dappled.daemon.console.studio import Studio
 from dappled.decode.geometry import camera_pose
 from dappled.decode.geometry.footprint import RectifiedFrame
 from tests import globe
@@ -86,6 +87,17 @@ def test_what_is_unknown_has_no_footprint(missing: dict[str, Any]) -> None:
     assert oriented_frame(POSE | missing, (20.0, 40.0), 50.0, MOUNT) is None
     assert oriented_frame(POSE, None, 50.0, MOUNT) is None
     assert oriented_frame(POSE, (20.0, 40.0), None, MOUNT) is None
+
+
+def test_a_body_with_sensors_of_several_sizes_has_no_footprint_before_its_frame_s_shape_is_known() -> None:
+    studio = Studio(None, MOUNT)
+    header = {"camera": "reference-36mm", "pose": POSE, "focal_length_mm": 50.0}
+    assert studio.corners(header) is None
+    small, large = (studio.corners({**header, "frame_shape": shape}) for shape in ([1388, 1844], [2776, 3688]))
+    assert small is not None
+    assert large is not None
+    assert np.ptp(large, axis=0) == pytest.approx(2 * np.ptp(small, axis=0), rel=0.01)
+    assert studio.corners({**header, "camera": "canon-eos-450d"}) is not None
 
 
 def parsed(document: bytes) -> ET.Element:

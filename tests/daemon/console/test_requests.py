@@ -30,7 +30,14 @@ def pipeline(tmp_path: Path) -> Iterator[Rig]:
 
 
 def asked(shutter: Shutter) -> ConsoleRequests:
-    return ConsoleRequests(shutter, Parameters(Body()), Logbook(RecordedClock(7)), SystemClock())
+    return ConsoleRequests(shutter, Parameters(Body()), NoLook(), Logbook(RecordedClock(7)), SystemClock())
+
+
+class NoLook:
+    """A camera without live view."""
+
+    def answer(self) -> dict[str, Any]:
+        return {"ok": False, "error": "none"}
 
 
 class Body(PlainCamera):
@@ -89,7 +96,7 @@ def test_the_log_is_told_from_a_number_on(pipeline: Rig) -> None:
     logbook = Logbook(RecordedClock(7))
     logbook.add("one")
     logbook.add("two", "warning")
-    requests = ConsoleRequests(pipeline.shutter, Parameters(Body()), logbook, SystemClock())
+    requests = ConsoleRequests(pipeline.shutter, Parameters(Body()), NoLook(), logbook, SystemClock())
     assert requests.answer({"do": "log", "after": 1})["lines"] == [
         {"number": 2, "utc_ns": 7, "level": "warning", "text": "two"}
     ]
@@ -103,7 +110,7 @@ class Late:
         self.clock = RecordedClock(1000 * MS)
         self.sink = FakeSink()
         self.body, self.shutter = Body(), Shutter(self.sink, self.clock, next_index=0)
-        self.requests = ConsoleRequests(self.shutter, Parameters(self.body), Logbook(self.clock), self.clock)
+        self.requests = ConsoleRequests(self.shutter, Parameters(self.body), NoLook(), Logbook(self.clock), self.clock)
         self.token = token(self.requests.run, self.clock.monotonic_ns())
 
     def at(self, ms: int, **request: Any) -> dict[str, Any]:

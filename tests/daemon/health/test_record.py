@@ -13,6 +13,7 @@ from dappled.config.settings import MaskSettings, MavlinkSettings, RecordSetting
 from dappled.daemon.health import record as health
 from dappled.daemon.health.record import DecodingState
 from dappled.daemon.navigation import Telemetry
+from dappled.daemon.navigation.navigation import unknown_pose
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.shutter import ShutterStatistics
@@ -125,6 +126,21 @@ def test_a_folder_that_is_gone_is_unknown_not_zero(tmp_path: Path) -> None:
     assert found["disk"]["free_bytes"] is None
     (problem,) = found["problems"]
     assert "new shots are refused" in problem
+
+
+@pytest.mark.parametrize(
+    ("on_gimbal", "heard", "problem"), [(True, False, True), (True, True, False), (False, False, False)]
+)
+def test_a_gimbal_that_is_not_heard_is_a_problem_where_the_camera_is_on_it(
+    tmp_path: Path, on_gimbal: bool, heard: bool, problem: bool
+) -> None:
+    settings = replace(WELL, pose=replace(WELL.pose, on_gimbal=on_gimbal))
+    level = (1.0, 0.0, 0.0, 0.0)
+    vehicle = replace(unknown_pose(1, 5), age_ms=100.0, gimbal_attitude=level if heard else None)
+    found = record(tmp_path, settings, vehicle=vehicle)["problems"]
+    assert any("pose.on_gimbal" in text for text in found) == problem
+    silent = replace(vehicle, age_ms=None)  # nothing is heard of the vehicle at all, which is told already
+    assert not any("pose.on_gimbal" in text for text in record(tmp_path, settings, vehicle=silent)["problems"])
 
 
 def test_a_link_on_which_no_ground_station_is_yet_is_no_problem(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from dappled.daemon.pipeline.decode_worker import DecodeWorker, nearest
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.decode.depth.ranging import Ranging
 from dappled.drivers.child_process import ChannelMessage
-from dappled.drivers.raw import darkroom
+from dappled.drivers.raw import law_check
 from dappled.drivers.raw.recipe import LawDecision, Recipe
 from dappled.products.opened import with_ranging
 from tests.cli.test_thesis_camera import PROFILE, QUARTER, dng_of
@@ -105,7 +105,7 @@ def test_a_search_that_fails_costs_no_frame_and_is_a_doubt_until_carriers_are_se
     recipe, frames = flown
     worker = worker_of(recipe)
     with monkeypatch.context() as patched:
-        patched.setattr(darkroom, "search_frame", fail)
+        patched.setattr(law_check, "search_frame", fail)
         for index in (1, 2):
             found = ask(worker, frames[1], index)
             assert (found["law"], found["decision"]) == ("fd", None)

@@ -74,7 +74,7 @@ class Bench:
             cast(FlightWriter, self),
             PendingShots(FakeCamera()),
             cast(Publisher, self),
-            method="gradient",
+            method="contrast",
             interval_s=interval_s,
             clock=self.clock,
             nearest=self,
@@ -109,7 +109,7 @@ def test_a_message_as_the_schema_says(bench: Bench) -> None:
     jsonschema.validate(header, schema("depth"))
     arrays = wire.Message("depth", header, body).arrays()
     assert [arrays[name].shape for name in ("disparity", "sigma")] == [(2, 3), (2, 3)]
-    assert bench.maker.asked == [("frames/3.dng", "gradient")]
+    assert bench.maker.asked == [("frames/3.dng", "contrast")]
 
 
 def test_not_more_often_than_asked_for(bench: Bench) -> None:

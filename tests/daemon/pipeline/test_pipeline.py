@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -23,10 +24,11 @@ from dappled.daemon.health.record import DecodingState
 from dappled.daemon.navigation import Telemetry, clocks
 from dappled.daemon.pipeline import capture
 from dappled.daemon.pipeline.pipeline import DecodeFailures
+from dappled.daemon.pipeline.verdicts import PictureFacts
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.drivers.camera import Blob, CameraError, CameraEvent, Companion, Deferred
-from dappled.drivers.raw import darkroom
+from dappled.drivers.raw import law_check
 from dappled.drivers.raw.recipe import LawDecision, of_flight
 from dappled.flight import FlightError, Recording, ShotState, flight_report, layout
 from dappled.flight.checks import flight_check
@@ -203,6 +205,21 @@ def test_a_frame_that_does_not_decode_is_told_and_the_next_does(tmp_path: Path) 
         one.request(2)
         assert one.ended(1).problem == ""
         assert "not decoded: no carriers" in one.events()
+
+
+def test_a_verdict_that_no_ledger_can_hold_costs_no_frame(tmp_path: Path) -> None:
+    with rig(tmp_path) as one:
+        assert one.decoder is not None
+        share: Any = np.float32(0.9)  # JSON has no such number
+        one.decoder.picture = PictureFacts(share, 0.0, 0.2, ((0.5, 1.0, 2.0),) * 2)
+        one.request(1)
+        assert one.ended(0).problem == ""
+        found = one.flight.ledger.result(0)
+        assert found is not None
+        assert found.verdict is not None
+        state, reasons = found.verdict
+        assert state == "unknown"
+        assert "could not be judged" in reasons[0]
 
 
 def test_frames_that_do_not_decode_are_counted_until_one_does(tmp_path: Path) -> None:
@@ -401,7 +418,7 @@ def jpeg_at(focal_length_mm: float, taken: str = "") -> bytes:
     return file.getvalue()
 
 
-DOUBT = darkroom.OTHER_LATTICE
+DOUBT = law_check.OTHER_LATTICE
 
 
 def judged(one: Rig) -> Check:

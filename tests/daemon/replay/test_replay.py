@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from dappled.config.settings import PoseSettings
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import PendingShot, PendingShots
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
+from dappled.daemon.pipeline.verdicts import Judge
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayProgress
 from dappled.drivers.camera import Arrival, CameraEvent, Fired, Identity, ShotFailed, StateChanged
@@ -54,6 +56,7 @@ def again(flight: Path, pace: replay.Pace | None = None) -> list[str]:
         names=Names("test", "mask", "geometric"),
         observer=progress,
         decode_queue=100,
+        judge=Judge(PoseSettings().mount, on_gimbal=False),
     )
     pipeline.start()
     try:
@@ -148,7 +151,10 @@ def test_a_folder_of_frames(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("start", "words"),
     [
-        (b"ULog\x01\x12\x35\x01", "log.x is a log of PX4.*tlog that a ground station"),
+        (
+            b"ULog\x01\x12\x35\x01",
+            "log.x (holds no messages|is damaged as a log of PX4|.*needs pyulog)",
+        ),
         (b"\xa3\x95\x80\x80Y", "log.x (holds no fix|is damaged as a log of ArduPilot)"),
     ],
 )

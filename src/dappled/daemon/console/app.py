@@ -22,7 +22,7 @@ from dappled.daemon.console import access, pictures
 from dappled.daemon.console.access import Access, Refusal, RequestGuard, refused
 from dappled.daemon.console.feed import Feed, FeedError
 from dappled.daemon.console.placement import KML_MEDIA_TYPE, Background, latest_kml, network_link_kml
-from dappled.daemon.console.process import ConsoleRequestError, DaemonChannel
+from dappled.daemon.console.process import ConsoleRequestError, DaemonQuestions
 from dappled.daemon.console.studio import Studio, StudioError
 from dappled.daemon.health import metrics
 from dappled.decode.geometry.footprint import RectifiedFrame
@@ -44,7 +44,7 @@ class ConsoleApp:
     """The application's endpoints. Pictures are made one at a time on a thread for that."""
 
     def __init__(
-        self, feed: Feed, studio: Studio, daemon: DaemonChannel, rules: Access, background: Background | None
+        self, feed: Feed, studio: Studio, daemon: DaemonQuestions, rules: Access, background: Background | None
     ) -> None:
         self._feed, self._hub, self._studio, self._daemon = feed, feed.hub, studio, daemon
         self._rules, self._background = rules, background
@@ -64,6 +64,7 @@ class ConsoleApp:
             Route("/api/outcome", self._outcome, methods=["POST"]),
             Route("/api/interval/stop", self._stop_interval, methods=["POST"]),
             Route("/api/setting", self._set, methods=["POST"]),
+            Route("/api/live", self._live, methods=["POST"]),
             Route("/api/frames/{frame}/{name}", self._frame_picture),
             Route("/api/map", self._map),
             Route("/metrics", self._metrics),
@@ -170,10 +171,15 @@ class ConsoleApp:
             raise StudioError("name and value must be texts: a setting, and one of its choices")
         return await self._do({"do": "set", **_numbered(body), "name": name, "value": value})
 
+    async def _live(self, _: Request) -> Response:
+        answer = await self._ask({"do": "look"})
+        picture = answer.pop("picture", None)
+        if picture is not None:
+            return Response(picture, media_type="image/jpeg", headers={"cache-control": "no-store"})
+        return _answered(answer)
+
     async def _do(self, question: Mapping[str, Any]) -> Response:
-        answer = await self._ask(question)
-        answer.pop("number", None)
-        return JSONResponse(answer, status_code=200 if answer.get("ok") else 409)
+        return _answered(await self._ask(question))
 
     async def _ask(self, question: Mapping[str, Any]) -> dict[str, Any]:
         return await asyncio.get_running_loop().run_in_executor(self._questions, self._daemon.ask, question)
@@ -222,7 +228,7 @@ class ConsoleApp:
         known = self._feed.frames.get(frame)
         if known is None:
             raise FeedError(f"there is no frame {frame} here")
-        picture, header = known.thumb, dict(known.tag)
+        picture, header = known.thumb, {**known.tag, "frame_shape": known.shape}
         if sharp or picture is None:
             message = await self._feed.slices(frame)
             header["frame_shape"] = message.header["frame_shape"]
@@ -257,6 +263,11 @@ class ConsoleApp:
     async def _kml_picture(self, request: Request) -> Response:
         self._hub.globe_asked()
         return _file(await self._rectified_png(_frame(request), _GLOBE_PICTURE_PX, sharp=True), "x.png")
+
+
+def _answered(answer: dict[str, Any]) -> Response:
+    answer.pop("number", None)
+    return JSONResponse(answer, status_code=200 if answer.get("ok") else 409)
 
 
 def _absolute(request: Request, path: str) -> str:

@@ -39,13 +39,16 @@ class FeedError(DappledError):
 
 @dataclass(slots=True)
 class FeedState:
-    """What is known of one frame: its tag; from its slices a small picture and the carriers; its depth, if any."""
+    """What is known of one frame: its tag; from its slices a small picture, the carriers and the frame's shape; its
+    depth, if any; how it was judged ("state", "reasons")."""
 
     tag: dict[str, Any]
     thumb: NDArray[np.uint8] | None = None
     depth: Message | None = None
     corners: list[tuple[float, float]] | None = None
+    shape: list[int] | None = None
     slices: dict[str, Any] | None = None
+    verdict: dict[str, Any] | None = None
 
 
 class Hub:
@@ -215,6 +218,7 @@ class Feed:
             "depth": seen.depth is not None,
             "corners": seen.corners,
             "slices": seen.slices,
+            "verdict": seen.verdict,
         }
 
     def track(self) -> list[tuple[float, float, float]]:
@@ -233,6 +237,7 @@ class Feed:
                 self.health = header
                 self._add_to_path(header.get("vehicle"))
                 self.hub.send(self.state())
+                self._judged((header.get("decode") or {}).get("judged") or {})
             case "start":
                 self._begin(header)
             case "frame":
@@ -246,6 +251,14 @@ class Feed:
             case "error":
                 asked = header.get("asked") or {}
                 self._answer(asked.get("frame"), FeedError(str(header.get("error"))))
+
+    def _judged(self, judged: dict[str, Any]) -> None:
+        """Take the verdicts of the last frames, and send the frames whose verdict is new."""
+        for one in judged.get("last", ()):
+            seen = self.frames.get(one["frame"])
+            if seen is not None and seen.verdict is None:
+                seen.verdict = {"state": one["state"], "reasons": one["reasons"]}
+                self.hub.send(self.frame_event(one["frame"]))
 
     def _add_to_path(self, vehicle: dict[str, Any] | None) -> None:
         if vehicle is not None and vehicle["latitude_deg"] is not None:
@@ -277,7 +290,8 @@ class Feed:
         if seen.thumb is None:
             seen.thumb = self._studio.thumb(message)
             seen.slices = _facts(message)
-            seen.corners = self._studio.corners({**seen.tag, "frame_shape": message.header.get("frame_shape")})
+            seen.shape = message.header.get("frame_shape")
+            seen.corners = self._studio.corners({**seen.tag, "frame_shape": seen.shape})
         self.hub.send(self.frame_event(index))
 
     def _depth(self, message: Message) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import fft
 
+from dappled.decode import srgb
 from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
 
@@ -57,17 +58,14 @@ def level(image: NDArray[np.floating]) -> float:
 
 def encoded(linear: NDArray[np.floating]) -> Grey:
     """Linear 0 to 1 as sRGB bytes, as a browser decodes them."""
-    value = np.clip(linear, 0, 1)
-    coded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
-    grey: Grey = np.rint(255 * coded).astype(np.uint8)
+    grey: Grey = np.rint(255 * srgb.encoded(np.clip(linear, 0, 1))).astype(np.uint8)
     return grey
 
 
 def decoded(coded: Grey) -> NDArray[np.float32]:
     """sRGB bytes as linear 0 to 1."""
-    value = coded / np.float32(255)
-    linear: NDArray[np.float32] = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    return linear.astype(np.float32)
+    linear: NDArray[np.float32] = srgb.decoded(coded / np.float32(255)).astype(np.float32)
+    return linear
 
 
 def spectrum(slices: NDArray[np.complex64], carriers: Sequence[Sequence[float]], grid: Sequence[Sequence[float]],

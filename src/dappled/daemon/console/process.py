@@ -93,7 +93,7 @@ class RequestHandler(Protocol):
     """Answers what the console asks of the daemon: `ConsoleRequests`."""
 
     def answer(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Do what is asked; the answer goes to the page."""
+        """Do what is asked; the answer goes to the page, bytes as "picture" too."""
 
 
 class Console:
@@ -149,8 +149,17 @@ class _PageRequests:
 
     def turn(self, channel: ProcessChannel, message: ChannelMessage | None) -> None:
         """See ProcessPeer."""
-        if message is not None:
-            channel.send({**self.handler.answer(message.body), "number": message.body.get("number")})
+        if message is None:
+            return
+        answer = {**self.handler.answer(message.body), "number": message.body.get("number")}
+        picture = answer.pop("picture", None)
+        if picture is None:
+            channel.send(answer)
+            return
+        with os.fdopen(os.memfd_create("picture", os.MFD_CLOEXEC), "wb") as file:  # too long for a message
+            file.write(picture)
+            file.flush()
+            channel.send({**answer, "size": len(picture)}, (file.fileno(),))
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,6 +216,13 @@ def start(
     return console
 
 
+class DaemonQuestions(Protocol):
+    """Answers the page's questions: `DaemonChannel`, or what stands for a daemon where there is none."""
+
+    def ask(self, question: Mapping[str, Any]) -> dict[str, Any]:
+        """The answer. Raises ConsoleRequestError."""
+
+
 class DaemonChannel:
     """The console process' end: asks the daemon, from any thread, one question at a time."""
 
@@ -223,8 +239,12 @@ class DaemonChannel:
             try:
                 self._channel.send({**question, "number": self._number}, timeout_s=1.0)
                 while (answer := self._channel.receive(_ANSWER_S)) is not None:
-                    if answer.body.get("number") == self._number:
-                        return dict(answer.body)
+                    told = dict(answer.body)
+                    for fd in answer.fds:
+                        told["picture"] = os.pread(fd, told["size"], 0)
+                        os.close(fd)
+                    if told.get("number") == self._number:
+                        return told
             except ChannelError:
                 self.gone.set()
                 raise ConsoleRequestError("the daemon has ended") from None

@@ -36,17 +36,27 @@ class Settable(Protocol):
         """Ask for another value. Whether it is set already; else the body will report it. Raises CameraError."""
 
 
+class LiveAnswers(Protocol):
+    """What shows a page the camera's live view: `live_view.CameraLook`."""
+
+    def answer(self) -> dict[str, Any]:
+        """A picture, or why there is none."""
+
+
 class ConsoleRequests:
     """Answers the console's questions. One thread asks."""
 
-    def __init__(self, shutter: Shutter, parameters: Settable, logbook: Logbook, clock: Clock) -> None:
+    def __init__(
+        self, shutter: Shutter, parameters: Settable, look: LiveAnswers, logbook: Logbook, clock: Clock
+    ) -> None:
         self.run = secrets.token_hex(4)
         self.logbook = logbook
-        self._shutter, self._parameters, self._clock = shutter, parameters, clock
+        self._shutter, self._parameters, self._look, self._clock = shutter, parameters, look, clock
         self._done: OrderedDict[int, dict[str, Any]] = OrderedDict()
 
     def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Do what is asked: a shot, an interval, its end, a setting, what became of a number, or lines of the log."""
+        """Do what is asked: a shot, an interval, its end, a setting, live view, what became of a number, or lines of
+        the log."""
         match request.get("do"):
             case "shoot" | "interval" | "set":
                 return self._once(request)
@@ -54,6 +64,8 @@ class ConsoleRequests:
                 return self._outcome(request)
             case "stop interval":
                 return self._stop_interval(request)
+            case "look":
+                return self._look.answer()
             case "log":
                 return {"ok": True, "lines": self.logbook.after(request["after"])}
             case _:

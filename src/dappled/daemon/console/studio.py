@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -29,6 +28,7 @@ Made = TypeVar("Made")
 KEPT_BYTES = 24_000_000
 SPECTRUM_PX = 880
 SLICES_PX = 1600
+_ALIKE = 0.05  # sensors whose sides differ by less have the same footprint
 
 
 class StudioError(DappledError):
@@ -136,7 +136,7 @@ class Studio:
     def _chip(self, camera: profiles.CameraProfile, header: Mapping[str, Any]) -> tuple[float, float] | None:
         shape = header.get("frame_shape")
         known = [raw.sensor.size_mm for raw in camera.raw if shape is None or list(raw.sensor.shape) == list(shape)]
-        return known[0] if known else None
+        return known[0] if known and np.allclose(known, known[0], rtol=_ALIKE) else None  # until it is decoded
 
     def _mosaic(self, message: Message) -> tuple[Mosaic, str]:
         def make() -> tuple[Mosaic, str]:
@@ -151,8 +151,8 @@ class Studio:
             sensor = profiles.camera(header["camera"]).sensor(tuple(header["frame_shape"]))
         except DappledError:
             return None
-        length, stop, one = header["focal_length_mm"], header["f_number"], made.sensor_px_per_disparity
-        return length / stop / math.hypot(*sensor.column_mm) / one if length and stop and one else None
+        aperture, one = sensor.aperture_px(header["focal_length_mm"], header["f_number"]), made.sensor_px_per_disparity
+        return aperture / one if aperture and one else None
 
     def _light_field(self, message: Message) -> LightField:
         header = message.header

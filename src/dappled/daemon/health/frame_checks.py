@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dappled.config import profiles
 from dappled.daemon.health.go_no_go import Check
+from dappled.daemon.pipeline.verdicts import DIRECTIONS, fineness
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.drivers.raw.raw_file import exposure
@@ -91,10 +92,10 @@ def _carriers(made: DecodeResult, recipe: Recipe) -> Check:
 
 def sharpness(picture: NDArray[Any]) -> list[Check]:
     """Check focus and motion blur of a picture (rows, columns) by the fineness of its detail in four directions."""
-    along = {name: _fineness(picture, step) for name, step in _DIRECTIONS.items()}
+    along = fineness(picture)
     measured = {"fineness": {name: round(value, 3) for name, value in along.items()}}
     shown = ", ".join(f"{value:.2f} {name}" for name, value in along.items())
-    sharp = any(along[name] >= SHARP[r * r + c * c] for name, (r, c) in _DIRECTIONS.items())
+    sharp = any(along[name] >= SHARP[r * r + c * c] for name, (r, c) in DIRECTIONS.items())
     if not sharp:
         text = f"the picture is not sharp anywhere (fineness {shown}): focus again"
         return [
@@ -108,24 +109,3 @@ def sharpness(picture: NDArray[Any]) -> list[Check]:
             text = f"detail is lost {soft} ({along[soft]:.2f} against {along[fine]:.2f} {fine}): shorten the exposure"
             return [focus, Check("motion", "no-go", text, measured=measured)]
     return [focus, Check("motion", "go", "equally sharp in both directions", measured=measured)]
-
-
-_DIRECTIONS = {"across": (0, 1), "along": (1, 0), "falling": (1, 1), "rising": (1, -1)}
-
-
-def _fineness(picture: NDArray[Any], step: tuple[int, int]) -> float:
-    """Mean squared difference over one step by that over two; of logarithms, so that shade counts like light."""
-    logs = np.log(np.maximum(picture, 1e-6 * max(float(picture.max()), 1e-12)))
-    one, two = (_differences(logs, (step[0] * n, step[1] * n)) for n in (1, 2))
-    return one / two if two > 0 else 0.0
-
-
-def _differences(values: NDArray[Any], step: tuple[int, int]) -> float:
-    (rows, columns), (height, width) = step, values.shape
-    a = values[_part(height, rows), _part(width, columns)]
-    b = values[_part(height, -rows), _part(width, -columns)]
-    return float(np.mean((a - b) ** 2))
-
-
-def _part(length: int, shift: int) -> slice:
-    return slice(max(shift, 0), length + min(shift, 0))

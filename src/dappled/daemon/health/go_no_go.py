@@ -14,6 +14,7 @@ _SURE_M, _SLOW_CLOCK_MS, _FRESH_MS = 5.0, 50.0, 3000.0
 FAILING = 3  # so many frames in a row that can't be decoded are no accident
 _FRAME_BYTES = 20e6  # of a large one: whether little room is left before a flight has shown its own
 _FRAMES = ("frames", "frame")
+_CARD_FRAMES = 100
 _EARLIEST_UTC_NS = 1_700_000_000 * 10**9  # a machine with a date before 2023 has no clock
 
 
@@ -47,6 +48,7 @@ def checks(health: Mapping[str, Any]) -> list[Check]:
     """The checks of one health record."""
     return [
         _camera(health["camera"]),
+        *_body(health),
         _disk(health),
         _link(health),
         _position(health.get("vehicle")),
@@ -63,6 +65,30 @@ def _camera(camera: Mapping[str, Any]) -> Check:
     if state == "starting":
         return Check("Camera", "caution", "starting")
     return Check("Camera", "no-go", f"{state}: {reason}" if reason else state)
+
+
+def _body(health: Mapping[str, Any]) -> list[Check]:
+    """The body's settings against the plan; none while no camera is ready, and in a record of an earlier version."""
+    body = health.get("body")
+    if body is None:
+        return []
+    room = body["card_frames"]
+    if body["wrong"]:
+        return [Check("Body", "no-go", "; ".join(body["wrong"]), "make the body as planned, or change [body]")]
+    if room == 0:
+        return [Check("Body", "no-go", "its card is full", "change the card, or empty it")]
+    doubts = [body["drift"]] if body["drift"] else []
+    if room is not None and room < _CARD_FRAMES:
+        doubts.append(f"its card has room for {counted(room, 'frame')}")
+    if not body["checked"]:
+        doubts.append("its settings are not compared with a plan (body.check)")
+    elif not body["read"]:
+        doubts.append(f"its settings can't be read; look at {', '.join(body['unknown'])}")
+    elif body["unknown"]:
+        doubts.append(f"it doesn't report {', '.join(body['unknown'])}: look at it")
+    if doubts:
+        return [Check("Body", "caution", "; ".join(doubts))]
+    return [Check("Body", "go", "as planned" if room is None else f"as planned, room for {counted(room, 'frame')}")]
 
 
 def frames_left(health: Mapping[str, Any]) -> int | None:

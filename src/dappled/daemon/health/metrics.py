@@ -49,6 +49,9 @@ def families(health: Mapping[str, Any]) -> Iterator[Metric]:
         yield _counter(f"stage_{key}", what, {name: stage[key] for name, stage in stages.items()}, "stage")
     sent = {topic: count for stage in health["stages"] for topic, count in stage.get("sent", {}).items()}
     yield _counter("published", "Messages published", sent, "topic")
+    judged = (health.get("decode") or {}).get("judged") or {}
+    judged_by = {state: judged.get(state) for state in ("good", "usable", "bad", "unknown")}
+    yield _counter("frames_judged", "Frames, by their verdict", judged_by, "verdict")
     yield _gauge("problems", "Problems in the health record", {"": len(health["problems"])})
 
 

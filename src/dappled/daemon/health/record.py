@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from dappled.config.settings import RecordSettings, Settings
+from dappled.daemon.body_plan import BodyReport
 from dappled.daemon.health.go_no_go import FAILING
 from dappled.daemon.navigation import BootClock, TelemetryStatistics
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.shutter import ShutterStatistics
+from dappled.daemon.pipeline.verdicts import STATES, VerdictCounts
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.decode.geometry import Pose
@@ -26,27 +28,43 @@ SILENT_NS = 5 * 10**9
 _RECEIVER_MS = 5000.0
 _NO_LINK = "no MAVLink link is configured: frames are tagged without poses"
 _NO_MASK = "no mask is configured: frames are kept, not decoded (set mask.profile)"
+_NO_GIMBAL = (
+    "no gimbal's attitude arrives (GIMBAL_DEVICE_ATTITUDE_STATUS, MOUNT_ORIENTATION), and the camera is on one "
+    "(pose.on_gimbal): frames are tagged without the direction of view"
+)
 _NO_UTC = "UTC is not known yet: all time stamps will be corrected when the autopilot gets it from its satellites"
 
 
 @dataclass(frozen=True, slots=True)
 class DecodingState:
-    """Whether frames are decoded in flight, what could not be decoded, and why the calibration can't be used ("" where
-    it can)."""
+    """Whether frames are decoded in flight, what could not be decoded, why the calibration can't be used ("" where
+    it can), and how the decoded frames were judged."""
 
     running: bool = False
     failures: DecodeFailures = field(default_factory=DecodeFailures)
     misfit: str = ""
+    verdicts: VerdictCounts = field(default_factory=VerdictCounts)
 
-    def problems(self) -> list[str]:
-        """What is wrong, a sentence each."""
+    def problems(self, now_ns: int) -> list[str]:
+        """What is wrong, a sentence each. Time is monotonic."""
         failed = self.failures
         found = [f"frames can't be decoded: {self.misfit}"] if self.misfit else []
         if failed.in_a_row >= FAILING:
             found.append(f"decoding fails: the last {_frames(failed.in_a_row)} are kept, not decoded: {failed.reason}")
         elif failed.count:
             found.append(f"decoding failed: {_frames(failed.count)} kept, not decoded: {failed.reason}")
-        return found
+        judged = (self.verdicts.problem(now_ns), self.verdicts.drifted(now_ns))
+        return [*found, *(one for one in judged if one is not None)]
+
+    def judged(self) -> dict[str, Any]:
+        """The verdicts, as JSON values."""
+        counts = self.verdicts
+        last = [{"frame": frame, "state": state, "reasons": list(reasons)} for frame, state, reasons in counts.last]
+        return {
+            **{state: counts.by_state.get(state, 0) for state in STATES},
+            "bad_in_a_row": counts.bad_in_a_row,
+            "last": last,
+        }
 
 
 def record(
@@ -70,11 +88,13 @@ def record(
     doubts: Sequence[str] = (),
     parameters: Sequence[Mapping[str, Any]] = (),
     frame_bytes: float | None = None,
+    body: BodyReport | None = None,
 ) -> dict[str, Any]:
     """The header of a `health` message. Its `problems` are sentences, none when all is well.
 
     `doubts` are further problems, found by other parts. `dead_threads` have ended without being asked to. `parameters`
     are the settings of body and decoder; `frame_bytes` is the mean size of this flight's frames, None before the first.
+    `body` is how the camera's settings stand to the plan; None where nothing is compared.
     """
     decoding = decoding or DecodingState()
     fresh = vehicle is not None and vehicle.age_ms is not None and vehicle.age_ms * 1e6 < SILENT_NS
@@ -85,15 +105,18 @@ def record(
         *([] if shots.state in ("starting", "ready", "busy") else [shots.camera_sentence()]),
         *silences,
         *doubts,
+        *([] if body is None else body.problems()),
+        *([_NO_GIMBAL] if fresh and settings.pose.on_gimbal and vehicle and not vehicle.gimbal_attitude else []),
         *([] if utc_known else [_NO_UTC]),
         *shortages,
         *([] if settings.mask.profile else [_NO_MASK]),
-        *decoding.problems(),
+        *decoding.problems(monotonic_ns),
         *(f"{one.name} fell behind by {_frames(one.dropped)}, kept in the record" for one in stages if one.dropped),
     ]
     return {
         "utc_ns": utc_ns,
         "camera": {"state": shots.state, "reason": shots.reason},
+        "body": None if body is None else body.values(),
         "link": link,
         "disk": disk,
         "shots": {
@@ -121,6 +144,7 @@ def record(
             "failure": decoding.failures.reason,
             "misfit": decoding.misfit,
             "doubt": decoding.failures.doubt,
+            "judged": decoding.judged(),
         },
         "min_free_bytes": settings.record.min_free_mb * 1_000_000,
         "frame_bytes": frame_bytes,
@@ -166,6 +190,7 @@ def _link(
         "silent": len(silent),
         "packets": telemetry.packets,
         "positions": telemetry.positions,
+        "impossible": telemetry.impossible,
         "each": [_counters(link) for link in links],
     }
     return facts, problems if settings.mavlink.url else [_NO_LINK, *problems]

@@ -13,7 +13,8 @@ from typing import Any, Protocol
 from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.pipeline.decode_process import DecodedFrame
 from dappled.daemon.pipeline.flight_writer import FlightWriter
-from dappled.decode.geometry import Pose
+from dappled.daemon.pipeline.verdicts import Verdict
+from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.camera import (
     Arrival,
     BodyState,
@@ -43,14 +44,16 @@ class PendingShot:
 
     `over`: its observers know that it is finished. `entered`: its row is in the ledger. `follows` says, for a shot
     whose file stays at the camera, how it will come; `where` is then when and where it was exposed, as far as that is
-    known without the file.
+    known without the file. `rates_rad_s` are the body's at mid-exposure.
     """
 
     shot: Shot
     fired: Fired | None = None
     frame: Frame | None = None
     tag: Tag | None = None
+    rates_rad_s: Vector3 | None = None
     decoded: DecodedFrame | None = None
+    verdict: Verdict | None = None
     problem: str = ""
     doubt: str = ""
     follows: str = ""

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from dappled.clock import Clock, SystemClock
+from dappled.daemon.pipeline.verdicts import PictureFacts
 from dappled.drivers.child_process import (
     ChannelError,
     ChannelMessage,
@@ -49,7 +50,7 @@ class DecodedFrame:
     `preview` is a JPEG of `preview_size` (width, height). `ms` names what took how long. `seen` is what viewers need
     besides, in the words of the `slices` schema. `carriers_found` is None where no carriers can be seen at the frame's
     aperture, `decision` the law for the flight where this frame decided it; `fingerprint` see
-    `decode.fingerprint`.
+    `decode.lightfield.light_field.fingerprint`. `picture` is what the frame is judged by.
     """
 
     body: mmap.mmap
@@ -67,14 +68,19 @@ class DecodedFrame:
     seen: Mapping[str, Any] = field(default_factory=dict)
     decision: LawDecision | None = None
     fingerprint: Mapping[str, Any] | None = None
+    picture: PictureFacts | None = None
 
-    def result(self, index: int, decode_ms: float | None, run: str = "live") -> Result:
-        """The row of the ledger."""
+    def result(
+        self, index: int, decode_ms: float | None, run: str = "live", judged: Mapping[str, Any] | None = None
+    ) -> Result:
+        """The row of the ledger; `judged` are the values of the frame's verdict."""
         details: dict[str, Any] = {"ms": dict(self.ms)}
         if self.seen.get("doubts"):
             details["doubts"] = self.seen["doubts"]
         if self.fingerprint is not None:
             details["fingerprint"] = dict(self.fingerprint)
+        if judged is not None:
+            details["verdict"] = dict(judged)
         return Result(
             index,
             self.sha256,
@@ -279,7 +285,16 @@ def _decoded(answer: ChannelMessage) -> DecodedFrame:
         seen=facts["seen"],
         decision=None if facts["decision"] is None else LawDecision.of_values(facts["decision"]),
         fingerprint=facts["fingerprint"],
+        picture=_picture(facts["picture"]),
     )
+
+
+def _picture(values: Mapping[str, Any] | None) -> PictureFacts | None:
+    try:
+        return None if values is None else PictureFacts.of_values(values)
+    except (KeyError, TypeError, ValueError) as error:  # a frame must not be lost with what only its verdict needs
+        log.warning("a frame can't be judged: its facts can't be read: %s", error)
+        return None
 
 
 def _send(channel: ProcessChannel, question: ChannelMessage, body: Mapping[str, Any], fds: tuple[int, ...]) -> None:

@@ -15,21 +15,22 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
+from dappled.config.profiles import VerdictBounds
 from dappled.daemon.pipeline.decode_process import NICENESS, serve
+from dappled.daemon.pipeline.verdicts import PictureFacts, detail, noise_of
 from dappled.daemon.stream import wire
 from dappled.decode import DecodeError
 from dappled.decode.depth import RANGING, DepthMap, Ranging, estimate, evidence
-from dappled.decode.fingerprint import fingerprint
 from dappled.decode.lightfield import LightField, ViewStack
-from dappled.decode.lightfield.light_field import slice_mosaic
+from dappled.decode.lightfield.light_field import fingerprint, slice_mosaic
 from dappled.drivers.camera import Blob
 from dappled.drivers.child_process import DECODER_GOES, ChannelMessage, end_with_parent, goes_first
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
-from dappled.drivers.raw.raw_file import exposure
 from dappled.drivers.raw.recipe import LawDecision
-from dappled.errors import sentence
+from dappled.errors import DappledError, sentence
 
 log = logging.getLogger(__name__)
 DEPTH_NICENESS = 14
@@ -49,12 +50,13 @@ class DecodeWorker:
         self._preview_px = 1024
         self._looks = False
         self._laws = LawLooks()
+        self._sensors: dict[tuple[str, int, int], tuple[tuple[float, float], VerdictBounds] | None] = {}
 
     def __call__(self, question: ChannelMessage) -> WorkerReply:
         body = question.body
         if body["do"] == "set up":
             recipe = Recipe.of_values(body["recipe"])
-            self._darkroom = Darkroom(replace(recipe, decided=None, try_laws=False))
+            self._darkroom = Darkroom(replace(recipe, decided=None, try_laws=False, keep_law=False))
             self._looks = recipe.try_laws and recipe.decided is None
             self._decided = None if recipe.decided is None else Darkroom(recipe)
             self._preview_px = body["preview_px"]
@@ -98,6 +100,13 @@ class DecodeWorker:
         blob = Blob.of(preview, "preview")
         ms["preview"] = (time.perf_counter() - began) * 1e3
         found, doubts = self._laws.judge(done)
+        began = time.perf_counter()
+        try:
+            picture = self._picture(configured, done, np.abs(slices[0]))
+        except Exception as error:  # noqa: BLE001  # a frame must not be lost with what only its verdict needs
+            log.warning("frame %d can't be judged: %s", index, sentence(error))
+            picture = None
+        ms["judge"] = (time.perf_counter() - began) * 1e3
         facts = {
             "sha256": sha256,
             "fingerprint": numbers,
@@ -110,6 +119,7 @@ class DecodeWorker:
             "grid": field.grid.tolist(),
             "seen": {**_seen(done), "doubts": doubts},
             "preview_size": list(size),
+            "picture": None if picture is None else asdict(picture),
             "ms": ms,
             "decision": None if decided is None or index < decided.first else asdict(decided),
         }
@@ -133,6 +143,28 @@ class DecodeWorker:
         self._laws.keep(looked, decides=not calibrated)
         return None if calibrated else looker.decision(looked, index)
 
+    def _picture(self, darkroom: Darkroom, done: DecodeResult, mean: NDArray[np.float32]) -> PictureFacts:
+        """What the frame is judged by, with the bounds of its camera's profile, where it has one."""
+        rows, columns = done.light_field.attributes["shape"]
+        key = done.raw.camera_model or "", rows, columns
+        if key not in self._sensors:
+            try:
+                profile = darkroom.camera(key[0])
+                self._sensors[key] = profile.sensor((rows, columns)).size_mm, profile.verdict
+            except DappledError:  # without a profile, or for another shape
+                self._sensors[key] = None
+        sigma = done.report.noise_rms or 0.0
+        noise = noise_of(mean, sigma * (mean.size / (rows * columns)) ** 0.5)
+        exposed, known = done.exposed, self._sensors[key]
+        seen = PictureFacts(exposed.clipped_share, exposed.black_share, exposed.mean_share, detail(mean), noise)
+        if known is None:
+            return seen
+        side_mm, bounds = known
+        pixel_mm = side_mm[0] / rows, side_mm[1] / columns
+        (down, _, _), (_, right, _) = done.light_field.grid.tolist()
+        view_mm = abs(down) * pixel_mm[0], abs(right) * pixel_mm[1]
+        return replace(seen, side_mm=side_mm, view_mm=view_mm, pixel_mm=pixel_mm, bounds=bounds)
+
     def _preview(self, slices: Any, carriers: Any) -> tuple[bytes, tuple[int, int]]:
         step = max(1, round(max(slices.shape[1:]) * np.sqrt(2 * len(slices) - 1) / self._preview_px))
         mosaic = slice_mosaic(slices[:, ::step, ::step], carriers)
@@ -152,16 +184,17 @@ class LawLooks:
         self._last = -1
         self._settled = False
         self._left = _LOOKS
-        self._unseen: dict[tuple[float | None, float | None], str | None] = {}
+        self._unseen: dict[tuple[float | None, float | None], tuple[bool, str | None]] = {}  # observable, doubt
 
     def wanted(self, done: DecodeResult, index: int) -> bool:
         """Whether to search this frame. Not one that was taken before another one that is decoded already."""
         in_order, self._last = index > self._last, max(index, self._last)
-        if done.report.found > 1:
+        if done.report.carriers_from == "measured":  # one peak near a prediction may be the scene's
             self._settled = True
-        told = None not in _lens(done)
-        blind = done.report.carriers_from in ("predicted", "calibrated")
-        return in_order and told and blind and not self._settled and self._left > 0 and _lens(done) not in self._unseen
+        length, stop = _lens(done)
+        blind = length is not None and done.report.carriers_from in ("predicted", "calibrated")
+        new = stop is None or _lens(done) not in self._unseen  # without an f-number each frame may be at another stop
+        return in_order and blind and new and not self._settled and self._left > 0
 
     def begin(self) -> None:
         """Count a search, before it may fail."""
@@ -171,19 +204,21 @@ class LawLooks:
         """Keep what a searched frame showed: carriers that stand elsewhere, if that `decides`, or why none was seen."""
         self._settled = decides and looked.search is not None and looked.search.found is not None
         if not self._settled:
-            self._unseen[_lens(looked)] = looked.contradiction
+            self._unseen[_lens(looked)] = looked.observable, looked.contradiction or looked.unsettled
 
     def fail(self, done: DecodeResult, why: str) -> None:
         """Keep that the search of a frame failed: whether its carriers stand elsewhere is not known."""
-        self._unseen[_lens(done)] = f"no carriers where predicted, and the search near other laws failed: {why}"
+        words = f"no carriers where predicted, and the search near other laws failed: {why}"
+        self._unseen[_lens(done)] = True, words
 
     def judge(self, done: DecodeResult) -> tuple[int | None, list[str]]:
         """How many carriers a frame shows, None where none can be seen with its lens so; and what is in doubt."""
         doubts = [words for words in (done.report.doubt, done.calibration_doubt) if words]
-        if done.report.found > 1 or _lens(done) not in self._unseen:
+        if done.report.carriers_from == "measured" or _lens(done) not in self._unseen:
             return done.carriers_found, doubts
-        missing = self._unseen[_lens(done)]
-        return (None, doubts) if missing is None else (done.carriers_found, [missing, *doubts])
+        observable, missing = self._unseen[_lens(done)]
+        found = done.carriers_found if observable or done.report.found > 1 else None
+        return found, doubts if missing is None else [missing, *doubts]
 
 
 def _lens(done: DecodeResult) -> tuple[float | None, float | None]:
@@ -238,14 +273,13 @@ def _seen(done: DecodeResult) -> dict[str, Any]:
         }
         for c, m in pairs
     ]
-    exposed = exposure(done.raw)
     return {
         "frame_shape": done.light_field.attributes["shape"],
         "mosaic": done.raw.cfa is not None,
         "noise_rms": report.noise_rms,
         "predicted": carriers,
-        "histogram": [round(one, 5) for one in exposed.histogram],
-        "clipped_share": round(exposed.clipped_share, 6),
+        "histogram": [round(one, 5) for one in done.exposed.histogram],
+        "clipped_share": round(done.exposed.clipped_share, 6),
     }
 
 

@@ -6,8 +6,12 @@ camera, the writer that records or compares, and the source of poses.
 
 from __future__ import annotations
 
+import json
+import logging
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import Capture, Observer, PendingShot, PendingShots, ShotEnds
@@ -15,13 +19,16 @@ from dappled.daemon.pipeline.decode_process import DecodedFrame, FrameDecoder
 from dappled.daemon.pipeline.flight_writer import FlightWriter
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.tagging import PoseSource, Tagging
+from dappled.daemon.pipeline.verdicts import Judge, Verdict, VerdictCounts
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import Camera
 from dappled.drivers.raw.recipe import LawDecision
-from dappled.errors import sentence
+from dappled.errors import report, sentence
 from dappled.flight import Tag
 from dappled.workers import Statistics, Worker
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +58,13 @@ class Pipeline:
         names: Names,
         observer: Observer,
         decode_queue: int,
+        judge: Judge,
         preview_interval_s: float = 0.0,
     ) -> None:
         shots.decoding = decoder is not None
         ends = ShotEnds(shots, writer, observer)
         self._decoding = Decoding(
-            ends, decoder, publisher, capacity=decode_queue, preview_interval_s=preview_interval_s
+            ends, decoder, publisher, capacity=decode_queue, judge=judge, preview_interval_s=preview_interval_s
         )
         self._tagging = Tagging(ends, poses, publisher, latency=latency, names=names, following=self._decoding)
         self._capture = Capture(camera, ends, self._tagging)
@@ -88,6 +96,11 @@ class Pipeline:
         """What could not be decoded so far. Frames that decoding had no time for are none of these."""
         return self._decoding.failures
 
+    @property
+    def verdicts(self) -> VerdictCounts:
+        """How the frames were judged so far."""
+        return self._decoding.judge.counts
+
     def statistics(self) -> tuple[Statistics, ...]:
         """Counters of each stage's queue."""
         return self._tagging.worker.statistics(), self._decoding.worker.statistics()
@@ -106,11 +119,13 @@ class Decoding:
         publisher: Publisher | None,
         *,
         capacity: int,
+        judge: Judge,
         preview_interval_s: float,
     ) -> None:
         self._ends, self._decoder, self._publisher = ends, decoder, publisher
         self._preview_interval_s, self._last_preview_s = preview_interval_s, -1e9
         self.failures = DecodeFailures()
+        self.judge = judge
         self._unrecorded: LawDecision | None = None
         self.worker: Worker[PendingShot] = Worker(
             "decode", self._work, capacity=capacity, on_failure=self._failed, on_drop=self._dropped
@@ -123,6 +138,7 @@ class Decoding:
         elif self._ends.shots.decoding:
             self.worker.put(pending)
         else:
+            self._unjudged(pending, "it was not decoded: decoding was switched off")
             self._ends.note("not decoded", "decoding was switched off", pending.shot.index)
             self._ends.finish(pending)
 
@@ -144,25 +160,49 @@ class Decoding:
         if self._unrecorded is not None:  # tried again with the next frame where the disk refuses
             writer.law_decided(self._unrecorded)
             self._unrecorded = None
-        writer.decoded(decoded.result(frame.index, (time.monotonic_ns() - began) / 1e6))
+        pending.verdict = self._judged(pending, tag, decoded)
+        judged = pending.verdict.values()
+        writer.decoded(decoded.result(frame.index, (time.monotonic_ns() - began) / 1e6, judged=judged))
         pending.ms["decode"] = (time.monotonic_ns() - began) / 1e6
         began = time.monotonic_ns()
-        self._publish(tag, decoded)
+        self._publish(tag, decoded, judged)
         pending.ms["publish"] = (time.monotonic_ns() - began) / 1e6
         self._ends.finish(pending)
+
+    def _judged(self, pending: PendingShot, tag: Tag, decoded: DecodedFrame) -> Verdict:
+        try:
+            found = self.judge.judge(
+                tag,
+                pending.rates_rad_s,
+                decoded.picture,
+                carriers=(decoded.carriers_found, decoded.carriers_predicted),
+                doubts=decoded.seen.get("doubts", ()),
+            )
+            json.dumps(found.values(), allow_nan=False)  # what the ledger can't hold is no verdict
+        except Exception as error:  # noqa: BLE001  # a decoded frame must not be lost with its verdict
+            report(log, "verdict", error)
+            found = Verdict("unknown", (f"it could not be judged: {sentence(error)}",))
+        return self.judge.count(tag.index, found, time.monotonic_ns(), (tag.focal_length_mm, tag.f_number))
+
+    def _unjudged(self, pending: PendingShot, why: str) -> None:
+        if pending.verdict is None:
+            found = Verdict("unknown", (why,))
+            pending.verdict = self.judge.count(pending.shot.index, found, time.monotonic_ns())
 
     def _failed(self, pending: PendingShot, error: Exception) -> None:
         before = self.failures
         self.failures = replace(before, count=before.count + 1, in_a_row=before.in_a_row + 1, reason=sentence(error))
+        self._unjudged(pending, "it could not be decoded")
         self._ends.leave(pending, "not decoded", sentence(error))
 
     def _dropped(self, pending: PendingShot) -> None:
+        self._unjudged(pending, "it was not decoded: decoding fell behind")
         self._ends.drop(pending, "not decoded")
 
-    def _publish(self, tag: Tag, decoded: DecodedFrame) -> None:
+    def _publish(self, tag: Tag, decoded: DecodedFrame, judged: Mapping[str, Any]) -> None:
         if self._publisher is None:
             return
-        self._publisher.publish("slices", wire.slices_header(tag, decoded), decoded.body)
+        self._publisher.publish("slices", {**wire.slices_header(tag, decoded), "verdict": judged}, decoded.body)
         now_s = time.monotonic()
         if decoded.preview and now_s - self._last_preview_s >= self._preview_interval_s:
             self._last_preview_s = now_s

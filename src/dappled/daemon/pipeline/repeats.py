@@ -165,48 +165,50 @@ class RecentRequests:
 class _Unpaired:
     at_ns: int
     autopilot: bool
-    index: int
+    index: int | None = None
+    refused: str = ""
 
 
 class ForwardedRequests:
-    """Ground stations' broadcasts and autopilots' requests of the last 0.25 s (at most 64) that have no partner yet."""
+    """Ground stations' broadcasts and autopilots' requests of the last 0.25 s (at most 64) that have no partner yet:
+    those that became a shot, and those that were refused."""
 
     def __init__(self) -> None:
-        self._unpaired: deque[_Unpaired] = deque(maxlen=_UNPAIRED_KEPT)
-        self._refused: deque[tuple[int, bool, str]] = deque(maxlen=_UNPAIRED_KEPT)  # when, by the autopilot, why
+        self._shots: deque[_Unpaired] = deque(maxlen=_UNPAIRED_KEPT)
+        self._refused: deque[_Unpaired] = deque(maxlen=_UNPAIRED_KEPT)
 
     def partner(self, request: CaptureRequest, now_ns: int) -> int | None:
         """The image index of the shot that the other side's message got; None where there is none. It has its partner
         then. Times are monotonic."""
-        if not (request.autopilot or request.broadcast):
-            return None
-        while self._unpaired and now_ns - self._unpaired[0].at_ns > FORWARDED_NS:
-            self._unpaired.popleft()
-        for one in self._unpaired:
-            if one.autopilot != request.autopilot:
-                self._unpaired.remove(one)
-                return one.index
-        return None
+        found = _pair(self._shots, request, now_ns)
+        return None if found is None else found.index
 
     def refusal(self, request: CaptureRequest, now_ns: int) -> str | None:
         """Why the other side's message was refused; None where none was. It has its partner then."""
-        while self._refused and now_ns - self._refused[0][0] > FORWARDED_NS:
-            self._refused.popleft()
-        for one in self._refused:
-            if (request.autopilot or request.broadcast) and one[1] != request.autopilot:
-                self._refused.remove(one)
-                return one[2]
-        return None
+        found = _pair(self._refused, request, now_ns)
+        return None if found is None else found.refused
 
     def refuse(self, request: CaptureRequest, now_ns: int, reason: str) -> None:
         """A request was refused; so is its partner, which is not counted."""
         if request.autopilot or request.broadcast:
-            self._refused.append((now_ns, request.autopilot, reason))
+            self._refused.append(_Unpaired(now_ns, request.autopilot, refused=reason))
 
     def add(self, request: CaptureRequest, now_ns: int, index: int) -> None:
         """A request that belongs to shot `index` may have a partner that comes later."""
         if request.autopilot or request.broadcast:
-            self._unpaired.append(_Unpaired(now_ns, request.autopilot, index))
+            self._shots.append(_Unpaired(now_ns, request.autopilot, index))
+
+
+def _pair(waiting: deque[_Unpaired], request: CaptureRequest, now_ns: int) -> _Unpaired | None:
+    """Take the oldest message of the other side; older ones than the window are forgotten."""
+    while waiting and now_ns - waiting[0].at_ns > FORWARDED_NS:
+        waiting.popleft()
+    if not (request.autopilot or request.broadcast):
+        return None
+    found = next((one for one in waiting if one.autopilot != request.autopilot), None)
+    if found is not None:
+        waiting.remove(found)
+    return found
 
 
 class PacketDedup:

@@ -12,11 +12,11 @@ from dappled.daemon.pipeline.capture import NextStage, PendingShot, ShotEnds
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.stream.publisher import Publisher
 from dappled.daemon.stream.wire import frame_header
-from dappled.decode.geometry import Pose
+from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
 from dappled.drivers.raw.raw_file import ExposureSettings
-from dappled.errors import DappledError, sentence
+from dappled.errors import DappledError, report, sentence
 from dappled.flight import Frame, Tag
 from dappled.workers import Worker
 
@@ -29,6 +29,9 @@ class PoseSource(Protocol):
 
     def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
         """The exposure as it is known better, and its pose. `exposure` is as expected. Waits a limited time."""
+
+    def rates(self, pose: Pose) -> Vector3 | None:
+        """The turn rates of the body (rad/s, about its own axes) at a pose that `pose` gave; None where unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,10 +143,18 @@ class Tagging:
         camera = camera_name(self._names.camera, settings.model)
         pending.tag = tag(frame, exposure, settings, camera=camera, mask=self._names.mask, pose=pose)
         self._ends.writer.tagged(pending.tag)
+        pending.rates_rad_s = self._rates(pose)
         pending.ms["tag"] = (time.monotonic_ns() - began) / 1e6
         self._ends.tell(self._ends.observer.tagged, pending)
         if self._publisher:
             self._publisher.publish("frame", frame_header(pending.tag, frame, self._names.law or None))
+
+    def _rates(self, pose: Pose) -> Vector3 | None:
+        try:
+            return self._poses.rates(pose)
+        except Exception as error:  # noqa: BLE001  # a tag must not be lost with what only its verdict needs
+            report(log, "turn rates", error)
+            return None
 
     def _settings(self, frame: Frame) -> FrameSettings:
         try:

@@ -11,6 +11,7 @@ from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.decode_process import DecodeProcess
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
+from dappled.daemon.pipeline.verdicts import Judge
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import Pace, RecordedFlight, RecordedTelemetry, ReplayProgress
 from dappled.daemon.replay.verifier import ReplayVerifier
@@ -77,6 +78,7 @@ def run(
             names=flown.names,
             observer=progress,
             decode_queue=_DECODE_QUEUE,
+            judge=Judge(flown.settings.pose.mount, on_gimbal=flown.settings.pose.on_gimbal),
         )
         pipeline.start()
         stack.callback(pipeline.stop, _STOP_S)

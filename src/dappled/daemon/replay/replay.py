@@ -19,7 +19,7 @@ from dappled.daemon.navigation.clocks import TAGGING_RULES
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
 from dappled.daemon.replay.verifier import Expected, ReplayVerifier, ResultWriter
-from dappled.decode.geometry import Pose
+from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser
 from dappled.drivers.replay import RecordedShot
 from dappled.errors import DappledError
@@ -122,20 +122,16 @@ def of_folder(
 ) -> RecordedFlight:
     """Frames in a folder, in the order of their names; the first at `start_utc_ns` (None: the telemetry's first
     position, or 1970 without telemetry), the others at `interval_s` after each other. A single .tlog (or, without
-    one, a single .bin of ArduPilot) in the folder is the telemetry, where none is named."""
+    one, a single .bin of ArduPilot or .ulg of PX4) in the folder is the telemetry, where none is named."""
     if telemetry is not None and not telemetry.is_file():
         raise ReplayError(f"{telemetry}: there is no such telemetry file; check --telemetry")
     telemetry = telemetry or _only_log(folder)
-    if telemetry is not None and _begins(telemetry, _ULOG):
-        raise ReplayError(
-            f"{telemetry} is a log of PX4 (ULog), not MAVLink telemetry: give the .tlog that a ground station recorded"
-        )
     paths = [path for path in sorted(folder.glob(match)) if path.suffix.lower() in FRAME_SUFFIXES and path.is_file()]
     if not paths:
         raise ReplayError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
     if start_utc_ns is None:
         start_utc_ns = _first_position_utc_ns(telemetry) if telemetry else 0
-    elif telemetry is not None and _begins(telemetry, _DATAFLASH):
+    elif telemetry is not None and _own_log(telemetry):
         next(_packets(telemetry), None)  # a log that can't be used is refused before anything is replayed
     shots, files, expected = [], [], []
     for index, path in enumerate(paths):
@@ -157,8 +153,9 @@ def _only_log(folder: Path) -> Path | None:
     logs = sorted(folder.glob("*.tlog"))
     kind = ".tlog"
     if not logs:
-        kind = ".bin"
-        logs = sorted(path for path in folder.glob("*.[bB][iI][nN]") if path.is_file() and _begins(path, _DATAFLASH))
+        kind = "autopilots' own log"
+        named = [*folder.glob("*.[bB][iI][nN]"), *folder.glob("*.[uU][lL][gG]")]
+        logs = sorted(path for path in named if path.is_file() and _own_log(path))
     if len(logs) > 1:
         raise ReplayError(f"{folder} holds {len(logs)} {kind} files: say which with --telemetry")
     return logs[0] if logs else None
@@ -235,6 +232,10 @@ class RecordedTelemetry:
             if horizon is None and stamp_us * 1000 > exposure.utc_ns + self._wait_ns:
                 break
         return self._telemetry.locate(exposure, upto_packet=horizon)
+
+    def rates(self, pose: Pose) -> Vector3 | None:
+        """See PoseSource."""
+        return self._telemetry.rates(pose)
 
 
 class ReplayProgress(Observer):
@@ -316,7 +317,7 @@ def _recorded(digests: dict[int, tuple[str, str]], index: int) -> str | None:
 
 
 def _packets(path: Path) -> Iterator[tuple[int, int, MavlinkMessage]]:
-    """The messages of a .tlog or of ArduPilot's own log. Raises FlightError and DataFlashError."""
+    """The messages of a .tlog or of an autopilot's own log. Raises FlightError and AutopilotLogError."""
     decoder = PacketParser()
     for number, stamp_us, raw in _logged(path):
         message = decoder(raw)
@@ -325,8 +326,13 @@ def _packets(path: Path) -> Iterator[tuple[int, int, MavlinkMessage]]:
 
 
 def _logged(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    if not _begins(path, _DATAFLASH):
+    kind = _own_log(path)
+    if kind is None:
         return log_reading.read_telemetry(path)
+    if kind == "ulog":
+        from dappled.drivers.mavlink import ulog  # noqa: PLC0415  loaded for these logs only
+
+        return ulog.packets(path)
     from dappled.drivers.mavlink import dataflash  # noqa: PLC0415  its reader takes a tenth of a second to load
 
     return dataflash.packets(path)
@@ -339,10 +345,11 @@ def _first_position_utc_ns(path: Path) -> int:
     return utc_ns
 
 
-_DATAFLASH = b"\xa3\x95\x80\x80"
-_ULOG = b"ULog\x01\x12\x35"
+_OWN_LOGS = {b"\xa3\x95\x80\x80": "dataflash", b"ULog\x01\x12\x35": "ulog"}
 
 
-def _begins(path: Path, magic: bytes) -> bool:
+def _own_log(path: Path) -> str | None:
+    """Whose own log a file is, by its first bytes: "dataflash" of ArduPilot, "ulog" of PX4; None for a .tlog."""
     with open(path, "rb", opener=durable.without_waiting) as file:
-        return file.read(len(magic)) == magic
+        begins = file.read(7)
+    return next((name for magic, name in _OWN_LOGS.items() if begins.startswith(magic)), None)

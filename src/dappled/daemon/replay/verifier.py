@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from dappled import durable
-from dappled.decode.fingerprint import difference
+from dappled.decode.lightfield.light_field import difference
 from dappled.drivers.camera import Blob, Fired
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import DappledError

@@ -127,7 +127,7 @@ function showCounters(health) {
 
 function showFrame(event) {
   const index = event.tag.frame, before = frames.get(index);
-  const frame = { ...event, slices: event.slices ?? before?.slices ?? null };
+  const frame = { ...event, slices: event.slices ?? before?.slices ?? null, verdict: event.verdict ?? before?.verdict ?? null };
   frames.set(index, frame);
   if (frames.size > 400) frames.delete(frames.keys().next().value);
   map.setFrame(index, frame.corners, frame.thumb);
@@ -146,6 +146,12 @@ function showThumb(index, frame) {
     $("strip").insertBefore(button, after ?? null);
     while ($("strip").children.length > 40) $("strip").lastChild.remove();
   }
+  if (frame.verdict && button.dataset.verdict !== frame.verdict.state) {
+    button.dataset.verdict = frame.verdict.state;
+    const words = [`frame ${index}: ${frame.verdict.state}`, ...frame.verdict.reasons].join("; ");
+    button.setAttribute("aria-label", words);
+    button.title = words;
+  }
   if (frame.thumb && !button.querySelector("img")) button.firstChild.replaceWith(element("img", { src: `/api/frames/${index}/thumb.jpg`, alt: "" }));
 }
 
@@ -159,10 +165,12 @@ function choose(index) {
   stage.set(frame);
 }
 
-function showFacts({ tag, slices }) {
+function showFacts({ tag, slices, verdict }) {
   const pose = tag.pose, known = pose.latitude_deg !== null;
   const exposure = tag.exposure_s ? (tag.exposure_s < 0.5 ? `1/${Math.round(1 / tag.exposure_s)} s` : `${tag.exposure_s} s`) : dash;
   rows($("facts"), [
+    ["verdict", verdict ? verdict.state : "not judged yet", verdict?.state === "bad"],
+    ...(verdict?.reasons ?? []).map((reason) => ["because", reason, verdict.state === "bad"]),
     ["exposed", `${utc(tag.utc_ns, true)} ±${fixed(tag.utc_sigma_ns / 1e6, 1, "ms")}`],
     ["position", known ? `${fixed(pose.latitude_deg, 6)}°, ${fixed(pose.longitude_deg, 6)}°` : "unknown", !known],
     ["accuracy", `±${fixed(pose.position_sigma_m, 2, "m")}`],

@@ -1,14 +1,16 @@
 // Show one frame as refocused picture, views, slices, spectrum or depth.
 import { element, fixed, svg } from "./format.js";
+import { Live } from "./live.js";
 import { Refocus, sharpest } from "./refocus.js";
 
-const TABS = ["refocus", "views", "slices", "spectrum", "depth"];
+const TABS = ["refocus", "views", "slices", "spectrum", "live", "depth"];
 const $ = (id) => document.getElementById(id);
 
 export class Stage {
   constructor() {
     this.tab = "refocus";
     this.frame = null;     // {tag, slices, thumb, depth}
+    this.live = new Live($("live"));
     this.layout = null;
     this.bitmap = null;
     this.turn = 0;         // number of the request: an older answer that comes late is ignored
@@ -73,6 +75,8 @@ export class Stage {
 
   async load() {
     const turn = ++this.turn, { frame, tab } = this;
+    if (tab === "live") { this.watch(); return; }
+    if ($("live").hasAttribute("data-on")) this.leave();
     if (!frame) return;
     const index = frame.tag.frame, base = `/api/frames/${index}/`;
     $("which").textContent = `frame ${index} …`;   // loading: the frame before is still shown
@@ -84,6 +88,45 @@ export class Stage {
       if (turn === this.turn) await this.fall(base, turn, error.message);
     }
     if (turn === this.turn) $("which").textContent = `frame ${index}`;
+  }
+
+  watch() {
+    for (const id of ["gl", "picture", "overlay"]) show($(id), false);
+    $("which").textContent = "live view";
+    if ($("live").hasAttribute("data-on")) return;
+    $("live").setAttribute("data-on", "");
+    this.noLive("Waiting for the camera's picture.");
+    this.live.run(
+      () => this.tab === "live",
+      ({ aspect, sharpness, clipped, closer }) => {
+        this.aspect = aspect;
+        this.size();
+        show($("live"), true);
+        show($("empty"), false);
+        $("which").textContent = `sharpness ${Math.round(100 * sharpness)} % of the best, ${clipped < 0.0005 ? "< 0.1" : fixed(100 * clipped, 1)} % clipped`;
+        $("caption").textContent = `Turn the focus ring until the sharpness of the ${closer ? "part that you see" : "middle"} rises no more. Tap to ${closer ? "see all" : "look closer"}. Leave this tab before take-off: a shot has to wait until live view has ended.`;
+      },
+      (why) => this.noLive(why),
+    );
+  }
+
+  noLive(why) {
+    $("which").textContent = "live view";
+    show($("live"), false);
+    show($("empty"), true);
+    $("empty").textContent = why;
+    $("caption").textContent = "";
+  }
+
+  leave() {
+    $("live").removeAttribute("data-on");
+    show($("live"), false);
+    this.aspect = null;
+    if (this.frame) return;
+    show($("empty"), true);
+    $("which").textContent = "no frame";
+    $("caption").textContent = "";
+    $("empty").textContent = "The first frame will appear here.";
   }
 
   // Without views, show the mean picture.
@@ -123,10 +166,10 @@ export class Stage {
       this.refocus.show(layout, bitmap);
       show($("picture"), false);
       show($("gl"), true);
-      $("caption").textContent = `${layout.row_steps.length} × ${layout.column_steps.length} views of ${layout.tile[1]} × ${layout.tile[0]} px, phases from the ${layout.source}. Tap a place to focus on it.`;
+      $("caption").textContent = `${layout.row_steps.length} × ${layout.column_steps.length} views of ${layout.tile[1]} × ${layout.tile[0]} px, made quickly, phases from the ${layout.source}. Tap a place to focus on it.`;
     } else {
       show($("gl"), false);
-      $("caption").textContent = `${layout.row_steps.length} × ${layout.column_steps.length} views, phases from the ${layout.source}. This browser has no WebGL2: the vehicle makes the picture.`;
+      $("caption").textContent = `${layout.row_steps.length} × ${layout.column_steps.length} views, made quickly, phases from the ${layout.source}. This browser has no WebGL2: the vehicle makes the picture.`;
     }
     this.size();
     this.draw();

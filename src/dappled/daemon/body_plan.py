@@ -1,0 +1,284 @@
+"""Compare the camera's body with the plan: set what can be set, say what a hand must turn, report drift."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from dappled.clock import Clock
+from dappled.config.settings import PlannedBody
+from dappled.drivers.camera import BodySettings, CameraError, Setting, SettingName, SettingsChanged, StateChanged
+from dappled.errors import counted
+from dappled.flight import Tag
+
+log = logging.getLogger(__name__)
+CARD_FRAMES = 20  # fewer than that, and the pilot is told
+_LAPSED_NS = 60 * 10**9
+_OFF = ("off", "0", "disable", "disabled", "never", "none")
+_WORDS: Mapping[tuple[str, str], tuple[str, ...]] = {
+    ("exposure_mode", "manual"): ("manual", "m"),
+    ("focus_mode", "manual"): ("manual", "manual focus", "mf", "m"),
+    ("drive_mode", "single"): ("single", "single shot", "single frame", "single silent"),
+    ("auto_power_off", "off"): _OFF,
+    ("mirror_lockup", "off"): _OFF,
+}
+"""What bodies call a planned value. Any other one is compared as it is written."""
+_TITLES: Mapping[SettingName, str] = {
+    "exposure_mode": "exposure mode",
+    "focus_mode": "focus mode",
+    "drive_mode": "drive mode",
+    "white_balance": "white balance",
+    "image_format": "image format",
+    "auto_power_off": "automatic power-off",
+    "mirror_lockup": "mirror lock-up",
+    "capture_target": "place of new pictures",
+    "iso": "ISO",
+    "shutter_speed": "shutter speed",
+    "aperture": "aperture",
+    "focal_length": "focal length",
+}
+_BY_HAND: Mapping[SettingName, str] = {
+    "exposure_mode": "turn the mode dial",
+    "focus_mode": "turn the switch at the lens",
+    "mirror_lockup": "set it in the body's menu (custom functions)",
+    "focal_length": "turn the zoom ring",
+}
+_NUMBERS: tuple[SettingName, ...] = ("iso", "shutter_speed", "aperture", "focal_length")
+_SAME: Mapping[SettingName, float] = {"iso": 0.12, "shutter_speed": 0.12, "aperture": 0.06, "focal_length": 0.01}
+"""Relative difference up to which numbers are equal: less than a third of a stop, and more than files round by."""
+_UNITS: Mapping[SettingName, str] = {"shutter_speed": " s", "focal_length": " mm"}
+
+
+@dataclass(frozen=True, slots=True)
+class BodyReport:
+    """How the body stands to the plan. `wrong` are sentences; `unknown` are the titles of planned settings that the
+    body doesn't report. `drift` says what the last frames were taken with instead; `card_frames` is the room on its
+    card, None where it reports none or stores elsewhere. `read`: its settings were read; `checked`: they are compared.
+    """
+
+    read: bool
+    checked: bool
+    wrong: tuple[str, ...]
+    unknown: tuple[str, ...]
+    drift: str
+    card_frames: int | None
+
+    def problems(self) -> list[str]:
+        """What the pilot is told, a sentence each."""
+        found = [*self.wrong, *([self.drift] if self.drift else [])]
+        if self.card_frames is not None and self.card_frames <= CARD_FRAMES:
+            room = f"room for {counted(self.card_frames, 'frame')}" if self.card_frames else "it is full"
+            found.append(f"the camera's card is nearly full: {room}")
+        return found
+
+    def values(self) -> dict[str, Any]:
+        """As the health record has it."""
+        return {
+            "read": self.read,
+            "checked": self.checked,
+            "wrong": list(self.wrong),
+            "unknown": list(self.unknown),
+            "drift": self.drift,
+            "card_frames": self.card_frames,
+        }
+
+
+class BodyPlan:
+    """The settings that a body is planned to have, and those that it has. It stands between a ground station's requests
+    and the camera: what a person sets there is the plan from then on.
+
+    A body is set once each time it is opened, never between shots: what a hand turns later is reported, not set back.
+    """
+
+    def __init__(self, planned: PlannedBody, capture_target: str, body: BodySettings, clock: Clock) -> None:
+        self._check, self._body, self._clock = planned.check, body, clock
+        self._planned = _planned(planned, capture_target)
+        self._requested: dict[SettingName, str] = {}
+        self._found: tuple[Setting, ...] = ()
+        self._may_set, self._ready = True, False
+        self._manual = planned.exposure_mode == "manual"
+        self._last: dict[SettingName, tuple[float, int]] = {}
+        self._drift, self._drift_ns = "", 0
+
+    # what a ground station uses
+
+    def settings(self) -> tuple[Setting, ...]:
+        """See BodySettings."""
+        return self._body.settings()
+
+    def change(self, name: SettingName, value: str) -> None:
+        """See BodySettings: a person's request, which is the plan from now on unless the body refuses it."""
+        self._body.change(name, value)
+        self._requested[name] = value
+
+    # what the camera reports
+
+    def take(self, news: StateChanged | SettingsChanged | Tag) -> str | None:
+        """Take what the camera reported, in order. Returns a sentence for a frame that is not as planned."""
+        match news:
+            case StateChanged():
+                self.camera_changed(news)
+            case SettingsChanged():
+                self.settings_changed(news)
+            case Tag():
+                return self.tagged(news)
+        return None
+
+    def camera_changed(self, change: StateChanged) -> None:
+        """The camera has come or gone. One that has gone is compared, and set, when it is opened again."""
+        self._ready = change.state in ("ready", "busy")  # the settings are read before
+        if change.state in ("absent", "faulted"):
+            self._found, self._may_set = (), True
+
+    def settings_changed(self, change: SettingsChanged) -> None:
+        """The settings were read. The first ones after opening are changed to the plan's where the body lets them."""
+        self._found = change.settings
+        if change.refused:
+            now = {one.name: one.value for one in change.settings}
+            self._requested = {k: v for k, v in self._requested.items() if k not in now or _is(k, v, now[k])}
+        if self._check == "set" and self._may_set and self._found:
+            self._may_set = False
+            self._set()
+
+    def tagged(self, tag: Tag) -> str | None:
+        """Compare a frame with the plan, and where the plan leaves an exposure open with the frame before. Returns a
+        sentence where they differ."""
+        if self._check == "off":
+            return None
+        plan = self._plan()
+        values = {"iso": tag.iso, "shutter_speed": tag.exposure_s, "aperture": tag.f_number}
+        said = []
+        for name in _NUMBERS:
+            value, wanted = values.get(name, tag.focal_length_mm), plan.get(name)
+            target = None if wanted is None else _number(wanted)
+            if target is not None and value is None:
+                said.append(f"{_TITLES[name]} unknown, not {wanted} as planned")
+            elif target is not None and value is not None and not _near(name, value, target):
+                said.append(f"{_shown(name, value)}, not {wanted} as planned")
+            elif target is None and value is not None and (was := self._changed(name, value, tag.index)):
+                said.append(was)
+        if not said:
+            return None
+        self._drift, self._drift_ns = f"frame {tag.index} was taken with {'; '.join(said)}", self._clock.monotonic_ns()
+        return self._drift
+
+    # what others ask
+
+    def report(self) -> BodyReport | None:
+        """The body against the plan, now; None while no camera is ready."""
+        if not self._ready:
+            return None
+        now = {one.name: one.value for one in self._found}
+        plan = self._plan() if self._check != "off" else {}
+        # A focal length that no body reports is compared by each frame's EXIF.
+        unknown = tuple(_TITLES[name] for name in plan if name not in now and name != "focal_length")
+        fresh = self._drift and self._clock.monotonic_ns() - self._drift_ns <= _LAPSED_NS
+        return BodyReport(
+            read=bool(self._found),
+            checked=self._check != "off",
+            wrong=tuple(
+                f"the camera's {_TITLES[name]} is {now[name]}, not {wanted} as planned: "
+                f"{_BY_HAND.get(name, 'set it at the body')}"
+                for name, wanted in plan.items()
+                if name in now and not _is(name, wanted, now[name])
+            ),
+            unknown=unknown,
+            drift=self._drift if fresh else "",
+            card_frames=_card_frames(now),
+        )
+
+    def _plan(self) -> dict[SettingName, str]:
+        return self._planned | {name: value for name, value in self._requested.items() if name in _TITLES}
+
+    def _set(self) -> None:
+        """Ask the body for each planned value that it hasn't, and accepts. It reports the outcome."""
+        plan = self._plan()
+        for one in self._found:
+            wanted = plan.get(one.name)
+            if wanted is None or _is(one.name, wanted, one.value):
+                continue
+            choice = _choice(one, wanted)
+            if choice is None:
+                continue
+            try:
+                self._body.change(one.name, choice)
+                log.info("the camera's %s is set from %s to %s", _TITLES[one.name], one.value, choice)
+            except CameraError as error:
+                log.warning("the camera's %s was not set: %s", _TITLES[one.name], error)
+
+    def _changed(self, name: SettingName, value: float, index: int) -> str:
+        """What an exposure was before, where the body is in manual mode and nobody has requested another."""
+        if not self._manual or name not in ("iso", "shutter_speed"):
+            return ""  # the verdicts compare the lens' settings
+        before = self._last.get(name)
+        if before is not None and index < before[1]:
+            return ""  # a file that comes late
+        self._last[name] = value, index
+        if before is None or _near(name, value, before[0]):
+            return ""
+        return f"{_shown(name, value)}; frame {before[1]} with {_shown(name, before[0])}"
+
+
+def _planned(planned: PlannedBody, capture_target: str) -> dict[SettingName, str]:
+    """The plan by the names of the driver's settings, without those that may have any value."""
+    focal = f"{planned.focal_length_mm:g} mm" if planned.focal_length_mm else ""
+    every: dict[SettingName, str] = {
+        "exposure_mode": planned.exposure_mode,
+        "focus_mode": planned.focus_mode,
+        "drive_mode": planned.drive_mode,
+        "white_balance": planned.white_balance,
+        "image_format": planned.image_format,
+        "auto_power_off": planned.auto_power_off,
+        "mirror_lockup": planned.mirror_lockup,
+        "capture_target": capture_target,
+        "iso": planned.iso,
+        "shutter_speed": planned.shutter_speed,
+        "aperture": planned.aperture,
+        "focal_length": focal,
+    }
+    return {name: value for name, value in every.items() if value}
+
+
+def _is(name: SettingName, wanted: str, value: str) -> bool:
+    """Whether a body's value is the one that is wanted."""
+    one, other = wanted.strip().lower(), value.strip().lower()
+    if name == "image_format" and one == "raw":
+        return re.search(r"\b(c?raw|nef|raf|dng|arw|orf)\b", other) is not None
+    if name == "capture_target" and one in ("card", "ram"):
+        return one in other
+    numbers = (_number(one), _number(other)) if name in _NUMBERS else (None, None)
+    if numbers[0] is not None and numbers[1] is not None:
+        return _near(name, numbers[1], numbers[0])
+    return other in _WORDS.get((name, one), (one,))
+
+
+def _choice(setting: Setting, wanted: str) -> str | None:
+    """The shortest of a setting's choices that is the wanted value ("RAW" before "L + RAW"); None without one."""
+    return min((one for one in setting.choices if _is(setting.name, wanted, one)), key=len, default=None)
+
+
+def _number(text: str) -> float | None:
+    """A number as bodies write it: "400", "1/250", "f/5.6", "35 mm"; None for other text, such as "auto"."""
+    found = re.fullmatch(r"(?:iso |f/)?(\d+(?:\.\d+)?)(?:/(\d+(?:\.\d+)?))?(?: ?(?:s|mm))?", text.strip().lower())
+    if found is None:
+        return None
+    below = float(found[2] or 1)
+    return float(found[1]) / below if below else None
+
+
+def _near(name: SettingName, value: float, target: float) -> bool:
+    return abs(value - target) <= _SAME[name] * target
+
+
+def _shown(name: SettingName, value: float) -> str:
+    short = f"1/{1 / value:.0f}" if name == "shutter_speed" and 0 < value < 0.4 else f"{value:g}"
+    return f"{_TITLES[name]} {short}{_UNITS.get(name, '')}"
+
+
+def _card_frames(now: Mapping[SettingName, str]) -> int | None:
+    """How many more frames the body's card takes, by its own count; None where it stores elsewhere or says nothing."""
+    count = now.get("free_shots", "")
+    return int(count) if count.isdecimal() and "card" in now.get("capture_target", "").lower() else None

@@ -1,0 +1,437 @@
+"""Judge each frame of a flight: motion blur, exposure, focus, carriers and pose, by facts and bounds."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.config.profiles import VerdictBounds
+from dappled.decode.geometry import FrameGeometry, Pose, Vector3, image_motion
+from dappled.errors import counted
+from dappled.flight import Tag
+
+VerdictState = Literal["good", "usable", "bad", "unknown"]
+STATES: tuple[VerdictState, ...] = ("good", "usable", "bad", "unknown")
+BAD_IN_A_ROW = 3
+LAST = 40  # as many as the console's film strip shows
+_MOST, _LEAST, _SHARPEST = 2000, 5, 0.25
+_FLOOR = 0.05  # of the median: what is darker counts as so bright, because its logarithm is noise
+_FIX_3D = 3  # GPS_FIX_TYPE
+_NOISY = 0.5  # of the finest detail: more noise than this, and its detail says nothing
+_LOW_M = 2.0  # a barometer's height is no better
+_LATE_NS = 50_000_000  # a time that is known less well may be that of another turn and speed
+_SILENT_MS = 2000.0
+_LAPSED_NS = 60 * 10**9
+_SAME = 0.01  # lens settings that differ by less are equal, but for rounding
+_STEPS = (1, 2, 4)  # pixels
+DIRECTIONS = {"across": (0, 1), "along": (1, 0), "falling": (1, 1), "rising": (1, -1)}
+
+
+@dataclass(frozen=True, slots=True)
+class PictureFacts:
+    """What the pixels of a decoded frame say, and the geometry of its camera.
+
+    `detail` is of the mean slice, along rows and along columns (see `detail`), and `noise` of its noise; `side_mm` is
+    (height, width) of the sensor, `view_mm` and `pixel_mm` the (row, column) pitch of views and of the frame; None
+    where the camera has no profile. `bounds` are the profile's.
+    """
+
+    clipped_share: float
+    black_share: float
+    mean_share: float
+    detail: tuple[tuple[float, ...], ...]
+    noise: float = 0.0
+    side_mm: tuple[float, float] | None = None
+    view_mm: tuple[float, float] | None = None
+    pixel_mm: tuple[float, float] | None = None
+    bounds: VerdictBounds = field(default_factory=VerdictBounds)
+
+    @classmethod
+    def of_values(cls, values: Mapping[str, Any]) -> PictureFacts:
+        """From what `asdict` made of it."""
+        pairs: dict[str, Any] = {
+            name: values[name] and tuple(values[name]) for name in ("side_mm", "view_mm", "pixel_mm")
+        }
+        pairs["detail"] = tuple(tuple(one) for one in values["detail"])
+        return cls(**{**values, **pairs, "bounds": VerdictBounds(**values["bounds"])})
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFacts:
+    """What a verdict is given by; None is unknown.
+
+    Blur is how far still ground moved over the sensor during the exposure where it moved most, in pixels of the frame
+    and of a view; the ground counts as flat, `height_m` below: at the take-off's height. `blur_unknown` says why it
+    isn't known, `focus_unknown` why `defocus_view_px` isn't: the diameter of the circle that a point is drawn as,
+    beyond that of the flight's sharpest frames.
+    """
+
+    blur_px: float | None
+    blur_view_px: float | None
+    blur_unknown: str
+    height_m: float | None
+    clipped_share: float
+    black_share: float
+    mean_share: float
+    defocus_view_px: float | None
+    focus_unknown: str
+    carriers_found: int | None
+    carriers_predicted: int
+    doubts: tuple[str, ...]
+    pose_source: str
+    position_sigma_m: float | None
+    gnss_fix: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """`reasons` are sentences with numbers: why the frame isn't good, the gravest first. `facts` are None where a frame
+    could not be decoded."""
+
+    state: VerdictState
+    reasons: tuple[str, ...] = ()
+    facts: FrameFacts | None = None
+
+    def values(self) -> dict[str, Any]:
+        """As ledger and stream have it."""
+        facts = {} if self.facts is None else asdict(self.facts)
+        numbers = {name: _plain(one) for name, one in facts.items()}
+        return {"state": self.state, "reasons": list(self.reasons), "facts": numbers}
+
+
+def _plain(value: Any) -> Any:
+    """A fact as JSON has it: what is not a finite number is unknown."""
+    if isinstance(value, float):
+        return round(value, 6) if math.isfinite(value) else None
+    return value
+
+
+def verdict(facts: FrameFacts, bounds: VerdictBounds) -> Verdict:
+    """Judge a frame. One bad finding makes it bad; else one that can't be judged makes it unknown, never good."""
+    found = [*_motion(facts, bounds), *_exposure(facts, bounds), *_focus(facts, bounds), *_rest(facts, bounds)]
+    order: tuple[VerdictState, ...] = ("bad", "unknown", "usable")
+    found.sort(key=lambda one: order.index(one[0]))
+    return Verdict(found[0][0] if found else "good", tuple(text for _, text in found), facts)
+
+
+LensSettings = tuple[float | None, float | None]  # focal length (mm) and f-number; None where the file has none
+Findings = list[tuple[VerdictState, str]]
+
+
+def _motion(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
+    blur, sensor = facts.blur_view_px, facts.blur_px
+    if blur is None or sensor is None:
+        return [("unknown", f"motion blur unknown: {facts.blur_unknown}")]
+    state = _worse(blur, bounds.blur_usable_px, bounds.blur_bad_px)
+    over = "over flat ground at the take-off's height"
+    return [(state, f"motion blur {blur:.1f} view pixels ({sensor:.1f} on the sensor) {over}")] if state else []
+
+
+def _exposure(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
+    found: Findings = []
+    if state := _worse(facts.clipped_share, bounds.clipped_usable, bounds.clipped_bad):
+        found.append((state, f"{facts.clipped_share:.1%} of the pixels are clipped"))
+    if not facts.mean_share >= bounds.mean_least:
+        found.append(("bad", f"too dark: {facts.mean_share:.1%} of white on average"))
+    if facts.black_share > bounds.black_usable:
+        found.append(("usable", f"{facts.black_share:.0%} of the pixels are black"))
+    return found
+
+
+def _focus(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
+    blur = facts.defocus_view_px
+    if blur is None:
+        return [("unknown", f"focus unknown: {facts.focus_unknown}")]
+    state = _worse(blur, bounds.defocus_usable_px, bounds.defocus_bad_px)
+    return [(state, f"out of focus by {blur:.1f} view pixels against this flight's sharpest frames")] if state else []
+
+
+def _rest(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
+    found: Findings = [("usable", text) for text in facts.doubts]
+    seen, predicted = facts.carriers_found, facts.carriers_predicted
+    if seen is not None and seen < bounds.carriers_share * predicted:
+        found.append(("usable", f"{seen} of {predicted} carriers seen where they are predicted"))
+    sigma_m = facts.position_sigma_m
+    if facts.pose_source != "interpolated":
+        found.append(("unknown", f"position {'unknown' if facts.pose_source == 'none' else 'not interpolated'}"))
+    elif facts.gnss_fix is None or facts.gnss_fix < _FIX_3D:
+        word = "the receiver is silent" if facts.gnss_fix is None else "the receiver has no 3D fix"
+        found.append(("unknown", f"the position's accuracy is unknown: {word}"))
+    elif sigma_m is None or not math.isfinite(sigma_m):
+        found.append(("unknown", "the position's accuracy is unknown"))
+    elif sigma_m > bounds.position_sigma_m:
+        found.append(("usable", f"position ±{sigma_m:.1f} m"))
+    return found
+
+
+def _worse(value: float, usable: float, bad: float) -> VerdictState | None:
+    """What a value above its bounds makes of a frame; one that is no number can't be judged."""
+    if not math.isfinite(value):
+        return "unknown"
+    return "bad" if value > bad else "usable" if value > usable else None
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictCounts:
+    """How a flight's frames were judged: by state, how many bad ones since the last good or usable one and why the
+    first of them, when the newest frame was judged (monotonic), and the last `LAST` as (frame, state, reasons).
+    `drift` says how the lens' settings last changed from one frame to a newer one, at `drift_ns`."""
+
+    by_state: Mapping[VerdictState, int] = field(default_factory=dict)
+    bad_in_a_row: int = 0
+    reason: str = ""
+    last: tuple[tuple[int, VerdictState, tuple[str, ...]], ...] = ()
+    judged_ns: int = 0
+    drift: str = ""
+    drift_ns: int = 0
+
+    def drifted(self, now_ns: int) -> str | None:
+        """A sentence for the pilot, for a minute after the lens' settings have changed."""
+        return self.drift if self.drift and now_ns - self.drift_ns <= _LAPSED_NS else None
+
+    def problem(self, now_ns: int) -> str | None:
+        """A sentence for the pilot, where three or more frames were bad without a good or usable one between them. It
+        lapses a minute after the last frame."""
+        if self.bad_in_a_row < BAD_IN_A_ROW or now_ns - self.judged_ns > _LAPSED_NS:
+            return None
+        return f"{counted(self.bad_in_a_row, 'bad frame')} in a row, the first: {self.reason}"
+
+
+class Judge:
+    """Judges the frames of one flight, in the order of their decoding, and keeps what later ones are compared with.
+
+    `mount` leads from camera axes to body axes; with `on_gimbal` it leads to the gimbal's, whose turn no message gives.
+    """
+
+    def __init__(self, mount: Sequence[float], *, on_gimbal: bool) -> None:
+        self._mount, self._on_gimbal = tuple(mount), on_gimbal
+        self._sharpest: dict[LensSettings, deque[float]] = {}
+        self._states: Counter[VerdictState] = Counter()
+        self._newest = -1
+        self._lens: LensSettings = (None, None)
+        self.counts = VerdictCounts()
+
+    def judge(
+        self,
+        tag: Tag,
+        rates: Vector3 | None,
+        seen: PictureFacts | None,
+        *,
+        carriers: tuple[int | None, int],
+        doubts: Sequence[str],
+    ) -> Verdict:
+        """Judge a frame. `rates` are the body's at mid-exposure (rad/s), None where unknown; `carriers` were found, and
+        are predicted."""
+        if seen is None:
+            return Verdict("unknown", ("the decoder said nothing about its pixels",))
+        blur, blur_unknown = self._blur(tag, rates, seen)
+        circle, focus_unknown = self._defocus((tag.focal_length_mm, tag.f_number), seen)
+        gnss = tag.pose.gnss
+        fresh = gnss is not None and gnss.age_ms <= _SILENT_MS
+        facts = FrameFacts(
+            blur_px=blur and _pixels(blur, seen.pixel_mm),
+            blur_view_px=blur and _pixels(blur, seen.view_mm),
+            blur_unknown=blur_unknown,
+            height_m=tag.pose.height_above_home_m,
+            clipped_share=seen.clipped_share,
+            black_share=seen.black_share,
+            mean_share=seen.mean_share,
+            defocus_view_px=circle,
+            focus_unknown=focus_unknown,
+            carriers_found=carriers[0],
+            carriers_predicted=carriers[1],
+            doubts=tuple(doubts),
+            pose_source=tag.pose.source,
+            position_sigma_m=tag.pose.position_sigma_m,
+            gnss_fix=gnss.fix_type if gnss is not None and fresh else None,
+        )
+        return verdict(facts, seen.bounds)
+
+    def count(self, frame: int, found: Verdict, now_ns: int, lens: LensSettings = (None, None)) -> Verdict:
+        """Count a verdict, also one that can't be given. An unknown frame proves nothing: it neither ends a row of bad
+        ones nor adds to it; nor does one that comes late, behind a newer frame. `lens` is what it was taken with."""
+        self._states[found.state] += 1
+        before, late = self.counts, frame < self._newest
+        self._newest = max(frame, self._newest)
+        in_a_row, reason = before.bad_in_a_row, before.reason
+        if found.state == "bad" and not late:
+            in_a_row, reason = in_a_row + 1, reason if in_a_row else found.reasons[0]
+        elif found.state != "unknown" and not late:
+            in_a_row, reason = 0, ""
+        last = (*before.last, (frame, found.state, found.reasons))[-LAST:]
+        judged_ns = before.judged_ns if late else now_ns
+        drift, drift_ns = before.drift, before.drift_ns
+        if not late:
+            if moved := _moved(self._lens, lens):
+                drift, drift_ns = f"{moved} at frame {frame}", now_ns
+            self._lens = (lens[0] or self._lens[0], lens[1] or self._lens[1])
+        self.counts = VerdictCounts(dict(self._states), in_a_row, reason, last, judged_ns, drift, drift_ns)
+        return found
+
+    def _defocus(self, lens: LensSettings, seen: PictureFacts) -> tuple[float | None, str]:
+        """The circle of confusion beyond that of the sharpest quarter of the frames in focus so far, which are kept by
+        the lens' settings; or None, and why."""
+        circle = _circle(seen)
+        if circle is None:
+            return None, "the picture has more noise than fine detail"
+        known = self._sharpest.setdefault(lens, deque(maxlen=_MOST))
+        reference = float(np.quantile(list(known), _SHARPEST)) if len(known) >= _LEAST else None
+        beyond = 0.0 if reference is None else math.sqrt(max(0.0, circle**2 - reference**2))
+        if beyond <= seen.bounds.defocus_usable_px:  # what is out of focus must not become the measure
+            known.append(circle)
+        if reference is None:  # what is sharp by itself needs no other frame
+            few = f"its circle is {circle:.1f} view pixels, with fewer than {_LEAST} frames in focus to compare with"
+            return (circle, "") if circle <= seen.bounds.defocus_usable_px else (None, few)
+        if reference > seen.bounds.defocus_usable_px:  # an absolute measure: then no frame was seen to be sharp
+            return None, f"this flight's sharpest frames have circles of {reference:.1f} view pixels"
+        return beyond, ""
+
+    def _blur(self, tag: Tag, rates: Vector3 | None, seen: PictureFacts) -> tuple[tuple[float, float] | None, str]:
+        """How far ground moved over the sensor during the exposure, (down, right) in mm; or None, and why."""
+        pose: Pose = tag.pose
+        missing = [
+            (tag.exposure_s is None, "the frame has no exposure time"),
+            (tag.focal_length_mm is None, "the frame has no focal length"),
+            (seen.side_mm is None, "the camera has no profile with the size of its sensor"),
+            ("in doubt" in tag.time_source, f"its time is {tag.time_source}"),
+            (tag.utc_sigma_ns > _LATE_NS, f"its time is known to ±{tag.utc_sigma_ns / 1e6:.0f} ms only"),
+            (pose.velocity_ned_m_s is None, "the telemetry has no velocity"),
+            (pose.attitude is None, "the telemetry has no attitude"),
+            (pose.source != "interpolated", f"the telemetry is {(pose.age_ms or 0) / 1e3:.1f} s old"),
+            (self._on_gimbal, "the camera is on a gimbal, whose turn rate is not reported"),
+            (rates is None, "the telemetry has no turn rates, or too few (10 a second are needed)"),
+            (pose.height_above_home_m is None, "the telemetry has no height"),
+        ]
+        if why := next((text for is_so, text in missing if is_so), None):
+            return None, why
+        assert pose.height_above_home_m is not None
+        if not pose.height_above_home_m >= _LOW_M:
+            return (
+                None,
+                f"the height above the take-off place is {pose.height_above_home_m:.1f} m, too little to be known",
+            )
+        assert tag.exposure_s is not None
+        assert tag.focal_length_mm is not None
+        assert seen.side_mm is not None
+        assert seen.view_mm is not None
+        assert pose.attitude is not None
+        assert pose.velocity_ned_m_s is not None
+        assert rates is not None
+        camera = FrameGeometry(self._mount, tag.focal_length_mm, seen.side_mm, seen.view_mm, pose.height_above_home_m)
+        moving = image_motion(camera, pose.attitude, pose.velocity_ned_m_s, rates)
+        if moving is None:
+            return None, "the camera sees no ground"
+        if not all(map(math.isfinite, (*pose.velocity_ned_m_s, *rates, *moving))):
+            return None, "the telemetry's numbers are not finite"
+        return (moving[0] * tag.exposure_s, moving[1] * tag.exposure_s), ""
+
+
+def _moved(before: LensSettings, now: LensSettings) -> str:
+    """How the lens' settings changed; "" where they did not, or either is unknown."""
+    words = ("the focal length changed from {0:g} to {1:g} mm", "the f-number changed from {0:g} to {1:g}")
+    pairs = zip(words, before, now, strict=True)
+    return ", ".join(word.format(a, b) for word, a, b in pairs if a and b and abs(b / a - 1) > _SAME)
+
+
+def _pixels(blur_mm: tuple[float, float], pitch_mm: tuple[float, float] | None) -> float | None:
+    return None if pitch_mm is None else math.hypot(blur_mm[0] / pitch_mm[0], blur_mm[1] / pitch_mm[1])
+
+
+def fineness(picture: NDArray[Any]) -> dict[str, float]:
+    """How fine the detail of a picture (rows, columns) is, in four directions: the mean squared difference over one
+    step by that over two, of logarithms, so that shade counts like light. 0.25 is perfectly smooth, 1 is noise."""
+    logs = np.log(np.maximum(picture, 1e-6 * max(float(picture.max()), 1e-12)))
+    found = {}
+    for name, step in DIRECTIONS.items():
+        one, two = (_differences(logs, (step[0] * n, step[1] * n)) for n in (1, 2))
+        found[name] = one / two if two > 0 and math.isfinite(one / two) else 0.0
+    return found
+
+
+def _differences(values: NDArray[Any], step: tuple[int, int]) -> float:
+    (rows, columns), (height, width) = step, values.shape
+    a = values[_part(height, rows), _part(width, columns)]
+    b = values[_part(height, -rows), _part(width, -columns)]
+    return float(np.mean((a - b) ** 2))
+
+
+def _part(length: int, shift: int) -> slice:
+    return slice(max(shift, 0), length + min(shift, 0))
+
+
+def detail(picture: NDArray[Any]) -> tuple[tuple[float, ...], ...]:
+    """Mean squared differences of a picture's logarithms over 1, 2 and 4 pixels, down its columns and along its rows.
+
+    Logarithms, so that shade counts like light; what is darker than a twentieth of the median counts as so bright. An
+    eighth of the picture is left out on each side: a frame's sides don't match, and what they differ by rings in the
+    slices of its spectrum next to the border, as fine as detail can be.
+    """
+    picture = _middle(picture)
+    logs = np.log(np.maximum(picture, _floor(picture)))
+    return tuple(tuple(_differences(logs, (down * n, right * n)) for n in _STEPS) for down, right in ((1, 0), (0, 1)))
+
+
+def noise_of(picture: NDArray[Any], sigma: float) -> float:
+    """What white noise of `sigma` adds to each number of `detail`."""
+    picture = _middle(picture)
+    return float(2 * np.mean((sigma / np.maximum(picture, _floor(picture))) ** 2))
+
+
+def _middle(picture: NDArray[Any]) -> NDArray[Any]:
+    rows, columns = (side // 8 for side in picture.shape)
+    return picture[rows : picture.shape[0] - rows, columns : picture.shape[1] - columns]
+
+
+def _floor(picture: NDArray[Any]) -> float:
+    return max(_FLOOR * float(np.median(picture)), 1e-12)
+
+
+def _circle(seen: PictureFacts) -> float | None:
+    """The circle of confusion of a picture in pixels of a view, the smaller ones where they are not square; None where
+    noise covers its finest detail.
+
+    Along the axis where it is smaller: motion blurs along one.
+    """
+    pitch = seen.view_mm or (1.0, 1.0)
+    found = []
+    for along, each in zip(seen.detail, pitch, strict=True):
+        if not along[0] > 0 or not seen.noise < _NOISY * along[0]:
+            return None
+        found.append(defocus(tuple(one - seen.noise for one in along)) * each)
+    return min(found) / min(pitch)
+
+
+def defocus(along: Sequence[float]) -> float:
+    """The diameter, in pixels, of the circle that a picture is out of focus by, from its `detail` along an axis.
+
+    Ground without blur looks alike at all scales: its power falls as f^−β. The differences over 2 and 4 pixels say how
+    fast, and what those over 1 pixel lack then is blur, by the transfer exp(−(π f d)² / 8) of a circle of diameter d.
+    At most 4.
+    """
+    one, two, four = along
+    diameters, fine, coarse = _blurred()
+    expected = [float(np.interp(-two / four, -coarse[:, at], fine[:, at])) for at in range(len(diameters))]
+    return float(np.interp(-one / two, -np.minimum.accumulate(expected), diameters))
+
+
+@cache
+def _blurred() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Diameters (D,), and of pictures of 51 slopes β from 0 to 5, blurred by them, the mean squared difference over one
+    pixel by that over two, and over two by that over four, (B, D) each."""
+    diameters, slopes = np.linspace(0, 4, 41), np.linspace(0, 5, 51)
+    f = (np.arange(48) + 0.5) / 96
+    squared = f[:, None] ** 2 + f[None, :] ** 2
+    powers = squared ** (-slopes[:, None, None] / 2)
+    sums = np.empty((3, len(slopes), len(diameters)))
+    for column, diameter in enumerate(diameters):
+        spectrum = (powers * np.exp(-((np.pi * diameter) ** 2) * squared / 4)).sum(axis=1)
+        for at, step in enumerate(_STEPS):
+            sums[at, :, column] = spectrum @ (1 - np.cos(2 * np.pi * step * f))
+    return diameters, sums[0] / sums[1], sums[1] / sums[2]

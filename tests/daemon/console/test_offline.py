@@ -1,0 +1,204 @@
+"""The console's page over a recording: what it is told, and pictures of frames that nobody published."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from dappled.clock import RecordedClock
+from dappled.daemon.console.access import Access
+from dappled.daemon.console.app import ConsoleApp
+from dappled.daemon.console.feed import FeedError
+from dappled.daemon.console.offline import RecordedFeed, RecordedHub, RecordedStudio
+from dappled.daemon.console.recorded import (
+    FlightFrames,
+    FrameSource,
+    LightFieldFrames,
+    RecordedFrameError,
+    ShownFrame,
+)
+from dappled.daemon.stream.wire import Message
+from dappled.decode.geometry import camera_pose
+from dappled.decode.lightfield import LightField
+from dappled.errors import DappledError
+from dappled.flight import Result, flight_report, layout, recording
+from tests.flight.makers import deliver, request, tag
+
+MOUNT = camera_pose.NADIR.ravel().tolist()
+START_NS = 1_795_256_103_000_000_000
+
+
+def light_field(*, slices: bool = True, views: bool = True) -> LightField:
+    rng = np.random.default_rng(1)
+    pictures = rng.random((3, 3, 24, 32)).astype(np.float32)
+    steps = np.linspace(-1 / 3, 1 / 3, 3)
+    offsets = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1)
+    count = 5 if slices else 0
+    orders = np.array([[0, 0], [0, 1], [1, -1], [1, 0], [1, 1]], dtype=np.float64)[:count]
+    carriers = np.concatenate([orders, orders * 0.1], axis=1)
+    stack = (rng.random((count, 24, 32)) + 1j * rng.random((count, 24, 32))).astype(np.complex64)
+    grid = np.array([[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
+    facts = {"shape": [120, 160], "camera": "c", "mask": "m", "f_number": 8.0, "focal_length_mm": 50.0}
+    if not views:
+        pictures, offsets = np.zeros((0, 0, 24, 32), np.float32), np.zeros((0, 0, 2))
+    return LightField(stack, carriers, pictures, offsets, grid, facts)
+
+
+class Served:
+    """The application over a source, asked without a network."""
+
+    def __init__(self, source: FrameSource) -> None:
+        studio = RecordedStudio(source, None, MOUNT)
+        self.hub = RecordedHub(source.shots)
+        self.feed = RecordedFeed(source, self.hub, studio)
+        self._app = ConsoleApp(self.feed, studio, Nobody(), Access(""), None)
+
+    async def get(self, path: str) -> httpx.Response:
+        transport = httpx.ASGITransport(app=self._app.asgi())
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+            return await client.get(path)
+
+    def asked(self, *paths: str) -> list[httpx.Response]:
+        async def ask() -> list[httpx.Response]:
+            return [await self.get(path) for path in paths]
+
+        try:
+            return asyncio.run(ask())
+        finally:
+            self._app.close()
+            self.feed.close()
+
+
+class Nobody:
+    """No daemon."""
+
+    def ask(self, _question: Mapping[str, Any]) -> dict[str, Any]:
+        return {"ok": False, "error": "nobody"}
+
+
+def test_a_light_field_s_own_views_are_shown() -> None:
+    field = light_field()
+    layout, views, slices, spectrum, missing = Served(LightFieldFrames("a.npz", 9, field)).asked(
+        *(f"/api/frames/0/{name}" for name in ("views.json", "views.jpg", "slices.jpg", "spectrum.jpg")),
+        "/api/frames/1/mean.jpg",
+    )
+    assert layout.json()["source"] == "the file"
+    assert len(layout.json()["row_steps"]) == 3
+    assert {one.headers["content-type"] for one in (views, slices, spectrum)} == {"image/jpeg"}
+    assert missing.status_code == 404
+
+
+def test_a_light_field_of_views_alone_and_one_of_slices_alone() -> None:
+    mean, layout = Served(LightFieldFrames("folder", 9, light_field(slices=False))).asked(
+        "/api/frames/0/mean.jpg", "/api/frames/0/views.json"
+    )
+    assert (mean.status_code, layout.status_code) == (200, 200)
+    mean, layout = Served(LightFieldFrames("a.npz", 9, light_field(views=False))).asked(
+        "/api/frames/0/mean.jpg", "/api/frames/0/views.json"
+    )
+    assert mean.status_code == 200
+    assert (layout.status_code, layout.json()["error"]) == (
+        422,
+        "this light field has no views, only slices: decode it with a calibration",
+    )
+
+
+def test_a_new_page_is_told_everything_and_then_that_the_flight_has_ended() -> None:
+    served = Served(LightFieldFrames("a.npz", 9, light_field()))
+
+    async def told() -> list[dict[str, Any]]:
+        feed = served.feed
+        pages = served.hub.listen([feed.state(), *(feed.frame_event(n) for n in feed.frames)])
+        served.hub.close()
+        return [json.loads(text.removeprefix("data: ")) async for text in pages if text.startswith("data: ")]
+
+    events = asyncio.run(told())
+    assert [event["is"] for event in events] == ["state", "frame", "end"]
+    assert events[0]["health"] is None
+    assert events[-1]["shots"] == {"wished": 1, "safe": 1}
+
+
+class FakeDecoder:
+    """Decodes frame 0, and refuses frame 1."""
+
+    def decode(self, path: str, focal_length_mm: float | None, f_number: float | None, *, index: int) -> Any:
+        if index:
+            raise DappledError(f"{path} is damaged")
+        return FakeDecoded()
+
+
+class FakeDecoded:
+    law, carriers, carriers_from, carriers_found = "law", [[0, 0, 0.0, 0.0]], "calibrated", 24
+    carriers_predicted, sha256, grid = 24, "00", [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]
+    seen: Mapping[str, Any] = {"frame_shape": [120, 160], "mosaic": False, "noise_rms": None, "doubts": []}
+    body = np.full((1, 24, 32), 0.5, dtype="<c8").tobytes()
+    arrays = ({"name": "slices", "dtype": "<c8", "shape": [1, 24, 32], "unit": "1"},)
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    begun = recording.begin(tmp_path, RecordedClock(START_NS))
+    for index in (0, 1, 2):
+        request(begun, index)
+        frame = deliver(begun, index, b"raw", f"IMG_{index}.CR2")
+        if index < 2:
+            begun.ledger.add_tag(tag(frame))
+    verdict = {"verdict": {"state": "usable", "reasons": ["blurred by 2.1 px"]}}
+    begun.ledger.add_result(Result(1, "00", 24, 24, "law", "calibrated", details=verdict))
+    begun.close()
+    return begun.folder.path
+
+
+def test_a_flight_s_frames_are_its_tags_and_verdicts_and_slices_are_decoded_when_asked_for(flight: Path) -> None:
+    contents = flight_report.show(flight)
+    source = FlightFrames(layout.open_folder(flight), contents, FakeDecoder())
+    assert source.start["flight"] == flight.name
+    assert source.shots == {"wished": 3, "safe": 3}
+    shown: Sequence[ShownFrame] = source.frames()
+    assert [(one.header["frame"], one.verdict) for one in shown] == [
+        (0, None),
+        (1, {"state": "usable", "reasons": ["blurred by 2.1 px"]}),
+    ]
+    served = Served(source)
+    mean, bad, state = served.asked("/api/frames/0/mean.jpg", "/api/frames/1/mean.jpg", "/api/state")
+    assert mean.status_code == 200
+    assert bad.status_code == 404
+    assert bad.json()["error"].endswith("frames/000001.cr2 is damaged")
+    assert state.json()["newest"] == 0
+    assert served.feed.frames[0].thumb is not None
+    assert served.feed.frames[1].verdict == {"state": "usable", "reasons": ["blurred by 2.1 px"]}
+
+
+def test_all_frames_get_their_small_pictures_and_a_bad_one_stops_none(
+    flight: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    source = FlightFrames(layout.open_folder(flight), flight_report.show(flight), FakeDecoder())
+    served = Served(source)
+    asyncio.run(served.feed.run())
+    served.asked()
+    assert [one.thumb is not None for one in served.feed.frames.values()] == [True, False]
+    assert "frame 1: " in caplog.text
+    assert "is damaged" in caplog.text
+
+
+def test_a_flight_without_a_mask_says_so(flight: Path) -> None:
+    source = FlightFrames(layout.open_folder(flight), flight_report.show(flight), None)
+    with pytest.raises(RecordedFrameError, match="without a mask: name one with --mask"):
+        source.slices(0)
+    served = Served(source)
+    with pytest.raises(FeedError, match="there is no frame 7"):
+        asyncio.run(served.feed.slices(7))
+    served.asked()
+
+
+def test_messages_of_a_light_field_are_of_the_stream() -> None:
+    message = LightFieldFrames("a.npz", 9, light_field()).slices(0)
+    assert isinstance(message, Message)
+    assert np.array_equal(message.arrays()["slices"], light_field().slices)
