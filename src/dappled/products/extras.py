@@ -1,4 +1,4 @@
-"""Import libraries of the extras `ground` and `cluster` where they are needed; the onboard install has none."""
+"""Import libraries of the extras `ground`, `cluster` and `ros` where they are needed; the onboard install has none."""
 
 from __future__ import annotations
 
@@ -7,8 +7,13 @@ from typing import Any
 
 from dappled.errors import DappledError, install_extra
 
-_PACKAGES = {"cv2": "opencv-python-headless", "distributed": "distributed"}
-_EXTRAS = {"distributed": "cluster"}
+_PACKAGES = {
+    "cv2": "opencv-python-headless",
+    "distributed": "distributed",
+    "mcap": "mcap",
+    "mcap_ros2": "mcap-ros2-support",
+}
+_EXTRAS = {"distributed": "cluster", "mcap": "ros", "mcap_ros2": "ros"}
 
 
 class MissingExtraError(DappledError):

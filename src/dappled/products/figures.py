@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _LONGEST = 1600  # pixels of a mosaic: more than a figure shows
 _GAMMA = 1 / 2.2
-_UNKNOWN = "0.6"  # grey, for pixels without a value
+_UNKNOWN, _HATCH = "0.8", "////"  # light grey and hatched, for pixels without a value
 
 
 def bright(picture: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -84,7 +84,7 @@ def spectrum(plane: Plane, field: LightField, axes: Axes | None = None) -> Axes:
 
 
 def depth(values: NDArray[np.float32], unit: str, title: str, axes: Axes | None = None) -> Axes:
-    """Draw a map of disparities or distances with its scale, from the 1st to the 99th percentile; unknown is grey.
+    """Draw a map of disparities or distances with its scale, from the 1st to the 99th percentile; unknown is hatched.
 
     Raises DecodeError where nothing is known.
     """
@@ -94,6 +94,7 @@ def depth(values: NDArray[np.float32], unit: str, title: str, axes: Axes | None 
     low, high = (float(x) for x in np.quantile(known, [0.01, 0.99]))
     made = _axes(axes)
     made.set_facecolor(_UNKNOWN)
+    made.patch.set(hatch=_HATCH, edgecolor="0.45")
     shown = made.imshow(values, vmin=low, vmax=high, cmap="viridis")
     made.figure.colorbar(shown, ax=made, label=unit, shrink=0.8)
     made.set(xticks=[], yticks=[], title=f"{title}, {known.size / values.size:.0%} known")

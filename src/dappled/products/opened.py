@@ -30,6 +30,7 @@ from dappled.decode.depth.evidence import Evidence
 from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield import refocus as refocusing
 from dappled.decode.lightfield.refocus import FocalPlane, StereoPair, eyes
+from dappled.decode.optics import Sensor
 from dappled.drivers.raw.darkroom import Darkroom, Recipe, of_flight
 from dappled.errors import DappledError, counted
 from dappled.flight import Tag, flight_report, layout
@@ -84,7 +85,7 @@ class Refocusable(ABC):
         return refocusing.tilted(one.stack, FocalPlane(at, *tilt), weights=weights, workers=one.workers)
 
     def depth(
-        self, method: str = "combined", *, between: tuple[float, float] | None = None, window: int = depths.WINDOW
+        self, method: str = "combined", *, between: tuple[float, float] | None = None, window: int | None = None
     ) -> DepthMap:
         """Return disparities with standard errors and confidence, NaN where unknown; `method` is one of `METHODS`."""
         one = self._decoded()
@@ -413,30 +414,28 @@ def light_field(path: str | Path, *, focus_m: float | None = None) -> OpenedLigh
 def lens_ranging(field: LightField, focus_m: float) -> Ranging | None:
     """Return distances by Eq 5, from a light field's focal length, f-number and camera; None without one of them."""
     known = field.attributes
-    pixel_mm = _pixel_mm(known)
-    if pixel_mm is None or not (known.get("focal_length_mm") and known.get("f_number")):
+    sensor = _sensor(known)
+    if sensor is None or not (known.get("focal_length_mm") and known.get("f_number")):
         return None
+    pixel_mm = math.hypot(*sensor.column_mm)
     return Ranging.of_lens(float(known["focal_length_mm"]), float(known["f_number"]), pixel_mm, focus_m)
 
 
 def aperture_px(known: Mapping[str, Any]) -> float | None:
     """Return the aperture f/N in columns of the sensor, from a light field's attributes; None where one is unknown."""
-    pixel_mm = _pixel_mm(known)
-    if pixel_mm is None or not (known.get("focal_length_mm") and known.get("f_number")):
-        return None
-    return float(known["focal_length_mm"]) / float(known["f_number"]) / pixel_mm
+    sensor = _sensor(known)
+    return None if sensor is None else sensor.aperture_px(known.get("focal_length_mm"), known.get("f_number"))
 
 
-def _pixel_mm(known: Mapping[str, Any]) -> float | None:
-    """Return the width of a column of the sensor; None under lenslets, and where no profile has the camera."""
+def _sensor(known: Mapping[str, Any]) -> Sensor | None:
+    """Return the sensor that took a frame; None under lenslets, and where no profile has the camera."""
     if not (known.get("camera") and known.get("shape")) or known.get("lenslet_pitch_px"):
         return None
     try:
         rows, columns = known["shape"]
-        sensor = profiles.camera(str(known["camera"])).sensor((int(rows), int(columns)))
+        return profiles.camera(str(known["camera"])).sensor((int(rows), int(columns)))
     except DappledError:
         return None
-    return math.hypot(*sensor.column_mm)
 
 
 def with_ranging(field: LightField, ranging: Ranging) -> LightField:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import multiprocessing
 import os
@@ -12,6 +13,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,11 +21,15 @@ from dappled import durable
 from dappled.cli import main
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
-from dappled.flight import Frame
+from dappled.flight import Frame, disk_error
 from dappled.products.batch import batch, workers
 from dappled.products.batch.batch import Done, Job, Manifest, ManifestError
 from dappled.products.exports import light_files
-from dappled.products.maps import photographs
+from dappled.products.geotags import geotags
+from dappled.products.geotags.geotags import Placed
+from dappled.products.handover import forms
+from dappled.products.handover.forms import HandedFrame
+from dappled.products.maps import georeference, photographs
 from dappled.products.maps.georeference import Options
 from tests import globe
 from tests.products.flown import Flown
@@ -69,6 +75,7 @@ def answer(one: Job) -> Done:
     return Done(one.key, "flight", name, (), None, 0.0, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_a_batch_goes_on_where_it_was_stopped(
     flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -133,6 +140,7 @@ def test_a_bad_flight_is_said_and_the_others_are_made(
     assert capsys.readouterr().err.count("is not a flight folder") == 1
 
 
+@pytest.mark.slow
 def test_a_flight_that_is_named_twice_is_made_once(
     flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -166,12 +174,95 @@ def test_frames_with_the_same_bytes_are_jobs_of_their_own(
 def test_a_frame_without_a_place_still_becomes_a_light_field(flight: Flown, tmp_path: Path) -> None:
     (first, _) = batch.plan(flight.folder, flight.recipe, Options(), ["npz", "cog"], tmp_path)
     lost = replace(first, station=None, why="no position is known for frames/000000.dng")
-    assert batch.make(lost).error == "no position is known for frames/000000.dng"
-    assert batch.make(replace(lost, kinds=("npz",))).error is None
+    done = batch.make(lost)
+    assert done.error == "no position is known for frames/000000.dng"
+    assert (dict(done.refused), [one.kind for one in done.outputs]) == ({"cog": done.error}, ["npz"])
+    done = batch.make(replace(lost, kinds=("cog",)))
+    assert (done.error, done.outputs) == ("no position is known for frames/000000.dng", ())
     with pytest.raises(DappledError, match="a batch makes"):
         batch.plan(flight.folder, flight.recipe, Options(), ["gif"], tmp_path)
 
 
+@pytest.fixture
+def listed(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
+    """Which frames the files of each form name. Frames are not decoded, and forms but a file each; STAC refuses the
+    first frame, and the second flight's nerfstudio file can't be written."""
+    named: dict[str, list[str]] = {}
+
+    def written(form: str, folder: Path, frame: HandedFrame) -> list[Path]:
+        if form == "stac" and frame.station.name == "000000":
+            raise DappledError("the time of frames/000000.dng in UTC was never known")
+        path = folder / f"{frame.station.name}.json"
+        durable.make_folder(folder)
+        durable.write_file(path, f"{frame.station.tag.pose.latitude_rad:.3f}".encode())
+        return [path]
+
+    def finished(form: str, folder: Path, flight: str, names: Sequence[str]) -> list[Path]:
+        if form == "nerfstudio" and flight == "second":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        named[f"{flight}/{form}"] = list(names)
+        return []
+
+    monkeypatch.setattr(georeference, "decode", lambda *_: None)
+    monkeypatch.setattr(workers, "in_processes", lambda jobs, make, _: map(make, jobs))
+    monkeypatch.setattr(forms, "write_frame", written)
+    monkeypatch.setattr(forms, "finish", finished)
+    monkeypatch.setattr(forms, "doubts", lambda *_: [])
+    return named
+
+
+def test_what_one_form_refuses_the_others_keep(
+    flight: Flown, tmp_path: Path, listed: dict[str, list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("first", "second"):
+        subprocess.run(["cp", "-r", str(flight.folder), str(tmp_path / name)], check=True)  # noqa: S607  on PATH
+    asked = words(flight, tmp_path / "out", "--as", "colmap", "nerfstudio", "stac", "--json")
+    assert main(["batch", str(tmp_path / "first"), str(tmp_path / "second"), *asked[2:]]) == 1
+    both = ["000000", "000001"]
+    first = {"first/colmap": both, "first/nerfstudio": both, "first/stac": ["000001"]}
+    assert listed == {**first, "second/colmap": both, "second/stac": ["000001"]}
+    said = capsys.readouterr()
+    full = disk_error("write the lists of", tmp_path / "out/second/nerfstudio", OSError(errno.ENOSPC, ""))
+    assert said.err.splitlines() == [
+        *["dappled batch: the time of frames/000000.dng in UTC was never known"] * 2,
+        f"dappled batch: {full}",
+    ]
+    rows = [json.loads(line) for line in said.out.splitlines()]
+    assert [sorted(row["refused"]) for row in rows] == [["stac"], [], ["stac"], []]
+    assert [len(row["files"]) for row in rows] == [2, 3, 2, 3]
+
+
+def test_files_of_other_positions_are_made_again(
+    flight: Flown, tmp_path: Path, listed: dict[str, list[str]], capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Both write under the same names, and the files are of one size."""
+    asked = words(flight, tmp_path, "--as", "colmap")
+    before, read = tmp_path / flight.folder.name / "colmap" / "000000.json", geotags.read
+
+    def moved(*given: Any) -> tuple[list[Placed], Any]:
+        placed, left = read(*given)
+        return [
+            replace(one, tag=replace(one.tag, pose=replace(one.tag.pose, latitude_rad=0.1))) for one in placed
+        ], left
+
+    assert main(asked) == 0
+    true = before.read_bytes()
+    monkeypatch.setattr(geotags, "read", moved)
+    assert main(asked) == 0
+    assert before.read_bytes() == b"0.100"
+    monkeypatch.setattr(geotags, "read", read)
+    assert main(asked) == 0
+    assert before.read_bytes() == true
+    before.write_bytes(b"0.200")  # a job that was killed before it could say so
+    capsys.readouterr()
+    assert main(asked) == 0
+    assert "1 frame made, 1 already there" in capsys.readouterr().out
+    assert before.read_bytes() == true
+    assert listed[f"{flight.folder.name}/colmap"] == ["000000", "000001"]
+
+
+@pytest.mark.slow
 def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
     jobs = [job(f"dies-once:{tmp_path}/a"), *(job(f"{n}") for n in range(8)), job(f"dies-once:{tmp_path}/b")]
     done = list(workers.in_processes(jobs, answer, 2))
@@ -179,6 +270,7 @@ def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
     assert all(one.error is None for one in done)
 
 
+@pytest.mark.slow
 def test_a_frame_that_kills_every_worker_is_given_up(tmp_path: Path) -> None:
     done = {one.frame: one.error for one in workers.in_processes([job("dies"), job("1"), job("2")], answer, 1)}
     assert done["1"] is None
@@ -277,7 +369,7 @@ class Cluster:
         url = str(json.loads(facts.read_text())["address"])
         from distributed import Client  # noqa: PLC0415  slow to import, and only here
 
-        async with Client(url, asynchronous=True, set_as_default=False) as client:  # type: ignore[no-untyped-call]  # untyped
+        async with Client(url, asynchronous=True, set_as_default=False) as client:
             if self.crew:
                 await client.wait_for_workers(self.crew, timeout=50)
         return url

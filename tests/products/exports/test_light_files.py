@@ -150,6 +150,17 @@ def test_doubts_that_are_no_sentences_are_told(tmp_path: Path) -> None:
             load(tmp_path / "a.npz")
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_standard_errors_of_views_are_kept_and_old_files_have_none(tmp_path: Path, kind: str) -> None:
+    needs(kind)
+    plain = light_field()
+    sigma = np.arange(np.prod([*plain.views.shape[:2], 3, 4]), dtype=np.float32).reshape(*plain.views.shape[:2], 3, 4)
+    save(tmp_path / f"new{kind}", replace(plain, view_sigma=sigma))
+    np.testing.assert_array_equal(load(tmp_path / f"new{kind}").view_sigma, sigma)
+    save(tmp_path / f"old{kind}", plain)
+    assert load(tmp_path / f"old{kind}").view_sigma is None
+
+
 @pytest.mark.parametrize("name", ["a.tiff", "a"])
 def test_other_extensions_are_told(tmp_path: Path, name: str) -> None:
     for act in (lambda: save(tmp_path / name, light_field()), lambda: load(tmp_path / name)):

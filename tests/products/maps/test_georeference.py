@@ -131,6 +131,7 @@ def test_terrain_and_difference(short_flight: Flown, tmp_path: Path, capsys: pyt
         assert np.nanmax(np.abs(read.read(1))) < 1e-4
 
 
+@pytest.mark.slow
 def test_frames_are_laid_on_heights_that_they_showed_themselves(short_flight: Flown, tmp_path: Path) -> None:
     """Where each pixel really lies the simulation knows; on flat ground what stands up leans."""
     assert main(words(short_flight, tmp_path, "--as", "terrain", "--gsd", "0.05")) == 0
@@ -229,6 +230,26 @@ def test_what_cant_be_compared_leaves_the_maps_and_a_report(
     assert why.startswith(f"no difference to {later_flight}: no two frames")
 
 
+@pytest.mark.slow
+def test_several_flights_are_each_compared_with_the_first(
+    short_flight: Flown, later_flight: Path, tmp_path: Path
+) -> None:
+    more = ["--as", "difference", "--against", str(later_flight), str(short_flight.folder), "--gsd", "0.1"]
+    assert main(words(short_flight, tmp_path / "maps", *more)) == 0
+    report = json.loads((tmp_path / "maps" / "report.json").read_text())
+    each = [f"difference-{one.name}.tif" for one in (later_flight, short_flight.folder)]
+    assert report["files"] == [*each, "trend.tif"]
+    assert report["notes"] == []
+    with rasterio.open(tmp_path / "maps" / report["files"][0]) as read:
+        change, sigma = read.read()
+        assert read.descriptions[1] == "sigma of a change by itself, share of brightness"
+    assert np.array_equal(np.isfinite(change), np.isfinite(sigma))
+    assert np.nanmin(sigma) >= 0
+    with rasterio.open(tmp_path / "maps" / "trend.tif") as read:
+        assert read.descriptions[0] == "change a day, share of brightness"
+        assert np.nanmax(read.read(5)) == 3
+
+
 def test_a_change_on_the_ground_stands_out_of_another_hours_light() -> None:
     eye, ground = eye_at(height_m=100.0), Flat(0.0)
     image = painted(eye, ground)
@@ -248,6 +269,7 @@ def test_a_change_on_the_ground_stands_out_of_another_hours_light() -> None:
         difference.of_pictures(first, elsewhere)
 
 
+@pytest.mark.slow
 def test_frames_that_cant_be_placed_are_named_and_the_flight_goes_on(tmp_path: Path, short_flight: Flown) -> None:
     """A frame without a tag, one without a position, one that looks at the horizon, and a good one."""
     raw = sorted((short_flight.folder / "frames").iterdir())[0].read_bytes()
@@ -398,3 +420,21 @@ def test_a_flight_that_doesnt_know_its_height_asks_for_the_ground(short_flight: 
         georeference.level_of([station], Options())
     with pytest.raises(PhotographError, match="never tagged"):
         photographs.station(frames[0], None, Mounting())
+
+
+def test_maps_in_a_named_folder_are_not_replaced_unasked(
+    short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = tmp_path / "maps" / "frames" / "000000.tif"
+    there.parent.mkdir(parents=True)
+    there.write_bytes(b"of before")
+    assert main(words(short_flight, tmp_path / "maps", "--as", "cog", "--each", "--frames", "0")) == 1
+    assert "000000.tif exists already: choose another name, or --overwrite replaces it" in capsys.readouterr().err
+    (tmp_path / "maps" / "footprints.geojson").write_bytes(b"of before")
+    more = ["--as", "footprints", "--frames", "0"]
+    assert main(words(short_flight, tmp_path / "maps", *more)) == 1
+    assert "footprints.geojson exists already" in capsys.readouterr().err
+    assert sorted(path.name for path in (tmp_path / "maps").iterdir()) == ["footprints.geojson", "frames"]
+    assert main(words(short_flight, tmp_path / "maps", *more, "--overwrite")) == 0
+    assert (tmp_path / "maps" / "footprints.geojson").read_bytes() != b"of before"
+    assert there.read_bytes() == b"of before"

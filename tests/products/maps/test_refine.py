@@ -13,18 +13,21 @@ import pytest
 import rasterio
 from numpy.typing import NDArray
 
+from dappled.config.profiles import Lens
 from dappled.decode.geometry import metres_per_radian
 from dappled.mocks.autopilot.path import TruePose
-from dappled.products.maps import georeference, hyperstereo, map_grid, references, refine, terrain
+from dappled.products.maps import georeference, hyperstereo, map_grid, references, refine, self_calibration, terrain
 from dappled.products.maps.eye import turn
 from dappled.products.maps.georeference import Options, Survey
 from dappled.products.maps.ground import Flat
 from dappled.products.maps.ground import load as load_ground
 from dappled.products.maps.photographs import Photograph
 from dappled.products.maps.references import BaseMap, BaseMapError, ControlPointError
+from dappled.products.maps.self_calibration import SelfCalibrationError
 from tests.products import flown
 from tests.products.flown import Flown
 from tests.products.maps.test_eye import eye_at
+from tests.products.maps.test_self_calibration import control
 
 pytestmark = pytest.mark.slow
 TIMES = tuple(1.0 + 0.6 * k for k in range(5))
@@ -151,6 +154,30 @@ def test_control_points_place_a_frame(rough: Case, tmp_path: Path) -> None:
     assert rough.corner_errors_m(better)[1].max() < 2 * gsd_m
     assert said[0].why == "it overlaps nothing"
     assert better[0] is rough.survey.photographs[0]
+
+
+def test_a_flight_tells_its_lens_with_control_points_and_not_without(exact: Case, tmp_path: Path) -> None:
+    """The lens is taken to be 1 mm and 0.3 mm off; the simulated one is 50 mm from the sensor's middle."""
+    wrong, photos = Lens(50.0, 51.0, (0.3, -0.3)), []
+    for one in exact.survey.photographs:
+        matrix = one.eye.matrix.copy()
+        matrix[:2, 2] += matrix[:2, :2] @ [-0.3 / 50, 0.3 / 50]
+        matrix[:2, :2] *= 51 / 50
+        photos.append(replace(one, eye=replace(one.eye, matrix=matrix), lens=wrong))
+    points = control(exact.flown, tmp_path / "points.csv")
+    found = self_calibration.find(
+        photos, exact.survey.ground, control=references.read_control_points(points, exact.survey.projection)
+    )
+    y, x = found.lens.principal_point_mm
+    off = np.array([found.lens.v_mm - 50, x, y, *found.lens.distortion[:4]])
+    assert (np.abs(off) < 4 * found.solution.sigmas).all()
+    assert found.solution.sigmas[0] < 0.15
+    assert found.solution.sigma_px < 0.2
+    assert found.control == 4 * len(TIMES)
+    better = self_calibration.with_lens(photos, found)
+    assert exact.corner_errors_m(better).max() < 0.25 * exact.corner_errors_m(photos).max()
+    with pytest.raises(SelfCalibrationError, match=r"doesn't tell the lens' distance .* control points"):
+        self_calibration.find(photos[:3], exact.survey.ground)
 
 
 def test_a_base_map_of_something_else_is_refused_frame_by_frame(exact: Case, tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ import json
 import os
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -22,20 +22,30 @@ from typing import Any, Self
 
 from dappled import __version__, confined, durable, file_lock
 from dappled.bounds.parsing import parse_json
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import DappledError, sentence
 from dappled.flight import Frame, Tag, canonical
 from dappled.products.exports import light_files
+from dappled.products.extras import need
 from dappled.products.geotags.geotags import Placed
-from dappled.products.handover import photo_files
+from dappled.products.handover import forms, photo_files
+from dappled.products.handover.forms import FORMS, HandedFrame
 from dappled.products.maps import cog, georeference, map_files, photographs
 from dappled.products.maps.earth import Projection, utm
 from dappled.products.maps.georeference import Options
 from dappled.products.maps.photographs import Station
 
-KINDS = {"npz": ".npz", "zarr": ".zarr", "h5": ".h5", "cog": ".tif", "kmz": ".kmz", "photos": ""}
+KINDS = {
+    "npz": ".npz",
+    "zarr": ".zarr",
+    "h5": ".h5",
+    "cog": ".tif",
+    "kmz": ".kmz",
+    "photos": "",
+    **dict.fromkeys(FORMS, ""),
+}
 MAPS = ("cog", "kmz")
-PLACED = (*MAPS, "photos")  # what needs a full pose
+PLACED = (*MAPS, "photos", *FORMS)  # what needs a full pose
 MANIFEST = "manifest.jsonl"
 _LINE_BYTES = 1 << 20  # of a manifest
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # mallopt(3)
@@ -63,16 +73,18 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class BatchOutput:
-    """A file or folder that was made: its name in the batch's folder, size and SHA-256."""
+    """A file or folder that was made: its name in the batch's folder, size and SHA-256, and the kind it belongs to."""
 
     name: str
     size: int
     sha256: str
+    kind: str = ""  # of a manifest that an older version wrote
 
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """The result of a job. `error` is a sentence, or None; `cpu_seconds` and `peak_mb` (so far) are the process'."""
+    """The result of a job. `error` is a sentence, or None; `cpu_seconds` and `peak_mb` (so far) are the process'.
+    `refused` says why a kind was not made where others were or could have been."""
 
     key: str
     flight: str
@@ -82,6 +94,11 @@ class Done:
     seconds: float
     cpu_seconds: float
     peak_mb: float
+    refused: Mapping[str, str] = field(default_factory=dict)
+
+    def lacks(self, kind: str) -> bool:
+        """Whether this kind was not made."""
+        return kind in self.refused or (self.error is not None and not self.refused)
 
 
 def plan(
@@ -98,6 +115,8 @@ def plan(
     for kind in kinds:
         if kind not in KINDS:
             raise DappledError(f"a batch makes {', '.join(KINDS)}, not {kind}")
+    if "mcap" in kinds:
+        need("mcap_ros2.writer")  # before any frame is decoded
     Darkroom(recipe).check()
     recipe = _anywhere(recipe)
     if options.terrain is not None:
@@ -110,11 +129,13 @@ def plan(
     reasons: dict[int, str] = {}
     for frame in frames:
         try:
-            stations[frame.index] = photographs.station(frame, tags.get(frame.index), options.mounting)
+            station = photographs.station(frame, tags.get(frame.index), options.mounting)
+            known = placed[frame.index].camera if frame.index in placed else None
+            stations[frame.index] = station if known is None else replace(station, camera=known)
         except DappledError as error:
             reasons[frame.index] = str(error)
     level = None
-    if set(kinds) & set(MAPS) and stations:
+    if set(kinds) & {*MAPS, *forms.MAPPED} and stations:
         level = georeference.level_of(list(stations.values()), options)
     if set(kinds) & set(PLACED) and stations:
         first = next(iter(stations.values())).camera
@@ -133,6 +154,8 @@ def plan(
         utc_ns = placed[frame.index].utc_ns if frame.index in placed else None
         said = {**common, "flight": flight.name, "name": frame.name, "frame": frame.sha256, "utc_ns": utc_ns,
                 "tag": None if tag is None else asdict(tag)}  # fmt: skip
+        if frame.index in stations and stations[frame.index].camera.height_ellipsoid_m is not None:
+            said["height_ellipsoid_m"] = stations[frame.index].camera.height_ellipsoid_m
         key = hashlib.sha256(canonical(said)).hexdigest()
         jobs.append(
             Job(
@@ -147,77 +170,108 @@ def make(job: Job) -> Done:
     """Run a job. A failure of this frame is an error in the result and never stops the others."""
     _settle_memory()
     began, cpu = time.monotonic(), time.process_time()
-    outputs: tuple[BatchOutput, ...] = ()
-    error = None
+    outputs: list[BatchOutput] = []
+    refused: dict[str, str] = {}
     try:
-        outputs = tuple(_made(job))
-    except (DappledError, OSError) as caught:
-        error = sentence(caught) if isinstance(caught, DappledError) else f"{job.frame.name}: {caught}"
+        making = _making(job)
+        for kind in job.kinds:
+            try:
+                outputs += making.made(kind)
+            except Exception as caught:  # noqa: BLE001  one kind must not cost the frame the others
+                refused[kind] = _why(job, caught)
+        error = "; ".join(dict.fromkeys(refused.values())) or None
     except Exception as caught:  # noqa: BLE001  one bad frame must not end the flight: its words go into the manifest
-        error = f"{job.frame.name}: {sentence(caught)}"
+        error = _why(job, caught)
     seconds, cpu = round(time.monotonic() - began, 3), round(time.process_time() - cpu, 3)
-    return Done(job.key, Path(job.flight).name, job.frame.name, outputs, error, seconds, cpu, _peak_mb())
+    name = Path(job.flight).name
+    return Done(job.key, name, job.frame.name, tuple(outputs), error, seconds, cpu, _peak_mb(), refused)
 
 
-def _made(job: Job) -> list[BatchOutput]:
-    flight = Path(job.flight)
-    folder = Path(job.output) / flight.name
-    durable.make_folder(folder)
-    beside = folder / Path(job.frame.name).stem
-    fields = [kind for kind in job.kinds if kind not in PLACED]
-    drawn = [kind for kind in job.kinds if kind in MAPS]
-    if set(job.kinds) & set(PLACED) and job.station is None:
-        raise DappledError(job.why)
-    darkroom = _darkroom(job.recipe)
-    made = georeference.decode(darkroom, flight, job.frame, job.tag, job.options)
-    outputs = []
-    for kind in fields:
-        path = beside.with_suffix(KINDS[kind])
-        pose = {} if job.tag is None else {"pose": asdict(job.tag.pose)}
-        field = replace(made.light_field, attributes={**made.light_field.attributes, **pose})
-        light_files.save(path, field, overwrite=True)
-        outputs.append(_output(path, job))
-    if "photos" in job.kinds:
-        assert job.station is not None
-        assert job.options.crs is not None
-        one = georeference.place(job.station, made, darkroom, _projection(job.options.crs), job.options)
-        for form, data in photo_files.encoded(one, job.station, job.utc_ns).items():
-            path = folder / "photos" / form / (beside.name + photo_files.SUFFIXES[form])
-            durable.make_folder(path.parent)
-            durable.write_file(path, data)
-            outputs.append(_output(path, job))
-    if drawn:
-        assert job.station is not None
-        assert job.level_m is not None
+def _why(job: Job, error: Exception) -> str:
+    if isinstance(error, DappledError):
+        return sentence(error)
+    return f"{job.frame.name}: {error if isinstance(error, OSError) else sentence(error)}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Making:
+    """A frame, decoded, of which one kind after the other is made."""
+
+    job: Job
+    darkroom: Darkroom
+    decoded: DecodeResult
+
+    def made(self, kind: str) -> list[BatchOutput]:
+        """Make one kind. Raises DappledError and OSError."""
+        job = self.job
+        if kind not in PLACED:
+            return [self._light_field(kind)]
+        if job.station is None:
+            raise DappledError(job.why)
         assert job.options.crs is not None
         projection = _projection(job.options.crs)
-        one = georeference.place(job.station, made, darkroom, projection, job.options)
+        folder = Path(job.output) / Path(job.flight).name
+        if kind == "photos":
+            one = georeference.place(job.station, self.decoded, self.darkroom, projection, job.options)
+            pictures = photo_files.encoded(one, job.station, job.utc_ns)
+            paths = photo_files.paths(folder / "photos", job.frame)
+            for path, data in zip(paths, pictures.values(), strict=True):
+                durable.make_folder(path.parent)
+                durable.write_file(path, data)
+        elif kind in FORMS:
+            frame = HandedFrame(
+                folder.name, job.station, self.decoded, self.darkroom, projection, job.options, job.level_m, job.utc_ns
+            )
+            paths = forms.write_frame(kind, folder / kind, frame)
+        else:
+            paths = [self._map(kind, job.station, projection)]
+        return [_output(path, job, kind) for path in paths]
+
+    def _light_field(self, kind: str) -> BatchOutput:
+        job = self.job
+        pose = {} if job.tag is None else {"pose": asdict(job.tag.pose)}
+        made = self.decoded.light_field
+        light_files.save(_beside(job, kind), replace(made, attributes={**made.attributes, **pose}), overwrite=True)
+        return _output(_beside(job, kind), job, kind)
+
+    def _map(self, kind: str, station: Station, projection: Projection) -> Path:
+        job, path = self.job, _beside(self.job, kind)
+        assert job.level_m is not None
+        one = georeference.place(station, self.decoded, self.darkroom, projection, job.options)
         survey = georeference.on_ground(
-            flight.name, [one], [], projection=projection, level_m=job.level_m, options=job.options
+            Path(job.flight).name, [one], [], projection=projection, level_m=job.level_m, options=job.options
         )
-        gain = cog.gain_of([one.image])
-        for kind in drawn:
-            path = beside.with_suffix(KINDS[kind])
-            if kind == "cog":
-                map_files.frame_cog(survey, one, path, gain)
-            else:
-                map_files.frame_kmz(survey, one, path, gain)
-            outputs.append(_output(path, job))
-    return outputs
+        draw = map_files.frame_cog if kind == "cog" else map_files.frame_kmz
+        draw(survey, one, path, cog.gain_of([one.image]))
+        return path
 
 
-def _output(path: Path, job: Job) -> BatchOutput:
+def _making(job: Job) -> _Making:
+    """Decode a job's frame. Raises DappledError, also where nothing that is wanted could be made of it."""
+    durable.make_folder(Path(job.output) / Path(job.flight).name)
+    if job.station is None and set(job.kinds) <= set(PLACED):
+        raise DappledError(job.why)
+    darkroom = _darkroom(job.recipe)
+    return _Making(job, darkroom, georeference.decode(darkroom, Path(job.flight), job.frame, job.tag, job.options))
+
+
+def _beside(job: Job, kind: str) -> Path:
+    """Where a kind that is one file or folder for each frame stands."""
+    return (Path(job.output) / Path(job.flight).name / Path(job.frame.name).stem).with_suffix(KINDS[kind])
+
+
+def _output(path: Path, job: Job, kind: str) -> BatchOutput:
     """A finished file or folder, with one hash over its content."""
     name = str(path.relative_to(job.output))
     if path.is_file():
-        return BatchOutput(name, path.stat().st_size, durable.hash_file(path))
+        return BatchOutput(name, path.stat().st_size, durable.hash_file(path), kind)
     whole = hashlib.sha256()
     size = 0
     for inner in sorted(path.rglob("*")):
         if inner.is_file():
             size += inner.stat().st_size
             whole.update(f"{inner.relative_to(path)} {durable.hash_file(inner)}\n".encode())
-    return BatchOutput(name, size, whole.hexdigest())
+    return BatchOutput(name, size, whole.hexdigest(), kind)
 
 
 def _digests(recipe: Recipe) -> dict[str, str]:
@@ -316,7 +370,10 @@ class Manifest:
                 ) from None
         except OSError as error:
             raise ManifestError(f"cannot keep a manifest in {output}: {error.strerror}") from None
-        self.done = self._read()
+        self._latest: dict[str, str] = {}  # the SHA-256 of each output as it was last written, by its name
+        self.done: dict[str, Done] = {}
+        for done in self._read():
+            self._note(done)
 
     def __enter__(self) -> Self:
         return self
@@ -328,17 +385,32 @@ class Manifest:
         """Append a result, durably."""
         os.write(self._fd, json.dumps(asdict(done), sort_keys=True).encode() + b"\n")
         os.fsync(self._fd)
-        self.done[done.key] = done
+        self._note(done)
 
     def holds(self, key: str) -> bool:
-        """Whether a job is done and its files are still there."""
+        """Whether a job is done and its files are still there, as it wrote them."""
         done = self.done.get(key)
-        if done is None or done.error is not None:
-            return False
-        folder, where = self.path.parent, f"the manifest {self.path}"
-        return all(_size(confined.path(folder, one.name, where)) == one.size for one in done.outputs)
+        return done is not None and done.error is None and all(map(self._there, done.outputs))
 
-    def _read(self) -> dict[str, Done]:
+    def made(self, key: str, kind: str) -> bool:
+        """Whether a job made this kind, and its files are still there, as it wrote them."""
+        done = self.done.get(key)
+        if done is None or done.lacks(kind):
+            return False
+        return all(self._there(one) for one in done.outputs if one.kind in (kind, ""))
+
+    def _there(self, one: BatchOutput) -> bool:
+        """Jobs with other options write under the same names: what the last one wrote is there."""
+        path = confined.path(self.path.parent, one.name, f"the manifest {self.path}")
+        if self._latest[one.name] != one.sha256 or _size(path) != one.size:
+            return False
+        return path.suffix != ".json" or durable.hash_file(path) == one.sha256
+
+    def _note(self, done: Done) -> None:
+        self.done[done.key] = done
+        self._latest |= {one.name: one.sha256 for one in done.outputs}
+
+    def _read(self) -> Iterator[Done]:
         text = b""
         while block := os.read(self._fd, 1 << 20):
             text += block
@@ -346,7 +418,6 @@ class Manifest:
         if whole < len(text):  # torn by a power cut: that job runs again
             os.ftruncate(self._fd, whole)
             os.lseek(self._fd, 0, os.SEEK_END)
-        known: dict[str, Done] = {}
         for number, line in enumerate(text[:whole].splitlines(), 1):
             try:
                 done = _done(parse_json(line, _LINE_BYTES))
@@ -355,8 +426,7 @@ class Manifest:
                     f"{self.path}, line {number} is not a line of a manifest: move the file away, "
                     "and everything will be made again"
                 ) from None
-            known[done.key] = done
-        return known
+            yield done
 
 
 def _done(row: dict[str, Any]) -> Done:
@@ -364,6 +434,8 @@ def _done(row: dict[str, Any]) -> Done:
     done = Done(**{**row, "outputs": tuple(BatchOutput(**one) for one in row["outputs"])})
     if not all(isinstance(name, str) for name in (done.key, *(one.name for one in done.outputs))):
         raise TypeError("a name is not text")
+    if not isinstance(done.refused, dict):
+        raise TypeError("what was refused is not told by kind")
     return done
 
 

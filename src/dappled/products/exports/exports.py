@@ -245,23 +245,27 @@ def rerun(
     rr = _rerun()
     if path.suffix != ".rrd":
         raise ExportError(f"{path}: the name of a Rerun recording must end in .rrd")
-    recording = rr.RecordingStream("dappled")
-    recording.save(str(path))
-    stack = ViewStack.of(field)
-    white = prints.white_of([stack.views])
-    for v, line in enumerate(stack.views):
-        for u, view in enumerate(line):
-            recording.log(f"view/{v}/{u}", rr.Image(prints.toned(view, white)), static=True)
-    recording.log("picture", rr.Image(prints.toned(picture, prints.white_of([picture]))), static=True)
-    if depth is not None:
-        recording.log("disparity", rr.DepthImage(np.nan_to_num(depth.disparity)), static=True)
-        recording.log("sigma", rr.DepthImage(np.nan_to_num(depth.sigma)), static=True)
-    if distances is not None:
-        cloud = point_cloud.of(field, picture, distances)
-        colours = (cloud.colours >> 8).astype(np.uint8)
-        recording.log("points", rr.Points3D(cloud.points.astype(np.float32), colors=colours), static=True)
-    recording.flush()
-    recording.disconnect()
+
+    def write(part: Path) -> None:
+        recording = rr.RecordingStream("dappled")
+        recording.save(str(part))
+        stack = ViewStack.of(field)
+        white = prints.white_of([stack.views])
+        for v, line in enumerate(stack.views):
+            for u, view in enumerate(line):
+                recording.log(f"view/{v}/{u}", rr.Image(prints.toned(view, white)), static=True)
+        recording.log("picture", rr.Image(prints.toned(picture, prints.white_of([picture]))), static=True)
+        if depth is not None:
+            recording.log("disparity", rr.DepthImage(np.nan_to_num(depth.disparity)), static=True)
+            recording.log("sigma", rr.DepthImage(np.nan_to_num(depth.sigma)), static=True)
+        if distances is not None:
+            cloud = point_cloud.of(field, picture, distances)
+            colours = (cloud.colours >> 8).astype(np.uint8)
+            recording.log("points", rr.Points3D(cloud.points.astype(np.float32), colors=colours), static=True)
+        recording.flush()
+        recording.disconnect()
+
+    _whole(path, write)
 
 
 def _rerun() -> Any:

@@ -2,7 +2,8 @@
 
 The child process judges the file first (see `packed_arrays`), writes the arrays end to end into a temporary file, and
 an answer in JSON to its standard output: `{"arrays": [[name, dtype, shape], …], "text": …}`, or `{"kind": …, "words":
-…}` for a file that is refused. `python -m dappled.products.exports.h5_reader FILE OUT TEXT NAME…`
+…}` for a file that is refused. `python -m dappled.products.exports.h5_reader FILE OUT TEXT NAME…`, where a name with a
+question mark behind it may be missing.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from dappled.products.exports import packed_arrays
 
 _PATIENCE_S, _BYTES_A_SECOND = 20.0, 20e6  # of a slow disk; a loaded machine takes seconds to start Python
 _MODULE = "dappled.products.exports.h5_reader"
+_MAY_LACK = "?"
 _ANSWER_BYTES = 8 << 20  # twice the longest text, for JSON's escapes
 _RAISED: dict[str, type[Exception]] = {
     "claim": ClaimError,
@@ -36,8 +38,10 @@ _RAISED: dict[str, type[Exception]] = {
 }
 
 
-def read(path: Path, names: Sequence[str], text_name: str) -> tuple[dict[str, NDArray[Any]], str]:
-    """Return the arrays of these names, and the text of the file's attribute `text_name`.
+def read(
+    path: Path, names: Sequence[str], text_name: str, *, also: Sequence[str] = ()
+) -> tuple[dict[str, NDArray[Any]], str]:
+    """Return the arrays of these names, `also` those where they are there, and the text of the attribute `text_name`.
 
     Raises ClaimError for a file that claims too much, KeyError for what is missing, ValueError for a damaged file,
     MemoryError, and OSError.
@@ -46,7 +50,16 @@ def read(path: Path, names: Sequence[str], text_name: str) -> tuple[dict[str, ND
         out = Path(folder, "arrays")
         try:
             done = subprocess.run(
-                [sys.executable, "-m", _MODULE, str(path), str(out), text_name, *names],
+                [
+                    sys.executable,
+                    "-m",
+                    _MODULE,
+                    str(path),
+                    str(out),
+                    text_name,
+                    *names,
+                    *(f"{name}{_MAY_LACK}" for name in also),
+                ],
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 timeout=_PATIENCE_S + path.stat().st_size / _BYTES_A_SECOND,
@@ -84,6 +97,11 @@ def _answer(path: str, target: str, text_name: str, names: Sequence[str]) -> dic
 
     try:
         with h5py.File(path, "r") as file, open(target, "wb") as out:
+            names = [
+                one.removesuffix(_MAY_LACK)
+                for one in names
+                if not one.endswith(_MAY_LACK) or one.removesuffix(_MAY_LACK) in file
+            ]
             packed_arrays.check_h5(file, names, text_name)
             described = []
             for name in names:

@@ -35,7 +35,15 @@ _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "view_offsets": (np.float64, 3),
     "grid": (np.float64, 2),
 }
-_UNITS = {"slices": "1", "carriers": "cycles/pixel", "views": "1", "view_offsets": "1", "grid": "pixel"}
+_ADDED: dict[str, tuple[type[np.generic], int]] = {"view_sigma": (np.float32, 4)}  # may be missing
+_UNITS = {
+    "slices": "1",
+    "carriers": "cycles/pixel",
+    "views": "1",
+    "view_offsets": "1",
+    "grid": "pixel",
+    "view_sigma": "1",
+}
 _ATTRIBUTES = "attributes"
 _NUMBERS = ("focal_length_mm", "f_number", "lenslet_pitch_px", "noise_rms")
 _WORDS = ("camera", "mask", "law", "aperture")
@@ -51,7 +59,11 @@ def save(path: Path, field: LightField, *, overwrite: bool = False) -> None:
     Raises LightFileError, also when the file exists and `overwrite` is false.
     """
     write = _of(path, {".zarr": _save_zarr, ".npz": _save_npz, ".h5": _save_h5})
-    arrays: _Arrays = {name: np.asarray(getattr(field, name), dtype=kind) for name, (kind, _) in _ARRAYS.items()}
+    arrays: _Arrays = {
+        name: np.asarray(getattr(field, name), dtype=kind)
+        for name, (kind, _) in {**_ARRAYS, **_ADDED}.items()
+        if name in _ARRAYS or getattr(field, name) is not None
+    }
     _fits(path, arrays)
     attributes = _json(path, field.attributes)
     if path.exists() and not overwrite:
@@ -89,8 +101,8 @@ def load(path: Path) -> LightField:
         raise LightFileError(f"{path} is not a light field, or is damaged: {first_line(error)}") from error
     _check_attributes(path, attributes)
     _fits(path, arrays)
-    for name, (kind, _) in _ARRAYS.items():
-        if arrays[name].dtype != kind:
+    for name, (kind, _) in {**_ARRAYS, **_ADDED}.items():
+        if name in arrays and arrays[name].dtype != kind:
             raise LightFileError(f"{path} is not a light field: {name} is {arrays[name].dtype}, not {np.dtype(kind)}")
     return LightField(**arrays, attributes=attributes)
 
@@ -108,6 +120,7 @@ def axes(arrays: Mapping[str, NDArray[Any]]) -> dict[str, tuple[str, ...]]:
         "views": ("v", "u", "y", "x", "channel")[: len(views)],
         "view_offsets": ("v", "u", "direction"),
         "grid": ("direction", "term"),
+        "view_sigma": ("v", "u", "patch_y", "patch_x"),
     }
 
 
@@ -121,11 +134,13 @@ def _of(path: Path, kinds: Mapping[str, Callable[..., Any]]) -> Callable[..., An
 
 def _fits(path: Path, arrays: _Arrays) -> None:
     """Check that the arrays' shapes agree with each other, as `LightField` has them. Raises LightFileError."""
-    for name, (_, dimensions) in _ARRAYS.items():
-        if arrays[name].ndim != dimensions and not (name == "views" and arrays[name].ndim == 5):
+    for name, (_, dimensions) in {**_ARRAYS, **_ADDED}.items():
+        if name in arrays and arrays[name].ndim != dimensions and not (name == "views" and arrays[name].ndim == 5):
             raise LightFileError(f"{path}: {name} has {arrays[name].ndim} dimensions, a light field has {dimensions}")
     slices, views = arrays["slices"].shape, arrays["views"].shape
     expected = {"carriers": (slices[0], 4), "view_offsets": (*views[:2], 2), "grid": (2, 3)}
+    if "view_sigma" in arrays:
+        expected["view_sigma"] = (*views[:2], *arrays["view_sigma"].shape[2:])
     for name, shape in expected.items():
         if arrays[name].shape != shape:
             raise LightFileError(
@@ -189,10 +204,12 @@ def _save_zarr(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
 def _load_zarr(path: Path) -> tuple[_Arrays, dict[str, Any]]:
     zarr = _zarr(path)
     confined.refuse_links(path, f"the light field {path}")
-    attributes = packed_arrays.zarr_attributes(path, {name: kind for name, (kind, _) in _ARRAYS.items()})
+    added = {name: kind for name, kind in _ADDED.items() if (path / name).is_dir()}
+    kinds = {name: kind for name, (kind, _) in {**_ARRAYS, **added}.items()}
+    attributes = packed_arrays.zarr_attributes(path, kinds)
     # Without consolidated metadata: it would replace what was judged.
     group = zarr.open_group(store=path, mode="r", zarr_format=3, use_consolidated=False)
-    return {name: np.asarray(group[name][...]) for name in _ARRAYS}, attributes
+    return {name: np.asarray(group[name][...]) for name in kinds}, attributes
 
 
 def _save_npz(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
@@ -201,7 +218,7 @@ def _save_npz(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
 
 
 def _load_npz(path: Path) -> tuple[_Arrays, dict[str, Any]]:
-    found = read_npz(path, [*_ARRAYS, _ATTRIBUTES])
+    found = read_npz(path, [*_ARRAYS, _ATTRIBUTES], also=_ADDED)
     return found, parse_json(str(found.pop(_ATTRIBUTES)))
 
 
@@ -220,7 +237,7 @@ def _save_h5(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
 
 def _load_h5(path: Path) -> tuple[_Arrays, dict[str, Any]]:
     _h5py(path)
-    arrays, attributes = h5_reader.read(path, list(_ARRAYS), _ATTRIBUTES)
+    arrays, attributes = h5_reader.read(path, list(_ARRAYS), _ATTRIBUTES, also=list(_ADDED))
     return arrays, parse_json(attributes)
 
 

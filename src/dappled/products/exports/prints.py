@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from dappled.decode import srgb
 from dappled.errors import DappledError
 
 Bytes = NDArray[np.uint8]
@@ -24,7 +25,8 @@ _VIRIDIS = np.array(
     ],
     dtype=np.float64,
 )  # fmt: skip
-_UNKNOWN = (150, 150, 150)
+UNKNOWN, HATCH = (205, 205, 205), (110, 110, 110)  # no colours of the scale
+_HATCH_STEP = 6  # px between the lines
 
 
 class PrintError(DappledError):
@@ -41,42 +43,56 @@ def white_of(pictures: Sequence[NDArray[np.floating]]) -> float:
 def toned(picture: NDArray[np.floating], white: float) -> Bytes:
     """uint8 of a linear picture with the sRGB curve; NaN is black."""
     linear = np.clip(np.nan_to_num(picture) / white, 0, 1)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    made: Bytes = np.rint(255 * encoded).astype(np.uint8)
+    made: Bytes = np.rint(255 * srgb.encoded(linear)).astype(np.uint8)
     return made
 
 
 def coloured(values: NDArray[np.floating], low: float, high: float) -> Bytes:
-    """uint8 (h, w, 3): viridis from `low` (dark) to `high` (bright), grey where unknown."""
+    """uint8 (h, w, 3): viridis from `low` (dark) to `high` (bright), hatched in grey where unknown."""
     share = np.clip((np.nan_to_num(values) - low) / max(high - low, 1e-12), 0, 1) * (len(_VIRIDIS) - 1)
     at = np.arange(len(_VIRIDIS))
     made = np.stack([np.interp(share, at, _VIRIDIS[:, c]) for c in range(3)], axis=-1)
-    made[~np.isfinite(values)] = _UNKNOWN
+    unknown = ~np.isfinite(values)
+    rows, columns = np.indices(unknown.shape, sparse=True)
+    made[unknown] = UNKNOWN
+    made[unknown & ((rows + columns) % _HATCH_STEP == 0)] = HATCH
     colours: Bytes = np.rint(made).astype(np.uint8)
     return colours
 
 
 def with_scale(values: NDArray[np.floating], low: float, high: float, unit: str) -> Bytes:
-    """`coloured`, with a scale below it that labels both ends and the meaning of grey."""
+    """`coloured`, with a scale below it that labels both ends, and what is hatched; as wide as the words need."""
     picture = coloured(values, low, high)
-    width = picture.shape[1]
-    size = max(11, min(22, width // 28))
-    strip = Image.new("RGB", (width, 2 * size + 10), (_PAPER,) * 3)
-    bar = coloured(
-        np.broadcast_to(np.linspace(low, high, max(width - 2 * size, 2)), (size, max(width - 2 * size, 2))), low, high
-    )
+    size = max(11, min(22, picture.shape[1] // 28))
+    font = ImageFont.load_default(size - 2)
+    ends = [f"{low:.3g} {unit}", f"{high:.3g} {unit}"]
+    least = math.ceil(sum(font.getlength(end) for end in ends)) + 4 * size
+    width = max(picture.shape[1], least)
+    told = [] if np.isfinite(values).all() else ["hatched: unknown"]
+    strip = Image.new("RGB", (width, (2 + len(told)) * size + 10), (_PAPER,) * 3)
+    bar = coloured(np.broadcast_to(np.linspace(low, high, width - 2 * size), (size, width - 2 * size)), low, high)
     strip.paste(Image.fromarray(bar), (size, 4))
-    draw, font = ImageDraw.Draw(strip), ImageFont.load_default(size - 2)
+    draw = ImageDraw.Draw(strip)
     y = size + 6
-    draw.text((size, y), f"{low:.3g} {unit}", fill=0, font=font)
-    draw.text((width - size, y), f"{high:.3g} {unit}", fill=0, font=font, anchor="ra")
-    if not np.isfinite(values).all():
-        draw.text((width // 2, y), "grey: unknown", fill=(110, 110, 110), font=font, anchor="ma")
-    return np.concatenate([picture, np.asarray(strip)], axis=0)
+    draw.text((size, y), ends[0], fill=0, font=font)
+    draw.text((width - size, y), ends[1], fill=0, font=font, anchor="ra")
+    for line in told:
+        draw.text((width // 2, y + size), line, fill=(110, 110, 110), font=font, anchor="ma")
+    return np.concatenate([_centred(picture, width), np.asarray(strip)], axis=0)
+
+
+def _centred(picture: Bytes, width: int) -> Bytes:
+    """The picture (h, w, 3) on paper that is at least as wide."""
+    left = (width - picture.shape[1]) // 2
+    right = width - picture.shape[1] - left
+    return np.pad(picture, ((0, 0), (left, right), (0, 0)), constant_values=_PAPER)
 
 
 def mosaic(pictures: Sequence[Bytes], captions: Sequence[str] = (), columns: int | None = None) -> Bytes:
-    """Pictures of one size side by side in rows of `columns` (None: as square as may be), captions below."""
+    """Pictures of one size side by side in rows of `columns` (None: as square as may be), captions below.
+
+    Captions that are wider than the pictures move these apart.
+    """
     if not pictures:
         raise PrintError("there is no picture to show")
     coloured_ones = [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in pictures]
@@ -84,13 +100,15 @@ def mosaic(pictures: Sequence[Bytes], captions: Sequence[str] = (), columns: int
     across = columns or math.ceil(math.sqrt(len(pictures)))
     down = math.ceil(len(pictures) / across)
     size = max(11, min(24, width // 16))
-    below = size + 8 if captions else 0
+    font = ImageFont.load_default(size)
+    below = size + 8 if any(captions) else 0
+    cell = max(width, *(math.ceil(font.getlength(caption)) for caption in captions or [""]))
     sheet = Image.new(
-        "RGB", (across * (width + _GAP) + _GAP, down * (height + below + _GAP) + _GAP), (_PAPER, _PAPER, _PAPER)
+        "RGB", (across * (cell + _GAP) + _GAP, down * (height + below + _GAP) + _GAP), (_PAPER, _PAPER, _PAPER)
     )
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size)
+    draw = ImageDraw.Draw(sheet)
     for number, picture in enumerate(coloured_ones):
-        left = _GAP + number % across * (width + _GAP)
+        left = _GAP + number % across * (cell + _GAP) + (cell - width) // 2
         top = _GAP + number // across * (height + below + _GAP)
         sheet.paste(Image.fromarray(np.ascontiguousarray(picture)), (left, top))
         if captions:

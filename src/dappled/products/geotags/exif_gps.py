@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
+from dappled.decode.geometry import Pose
 from dappled.decode.geometry.camera_pose import CameraPose
 from dappled.errors import DappledError
 
@@ -48,10 +49,19 @@ class Place:
     satellites: int | None = None
 
 
-def place(camera: CameraPose, utc_ns: int | None, error_m: float | None = None) -> Place:
-    """The place of a camera, with the direction of the image's top (true north is 0)."""
-    direction = None if camera.pix4d is None else camera.pix4d.yaw_deg
-    return Place(camera.latitude_deg, camera.longitude_deg, camera.altitude_msl_m, utc_ns, direction, error_m)
+def place(camera: CameraPose, utc_ns: int | None, pose: Pose) -> Place:
+    """The place of a camera, with the direction of the image's top (true north is 0), and what the pose's receiver
+    says."""
+    return Place(
+        camera.latitude_deg,
+        camera.longitude_deg,
+        camera.altitude_msl_m,
+        utc_ns,
+        None if camera.pix4d is None else camera.pix4d.yaw_deg,
+        pose.position_sigma_m,
+        None if pose.gnss is None else pose.gnss.hdop,
+        None if pose.gnss is None else pose.gnss.satellites,
+    )
 
 
 def tagged(data: bytes, where: Place) -> bytes:

@@ -7,7 +7,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -118,12 +118,7 @@ def copies(
         if one.camera is None:
             yield one.frame.name, "its position is not known"
             continue
-        gnss = one.tag.pose.gnss
-        where = replace(
-            exif_gps.place(one.camera, one.utc_ns, one.tag.pose.position_sigma_m),
-            dop=gnss.hdop if gnss else None,
-            satellites=gnss.satellites if gnss else None,
-        )
+        where = exif_gps.place(one.camera, one.utc_ns, one.tag.pose)
         try:
             made = exif_gps.tagged(original.read_bytes(), where)
         except OSError as error:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import struct
 from collections.abc import Sequence
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -14,11 +13,13 @@ import tifffile
 from PIL import Image
 
 from dappled import __version__, durable
+from dappled.decode import srgb
 from dappled.decode.array_types import Floats, Singles
 from dappled.flight import Frame, Tag
 from dappled.products.geotags import exif_gps, geotags, sidecars
 from dappled.products.geotags.exif_gps import Entry
 from dappled.products.geotags.geotags import Placed
+from dappled.products.maps import cog
 from dappled.products.maps.photographs import Photograph, Station
 
 SUFFIXES = {"tiff": ".tif", "jpeg": ".jpg"}
@@ -36,26 +37,15 @@ _FIRST_OF_JPEG: list[Entry] = [
 ]
 
 
-def gain_of(image: Singles) -> float:
-    """The gain that brings the brightest hundredth of a picture to 0.9 of white."""
-    level = float(np.nanpercentile(image, 99))
-    return 0.9 / level if level > 0 else 1.0
-
-
 def encoded(one: Photograph, station: Station, utc_ns: int | None) -> dict[str, bytes]:
     """The files by kind, "tiff" and "jpeg": the picture in sRGB's curve, its brightest hundredth at 0.9 of white.
 
     `utc_ns` is mid-exposure, corrected; None where UTC was never known.
     """
-    shown = _srgb(one.image * gain_of(one.image))
+    gain = cog.gain_of([one.image])
+    shown = _srgb(one.image * gain)
     xmp = sidecars.text(station.tag, station.camera, utc_ns).encode()
     first, inner = _settings(one, station.tag, utc_ns)
-    gnss = station.tag.pose.gnss
-    where = replace(
-        exif_gps.place(station.camera, utc_ns, station.tag.pose.position_sigma_m),
-        dop=gnss.hdop if gnss else None,
-        satellites=gnss.satellites if gnss else None,
-    )
     buffer = io.BytesIO()
     tifffile.imwrite(
         buffer,
@@ -66,15 +56,24 @@ def encoded(one: Photograph, station: Station, utc_ns: int | None) -> dict[str, 
         software=False,
         extratags=[(_XMP_TAG, 1, len(xmp), xmp, True)],
     )
-    tiff = exif_gps.tagged(exif_gps.with_directory(buffer.getvalue(), _EXIF_IFD, inner, first), where)
+    tiff = exif_gps.with_directory(buffer.getvalue(), _EXIF_IFD, inner, first)
+    return {"tiff": exif_gps.tagged(tiff, _place(station, utc_ns)), "jpeg": jpeg(one, station, utc_ns, gain)}
+
+
+def jpeg(one: Photograph, station: Station, utc_ns: int | None, gain: float) -> bytes:
+    """The picture times `gain`, in sRGB's curve, as JPEG with EXIF and XMP."""
+    first, inner = _settings(one, station.tag, utc_ns)
     buffer = io.BytesIO()
     settings = exif_gps.with_directory(exif_gps.EMPTY, _EXIF_IFD, inner, [*first, *_FIRST_OF_JPEG])
-    eight = Image.fromarray(np.round(shown * 255).astype(np.uint8))
+    eight = Image.fromarray(np.round(_srgb(one.image * gain) * 255).astype(np.uint8))
     eight.save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=b"Exif\0\0" + settings)
-    jpeg = exif_gps.tagged(buffer.getvalue(), where)
-    packet = _XMP_HEAD + xmp
-    jpeg = jpeg[:2] + struct.pack(">BBH", 0xFF, 0xE1, len(packet) + 2) + packet + jpeg[2:]
-    return {"tiff": tiff, "jpeg": jpeg}
+    made = exif_gps.tagged(buffer.getvalue(), _place(station, utc_ns))
+    packet = _XMP_HEAD + sidecars.text(station.tag, station.camera, utc_ns).encode()
+    return made[:2] + struct.pack(">BBH", 0xFF, 0xE1, len(packet) + 2) + packet + made[2:]
+
+
+def _place(station: Station, utc_ns: int | None) -> exif_gps.Place:
+    return exif_gps.place(station.camera, utc_ns, station.tag.pose)
 
 
 def paths(folder: Path, frame: Frame) -> list[Path]:
@@ -91,7 +90,7 @@ def write_lists(folder: Path, placed: Sequence[Placed]) -> None:
 def _srgb(image: Singles) -> Floats:
     """Linear values in sRGB's curve (IEC 61966-2-1), within 0 and 1; unknown ones are black."""
     linear = np.clip(np.nan_to_num(image.astype(np.float64)), 0.0, 1.0)
-    return np.asarray(np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
+    return np.asarray(srgb.encoded(linear))
 
 
 def _settings(one: Photograph, tag: Tag, utc_ns: int | None) -> tuple[list[Entry], list[Entry]]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled import durable
+from dappled.decode import srgb
 from dappled.decode.array_types import Singles
 from dappled.products.extras import need
 from dappled.products.maps.map_grid import MapError, MapGrid
@@ -26,8 +27,7 @@ def display(image: Singles, gain: float) -> NDArray[np.uint8]:
     """
     known = np.asarray(np.isfinite(image).all(axis=2))
     linear = np.clip(np.where(known[..., None], image, 0.0) * gain, 0.0, 1.0)
-    curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
-    return np.concatenate([np.round(curve * 255), known[..., None] * 255], axis=2).astype(np.uint8)
+    return np.concatenate([np.round(srgb.encoded(linear) * 255), known[..., None] * 255], axis=2).astype(np.uint8)
 
 
 def gain_of(images: Iterable[Singles]) -> float:

@@ -7,14 +7,15 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
+from dappled.decode.lightfield import LightField
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import DappledError
 from dappled.flight import FlightFolder, Frame, Tag
-from dappled.products.maps import map_grid, photographs, references, refine
+from dappled.products.maps import map_grid, photographs, references, refine, self_calibration
 from dappled.products.maps.earth import Geoid, Projection, utm
 from dappled.products.maps.eye import EyeError
 from dappled.products.maps.ground import Flat, Ground, Raster
@@ -22,9 +23,16 @@ from dappled.products.maps.ground import load as load_ground
 from dappled.products.maps.map_grid import MapError
 from dappled.products.maps.photographs import Photograph, Station
 from dappled.products.maps.references import BaseMap
+from dappled.products.maps.self_calibration import FlightLens
 from dappled.products.mounting import Mounting
 
 Progress = Callable[[str, int, int], None]  # what, done, of
+
+
+class Watch(Protocol):
+    """Gets each decoded frame while its light field is in memory."""
+
+    def measure(self, one: Photograph, decoded: LightField) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +60,8 @@ class Options:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Survey:
-    """A flight's photographs on one map. `left` names the frames that are not among them, with the reason."""
+    """A flight's photographs on one map. `left` names the frames that are not among them, with the reason; `lens` is
+    the one that the flight told, where it was asked."""
 
     flight: str
     photographs: tuple[Photograph, ...]
@@ -63,6 +72,7 @@ class Survey:
     left: tuple[tuple[str, str], ...]
     notes: tuple[str, ...] = ()
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
+    lens: FlightLens | None = None
 
     def tags(self) -> dict[str, str]:
         """The metadata of map files."""
@@ -74,9 +84,18 @@ class Survey:
         }
 
 
-def survey(flight: Path, recipe: Recipe, options: Options, progress: Progress, stack: ExitStack) -> Survey:
+def survey(
+    flight: Path,
+    recipe: Recipe,
+    options: Options,
+    progress: Progress,
+    stack: ExitStack,
+    *,
+    watch: Watch | None = None,
+) -> Survey:
     """Decode and place a flight's frames. Those that can't be decoded or placed are left out and named; `stack` owns
-    the pictures' scratch folder. Raises DappledError where no frame is left, or the options are wrong."""
+    the pictures' scratch folder; `watch` gets each frame. Raises DappledError where no frame is left, or the
+    options are wrong."""
     stations, left = photographs.stations(flight, options.mounting)
     if options.frames is not None:
         stations = [one for one in stations if one.frame.index in options.frames]
@@ -99,6 +118,8 @@ def survey(flight: Path, recipe: Recipe, options: Options, progress: Progress, s
         except DappledError as error:
             left.append((station.frame.name, str(error)))
             continue
+        if watch is not None:
+            watch.measure(one, made.light_field)
         taken.append(_shelved(one, scratch))
     progress("decode", len(stations), len(stations))
     return on_ground(flight.name, taken, left, projection=projection, level_m=level, options=options)
@@ -177,6 +198,22 @@ def refined(
     kept = [f"frame {one.name} keeps its recorded pose: {said.why}" for one, said in zip(photos, judged, strict=True)
             if said.why is not None]  # fmt: skip
     return replace(made, photographs=tuple(photos), facts=facts, notes=(*made.notes, *unseen, *kept))
+
+
+def with_own_lens(
+    made: Survey,
+    *,
+    control: Path | None = None,
+    sigmas: tuple[float, float] | None = None,
+    progress: Progress = lambda *_: None,
+) -> Survey:
+    """The survey with the lens that its own frames tell, and the poses that go with it. Raises DappledError where they
+    don't tell it, or the control points can't be used."""
+    points = [] if control is None else references.read_control_points(control, made.projection)
+    points, unseen = references.sighted(points, {one.name for one in made.photographs})
+    found = self_calibration.find(made.photographs, made.ground, control=points, sigmas=sigmas, progress=progress)
+    photos = self_calibration.with_lens(made.photographs, found)
+    return replace(made, photographs=tuple(photos), notes=(*made.notes, *unseen, *found.doubts), lens=found)
 
 
 def decode(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, options: Options) -> DecodeResult:

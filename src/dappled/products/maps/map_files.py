@@ -106,6 +106,7 @@ def write_report(made: Survey, output: Path, files: Sequence[Path]) -> Path:
         "frames": [{"name": one.name, **made.facts.get(one.name, {})} for one in made.photographs],
         "left_out": [{"name": name, "why": why} for name, why in made.left],
         "notes": list(made.notes),
+        "lens": None if made.lens is None else made.lens.facts(),
         "files": [path.name for path in files],
     }
     path = output / "report.json"

@@ -25,6 +25,9 @@ DEFAULT_POSITION_SIGMA_M = 3.0
 DEFAULT_ATTITUDE_SIGMA_RAD = 0.02
 
 
+_NOMINAL_SIGMA = 0.02  # relative, of the aperture that an f-number tells: nominal f/22 is 22.6
+
+
 class PhotographError(DappledError):
     """A frame can't be placed on the map."""
 
@@ -50,13 +53,23 @@ class Station:
         return None if height is None else self.camera.altitude_msl_m - height
 
 
+@dataclass(frozen=True, slots=True)
+class ApertureWidth:
+    """The full aperture's diameter (m), its standard error, None where unknown; `source` is "carriers" where the frame
+    showed it, else "f-number"."""
+
+    width_m: float
+    sigma_m: float | None
+    source: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Photograph:
     """One frame's image float32 (h, w) or (h, w, 3), linear, 1.0 = sensor white, and its eye on the map.
 
     Sigmas are one standard deviation of the eye's centre (m) and attitude (rad) as recorded. `grid` maps to the
     sensor, as in `LightField`. With `views` (n, h, w[, 3]) and their aperture points, maps are drawn from the views:
-    their mean on the ground is the frame refocused there.
+    their mean on the ground is the frame refocused there. `doubts` are the light field's; `lens` is that of the eye.
     """
 
     name: str
@@ -68,6 +81,9 @@ class Photograph:
     grid: NDArray[np.float64]
     views: Singles | None = None
     apertures_m: NDArray[np.float64] | None = None
+    aperture: ApertureWidth | None = None
+    doubts: tuple[str, ...] = ()
+    lens: Lens | None = None
 
     def layers(self, focus_m: float = math.inf) -> list[tuple[Singles, Eye]]:
         """The images that make up the map, each with its eye."""
@@ -163,28 +179,38 @@ def photograph(
     """A decoded frame's photograph; `view` is "mean", "ground" (all views, to be laid over each other on the ground),
     or "v,u", the row and column of one view. Raises PhotographError where there is no such view, and as `eye_of`."""
     eye = eye_of(station, field, profile, projection, focus_m=focus_m)
-    image, views, apertures = mean_view(field), None, None
+    image, views, apertures, aperture = mean_view(field), None, None, None
     if view == "ground" and field.views.shape[0]:
-        views = field.views.reshape(-1, *field.views.shape[2:])
-        apertures = field.view_offsets.reshape(-1, 2) * _aperture_m(station, field)
+        views, aperture = field.views.reshape(-1, *field.views.shape[2:]), aperture_of(station, field)
+        apertures = field.view_offsets.reshape(-1, 2) * aperture.width_m
     elif view not in ("mean", "ground"):
         v, u = _which(view, field)
         image = np.ascontiguousarray(field.views[v, u])
-        y, x = field.view_offsets[v, u] * _aperture_m(station, field)
+        y, x = field.view_offsets[v, u] * aperture_of(station, field).width_m
         eye = through(eye, (float(y), float(x)), focus_m)
+    doubts = tuple(map(str, field.attributes.get("doubts") or ()))
+    sigmas = _sigmas(station.tag.pose)
     return Photograph(
-        station.name, station.tag.utc_ns, image, eye, *_sigmas(station.tag.pose), field.grid, views, apertures
-    )
+        station.name, station.tag.utc_ns, image, eye, *sigmas, field.grid, views, apertures, aperture, doubts,
+        lens_of(profile, _focal_length_mm(station, field), focus_m),
+    )  # fmt: skip
 
 
-def _aperture_m(station: Station, field: LightField) -> float:
-    """The full aperture's diameter: focal length / f-number. Raises PhotographError where one is unknown."""
+def aperture_of(station: Station, field: LightField) -> ApertureWidth:
+    """The full aperture: focal length / f-number, the one that the carriers show where they do. Raises PhotographError
+    where one is unknown."""
+    length_m = _focal_length_mm(station, field) * 1e-3
+    shown, sigma = (field.attributes.get(f"f_number_shown{word}") for word in ("", "_sigma"))
+    if shown and sigma:
+        return ApertureWidth(length_m / float(shown), length_m / float(shown) ** 2 * float(sigma), "carriers")
     f_number = field.attributes.get("f_number") or station.tag.f_number
     if f_number is None:
         raise PhotographError(
             f"the f-number of {station.frame.name} is unknown: give it with --f-number, or map its mean"
         )
-    return _focal_length_mm(station, field) / float(f_number) * 1e-3
+    width_m = length_m / float(f_number)
+    off = max(_NOMINAL_SIGMA, abs(float(f_number) / float(shown) - 1)) if shown else _NOMINAL_SIGMA
+    return ApertureWidth(width_m, off * width_m, "f-number")
 
 
 def true_colours(raw: RawFile) -> NDArray[np.float64] | None:

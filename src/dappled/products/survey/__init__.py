@@ -1,0 +1,1 @@
+"""What the frames of a flight show together: terrain from their light fields, pictures refocused over them, changes."""
