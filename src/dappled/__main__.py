@@ -12,9 +12,13 @@ INTERRUPTED = 130
 def main() -> int:
     """Run the command line; returns its exit code."""
     signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))  # nothing is there yet to end in order
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices here are small, and work is shared among own threads
     from dappled.cli import main as command  # noqa: PLC0415  # it loads for a second
 
-    return command(loaded=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+    try:
+        return command(loaded=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+    except KeyboardInterrupt:  # while it told how the verb had failed
+        return INTERRUPTED
 
 
 if __name__ == "__main__":

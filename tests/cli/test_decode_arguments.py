@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from dappled.cli import VERBS, completion, decode_arguments, main, parser
 from dappled.cli.arguments import OutputExistsError, refuse_existing
+from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 
-FOLDERS = {"batch", "geotag", "georeference"}  # their -o is a folder that they add to
+FOLDERS = {"batch", "geotag"}  # their -o is a folder that they add to
 WRITERS = {
     "decode": ["x.dng", "--mask", "m"],
     "calibrate": ["x.dng"],
@@ -80,6 +82,31 @@ def test_an_export_is_refused_with_a_remedy_that_works(
     if kind == "mat":
         assert main(["export", "x.zarr", "--as", kind, "-o", str(tmp_path / "new.mat"), "--overwrite"]) == 1
         assert "remove what is there yourself" in capsys.readouterr().err
+
+
+def test_a_flights_frames_are_decoded_by_its_own_recipe(tmp_path: Path) -> None:
+    flight = tmp_path / "f"
+    (flight / "frames").mkdir(parents=True)
+    (flight / "inputs" / "masks").mkdir(parents=True)
+    (flight / "inputs" / "masks" / "mask-2.toml").touch()
+    (flight / "flight.toml").write_text(
+        '[settings.mask]\nprofile = "mask-2"\n[settings.decode]\ncalibration = "/gone/mine.toml"\nworkers = 1\n'
+    )
+    asked = Recipe(camera="auto", mask="", workers=2, colour=True, try_laws=True)
+    for given in (flight, flight / "frames", flight / "frames" / "000000.dng"):
+        made = decode_arguments.recorded([given], asked)
+        assert made.mask == str(flight / "inputs" / "masks" / "mask-2.toml")
+        assert made.calibration == str(flight / "inputs" / "calibration.toml")
+        assert (made.workers, made.colour, made.try_laws) == (2, True, True)
+    assert decode_arguments.recorded([flight], replace(asked, calibration="c")).calibration == "c"
+    assert decode_arguments.recorded([flight], replace(asked, mask="mask-1")).calibration == ""
+    with pytest.raises(DappledError, match=r"no mask is named: give --mask P"):
+        decode_arguments.recorded([tmp_path / "x.dng"], asked)
+    with pytest.raises(DappledError, match="not the frames of one flight"):
+        decode_arguments.recorded([flight, tmp_path / "x.dng"], asked)
+    (flight / "flight.toml").write_text("[settings]\n")
+    with pytest.raises(DappledError, match="recorded without a mask"):
+        decode_arguments.recorded([flight], asked)
 
 
 @pytest.mark.slow  # it loads every verb

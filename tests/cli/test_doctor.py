@@ -133,7 +133,8 @@ def test_beside_a_running_daemon_it_asks_that_one(
     out = capfd.readouterr().out.splitlines()
     assert out[0] == "a daemon runs here, flight 20261121T101503Z-1a2b3c4d; it reports"
     assert out[1] == "go       Camera      ready"
-    assert out[-1] == "GO"
+    assert out[-2].startswith("caution  settings    ")  # there is no flight.toml to compare with
+    assert out[-1] == "GO, with the cautions above"
     assert main(["doctor", "--config", config, "--test-shot"]) == 1
     assert "holds the camera: stop it first" in capfd.readouterr().err
 
@@ -150,17 +151,22 @@ def test_a_running_daemon_without_a_camera_is_no_go(
     assert told["next"]
 
 
-def test_a_file_that_the_daemon_was_not_started_with_is_told_by_its_differences(
-    running: Callable[[dict[str, Any]], Path],
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.fixture
+def flown(
+    running: Callable[[dict[str, Any]], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> tuple[Path, dict[str, Any]]:
+    """The settings file of a running daemon, and the settings that its flight.toml is to hold."""
     monkeypatch.setattr("dappled.cli.doctor.HEAR_S", 60.0)
     config = running(WELL | {"disk": WELL["disk"] | {"folder": str(tmp_path)}})
-    flown = configuration.to_tables(configuration.load(config))
-    flown["record"]["min_free_mb"] = 4  # when it began; the health record says what it is now
-    (tmp_path / "flight.toml").write_text(tomli_w.dumps({"settings": flown}))
+    return config, configuration.to_tables(configuration.load(config))
+
+
+def test_a_file_that_the_daemon_was_not_started_with_is_told_by_its_differences(
+    flown: tuple[Path, dict[str, Any]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    config, recorded = flown
+    recorded["record"]["min_free_mb"] = 4  # when it began; the health record says what it is now
+    (tmp_path / "flight.toml").write_text(tomli_w.dumps({"settings": recorded}))
     assert main(["doctor", "--config", str(config)]) == 0
     assert "settings" not in capfd.readouterr().out
     config.write_text(config.read_text() + '[mask]\nprofile = "mask-2"\n[camera]\nmax_pending = 3\n')
@@ -171,6 +177,24 @@ def test_a_file_that_the_daemon_was_not_started_with_is_told_by_its_differences(
         f'NO GO    settings    mask.profile is "mask-2" in {config}, the daemon has ""',
     ]
     assert out[-1].startswith("NO GO; next: restart the daemon with this file")  # not "GO" under lines of NO GO
+
+
+def test_a_daemon_that_simulates_is_a_caution_not_a_list_of_differences(
+    flown: tuple[Path, dict[str, Any]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    config, recorded = flown
+    recorded["camera"] |= {"port": "ptpip:127.0.0.1:9:9", "profile": "canon-eos-450d"}
+    recorded["record"]["min_free_mb"] = 4
+    (tmp_path / "flight.toml").write_text(tomli_w.dumps({"settings": recorded, "camera": {"serial": "SIM00000001"}}))
+    assert main(["doctor", "--config", str(config)]) == 0
+    out = capfd.readouterr().out.splitlines()
+    assert [line for line in out if "settings" in line] == [
+        f"caution  settings    the daemon simulates: camera and calibration of {config} are not in use"
+    ]
+    assert out[-1] == "GO, with the cautions above"
+    config.write_text(config.read_text() + '[record]\ndirectory = "elsewhere"\n')
+    assert main(["doctor", "--config", str(config)]) == 1  # what a simulation leaves as it is still counts
+    assert "record.directory is" in capfd.readouterr().out
 
 
 def test_another_user_s_daemon_is_not_reported_as_one_s_own(

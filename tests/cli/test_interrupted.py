@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -54,6 +56,39 @@ def test_a_run_ends_in_order_with_pages_open(tmp_path: Path, pages: int) -> None
     assert said[-1].startswith("0 shots")
 
 
+@pytest.fixture
+def short() -> Iterator[Path]:
+    """A folder with a short name, for ipc sockets."""
+    with tempfile.TemporaryDirectory(prefix="dpl-") as folder:
+        yield Path(folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("span_s", [(0.1, 0.1), (0.3, 2.5), (2.5, 6.0)], ids=["at once", "loading", "starting"])
+def test_a_start_is_interrupted_at_any_moment(
+    tmp_path: Path, short: Path, span_s: tuple[float, float], sent: signal.Signals
+) -> None:
+    moment_s = random.uniform(*span_s)  # noqa: S311  # any moment must do; the failure names it
+    (tmp_path / "d.toml").write_text(
+        f'[record]\ndirectory = "flights"\n[publish]\nslices = "ipc://{short}/s"\n[console]\nbind = "127.0.0.1:0"\n'
+    )
+    with subprocess.Popen(
+        [sys.executable, "-m", "dappled", "run", "--simulate", "--config", "d.toml"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    ) as process:  # fmt: skip
+        try:
+            threading.Event().wait(moment_s)  # not for a thing to happen: the moment is what is tested
+            os.killpg(process.pid, sent)
+            _, err = process.communicate(timeout=50)
+        finally:
+            process.kill()
+    told = f"{sent.name} after {moment_s:.3f} s: {process.returncode}, {err}"
+    assert process.returncode in (0, INTERRUPTED, -sent), told  # -sent: nothing was there yet to end in order
+    assert "Traceback" not in err, told
+    assert "died" not in err, told
+
+
 def _interrupted(tmp_path: Path, sockets: str, port: int, pages: int) -> list[str]:
     """What a run says that is interrupted when so many pages are open."""
     (tmp_path / "d.toml").write_text(
@@ -92,6 +127,7 @@ PRINTING = [
     ["config", "show", "--json"],
     ["profiles"],
     ["profiles", "--json"],
+    ["completion", "bash"],
     ["mask", "table", "--camera", "canon-eos-450d", "--mask", "mask-2"],
     ["carriers", "--shape", "1388", "1844", *REFERENCE, "--focal-length", "50"],
 ]

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+import logging
+import warnings
 from pathlib import Path
 
 import pytest
 
 import dappled.cli
 from dappled.cli import VERBS, main, parser
+from dappled.cli.completion import below
 
 
 @pytest.mark.parametrize("verb", sorted(VERBS))
@@ -21,7 +25,7 @@ def test_every_verb_has_help_with_an_example(verb: str, capsys: pytest.CaptureFi
 
 ACTIONS = [
     *(("config", name) for name in ("check", "show")),
-    *(("flight", name) for name in ("list", "show", "check", "report", "offload", "pickup", "seal")),
+    *(("flight", name) for name in ("list", "show", "check", "report", "coverage", "offload", "pickup", "seal")),
     *(("keys", name) for name in ("make", "seal", "show", "token")),
     *(("mask", name) for name in ("make", "table", "diffraction", "design", "plan", "kit")),
     ("mavlink", "key"),
@@ -98,6 +102,37 @@ def test_an_unforeseen_error_has_no_traceback_without_debug(
     assert "unexpected RuntimeError: of its own kind" in capsys.readouterr().err
     with pytest.raises(RuntimeError):
         main(["--debug", "profiles"])
+
+
+def test_a_library_s_warning_is_for_the_log_alone(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    def warned(_: object) -> int:
+        warnings.warn("divide by zero encountered in log", RuntimeWarning, stacklevel=1)
+        return 0
+
+    monkeypatch.setattr("dappled.cli.config.run", warned)
+    for words, logged in ((["profiles"], False), (["--debug", "profiles"], True)):
+        caplog.clear()
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            logging.captureWarnings(False)  # as before the first command of a process
+            assert main(words) == 0
+        assert capsys.readouterr().err == ""
+        assert ("divide by zero" in caplog.text) is logged
+
+
+def leaves(path: str, one: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """Verbs, and their actions where they have some."""
+    actions = below(one)
+    return {p: q for name, a in actions.items() for p, q in leaves(f"{path} {name}", a).items()} or {path: one}
+
+
+def test_every_verb_prints_json_but_the_one_that_prints_a_script() -> None:
+    all_of_them = {path: one for verb in VERBS for path, one in leaves(verb, below(parser(verb))[verb]).items()}
+    assert len(all_of_them) > 35
+    without = [path for path, one in all_of_them.items() if "--json" not in one._option_string_actions]
+    assert without == ["completion"]
 
 
 def test_profiles_and_settings_as_json(capsys: pytest.CaptureFixture[str]) -> None:

@@ -35,6 +35,22 @@ def size(path: Path) -> tuple[int, int]:
         return picture.size
 
 
+def test_views_that_the_model_did_not_make_are_told_with_the_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = light_field()
+    told = {"views_model": "independent", "views_reason": "slices of 9 × 9 px are smaller than a patch of 24 px"}
+    quick = replace(plain, attributes={**plain.attributes, **told})
+    light_files.save(tmp_path / "f.npz", quick)
+    words = "views of each spatial frequency by itself: slices of 9 × 9 px are smaller than a patch of 24 px"
+    assert main(["views", str(tmp_path / "f.npz"), "-o", str(tmp_path / "a.png")]) == 0
+    assert words in capsys.readouterr().out
+    assert main(["export", str(tmp_path / "f.npz"), "--as", "npz", "-o", str(tmp_path / "g.npz")]) == 0
+    assert capsys.readouterr() == (f"{tmp_path}/g.npz\n", f"{words}\n")
+    assert main(["export", str(tmp_path / "f.npz"), "--as", "npz", "-o", str(tmp_path / "h.npz"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["views"] == words
+
+
 @pytest.mark.parametrize("of", ["views", "slices", "shifts", "slice-shifts"])
 def test_views_as_one_picture(field: str, of: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if "shifts" in of:
@@ -74,6 +90,11 @@ def test_fourier_tells_how_far_the_sum_is(field: str, tmp_path: Path, capsys: py
     assert main(["refocus", field, "--alpha", "1.03", "1", "--fourier", "-o", str(tmp_path / "a.png")]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [float(line.split("by ")[1].split(" dB")[0]) > 35 for line in lines[:2]] == [True, True]
+    again = ["--fourier", "-o", str(tmp_path / "a.png"), "--overwrite", "--json"]
+    assert main(["refocus", field, "--disparity", "0.5", *again]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["file"], told["disparities_px"]) == (str(tmp_path / "a.png"), [0.5])
+    assert told["notes"][0]["shift_and_add_psnr_db"] > 35
 
 
 def test_stack_eyes_and_all_in_focus(field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -95,6 +95,19 @@ def test_a_service_is_found_where_no_daemon_of_the_user_s_own_answers(own: Path,
     assert stream_endpoint(None, service) == f"ipc://{service}/slices"
 
 
+def test_the_settings_of_one_camera_of_several_lead_to_its_own_service(own: Path, tmp_path: Path) -> None:
+    """`dappled@left` beside `dappled`: the other one's state would be a wrong answer."""
+    service, settings = tmp_path / "run" / "dappled", tmp_path / "etc" / "dappled"
+    settings.mkdir(parents=True)
+    for name in ("dappled", "left"):
+        (settings / f"{name}.toml").write_text("", encoding="utf-8")
+    service.mkdir(parents=True)
+    assert stream_endpoint(settings / "dappled.toml", service) == f"ipc://{service}/slices"
+    assert stream_endpoint(settings / "left.toml", service) == f"ipc://{own}/slices"  # it does not run
+    (tmp_path / "run" / "dappled-left").mkdir()
+    assert stream_endpoint(settings / "left.toml", service) == f"ipc://{service}-left/slices"
+
+
 def test_settings_that_name_an_endpoint_are_obeyed(own: Path, tmp_path: Path) -> None:
     (tmp_path / "dappled.toml").write_text('[publish]\nslices = "tcp://127.0.0.1:5555"\n', encoding="utf-8")
     assert stream_endpoint(tmp_path / "dappled.toml", tmp_path) == "tcp://127.0.0.1:5555"

@@ -24,15 +24,15 @@ PROFILE = (
 )
 
 
-def dng_of(path: Path, shot: Shot, plane: np.ndarray, *, colours: bool = False) -> Path:
-    """A DNG of a plane; `colours` with an RGGB pattern of a warm light."""
+def dng_of(path: Path, shot: Shot, plane: np.ndarray, *, colours: bool = False, told: bool = True) -> Path:
+    """A DNG of a plane; `colours` with an RGGB pattern of a warm light, not `told` from behind a manual lens."""
     black, white = 1024, 15000
     light = plane.astype(np.float64) * 0.8
     if colours:
         light[::2, ::2] *= 0.6
         light[1::2, 1::2] *= 0.45
     raw = np.clip(black + light * (white - black), 0, white).astype(np.uint16)
-    exif = dng.Exif("Canon", "Canon EOS 450D", "1", shot.focal_length_mm, shot.f_number, 1e-2, 100, 0)
+    exif = dng.Exif("Canon", "Canon EOS 450D", "1", shot.focal_length_mm, shot.f_number if told else 0.0, 1e-2, 100, 0)
     path.write_bytes(dng.encode(raw, black=black, white=white, exif=exif, mono=not colours))
     return path
 
@@ -111,3 +111,87 @@ def test_where_no_carrier_can_be_seen_that_is_no_failure(tmp_path: Path, capsys:
     told = json.loads(capsys.readouterr().out)
     assert told["observable"] is False
     assert "averaged out over the stop" in told["reason"]
+
+
+TEXTURED = Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, turn_deg=1.0, scene="texture", seed=2, finer=2)
+
+
+@pytest.fixture(scope="module")
+def textured() -> np.ndarray:
+    return TEXTURED.frame()
+
+
+def test_behind_a_lens_that_tells_no_f_number_the_carriers_are_found_or_nothing_is_claimed(
+    textured: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frame = str(dng_of(tmp_path / "manual.dng", TEXTURED, textured, told=False))
+    assert main(["decode", frame, *_quarter(tmp_path), "-o", str(tmp_path / "f.npz")]) == 0
+    made = light_files.load(tmp_path / "f.npz")
+    assert (made.attributes["law"], made.attributes["f_number"], made.attributes["doubts"]) == ("geometric", None, [])
+    at = {(int(ky), int(kx)): (fy, fx) for ky, kx, fy, fx in made.carriers}
+    assert np.abs((np.array(at[1, 1]) - (1, 1) @ TEXTURED.lattice) * QUARTER.shape).max() < 0.1
+    bare = str(dng_of(tmp_path / "bare.dng", TEXTURED, TEXTURED.without_film(), told=False))
+    assert main(["decode", bare, *_quarter(tmp_path), "-o", str(tmp_path / "b.npz")]) == 0
+    made = light_files.load(tmp_path / "b.npz")
+    assert made.attributes["carriers_found"] is None
+    (doubt,) = made.attributes["doubts"]
+    assert "the f-number is unknown" in doubt
+    assert "may stand or be averaged out" in doubt
+    capsys.readouterr()
+    assert main(["carriers", bare, *_quarter(tmp_path)]) == 0
+    assert "the f-number is unknown" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("law", ["fd", "geometric"])
+def test_a_law_that_is_asked_for_is_checked_all_the_same(
+    law: str, textured: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [*_quarter(tmp_path), "--law", law]
+    if law == "geometric":
+        frame = dng_of(tmp_path / "bare.dng", TEXTURED, TEXTURED.without_film())
+    else:
+        frame = dng_of(tmp_path / "other-law.dng", TEXTURED, textured)
+    assert main(["decode", str(frame), *words, "-o", str(tmp_path / "f.npz")]) == 1
+    told = capsys.readouterr().err
+    assert ("should stand out at f/22" if law == "geometric" else "but where geometric has") in told
+    assert main(["carriers", str(frame), *words]) == 1
+
+
+def test_one_peak_of_the_scene_does_not_hide_that_a_calibration_is_wrong(
+    textured: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = _quarter(tmp_path)
+    frame = dng_of(tmp_path / "f.dng", TEXTURED, textured)
+    assert main(["calibrate", str(frame), *words, "-o", str(tmp_path / "c.toml")]) == 0
+    rows, columns = np.indices(QUARTER.shape)
+    fy, fx = np.array([1, 1]) @ TEXTURED.lattice
+    peak = 1 + 0.1 * np.cos(2 * np.pi * (fy * rows + fx * columns))
+    bare = dng_of(tmp_path / "bare.dng", TEXTURED, TEXTURED.without_film() * peak)
+    capsys.readouterr()
+    made = [*words, "--calibration", str(tmp_path / "c.toml"), "-o", str(tmp_path / "b.npz")]
+    assert main(["decode", str(bare), *made]) == 1
+    assert "should stand out at f/22 where the calibration has them, and" in capsys.readouterr().err
+
+
+def test_a_full_mask_is_no_diagonal_one_of_its_period(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shot = replace(TEXTURED, film=MASKS["mask-2-full"])
+    frame = dng_of(tmp_path / "full.dng", shot, shot.frame())
+    assert main(["decode", str(frame), *_quarter(tmp_path), "-o", str(tmp_path / "f.npz")]) == 1
+    assert "a full mask of its period" in capsys.readouterr().err
+    geometric = tmp_path / "geometric.toml"
+    geometric.write_text(PROFILE.replace('"fd"', '"geometric"'))
+    words = [str(frame), "--camera", str(geometric), "--mask", "mask-2", "-o", str(tmp_path / "g.npz")]
+    assert main(["decode", *words]) == 1 or light_files.load(tmp_path / "g.npz").attributes["doubts"]
+
+
+def test_the_advice_where_no_carrier_can_be_seen_is_what_the_lens_can_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shot = replace(TEXTURED, f_number=4.0)
+    frame = dng_of(tmp_path / "open.dng", shot, shot.without_film())
+    camera, words = _quarter(tmp_path)[1], ["--mask", "mask-2"]
+    Path(camera).write_text("f_number = [1.8, 8.0]\n" + PROFILE)
+    assert main(["calibrate", str(frame), "--camera", camera, *words, "-o", str(tmp_path / "c.toml")]) == 1
+    told = capsys.readouterr().err
+    assert "the lens ends at f/8, where no carrier can be counted on" in told
+    assert "f/34" not in told

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dappled.cli import main
+from dappled.drivers.raw import calibration_files
 from dappled.products.exports import light_files
 from tests.cli.test_thesis_camera import QUARTER, dng_of
 from tests.cli.test_thesis_camera import _quarter as quarter
@@ -133,6 +134,12 @@ def test_what_is_not_linear_is_no_calibration_and_a_doubt_of_the_light_field(
     assert told in capsys.readouterr().err
     assert not (tmp_path / "c.toml").exists()
     assert main(["calibrate", *words, "--anyway", "-o", str(tmp_path / "c.toml")]) == 0
+    assert f"written with this doubt in it: {path.name}: " in capsys.readouterr().err
+    known = calibration_files.load(tmp_path / "c.toml")
+    assert told in known.doubts[0]
+    doubted = known.doubt or ""
+    assert known.doubts[0] in doubted
+    assert ("neither law" in doubted) == known.verdict.startswith("neither law")
     assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 0
     assert "in doubt: " in capsys.readouterr().out
     assert any(told in doubt for doubt in light_files.load(tmp_path / "f.npz").attributes["doubts"])

@@ -23,6 +23,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "replay": ("replay", "run a recorded flight, or a folder of frames, through the same pipeline"),
     "doctor": ("doctor", "say what is missing on this machine; fire a test shot; measure latency"),
     "status": ("status", "show the state of the running daemon"),
+    "open": ("open", "look at a recorded flight or a light field in the browser"),
     "watch": ("watch", "subscribe to the stream: show and save what arrives"),
     "keys": ("keys", "make keys for subscribers on the network, and the console's token"),
     "trigger": ("trigger", "ask for frames over MAVLink, as a ground station does"),
@@ -35,10 +36,12 @@ VERBS: dict[str, tuple[str, str]] = {
     "depth": ("depth", "measure disparities and distances with their uncertainty; write point clouds"),
     "export": ("export", "write light fields for other tools: hci, eslf, mat, quilt, h5 …"),
     "mask": ("mask", "the printed mask: make, table, diffraction, design, and plan a flight with it"),
-    "flight": ("flight", "recorded flights: list, show, check, report, offload, pickup"),
+    "plan": ("mask.plan", "plan a flight: interval, motion blur, frame rate and disk space"),
+    "flight": ("flight", "recorded flights: list, show, check, report, coverage, offload, pickup"),
     "geotag": ("geotag", "write positions and attitudes for other programs: XMP, geo.txt, CSV, GeoJSON"),
     "georeference": ("georeference", "make maps of a flight: KMZ overlay, GeoTIFF, footprints, terrain"),
     "batch": ("batch", "process whole flights frame by frame, on all cores or a Dask cluster"),
+    "hand-over": ("hand_over", "give pictures to OpenDroneMap (NodeODM), and fetch the model"),
     "config": ("config", "check or show settings"),
     "init": ("init", "write a settings file: finds what is plugged in, and asks"),
     "completion": ("completion", "print a completion script for bash, zsh or fish"),
@@ -88,6 +91,9 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
     quiet = logging.INFO if parsed.verb == "run" and "JOURNAL_STREAM" in os.environ else logging.WARNING
     logging.basicConfig(level=logging.DEBUG if parsed.debug else quiet, handlers=[systemd.handler()])
     logging.getLogger("PIL").setLevel(logging.INFO)
+    logging.captureWarnings(True)  # of libraries, about arithmetic or their future: for the log, not for a person
+    logged = parsed.debug or quiet < logging.WARNING
+    logging.getLogger("py.warnings").setLevel(logging.NOTSET if logged else logging.ERROR)
     try:
         if loaded is not None:
             loaded()

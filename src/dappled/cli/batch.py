@@ -15,13 +15,15 @@ from tqdm import tqdm
 from dappled.cli import georeference, geotag
 from dappled.cli.arguments import whole
 from dappled.errors import DappledError, counted
-from dappled.flight import layout
+from dappled.flight import disk_error, layout
 from dappled.products.batch import batch, workers
-from dappled.products.batch.batch import KINDS, Job, Manifest
+from dappled.products.batch.batch import KINDS, Done, Job, Manifest
 from dappled.products.geotags import geotags, marks
 from dappled.products.geotags.geotags import Placed
-from dappled.products.handover import photo_files
+from dappled.products.handover import forms, photo_files
+from dappled.products.handover.forms import FORMS
 from dappled.products.maps import earth
+from dappled.products.maps.earth import EarthError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +39,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the results")
     parser.add_argument("--as", dest="kinds", nargs="+", choices=tuple(KINDS), default=["npz"],
                         help="per frame: a light field (npz, zarr, h5; default: npz), a map (cog, kmz), or pictures\n"
-                        "with position (photos: 16-bit TIFF and JPEG, and geo.txt for OpenDroneMap)")  # fmt: skip
+                        "with position (photos: 16-bit TIFF and JPEG, and geo.txt for OpenDroneMap);\n"
+                        "per flight: a rig of the views' cameras (colmap, nerfstudio), a catalogue of maps (stac),\n"
+                        "or a recording for Foxglove and ROS 2 (mcap)")  # fmt: skip
     parser.add_argument("--pos", type=Path, metavar="FILE",
                         help="marks after PPK, as for dappled geotag; one FLIGHT only")  # fmt: skip
     geotag.add_mark_arm(parser)
@@ -56,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise DappledError(f"--pos {arguments.pos} holds the marks of one flight: give one FLIGHT")
     jobs: list[Job] = []
     refused = 0
-    lists: list[Callable[[Manifest], None]] = []
+    lists: list[Callable[[Manifest], list[str]]] = []
     for flight in flights:
         try:
             planned, placed = _planned(flight, arguments)
@@ -80,19 +84,26 @@ def run(arguments: argparse.Namespace) -> int:
             for done in answers:
                 manifest.add(done)
                 bar.update()
-                if done.error is not None:
-                    bad += 1
-                    tqdm.write(f"dappled batch: {done.error}", file=sys.stderr)
-                if arguments.json:
-                    said = {"flight": done.flight, "frame": done.frame, "error": done.error, "seconds": done.seconds}
-                    print(json.dumps({**said, "files": [one.name for one in done.outputs]}))
-        for write in lists if "photos" in arguments.kinds else ():
-            write(manifest)
+                bad += done.error is not None
+                _report(done, as_json=arguments.json)
+        for write in lists:
+            for text in write(manifest):
+                refused += 1
+                print(f"dappled batch: {text}", file=sys.stderr)
     if not jobs:
         raise DappledError("these flights hold no frames")
     if not arguments.json:
         print(f"{counted(len(todo) - bad, 'frame')} made, {len(jobs) - len(todo)} already there, {bad} failed")
     return 1 if bad or refused else 0
+
+
+def _report(done: Done, *, as_json: bool) -> None:
+    """Say what became of a frame."""
+    for text in dict.fromkeys(done.refused.values()) or ([done.error] if done.error else []):
+        tqdm.write(f"dappled batch: {text}", file=sys.stderr)
+    if as_json:
+        said = {"flight": done.flight, "frame": done.frame, "error": done.error, "refused": dict(done.refused)}
+        print(json.dumps({**said, "seconds": done.seconds, "files": [one.name for one in done.outputs]}))
 
 
 def _flights(given: Sequence[Path]) -> list[Path]:
@@ -128,21 +139,43 @@ def _planned(flight: Path, arguments: argparse.Namespace) -> tuple[list[Job], li
         marked = marks.find(folder.path, arguments.pos, geoid, geotag.mark_arm(arguments, options.mounting))
         for text in marks.sentences(marked):
             print(text, file=sys.stderr)
+    elif "mcap" in arguments.kinds:  # its altitudes are above the ellipsoid, or unknown
+        geoid = _geoid(arguments.geoid)
     placed, _ = geotags.read(folder.path, options.mounting, geoid, marked)
     by_index = {one.frame.index: one for one in placed}
     return batch.plan(folder.path, recipe, options, arguments.kinds, arguments.output, placed=by_index), placed
 
 
-def _lists(manifest: Manifest, placed: Sequence[Placed], jobs: Sequence[Job]) -> None:
-    """Write geo.txt beside the pictures of a flight that are there."""
+def _geoid(given: str | None) -> earth.Geoid | None:
+    """The geoid that was named, or one of this machine's; None where it has none. Raises EarthError."""
+    try:
+        return earth.geoid(given)
+    except EarthError as error:
+        if given is not None:
+            raise
+        print(f"dappled batch: {error}; until then heights above the ellipsoid are left out", file=sys.stderr)
+        return None
+
+
+def _lists(manifest: Manifest, placed: Sequence[Placed], jobs: Sequence[Job]) -> list[str]:
+    """Write what names the files of a flight that are there; returns what could not be written, a sentence each."""
     if not jobs:
-        return
-    folder = manifest.path.parent / Path(jobs[0].flight).name / "photos"
-    failed = {job.frame for job in jobs if not manifest.holds(job.key)}  # pictures of an earlier call: other positions
-    there = [
-        one
-        for one in placed
-        if one.frame not in failed and all(path.is_file() for path in photo_files.paths(folder, one.frame))
-    ]
-    if there:
-        photo_files.write_lists(folder, there)
+        return []
+    flight = Path(jobs[0].flight).name
+    folder = manifest.path.parent / flight
+    said = []
+    for kind in (one for one in ("photos", *FORMS) if one in jobs[0].kinds):
+        frames = [job.frame.name for job in jobs if manifest.made(job.key, kind)]
+        try:
+            if frames and kind == "photos":
+                photo_files.write_lists(folder / kind, [one for one in placed if one.frame.name in frames])
+            elif frames:
+                names = [Path(name).stem for name in frames]
+                forms.finish(kind, folder / kind, flight, names)
+                for text in forms.doubts(kind, folder / kind, names):
+                    print(f"dappled batch: {folder / kind}: {text}", file=sys.stderr)
+        except OSError as error:
+            said.append(str(disk_error("write the lists of", folder / kind, error)))
+        except DappledError as error:
+            said.append(str(error))
+    return said

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import math
 import sys
@@ -13,6 +14,7 @@ from typing import Any
 
 from PIL import Image
 
+from dappled import durable
 from dappled.cli import decode_arguments
 from dappled.cli.arguments import add_overwrite, refuse_existing
 from dappled.config import profiles
@@ -26,7 +28,8 @@ from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
 from dappled.decode.spectrum.peaks import Measured, measure
 from dappled.decode.spectrum.pictures import LOOKS, Look, around, spectrum_boxes
 from dappled.decode.spectrum.transform import padded_shape, transform
-from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, at_found, known_to, search_frame
+from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, known_to
+from dappled.drivers.raw.law_check import FrameLens, LawCheck, check
 from dappled.errors import counted
 
 
@@ -69,12 +72,17 @@ class Table:
     carriers_from: CarriersFrom | None = None
     own: Lattice | None = None
     rotation_rad: float | None = None
-    search: LawSearch | None = None
+    checked: LawCheck | None = None
 
     @property
-    def contradicted(self) -> bool:
-        """Whether carriers must be visible in this frame, and none is."""
-        return self.search is not None and self.search.found is None and self.search.expected
+    def search(self) -> LawSearch | None:
+        """What the frame shows under all laws, where they were tried."""
+        return None if self.checked is None else self.checked.search
+
+    @property
+    def doubt(self) -> str | None:
+        """Why the carriers can't be where slices are cut, or what can't be told of them; None where nothing is."""
+        return None if self.checked is None else self.checked.contradiction or self.checked.unsettled
 
     @property
     def used(self) -> Lattice:
@@ -98,11 +106,21 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.picture:
         if plane is None:
             raise DarkroomError("--picture draws a frame's spectrum: name the frame")
-        Image.fromarray(_picture(plane, table, arguments)).save(arguments.picture)
+        _save(_picture(plane, table, arguments), arguments.picture)
     print(json.dumps(_as_json(table), indent=2) if arguments.json else _as_text(table))
-    if table.contradicted:
-        print(f"dappled carriers: {table.search.reason if table.search else ''}", file=sys.stderr)
-    return 1 if table.contradicted else 0
+    if table.doubt:
+        print(f"dappled carriers: {table.doubt}", file=sys.stderr)
+    return 1 if table.checked is not None and table.checked.contradiction else 0
+
+
+def _save(shown: Any, path: Path) -> None:
+    """Write a picture, whole or not at all, in the form that its name says. Raises DarkroomError and OSError."""
+    coded = io.BytesIO()
+    try:
+        Image.fromarray(shown).save(coded, Image.registered_extensions()[path.suffix.lower()])
+    except KeyError:
+        raise DarkroomError(f"{path}: no picture is written under such a name; end it in .png") from None
+    durable.write_file(path, coded.getvalue())
 
 
 def picture(plane: Plane, table: Table, look: Look = "magnitude") -> Any:
@@ -170,13 +188,21 @@ def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
         predicted = decoder.predict(length)
         used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
         stop = arguments.f_number or raw.f_number
-        search = None
-        if carriers_from == "predicted" and stop is not None and not arguments.law:
-            search = search_frame(decoder, plane, length, stop)
-            if search.found is not None:
-                decoder = at_found(decoder, search)
-                predicted = decoder.predict(length)
-                used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
+        stops = darkroom.camera(raw.camera_model or "").f_numbers
+        lens = FrameLens(length, stop, None if stops is None else stops[1])
+        checked = check(
+            decoder,
+            plane,
+            lens,
+            used,
+            list(zip(predicted, seen, strict=True)),
+            carriers_from=carriers_from,
+            keep_law=bool(arguments.law),
+        )
+        if checked.decoder is not decoder:
+            decoder = checked.decoder
+            predicted = decoder.predict(length)
+            used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
         known = {(c.ky, c.kx): m for c, m in zip(predicted, seen, strict=True)}
         lattice = decoder.lattice_at(length)
         mask = decoder.mask
@@ -198,7 +224,7 @@ def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
             carriers_from=carriers_from,
             own=used,
             rotation_rad=turned,
-            search=search,
+            checked=checked,
         )
 
 
@@ -257,7 +283,7 @@ def _as_json(table: Table) -> dict[str, Any]:
         whole["rotation_rad"] = table.rotation_rad
     if table.search is not None:
         whole["observable"] = table.search.found is not None or table.search.expected
-        whole["reason"] = table.search.reason or None
+        whole["reason"] = table.doubt or table.search.reason or None
         whole["laws"] = [{"law": one.law, "odds_nats": one.nats} for one in table.search.odds]
     if table.found:
         whole["pitch_px"] = list(table.found.spacing_px)
@@ -302,7 +328,7 @@ def _summary(table: Table) -> str:
         orders = [(c.ky, c.kx) for c, _ in table.rows]
         if table.search is not None:
             sentence += f"; {table.search.sentence}"
-        strange = doubt(table.used.carriers(orders), [c for c, _ in table.rows])
+        strange = table.doubt or doubt(table.used.carriers(orders), [c for c, _ in table.rows])
         return f"{sentence}; {strange}" if strange else sentence
     whose = "calibration's" if table.carriers_from == "calibrated" else "law's"
     if table.search is not None and table.search.found is None:

@@ -21,10 +21,11 @@ from dappled.products.exports import light_files
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n  dappled decode frame.dng --mask reference-5x5 --calibration c.toml -o frame.zarr\n"
+        "  dappled decode FLIGHT -o decoded/    (by the flight's own mask, camera and calibration)\n"
         "  dappled decode *.png --mask lenslet --white white.png -o decoded/"
     )
     decode_arguments.add_frames(parser, "+")
-    decode_arguments.add_recipe(parser)
+    decode_arguments.add_recipe(parser, mask_needed=False, mask_otherwise="that of the flight that the frames are of")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT",
                         help="light field (.zarr, .npz, .h5); with several frames a folder")  # fmt: skip
     parser.add_argument("--colour", action="store_true", help="views in red, green and blue (default: grey)")
@@ -37,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    darkroom = Darkroom(decode_arguments.recipe(arguments))
+    darkroom = Darkroom(decode_arguments.recorded(arguments.frames, decode_arguments.recipe(arguments)))
     darkroom.check()
     arguments.frames = decode_arguments.frames(arguments.frames)
     single = len(arguments.frames) == 1 and arguments.output.suffix
@@ -93,6 +94,8 @@ def _facts(target: Path, made: DecodeResult) -> dict[str, Any]:
         "carriers_predicted": made.carriers_predicted,
         "carriers_from": made.report.carriers_from,
         "law": field.attributes["law"],
+        "views_model": field.attributes.get("views_model"),
+        "views_reason": field.attributes.get("views_reason") or None,
         "doubts": field.attributes["doubts"],
         "contradiction": made.contradiction,
     }
@@ -109,6 +112,8 @@ def summary(made: DecodeResult) -> str:
     whose = "calibration's" if made.report.carriers_from == "calibrated" else "law's"
     if made.contradiction:
         whole += f": {made.contradiction}; cut at the {whose} prediction"
+    elif made.unsettled:
+        whole += f": {made.unsettled}"
     elif not made.observable:
         whole += f", not observable at this aperture: no carriers in this frame, cut at the {whose} prediction"
     elif made.carriers_found == 0:
@@ -118,6 +123,8 @@ def summary(made: DecodeResult) -> str:
         )
     if made.search is not None and made.search.found is not None:
         whole += f", by the law {field.attributes['law']} ({made.search.sentence})"
+    if words := decode_arguments.views_words(field):
+        whole += f"; {words}"
     if made.report.doubt:
         whole += f": {made.report.doubt}"
     if made.not_linear:

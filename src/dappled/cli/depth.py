@@ -5,26 +5,35 @@ from __future__ import annotations
 import argparse
 import json
 import secrets
+import sys
+import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.cli import decode_arguments
+from dappled.cli import decode_arguments, georeference
 from dappled.cli.arguments import add_overwrite, refuse_existing
+from dappled.cli.decode_arguments import FieldCallError
 from dappled.decode import DecodeError
 from dappled.decode.depth import DepthMap, DistanceMap
 from dappled.decode.depth import estimate as depths
 from dappled.errors import counted
 from dappled.flight import layout
 from dappled.products.exports import exports, point_cloud, prints
-from dappled.products.maps import photographs
+from dappled.products.maps import photographs, terrain
+from dappled.products.maps.georeference import Progress, Survey
+from dappled.products.maps.terrain import TerrainModel
 from dappled.products.mounting import Mounting
 from dappled.products.opened import OpenedLightField, OpenError
+from dappled.products.survey import flight_sweep, frame_terrain
+from dappled.products.survey.frame_depths import FrameDepths
 
 _POINTS = (".ply", ".las", ".laz")
+_RASTERS, _PICTURES = (".tif", ".tiff"), (".png", ".jpg", ".jpeg")  # of a flight's heights
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -32,31 +41,47 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "examples:\n  dappled depth frame.zarr -o depth.png\n"
         "  dappled depth frame.zarr --focus inf -o depth.npz points.ply\n"
         "  dappled depth frame.zarr --calibration c.toml --flight FLIGHT --frame 42 -o points.las\n"
-        "OUT: .png (false colours), .npz (all values), .pfm (disparity), .ply, .las, .laz (points)."
+        "  dappled depth --flight FLIGHT --terrain n41_w092_1arc_v3.dt2 -o heights.tif\n"
+        "OUT: .png (false colours), .npz (all values), .pfm (disparity), .ply, .las, .laz (points); of a flight .tif."
     )
-    decode_arguments.add_field(parser)
-    parser.add_argument("--method", choices=tuple(depths.METHODS), default="combined",
-                        help="combined (default), contrast, gradient or stereo")  # fmt: skip
+    decode_arguments.add_field(parser, needed=False)
+    parser.add_argument("--method", type=_method, metavar="M", default="combined",
+                        help=f"{', '.join(depths.METHODS)} (default: combined)")  # fmt: skip
     decode_arguments.add_between(parser)
-    parser.add_argument("--window", type=int, default=depths.WINDOW, metavar="PX",
-                        help=f"side of the window around a pixel (default: {depths.WINDOW})")  # fmt: skip
+    parser.add_argument("--window", type=int, metavar="PX",
+                        help="side of the window around a pixel, odd (default: the method's own, 3 to 13)")  # fmt: skip
     parser.add_argument("--most-sigma", type=float, default=0.1, metavar="SHARE",
                         help="omit points with a σ above this share of their distance (default: 0.1)")  # fmt: skip
     parser.add_argument(
         "--flight",
         type=Path,
         metavar="FLIGHT",
-        help="with --frame: place the points on the map, using the pose of that frame",
+        help="with --frame: place the points on the map, using the pose of that frame; without\n"
+        "LIGHTFIELD: heights of the ground from its frames, each by itself, fused (a GeoTIFF)",
     )
-    parser.add_argument("--frame", type=int, metavar="N", help="number of this frame in the flight")
-    parser.add_argument("--crs", default="", metavar="EPSG:N", help="projection of the points (default: the UTM zone)")
+    parser.add_argument("--frame", type=int, metavar="N",
+                        help="number of this frame in the flight; without LIGHTFIELD: use only this one")  # fmt: skip
+    decode_arguments.add_flight(parser)
+    parser.add_argument("--together", action="store_true",
+                        help="of a flight: find heights where all frames agree (a plane sweep over the flight),\n"
+                        "not from each frame by itself")  # fmt: skip
     parser.add_argument("-o", "--output", nargs="+", type=Path, default=[], metavar="OUT", help="files to write")
     add_overwrite(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
+def _method(text: str) -> str:
+    try:
+        return depths.known_method(text)
+    except DecodeError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
 def run(arguments: argparse.Namespace) -> int:
     refuse_existing(arguments, *arguments.output)
+    if arguments.field is None:
+        return _heights(arguments)
+    decode_arguments.refuse_of_flight(arguments, "together")
     found = decode_arguments.opened_field(arguments)
     between = None if arguments.between is None else (arguments.between[0], arguments.between[1])
     made = found.depth(arguments.method, between=between, window=arguments.window)
@@ -66,6 +91,60 @@ def run(arguments: argparse.Namespace) -> int:
         report.setdefault("written", []).append(str(path))
         report |= _write(path, found, made, distances, arguments)
     print(json.dumps(report) if arguments.json else words(report))
+    return 0
+
+
+def _heights(arguments: argparse.Namespace) -> int:
+    """Heights of a flight from its single frames."""
+    given = decode_arguments.of_flight(arguments)
+    wrong = [path for path in arguments.output if path.suffix.lower() not in (*_RASTERS, *_PICTURES)]
+    if wrong:
+        raise FieldCallError(f"{wrong[0]}: heights of a flight are written as .tif (GeoTIFF) or .png, .jpg (a picture)")
+    between = None if arguments.between is None else (arguments.between[0], arguments.between[1])
+    given["frames"] = None if arguments.frame is None else str(arguments.frame)
+    with ExitStack() as stack:
+        progress = stack.enter_context(georeference.Bar())
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-depths-")))
+        if arguments.together:
+            return _together(arguments, georeference.placed(arguments.flight, given, progress, stack), progress)
+        depths = FrameDepths(
+            scratch,
+            lambda found: found.depth(arguments.method, between=between, window=arguments.window),
+            given["focus"],
+        )
+        made = georeference.placed(arguments.flight, given, progress, stack, watch=depths)
+        for _, why in (*made.left, *depths.left):
+            print(why, file=sys.stderr)
+        found = frame_terrain.of(made, depths.found, progress, cell_m=arguments.cell)
+        for path in arguments.output:
+            if path.suffix.lower() in _RASTERS:
+                frame_terrain.write_raster(made, found, path)
+            else:
+                prints.save(path, _picture(found.height_m, "m"))
+    written = [str(path) for path in arguments.output]
+    lines = frame_terrain.words(made, found)
+    report = frame_terrain.summary(made, found) | {"notes": lines[1:], "written": written}
+    print(json.dumps(report) if arguments.json else "\n".join([*lines, *(f"written: {path}" for path in written)]))
+    return 0
+
+
+def _together(arguments: argparse.Namespace, made: Survey, progress: Progress) -> int:
+    """Heights of a flight where all of its frames agree."""
+    for _, why in made.left:
+        print(why, file=sys.stderr)
+    surface = flight_sweep.surface(made, progress, cell_m=arguments.cell)
+    found = TerrainModel(surface, flight_sweep.difference(made, surface))
+    for path in arguments.output:
+        if path.suffix.lower() in _RASTERS:
+            terrain.write_raster(made, found, path)
+        else:
+            prints.save(path, _picture(surface.height_m, "m"))
+    written = [str(path) for path in arguments.output]
+    known, sigma = float(surface.known.mean()), _quartiles(surface.sigma_m)
+    report = {"known": known, "height_m": _quartiles(surface.height_m), "sigma_m": sigma, "written": written}
+    told = "" if sigma is None else f", to ±{sigma[1]:.2g} m (median)"
+    line = f"{counted(len(made.photographs), 'frame')} together: {known:.0%} of the map known{told}"
+    print(json.dumps(report) if arguments.json else "\n".join([line, *(f"written: {path}" for path in written)]))
     return 0
 
 

@@ -8,7 +8,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -103,9 +103,9 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
         ]
     verdict = go_no_go.verdict(checks)
     if arguments.config is not None:
-        looked += _differences(arguments.config, settings, report)
-    different = any(one.name == "settings" and one.state == "no-go" for one in looked)
-    verdict = "no-go" if different else verdict
+        compared = _differences(arguments.config, settings, report)
+        looked += compared
+        verdict = go_no_go.verdict([*checks, *compared])
     todo = go_no_go.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
     if arguments.json:
         facts = _facts([*checks, *looked])
@@ -132,12 +132,20 @@ def _differences(file: Path, wanted: Settings, report: Mapping[str, Any]) -> lis
     todo = (
         "restart the daemon with this file (sudo systemctl restart dappled), or name the file that it was started with"
     )
-    return [
+    simulated: Collection[tuple[str, str]] = ()
+    found = []
+    if str(tables.get("camera", {}).get("serial", "")).startswith("SIM"):
+        from dappled.mocks.simulation import REPLACED  # noqa: PLC0415  # a real flight doesn't load the mocks
+
+        simulated = REPLACED
+        text = f"the daemon simulates: camera and calibration of {file} are not in use"
+        found = [Check("settings", "caution", text, "start `dappled run` without --simulate to fly")]
+    return found + [
         Check(
             "settings", "no-go", f"{table}.{key} is {_toml(ours, table, key)} in {file}, the daemon has {there}", todo
         )
         for table, key, *_ in configuration.describe()
-        if (there := _toml(live, table, key)) != _toml(ours, table, key)
+        if (table, key) not in simulated and (there := _toml(live, table, key)) != _toml(ours, table, key)
     ]
 
 

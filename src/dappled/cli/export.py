@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 from dappled.cli import decode_arguments
@@ -48,7 +49,13 @@ def run(arguments: argparse.Namespace) -> int:
     _make_room(arguments)
     found = decode_arguments.opened_field(arguments)
     written = write(found, arguments.kind, arguments.output, arguments)
-    print(json.dumps({"file": str(written), "as": arguments.kind}) if arguments.json else written)
+    words = decode_arguments.views_words(found.field)
+    if arguments.json:
+        print(json.dumps({"file": str(written), "as": arguments.kind, "views": words or None}))
+    else:
+        print(written)
+        if words:
+            print(words, file=sys.stderr)
     return 0
 
 

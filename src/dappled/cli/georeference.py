@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
@@ -13,19 +14,33 @@ from typing import Any
 
 from tqdm import tqdm
 
-from dappled.cli.arguments import metres, positive
+from dappled.cli.arguments import add_overwrite, metres, positive, refuse_existing
+from dappled.cli.calibrate import lens
 from dappled.daemon.pipeline import recipes
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, counted
 from dappled.flight import layout
-from dappled.products.maps import difference, earth, georeference, map_files, terrain
-from dappled.products.maps.georeference import Options, Progress, Survey
+from dappled.products.maps import difference, earth, georeference, map_files, photographs, terrain
+from dappled.products.maps.difference import DifferenceError, MapDifference
+from dappled.products.maps.georeference import Options, Progress, Survey, Watch
 from dappled.products.maps.hyperstereo import HyperstereoError
 from dappled.products.maps.references import BaseMapError
 from dappled.products.maps.terrain import TerrainModel
 from dappled.products.mounting import Mounting
+from dappled.products.survey import frame_terrain
+from dappled.products.survey.frame_depths import FrameDepths
+from dappled.products.survey.frame_terrain import FrameTerrainError
 
-KINDS = ("kmz", "cog", "footprints", "terrain", "difference")
+_FILES = {
+    "kmz": ("mosaic.kmz",),
+    "cog": ("mosaic.tif",),
+    "footprints": ("footprints.geojson",),
+    "terrain": ("terrain.tif", "terrain.las", "ground.tif"),
+    "frame-terrain": ("terrain-frames.tif",),
+    "difference": ("difference.tif", "height-difference.tif"),
+}
+KINDS = tuple(_FILES)
+_EACH = {"kmz": ".kmz", "cog": ".tif"}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -33,7 +48,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "examples:\n"
         "  dappled georeference ~/flights/20261121T101503Z-0a1b2c3d --as kmz\n"
         "  dappled georeference FLIGHT --as cog footprints --terrain n41_w092_1arc_v3.dt2 --refine neighbours\n"
-        "Writes into FLIGHT/maps unless -o says otherwise. The recording is not changed."
+        "Writes into FLIGHT/maps, whose maps it replaces, unless -o says otherwise. The recording is not changed."
     )
     parser.add_argument("flight", type=Path, metavar="FLIGHT", help="flight folder")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="folder for the maps (default: FLIGHT/maps)")
@@ -43,19 +58,26 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quad", action="store_true", help="write each frame's kmz as a LatLonQuad: the view itself")
     parser.add_argument(
         "--against",
+        nargs="+",
         type=Path,
         metavar="FLIGHT",
-        help="for difference: the later flight to compare with; all of its frames are used",
+        help="for difference: the later flight to compare with, or several; all of their frames are used",
     )
     parser.add_argument("--between", nargs=2, type=float, metavar=("LOW", "HIGH"),
                         help="for terrain: heights to search, metres above sea level\n"
                         "(default: from 3 m below to 12 m above the ground given)")  # fmt: skip
+    parser.add_argument("--cell", type=positive, metavar="M",
+                        help="for frame-terrain: side of a cell (default: half a depth map's window)")  # fmt: skip
+    add_overwrite(parser)
     add_placing(parser)
     better = parser.add_argument_group("refinement")
     better.add_argument("--refine", nargs="+", default=[], metavar="WITH",
                         help="neighbours (frames against each other), a base map (GeoTIFF …), or both")  # fmt: skip
     better.add_argument("--gcp", type=Path, metavar="CSV",
                         help="control points: name, frame, column, row, latitude, longitude, altitude")  # fmt: skip
+    better.add_argument("--solve-lens", type=Path, metavar="FILE.toml",
+                        help="find the lens from the frames' own overlap, telemetry and --gcp,\n"
+                        "and write a copy of the camera's profile with it")  # fmt: skip
     better.add_argument("--search", type=positive, default=5.0, metavar="M",
                         help="search radius on the base map (default: 5 m)")  # fmt: skip
     better.add_argument("--pose-sigma", nargs=2, type=positive, metavar=("M", "DEG"),
@@ -101,20 +123,39 @@ def add_placing(parser: argparse.ArgumentParser) -> None:
     maps.add_argument("--frames", metavar="N,A-B", help="use only these frames")
 
 
+def placed(flight: Path, given: Mapping[str, Any], progress: Progress, stack: ExitStack, *,
+           watch: Watch | None = None) -> Survey:  # fmt: skip
+    """A flight's frames on the map, for other verbs: `given` are arguments of this one, the rest are their defaults.
+
+    Raises DappledError.
+    """
+    parser = argparse.ArgumentParser()
+    configure(parser)
+    arguments = argparse.Namespace(**{**vars(parser.parse_args([str(flight)])), **given})
+    return _survey(flight, arguments, progress, stack, [], watch=watch)
+
+
 def run(arguments: argparse.Namespace) -> int:
     folder = layout.open_folder(arguments.flight)
     output = arguments.output or folder.path / "maps"
-    if ("difference" in arguments.kinds) != (arguments.against is not None):
-        raise DappledError("--as difference and --against FLIGHT go together")
-    if arguments.between and not arguments.between[0] < arguments.between[1]:
-        raise DappledError("--between: the lower height comes first")
-    if arguments.against is not None:
-        layout.open_folder(arguments.against)
+    _check(arguments, output)
     with ExitStack() as stack:
         progress = stack.enter_context(Bar())
         missing: list[str] = []  # a sentence for each product that could not be made
-        made = _survey(folder.path, arguments, progress, stack, missing)
+        depths = _frame_depths(arguments, stack) if "frame-terrain" in arguments.kinds else None
+        made = _survey(folder.path, arguments, progress, stack, missing, watch=depths)
         files = _draw(made, output, arguments)
+        if made.lens is not None:
+            lens.write(_camera(folder.path, arguments), made.lens.lens, arguments.solve_lens)
+            files.append(arguments.solve_lens)
+        if depths is not None:
+            try:
+                fused = frame_terrain.of(made, depths.found, progress, cell_m=arguments.cell)
+                files.append(frame_terrain.write_raster(made, fused, output / "terrain-frames.tif"))
+                made = replace(made, notes=(*made.notes, *frame_terrain.words(made, fused)))
+            except FrameTerrainError as error:
+                missing.append(str(error))
+            made = replace(made, notes=(*made.notes, *(why for _, why in depths.left)))
         terrain_of = None
         if "terrain" in arguments.kinds:
             try:
@@ -125,12 +166,7 @@ def run(arguments: argparse.Namespace) -> int:
             except HyperstereoError as error:
                 missing.append(str(error))
         if arguments.against is not None:
-            try:
-                other = _survey(arguments.against, _for_the_other(arguments, made), progress, stack, missing)
-                for path in _compare(made, other, terrain_of, output, arguments=arguments, progress=progress):
-                    files.append(path)
-            except DappledError as error:
-                missing.append(f"no difference to {arguments.against}: {error}")
+            files += _changes(made, terrain_of, output, arguments, progress=progress, missing=missing)
     made = replace(made, notes=(*made.notes, *missing))
     report = map_files.write_report(made, output, files)
     if arguments.json:
@@ -138,6 +174,8 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         frames = counted(len(made.photographs), "frame")
         print(f"{frames} on {made.projection.name}, {made.gsd_m:g} m per cell, {made.ground.name}")
+        for line in made.lens.words() if made.lens is not None else ():
+            print(line)
         for path in (*files, report):
             print(path)
     for why in (*(why for _, why in made.left), *made.notes):
@@ -145,39 +183,122 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if missing else 0
 
 
+def _check(arguments: argparse.Namespace, output: Path) -> None:
+    """Refuse what can't be done before the work begins. Raises DappledError."""
+    if ("difference" in arguments.kinds) != (arguments.against is not None):
+        raise DappledError("--as difference and --against FLIGHT go together")
+    if arguments.between and not arguments.between[0] < arguments.between[1]:
+        raise DappledError("--between: the lower height comes first")
+    if "frame-terrain" in arguments.kinds and arguments.view not in ("mean", "ground"):
+        raise DappledError(f"--as frame-terrain is of all views: leave --view {arguments.view} out")
+    if arguments.solve_lens is not None:
+        if arguments.solve_lens.suffix != ".toml":
+            raise DappledError(f"{arguments.solve_lens}: the name of a camera profile must end in .toml")
+        refuse_existing(arguments, arguments.solve_lens)
+    for flight in arguments.against or ():
+        layout.open_folder(flight)
+    if len({flight.resolve().name for flight in arguments.against or ()}) < len(arguments.against or ()):
+        raise DappledError("--against names a flight twice")
+    if arguments.output is not None:  # a folder that the user named: its report is of the last call
+        refuse_existing(arguments, *_outputs(output, arguments))
+
+
+def _outputs(output: Path, arguments: argparse.Namespace) -> Iterator[Path]:
+    """What the call will write, but for the report; of single frames, what is there of these kinds."""
+    several = arguments.against is not None and len(arguments.against) > 1
+    for kind in arguments.kinds:
+        if kind == "difference" and several:
+            yield from (output / name for name in ("trend.tif", "height-trend.tif"))
+            yield from (output / f"difference-{flight.name}.tif" for flight in arguments.against)
+            yield from (output / f"height-difference-{flight.name}.tif" for flight in arguments.against)
+            continue
+        yield from (output / name for name in _FILES[kind])
+        if arguments.each and kind in _EACH:
+            yield from (output / "frames").glob(f"*{_EACH[kind]}")
+
+
 def _heights(made: Survey, arguments: argparse.Namespace, progress: Progress) -> TerrainModel:
     low, high = arguments.between or (None, None)
     return terrain.of(made, progress, lowest_m=low, highest_m=high)
 
 
-def _compare(
+def _frame_depths(arguments: argparse.Namespace, stack: ExitStack) -> FrameDepths:
+    """What measures single frames while they are decoded."""
+    scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-depths-")))
+    return FrameDepths(scratch, lambda found: found.depth(), arguments.focus)
+
+
+def _changes(
     made: Survey,
-    other: Survey,
     heights: TerrainModel | None,
     output: Path,
-    *,
     arguments: argparse.Namespace,
+    *,
     progress: Progress,
-) -> Iterator[Path]:
-    """Write the rasters of the change up to the flight of --against; yields each path."""
-    changed = difference.of_pictures(made, other)
-    yield difference.write(made, other, changed, output / "difference.tif", "share of brightness")
-    if heights is not None:
-        raised = difference.of_heights(heights, _heights(other, arguments, progress))
-        yield difference.write(made, other, raised, output / "height-difference.tif", "m")
+    missing: list[str],
+) -> list[Path]:
+    """Write the change up to each flight of --against and, of several, the change over time."""
+    files: list[Path] = []
+    times, names = [difference.time_ns(made)], list[str]()
+    pictures, raised = list[MapDifference](), list[MapDifference]()
+    several = len(arguments.against) > 1
+    for flight in arguments.against:
+        tail = f"-{flight.name}" if several else ""
+        with ExitStack() as stack:
+            try:
+                other = _survey(flight, _for_the_other(arguments, made), progress, stack, missing)
+                changed = difference.of_pictures(made, other)
+                path = output / f"difference{tail}.tif"
+                files.append(difference.write(made, other, changed, path, "share of brightness"))
+                pictures.append(changed)
+                times.append(difference.time_ns(other))
+                names.append(other.flight)
+                if heights is not None:
+                    raised.append(difference.of_heights(heights, _heights(other, arguments, progress)))
+                    files.append(
+                        difference.write(made, other, raised[-1], output / f"height-difference{tail}.tif", "m")
+                    )
+            except DappledError as error:
+                missing.append(f"no difference to {flight}: {error}")
+    if several:
+        kinds = (("trend.tif", pictures, "share of brightness"), ("height-trend.tif", raised, "m"))
+        for name, changes, unit in kinds[: 1 if heights is None else 2]:
+            if len(changes) < len(arguments.against):
+                missing.append(f"no {name}: not every flight could be compared")
+                continue
+            try:
+                made_trend = difference.over_time(times, changes)
+                files.append(difference.write_trend(made, made_trend, names, output / name, unit))
+            except DifferenceError as error:
+                missing.append(f"no {name}: {error}")
+    return files
 
 
 def _for_the_other(arguments: argparse.Namespace, made: Survey) -> argparse.Namespace:
-    """The arguments for the flight of --against, without those that name frames of the first flight."""
-    return argparse.Namespace(**{**vars(arguments), "crs": made.projection.name, "frames": None, "gcp": None})
+    """The arguments for a flight of --against, without those that name frames of the first flight."""
+    same = {"gsd": made.gsd_m} if len(arguments.against) > 1 else {}  # a trend needs one grid
+    return argparse.Namespace(**{**vars(arguments), "crs": made.projection.name, "frames": None, "gcp": None,
+                                 "solve_lens": None, **same})  # fmt: skip
 
 
 def _survey(
-    flight: Path, arguments: argparse.Namespace, progress: Progress, stack: ExitStack, missing: list[str]
+    flight: Path,
+    arguments: argparse.Namespace,
+    progress: Progress,
+    stack: ExitStack,
+    missing: list[str],
+    *,
+    watch: Watch | None = None,
 ) -> Survey:
-    """Decode, place and refine a flight as the arguments say. Adds what could not be done to `missing`."""
+    """Decode, place and refine a flight as the arguments say; `watch` gets each decoded frame. Adds what could
+    not be done to `missing`."""
     facts = layout.read_facts(layout.open_folder(flight))
-    made = georeference.survey(flight, recipe(flight, facts, arguments), options(facts, arguments), progress, stack)
+    made = georeference.survey(
+        flight, recipe(flight, facts, arguments), options(facts, arguments), progress, stack, watch=watch
+    )
+    if arguments.solve_lens is not None:
+        sigmas = _pose_sigmas(arguments)
+        made = georeference.with_own_lens(made, control=arguments.gcp, sigmas=sigmas, progress=progress)
     rasters = [Path(word) for word in arguments.refine if word != "neighbours"]
     if len(rasters) > 1:
         raise DappledError(f"--refine takes one base map, not {len(rasters)}")
@@ -192,16 +313,28 @@ def _survey(
 
 
 def _refined(made: Survey, base: Path | None, arguments: argparse.Namespace, progress: Progress) -> Survey:
-    sigmas = arguments.pose_sigma
     return georeference.refined(
         made,
         base=base,
         neighbours="neighbours" in arguments.refine,
         control=arguments.gcp,
         search_m=arguments.search,
-        sigmas=None if sigmas is None else (sigmas[0], math.radians(sigmas[1])),
+        sigmas=_pose_sigmas(arguments),
         progress=progress,
     )
+
+
+def _pose_sigmas(arguments: argparse.Namespace) -> tuple[float, float] | None:
+    given = arguments.pose_sigma
+    return None if given is None else (given[0], math.radians(given[1]))
+
+
+def _camera(flight: Path, arguments: argparse.Namespace) -> str:
+    """The name of the camera's profile."""
+    if arguments.camera is not None:
+        return str(arguments.camera)
+    _, tags = photographs.recorded(flight)
+    return next(iter(tags.values())).camera
 
 
 def _draw(made: Survey, output: Path, arguments: argparse.Namespace) -> list[Path]:

@@ -57,12 +57,14 @@ def _configure_mavlink(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="ask for the passphrase that the ground station was given (default: a random key)",
     )
+    key.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     if arguments.verb == "mavlink":
         make_key(arguments.file, _passphrase() if arguments.passphrase else None)
-        print(f'{arguments.file}: a key for this user alone; set keys = ["{arguments.file.absolute()}"] in [mavlink]')
+        words = f'{arguments.file}: a key for this user alone; set keys = ["{arguments.file.absolute()}"] in [mavlink]'
+        print(json.dumps({"key_file": str(arguments.file)}) if arguments.json else words)
         return 0
     match arguments.action:
         case "make":

@@ -63,7 +63,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--telemetry",
         type=Path,
         metavar="FILE",
-        help="telemetry for a folder of frames: a .tlog, or ArduPilot's own log, a .bin (default: the only one in it)",
+        help="telemetry for a folder of frames: a .tlog, or the autopilot's own log (ArduPilot's .bin, PX4's .ulg)\n"
+        "(default: the only one in it)",
     )
     parser.add_argument("--white", metavar="FILE", help="white frame")
     parser.add_argument("--dark", metavar="FILE", help="dark frame")

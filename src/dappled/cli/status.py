@@ -53,10 +53,13 @@ def run(arguments: argparse.Namespace) -> int:
 def stream_endpoint(config: Path | None, service: Path = SERVICE_FOLDER) -> str:
     """Endpoint of the daemon on this machine: the one in the settings, else this user's own, else the service's.
 
-    Raises ConfigError, and WireError if this user may not open the service's folder.
+    Settings with another name beside the service's (/etc/dappled/left.toml) are those of `dappled@left`, which has a
+    folder of its own. Raises ConfigError, and WireError if this user may not open the service's folder.
     """
     endpoint = settings.load(config).publish.slices
     ours = settings.runtime_folder() / "slices"
+    if config is not None and config.absolute().parent.name == "dappled" and config.stem != "dappled":
+        service = service.with_name(f"{service.name}-{config.stem}")
     if endpoint != f"ipc://{ours}" or ours.parent == service or not service.is_dir() or is_listening(endpoint):
         return endpoint
     if not os.access(service, os.X_OK):

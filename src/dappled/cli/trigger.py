@@ -8,13 +8,23 @@ from pathlib import Path
 
 from dappled.cli.arguments import seconds, whole
 from dappled.cli.terminal import waiting_for
+from dappled.config import settings
 from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
+from dappled.drivers.mavlink import LinkError, parse
+
+DEFAULT_URL = "udpout:127.0.0.1:14550"
+_CALLED_AT = {"udpin": "udpout", "tcpin": "tcp"}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "example: dappled trigger --url udpout:127.0.0.1:14550 --count 3 --interval 2"
-    parser.add_argument(
-        "--url", default="udpout:127.0.0.1:14550", help="pymavlink connection string (default: %(default)s)"
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--url", help=f"pymavlink connection string (default: {DEFAULT_URL})")
+    where.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="the daemon's settings file, which names its link",
     )
     parser.add_argument("--count", type=whole, default=1, metavar="N", help="number of photographs (default: 1)")
     parser.add_argument(
@@ -32,8 +42,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    with GroundClient(arguments.url, key_file=arguments.key) as client:
-        with waiting_for(f"a camera on {arguments.url}"):
+    url, key = _link(arguments)
+    with GroundClient(url, key_file=key) as client:
+        with waiting_for(f"a camera on {url}"):
             client.find_camera(arguments.timeout)
         outcomes = client.capture(
             arguments.count,
@@ -42,6 +53,23 @@ def run(arguments: argparse.Namespace) -> int:
             on_outcome=lambda one: print(_json(one) if arguments.json else _line(one), flush=True),
         )
     return 0 if all(one.ok for one in outcomes) else 1
+
+
+def _link(arguments: argparse.Namespace) -> tuple[str, Path | None]:
+    """The url to call at, and its key. Raises LinkError where the settings file names no link that can be called."""
+    if arguments.config is None:
+        return arguments.url or DEFAULT_URL, arguments.key
+    mavlink = settings.load(arguments.config).mavlink
+    for number, url in enumerate(mavlink.url):
+        at = parse(url)
+        if at.kind in _CALLED_AT:
+            key = mavlink.link_keys[number]
+            host = "127.0.0.1" if at.host == "0.0.0.0" else at.host  # noqa: S104  # nothing is bound to it here
+            return f"{_CALLED_AT[at.kind]}:{host}:{at.port}", arguments.key or (Path(key) if key else None)
+    raise LinkError(
+        f"{arguments.config} names no link that listens: a ground station reaches the daemon by udpin: or tcpin: in "
+        "mavlink.url, or on the autopilot's network; give --url"
+    )
 
 
 def _line(one: Outcome) -> str:

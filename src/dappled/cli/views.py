@@ -10,11 +10,12 @@ import numpy as np
 
 from dappled.cli import decode_arguments
 from dappled.cli.arguments import add_overwrite, refuse_existing
+from dappled.cli.decode_arguments import FieldCallError
 from dappled.decode.depth.evidence import of_light_field
 from dappled.decode.depth.stereo import shifts_from_middle
 from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.light_field import slice_mosaic
-from dappled.products.exports import prints
+from dappled.products.exports import epi, prints
 from dappled.products.opened import OpenedLightField, OpenError
 
 _LONGEST = 2400  # px
@@ -26,9 +27,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  dappled views frame.zarr --of shifts -o shifts.png"
     )
     decode_arguments.add_field(parser, ranged=False)
-    parser.add_argument("--of", choices=("views", "slices", "shifts", "slice-shifts"), default="views",
+    parser.add_argument("--of", choices=("views", "slices", "shifts", "slice-shifts", "epi"), default="views",
                         help="views (default), slices at their carriers, or shifts: how far each view has\n"
-                        "moved from the middle; slice-shifts: the same for slices, as the thesis tried")  # fmt: skip
+                        "moved from the middle; slice-shifts: the same for slices, as the thesis tried;\n"
+                        "epi: a row and a column of the picture in each view (Fig 54)")  # fmt: skip
+    parser.add_argument("--row", type=int, metavar="N", help="of epi: row of the picture (default: the middle one)")
+    parser.add_argument("--column", type=int, metavar="N", help="of epi: column of the picture")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="picture to write")
     add_overwrite(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -36,12 +40,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     refuse_existing(arguments, arguments.output)
+    if arguments.of != "epi" and (arguments.row, arguments.column) != (None, None):
+        raise FieldCallError(f"--row and --column are of --of epi: leave them out of {arguments.of}")
     found = decode_arguments.opened_field(arguments)
-    made, note = {"views": _views, "slices": _slices, "shifts": _shifts, "slice-shifts": _slice_shifts}[arguments.of](
-        found
-    )
-    prints.save(arguments.output, _small(made))
+    if arguments.of == "epi":
+        made, note = epi.drawn(found.stack, arguments.row, arguments.column), ""
+    else:
+        draw = {"views": _views, "slices": _slices, "shifts": _shifts, "slice-shifts": _slice_shifts}[arguments.of]
+        made, note = draw(found)
+        made = _small(made)
+    prints.save(arguments.output, made)
     count_v, count_u = found.views.shape[:2]
+    note = "; ".join(words for words in (note, decode_arguments.views_words(found.field)) if words)
     if arguments.json:
         facts = {"file": str(arguments.output), "of": arguments.of, "views": list(found.views.shape[:4])}
         print(json.dumps({**facts, **({"note": note} if note else {})}))

@@ -58,6 +58,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Frames:
     return made
 
 
+@pytest.mark.slow
 def test_tables_law_and_pair_of_files(
     frames: Frames, profile: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -86,6 +87,7 @@ def test_tables_law_and_pair_of_files(
     assert "geometric explains these frames" in text
 
 
+@pytest.mark.slow
 def test_a_frame_in_between_is_predicted_to_a_fraction_of_a_bin_and_searched_no_farther_than_its_exif_is_rounded(
     frames: Frames, profile: Path, tmp_path: Path
 ) -> None:
@@ -103,7 +105,8 @@ def test_a_frame_in_between_is_predicted_to_a_fraction_of_a_bin_and_searched_no_
     assert all(b >= a for a, b in zip(near, far, strict=True))
 
 
-def test_frames_of_the_other_law_choose_it_unless_one_is_asked_for(
+@pytest.mark.slow
+def test_frames_of_the_other_law_choose_it_and_refuse_the_one_that_is_asked_for(
     frames: Frames, profile: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["calibrate", *frames("fd"), "--camera", str(profile), "--mask", MASK, "-o", str(tmp_path / "c.toml")]
@@ -111,8 +114,17 @@ def test_frames_of_the_other_law_choose_it_unless_one_is_asked_for(
     told = json.loads(capsys.readouterr().out)
     assert told["law"] == "fd"
     assert "fd explains" in told["verdict"]
-    assert main([*words, "--law", "geometric", "--overwrite"]) == 0
-    assert calibration_files.load(tmp_path / "c.toml").law == "geometric"
+    for written in tmp_path.glob("c.*"):
+        written.unlink()
+    assert main([*words, "--law", "geometric"]) == 1
+    told = capsys.readouterr().err
+    assert "the law geometric was asked for, and does not explain these frames: fd explains these frames" in told
+    assert "leave out --law" in told
+    assert not (tmp_path / "c.toml").exists()
+    assert main([*words, "--law", "geometric", "--anyway"]) == 0
+    made = calibration_files.load(tmp_path / "c.toml")
+    assert made.law == "geometric"
+    assert "asked for, and does not explain" in (made.doubt or "")
 
 
 def test_a_batch_goes_on_past_bad_frames_and_says_so(
@@ -146,6 +158,7 @@ def test_a_wrong_mask_is_told_in_a_sentence(
     assert "\n" not in told
     assert not (tmp_path / "c.toml").exists()
     assert main(["calibrate", *words, "--anyway"]) == 0
+    assert "written with this doubt in it: neither law explains" in capsys.readouterr().err
     assert calibration_files.load(tmp_path / "c.toml").verdict.startswith("neither law explains")
     frame = [*words[:-2], "--calibration", str(tmp_path / "c.toml"), "-o", str(tmp_path / "f.npz")]
     assert main(["decode", *frame]) == 0

@@ -188,7 +188,7 @@ def test_a_kit_is_printed_and_shot_by_its_list(tmp_path: Path, capsys: pytest.Ca
     assert main(words) == 0
     folder = tmp_path / "kit"
     assert {path.name for path in folder.iterdir()} == {
-        "full.png", "full.toml", "diagonal.png", "diagonal.toml", "wedge.png", "target.png", "shots.txt",
+        "full.png", "full.toml", "diagonal.png", "diagonal.toml", "wedge.png", "target.png", "shots.txt", "kit.toml",
     }  # fmt: skip
     for name, carriers in (("full", {(0, 1), (1, 0), (1, 1), (2, 2)}), ("diagonal", {(1, 1), (2, 2)})):
         image = np.asarray(Image.open(folder / f"{name}.png"), dtype=float)
@@ -203,7 +203,19 @@ def test_a_kit_is_printed_and_shot_by_its_list(tmp_path: Path, capsys: pytest.Ca
     assert np.count_nonzero(below < 200) == 100 * 12  # a bar of 100 mm
     told = (folder / "shots.txt").read_text()
     assert told.count("[ ] full: ") == told.count("[ ] bare: ") + 1 == 10
+    assert f"dappled calibrate --kit {folder} -o calibration.toml" in told
     assert "dappled calibrate full/* --camera canon-eos-450d --mask full.toml" in told
+    assert (folder / "kit.toml").read_text().splitlines()[0] == 'camera = "canon-eos-450d"'
     capsys.readouterr()
     assert main(words) == 1
     assert "exists already" in capsys.readouterr().err
+
+
+def test_a_plan_by_a_law_that_no_shadow_obeys_says_what_views_geometry_gives(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = ["--altitude", "40", "--speed", "8", "--camera", "fujifilm-s5200", "--focal-length", "13"]
+    assert main(["plan", *words, "--mask", "mask-2"]) == 0
+    assert (
+        "no shadow can be finer than the mask; the law geometric gives views of 60 × 44 px" in capsys.readouterr().out
+    )

@@ -57,7 +57,7 @@ def run(recipe: Recipe, frames: list[Path], board: str, output: Path, focal_leng
         raise DarkroomError("the frames don't say their focal length: give --focal-length")
     profile = darkroom.camera(model)
     fit = chessboard.fit(seen, grids, board=size, sensor=profile.sensor(shape), focal_length_mm=length)
-    _write(recipe.camera if recipe.camera != "auto" else profile.name, fit.lens, output)
+    write(recipe.camera if recipe.camera != "auto" else profile.name, fit.lens, output)
     y, x = fit.lens.principal_point_mm
     print(f"{counted(fit.boards, 'board')}, residual {fit.residual_um:.2f} µm on the chip")
     print(f"v = {fit.lens.v_mm:.3f} ± {fit.v_sigma_mm:.3f} mm at {length:g} mm, principal point {y:+.3f}, {x:+.3f} mm")
@@ -88,7 +88,8 @@ def _size(shape: tuple[int, int]) -> str:
     return f"{shape[0]} × {shape[1]} px"
 
 
-def _write(camera: str, lens: profiles.Lens, output: Path) -> None:
+def write(camera: str, lens: profiles.Lens, output: Path) -> None:
+    """Write a copy of a camera's profile with this lens."""
     tables = profiles.tables(camera, "cameras")
     others = [one for one in tables.get("lens", []) if abs(one["focal_length_mm"] / lens.focal_length_mm - 1) > 0.01]
     mine = {

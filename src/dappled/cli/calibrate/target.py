@@ -59,7 +59,8 @@ def from_frames(
     lengths: set[float | None] = set()
     lens: Ranging | None = None
     for path, distance in zip(tqdm(frames, unit="frame", disable=not sys.stderr.isatty()), metres, strict=True):
-        field = OpenedLightField(darkroom.decode(path, focal_length_mm=focal_length_mm).light_field, path)
+        made = darkroom.decode(path, focal_length_mm=focal_length_mm, joint_views=False)  # depth is made from slices
+        field = OpenedLightField(made.light_field, path)
         with darkroom.naming(path):
             targets.append(Target(distance, *target_shift(field.depth(), field.stack)))
         stops.add(None if recipe.mask == profiles.LENSLET else field.attributes.get("f_number"))

@@ -1,4 +1,4 @@
-"""`dappled flight list|show|check|report|seal|offload|pickup`: work with recorded flights."""
+"""`dappled flight list|show|check|report|coverage|seal|offload|pickup`: work with recorded flights."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from tqdm import tqdm
 
 from dappled.cli import sealing
 from dappled.cli.arguments import Actions
+from dappled.cli.flight import arguments as words
 from dappled.cli.flight import lines as flight_lines
-from dappled.cli.flight import pickup
 from dappled.clock import SystemClock
 from dappled.config import settings
 from dappled.errors import counted, printable
@@ -56,14 +56,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         f"dappled flight offload /media/disk {_FLIGHT}",
         f"dappled flight offload /media/disk {_FLIGHT} --prune",
     )
-    bring = actions.add("pickup", pickup.HELP, *pickup.EXAMPLES)
+    seen = actions.add("coverage", words.COVERAGE_HELP, *words.COVERAGE_EXAMPLES)
+    bring = actions.add("pickup", words.PICKUP_HELP, *words.PICKUP_EXAMPLES)
     listing.add_argument(
         "folder", nargs="?", type=Path, metavar="FOLDER", help="flights folder (default: record.directory)"
     )
     away.add_argument("destination", type=Path, metavar="DEST", help="folder that will hold the flight's folder")
     away.add_argument("--prune", action="store_true", help="then remove the frames here, each by the proof of its copy")
     away.add_argument("--same-device", action="store_true", help="insist on a DEST that is on the same disk")
-    pickup.configure(bring)
+    words.configure_pickup(bring)
+    words.configure_coverage(seen)
     intact.add_argument(
         "--key",
         type=Path,
@@ -73,7 +75,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     signing.add_argument(
         "--key", type=Path, metavar="FILE", help="the key that signs (default: record.seal_key); see dappled keys seal"
     )
-    for one in (show, intact, report, signing, away, bring):
+    for one in (show, intact, report, signing, away, bring, seen):
         one.add_argument(
             "flight", nargs="?", type=Path, metavar="FLIGHT", help="flight folder (default: the last with shots)"
         )
@@ -86,15 +88,26 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.action == "list":
         return _list(arguments.folder or _flights(arguments.config), arguments.json)
     flight = arguments.flight or _last_flight(_flights(arguments.config))
-    if arguments.action == "pickup":
-        return pickup.run(flight, arguments)
-    if arguments.action == "offload":
-        return _offload(flight, arguments)
+    alone = {"pickup": _pickup, "coverage": _coverage, "offload": _offload}
+    if arguments.action in alone:
+        return alone[arguments.action](flight, arguments)
     if arguments.action == "seal":
         return _seal(flight, arguments.config, arguments.key, arguments.json)
     if arguments.action == "check":
         return _check(flight, arguments.config, arguments.key, arguments.json)
     return {"show": _show, "report": _report}[arguments.action](flight, arguments.json)
+
+
+def _pickup(flight: Path, arguments: argparse.Namespace) -> int:
+    from dappled.cli.flight import pickup  # noqa: PLC0415  the decoder and MAVLink: a second that other verbs are spared
+
+    return pickup.run(flight, arguments)
+
+
+def _coverage(flight: Path, arguments: argparse.Namespace) -> int:
+    from dappled.cli.flight import coverage  # noqa: PLC0415  as above, for SciPy and PROJ
+
+    return coverage.run(flight, arguments)
 
 
 def _last_flight(flights: Path) -> Path:

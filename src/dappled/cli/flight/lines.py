@@ -12,6 +12,8 @@ from dappled.flight.checks.flight_check import CheckReport
 from dappled.flight.flight_report import Balance, FlightContents, ListedFlight, ShotLine, SourceReport
 from dappled.flight.offload import Offloaded
 
+_BAD_SHOWN = 20
+
 
 def of_list(one: ListedFlight) -> str:
     """A flight of a list: when it began and what is in it, or why it can't be read."""
@@ -58,6 +60,8 @@ def _of_shot(line: ShotLine, utc_correction_ns: int) -> str:
     if line.result:
         found = "-" if line.result.carriers_found is None else line.result.carriers_found
         words.append(f"{found}/{line.result.carriers_predicted} carriers")
+        if line.result.verdict is not None:
+            words.append(line.result.verdict[0])
     return "  ".join(words)
 
 
@@ -84,6 +88,11 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
     yield f"  {counted(found.wishes, 'shot', 6)}: {found.safe} safe, {found.failed} failed, {found.open} open"
     frames = counted(found.frames, "frame", 6)
     yield f"  {frames}, {found.size / 1e6:.1f} MB: {found.tagged} tagged, {found.decoded} decoded"
+    if found.judged:
+        yield f"  {'judged':>13}: {', '.join(f'{count} {state}' for state, count in found.judged.items())}"
+        yield from (f"  {'bad':>13}: {text}" for text in found.bad[:_BAD_SHOWN])
+        if len(found.bad) > _BAD_SHOWN:
+            yield f"  {'':13}  and {len(found.bad) - _BAD_SHOWN} more bad ones (--json names all)"
     if found.following:
         yield f"  {found.following:6d} of the failed still have their files in the camera: dappled flight pickup"
     if found.companions:

@@ -16,27 +16,6 @@ from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
 from dappled.errors import counted
 
-HELP = "fetch the files that stayed in the camera; exits 1 if shots still lack files"
-EXAMPLES = (
-    "dappled flight pickup --from /media/card/DCIM --dry-run",
-    "dappled flight pickup ~/flights/20261121T101503Z-0a1b2c3d --from usb: --pair 17=DSCF0042.RAF",
-)
-
-
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--from", dest="source", required=True, metavar="SOURCE", help="folder, storage, usb: or a libgphoto2 port"
-    )
-    parser.add_argument("--offset", type=float, metavar="S", help="the camera's clock minus UTC, if you know it")
-    parser.add_argument("--any-clock", action="store_true", help="the camera's clock may be off by more than a day")
-    parser.add_argument(
-        "--by-order", action="store_true", help="pair files and shots in order, if there are as many of both"
-    )
-    parser.add_argument(
-        "--pair", action="append", default=[], type=_pair, metavar="INDEX=NAME", help="this file belongs to this shot"
-    )
-    parser.add_argument("--dry-run", action="store_true", help="only say what would be done")
-
 
 def run(flight: Path, arguments: argparse.Namespace) -> int:
     source = parse_source(arguments.source, PtpSource)
@@ -100,10 +79,3 @@ def _print_json(flight: Path, proposal: Proposal, picked: Picked | None) -> None
             indent=2,
         )
     )
-
-
-def _pair(text: str) -> tuple[int, str]:
-    index, equals, name = text.partition("=")
-    if not equals or not index.isdecimal() or not name:
-        raise argparse.ArgumentTypeError(f"{text!r} is not INDEX=NAME, as in 17=DSCF0042.RAF")
-    return int(index), name

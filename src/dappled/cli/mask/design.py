@@ -136,7 +136,7 @@ def _as_text(made: Design, instead: Design | None) -> str:
         f"distance   {made.mask_distance_mm:.3f} mm before the sensor",
         f"aperture   {wanted.aperture_mm:.2f} mm (f/{wanted.f_number:g}), {made.baseline_mm:.2f} mm from view to view",
         f"a view     ±{made.bandwidth_per_mm:.2f} cycles/mm, {made.ground_sample_m * 100:.1f} cm of ground per pixel",
-        f"spectrum   {100 * made.spectrum_used:.0f} % used",
+        f"spectrum   {100 * made.spectrum_used:.{0 if made.spectrum_used >= 0.01 else 2}f} % used",
         (
             f"depth      ±{made.depth_sigma_m:.2g} m at {wanted.altitude_m:g} m, "
             f"shifts known to {wanted.shift_sigma_px:g} px per view"

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import tomli_w
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -26,6 +28,7 @@ _PAGE_MM, _PAGE_PX_PER_MM = (297.0, 210.0), 12.0  # A4
 _BAR_MM = 100
 _LENGTHS = 3  # focal lengths: with three, a law's second constant is fitted, too
 _STOPS = (11.0, 22.0, 32.0)
+KIT = "kit.toml"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -36,6 +39,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="fundamental frequency of both masks (default: Mask 2's 11.38)")  # fmt: skip
     parser.add_argument("--negative", action="store_true", help="write negatives (Eq 13), for negative film")
     add_overwrite(parser)
+    parser.add_argument("--json", action="store_true", help="print the files as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -43,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     folder: Path = arguments.folder
     masks = {name: Mask(arguments.frequency, 2, name, "linear") for name in ("full", "diagonal")}
     files = [folder / f"{name}.{ending}" for name in masks for ending in ("png", "toml")]
-    files += [folder / name for name in ("wedge.png", "target.png", "shots.txt")]
+    files += [folder / name for name in ("wedge.png", "target.png", "shots.txt", KIT)]
     refuse_existing(arguments, *files)
     folder.mkdir(parents=True, exist_ok=True)
     for name, mask in masks.items():
@@ -56,8 +60,12 @@ def run(arguments: argparse.Namespace) -> int:
         )
     mask_files.write(folder / "wedge.png", chosen.shape, 8, chosen.px_per_mm, _wedge(chosen))
     Image.fromarray(_target()).save(folder / "target.png", dpi=(25.4 * _PAGE_PX_PER_MM,) * 2)
-    (folder / "shots.txt").write_text(shots(camera, arguments.camera, chosen))
-    print("\n".join(str(one) for one in files))
+    lengths, stops = shot_list(camera)
+    named = str(Path(arguments.camera).resolve()) if arguments.camera.endswith(".toml") else arguments.camera
+    asked = {"camera": named, "focal_lengths_mm": lengths, "f_numbers": stops}
+    (folder / KIT).write_text(tomli_w.dumps(asked))
+    (folder / "shots.txt").write_text(_shots(camera, named, chosen, folder))
+    print(json.dumps({"files": [str(one) for one in files]}) if arguments.json else "\n".join(map(str, files)))
     return 0
 
 
@@ -84,12 +92,17 @@ def _target() -> NDArray[np.uint8]:
     return values
 
 
-def shots(camera: CameraProfile, named: str, chosen: Film) -> str:
-    """What to print, measure, mount and shoot, in order, with the commands that read it."""
+def shot_list(camera: CameraProfile) -> tuple[list[float], list[float]]:
+    """(focal lengths in mm, f-numbers) to shoot with each mask."""
     low, high = camera.focal_length_mm or (18.0, 55.0)
     lengths = np.unique(np.round(np.geomspace(low, high, _LENGTHS)))
     widest, narrowest = camera.f_numbers or (1.0, 64.0)
-    stops = [stop for stop in _STOPS if widest <= stop <= narrowest] or [narrowest]
+    return lengths.tolist(), [stop for stop in _STOPS if widest <= stop <= narrowest] or [narrowest]
+
+
+def _shots(camera: CameraProfile, named: str, chosen: Film, folder: Path) -> str:
+    """What to print, measure, mount and shoot, in order, with the commands that read it."""
+    lengths, stops = shot_list(camera)
     lines = [
         f"Kit for {camera.name}, film {chosen.name}",
         "",
@@ -108,10 +121,10 @@ def shots(camera: CameraProfile, named: str, chosen: Film) -> str:
         "[ ] full: target.png at 1 m and at 4 m, widest stop, one focal length",
         "",
         "Put the files into the folders bare, diagonal and full, and read them:",
-        f"    dappled carriers bare/FILE --camera {named} --mask full.toml        must say: no carriers",
-        f"    dappled calibrate diagonal/* --camera {named} --mask diagonal.toml -o diagonal-calibration.toml",
+        f"    dappled calibrate --kit {folder} -o calibration.toml",
+        "It names the law, the distance and the print's scale with their errors for each mask, whether both agree, and",
+        "what is missing; or it says what can't be told, and ends with 1. The calibration is the full mask's. One",
+        "mask alone:",
         f"    dappled calibrate full/* --camera {named} --mask full.toml -o full-calibration.toml",
-        "The last line of each names the law, the distance and the print's scale with their errors over all focal",
-        "lengths, or says that neither law explains the frames. Both masks must name the same law and distance.",
     ]
     return "\n".join(lines) + "\n"

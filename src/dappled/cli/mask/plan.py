@@ -1,4 +1,4 @@
-"""`dappled mask plan`: the interval, motion blur, frame rate and disk space of a flight at an altitude."""
+"""`dappled plan`, also `dappled mask plan`: interval, motion blur, frame rate and disk space at an altitude."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ EXAMPLE = "dappled mask plan --altitude 40 --speed 8 --camera fujifilm-s5200 --f
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = parser.epilog or f"example: {EXAMPLE.replace('mask plan', 'plan')}"
     mask_arguments.add_altitude(parser)
     parser.add_argument("--speed", type=float, required=True, metavar="M/S", help="speed over ground")
     parser.add_argument(
@@ -44,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
         lattice = carrier_tables.lattice_of(camera.law, mask, sensor, camera.mask_distance_mm, length)
         size = carrier_tables.slice_size(lattice, sensor.shape)
         columns = size[1] if size else None
-        warnings = list(_warnings(camera, mask, sensor, lattice, size))
+        warnings = list(_warnings(camera, mask, sensor, lattice, length))
     made = lenses.plan_survey(
         sensor,
         focal_length_mm=length,
@@ -74,16 +75,20 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _warnings(
-    camera: CameraProfile, mask: Mask, sensor: Sensor, lattice: Lattice, size: tuple[int, int] | None
+    camera: CameraProfile, mask: Mask, sensor: Sensor, lattice: Lattice, focal_length_mm: float
 ) -> Iterator[str]:
     """What the camera's own limits make of this mask."""
+    size = carrier_tables.slice_size(lattice, sensor.shape)
     if size is None:
         yield "the carriers lie too close together for views"
     elif min(size) < SMALL_VIEW_PX:
         yield f"views of {size[1]} × {size[0]} px show little more than large shapes"
     beyond = carrier_tables.beyond_mask(mask, sensor, lattice)
     if beyond is not None:
-        yield beyond
+        by_rays = carrier_tables.lattice_of("geometric", mask, sensor, camera.mask_distance_mm, focal_length_mm)
+        smaller = carrier_tables.slice_size(by_rays, sensor.shape)
+        views = "no views" if smaller is None else f"views of {smaller[1]} × {smaller[0]} px"
+        yield f"{beyond}; the law geometric gives {views}"
     unreachable = mask_arguments.out_of_reach(camera, mask.frequency_per_mm * camera.mask_distance_mm)
     if unreachable is not None:
         yield unreachable

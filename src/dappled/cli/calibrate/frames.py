@@ -1,0 +1,101 @@
+"""Read stopped-down frames for a calibration: what each shows of the mask, and what they show together."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from tqdm import tqdm
+
+from dappled.config import profiles
+from dappled.decode.calibration import Calibration
+from dappled.decode.calibration.fit import CalibrationFrame, from_lattices, lattice_of
+from dappled.decode.calibration.lattice_fit import FrameLattice
+from dappled.drivers.raw.darkroom import Darkroom, DarkroomError
+from dappled.drivers.raw.raw_file import RawFile, exposure, not_linear
+from dappled.errors import DappledError
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationView:
+    """What a calibration frame shows, with its camera and size. `doubts` are why its values may not be linear."""
+
+    shown: FrameLattice
+    shape: tuple[int, int]
+    model: str
+    doubts: tuple[str, ...] = ()
+
+
+def view_of(
+    darkroom: Darkroom,
+    path: Path,
+    focal_length_mm: float | None = None,
+    f_number: float | None = None,
+    anyway: bool = False,
+) -> CalibrationView:
+    """What one frame shows, `anyway` also where it is not linear. Raises DappledError where it can't be used."""
+    raw = darkroom.read(path)
+    length, stop = focal_length_mm or raw.focal_length_mm, f_number or raw.f_number
+    if length is None or stop is None:
+        raise DarkroomError(f"{path} doesn't say its focal length and f-number: give --focal-length and --f-number")
+    bent = not_linear(raw, exposure(raw))
+    if bent and not anyway:
+        raise DarkroomError(f"{path}: {'; '.join(bent)}; --anyway calibrates with it")
+    camera = darkroom.camera(raw.camera_model or "")
+    stops = camera.f_numbers
+    with darkroom.naming(path):
+        plane = darkroom.plane(raw)
+        shape = plane.shape[0], plane.shape[1]
+        shown = lattice_of(
+            CalibrationFrame(plane, length, stop, _focal_sigma_mm(raw, focal_length_mm), stops and stops[1]),
+            camera.sensor(shape),
+            profiles.mask(darkroom.recipe.mask).mask,
+            darkroom.recipe.law or camera.law,
+            camera.mask_distance_mm,
+            workers=2,
+        )
+    return CalibrationView(shown, shape, raw.camera_model or "", tuple(f"{path.name}: {words}" for words in bent))
+
+
+def views_of(
+    darkroom: Darkroom,
+    paths: Sequence[Path],
+    focal_length_mm: float | None = None,
+    f_number: float | None = None,
+    anyway: bool = False,
+) -> tuple[list[CalibrationView], list[tuple[Path, DappledError]]]:
+    """What the good frames show, and why the others can't be used. All are of one camera and size."""
+    good: list[CalibrationView] = []
+    bad: list[tuple[Path, DappledError]] = []
+    for path in tqdm(paths, unit="frame", disable=len(paths) < 2 or not sys.stderr.isatty()):
+        try:
+            one = view_of(darkroom, path, focal_length_mm, f_number, anyway)
+            if good and (one.shape, one.model) != (good[0].shape, good[0].model):
+                first, this = (f"{s.model} {s.shape[0]} × {s.shape[1]}" for s in (good[0], one))
+                raise DarkroomError(f"{path} is of another camera or size ({this}, the first {first})")
+            good.append(one)
+        except DappledError as error:
+            bad.append((path, error))
+    return good, bad
+
+
+def _focal_sigma_mm(raw: RawFile, named_mm: float | None) -> float:
+    """The standard error of a frame's focal length, which EXIF rounds within ± focal_sigma_mm; 0 if it is named."""
+    return 0.0 if named_mm or raw.focal_sigma_mm is None else raw.focal_sigma_mm / math.sqrt(3)
+
+
+def fit_views(darkroom: Darkroom, seen: Sequence[CalibrationView], *, choose_law: bool = False) -> Calibration:
+    """The calibration that these frames show together; with `choose_law` also which law explains them best."""
+    camera = darkroom.camera(seen[0].model)
+    found = from_lattices(
+        [one.shown for one in seen],
+        sensor=camera.sensor(seen[0].shape),
+        mask=profiles.mask(darkroom.recipe.mask).mask,
+        law=darkroom.recipe.law or camera.law,
+        mask_distance_mm=camera.mask_distance_mm,
+        choose_law=choose_law,
+    )
+    return replace(found, doubts=(*found.doubts, *(doubt for one in seen for doubt in one.doubts)))

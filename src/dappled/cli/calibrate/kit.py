@@ -1,0 +1,344 @@
+"""`dappled calibrate --kit`: read frames shot by the list of `dappled mask kit`: law, distance, print scale."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dappled.cli import decode_arguments
+from dappled.cli.calibrate.frames import fit_views, view_of, views_of
+from dappled.cli.mask.kit import KIT
+from dappled.config.schema import ConfigError, read_toml
+from dappled.decode.calibration import Calibration, report
+from dappled.decode.calibration.law_choice import EXPLAINED_BINS, LawFit
+from dappled.decode.errors import NoCarriers
+from dappled.drivers.raw import calibration_files
+from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.raw_file import exposure
+from dappled.errors import DappledError, counted
+
+_MASKS = ("diagonal", "full")
+_DARK_SHARE = 0.05  # of white: a white frame so dark was not exposed
+_SAME_LENGTH, _SAME_STOP = 0.1, 0.15  # relative: a zoom is set by eye; f/22 may be f/22.6
+_TOLD = 0.1  # relative: a distance with a larger error is not told
+_AGREE = 3.0  # standard errors between the two masks
+_REMOUNTED_MM = 0.1  # by which a film's distance may differ after it was mounted again
+
+
+class KitError(DappledError):
+    """A kit's folder can't be read; one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class MaskResult:
+    """What the frames of one mask show: `used` frames, `unseen` ones in which no carrier can be seen at their stop.
+
+    `fit` is the law that explains them, as fitted; None where no frame shows carriers, or neither law explains them.
+    `shots` are the focal lengths and f-numbers of the used frames.
+    """
+
+    used: int
+    unseen: int
+    found: Calibration | None
+    fit: LawFit | None
+    shots: tuple[tuple[float, float], ...] = ()
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Add --kit."""
+    group = parser.add_argument_group("test kit")
+    group.add_argument("--kit", type=Path, metavar="FOLDER", help="read the frames that were shot by the list of\n"
+                       "`dappled mask kit`, from its folders bare, diagonal and full: which law, distance and print\n"
+                       "scale; exit 1 if in doubt. -o is optional, and takes the full mask's calibration")  # fmt: skip
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read a kit's frames, print what they say, and write the full mask's calibration where it was asked for."""
+    folder: Path = arguments.kit
+    if arguments.frames or arguments.mask:
+        raise ConfigError("--kit reads the frames and masks of its folder: leave out FRAME and --mask")
+    asked = _asked(folder)
+    if arguments.camera == "auto":
+        arguments.camera = asked["camera"]
+    doubts: list[str] = []
+    results = {name: _mask_result(arguments, folder, name, asked, doubts) for name in _MASKS}
+    bare = _bare(arguments, folder, results["diagonal"].shots, doubts)
+    agree = _agree(results, doubts)
+    full = results["full"].found
+    written = False
+    if arguments.output is not None and full is not None and (arguments.anyway or not doubts):
+        written = True
+        calibration_files.save(arguments.output, replace(full, doubts=tuple(doubts)))
+    if arguments.json:
+        print(json.dumps(_values(arguments.camera, results, bare, agree, doubts), indent=2))
+    else:
+        print("\n".join(_lines(results, bare, agree)))
+        if written:
+            print(f"written to {' and '.join(map(str, calibration_files.pair(arguments.output)))}")
+    for doubt in doubts:
+        print(f"dappled calibrate: in doubt: {doubt}", file=sys.stderr)
+    if arguments.output is not None and full is None:
+        print("dappled calibrate: nothing written: no frame of the full mask shows its carriers", file=sys.stderr)
+    unwritten = arguments.output is not None and not written
+    return 1 if unwritten or (doubts and not arguments.anyway) else 0
+
+
+def _asked(folder: Path) -> dict[str, Any]:
+    """What the kit's list asks for: camera, focal lengths, f-numbers. Raises KitError for a folder that is no kit."""
+    path = folder / KIT
+    if not path.is_file():
+        raise KitError(f"{folder} is no test kit, it has no {KIT}: name the folder that dappled mask kit wrote")
+    asked = read_toml(path)[0]
+    numbers = [asked.get(name) for name in ("focal_lengths_mm", "f_numbers")]
+    if not isinstance(asked.get("camera"), str) or not all(
+        isinstance(row, list) and row and all(isinstance(one, int | float) and one > 0 for one in row)
+        for row in numbers
+    ):
+        raise KitError(
+            f"{path} doesn't name camera, focal_lengths_mm and f_numbers: write it again with dappled mask kit"
+        )
+    return asked
+
+
+def _darkroom(arguments: argparse.Namespace, folder: Path, name: str) -> Darkroom:
+    arguments.mask = str(folder / f"{name}.toml")
+    darkroom = Darkroom(decode_arguments.recipe(arguments))
+    darkroom.check()
+    return darkroom
+
+
+def _frames(folder: Path) -> list[Path]:
+    return decode_arguments.frames([folder]) if folder.is_dir() and any(folder.iterdir()) else []
+
+
+def _mask_result(
+    arguments: argparse.Namespace, folder: Path, name: str, asked: dict[str, Any], doubts: list[str]
+) -> MaskResult:
+    """What the frames of one mask show. Appends what speaks against it to `doubts`."""
+    darkroom = _darkroom(arguments, folder, name)
+    paths = _frames(folder / name)
+    seen, bad = views_of(darkroom, paths, arguments.focal_length, arguments.f_number, arguments.anyway)
+    blank = [none for _, error in bad if (none := _no_carriers(error)) is not None]
+    unseen = [none for none in blank if not none.expected]
+    doubts += [str(error) for _, error in bad if (none := _no_carriers(error)) is None or none.expected]
+    used = tuple((one.shown.focal_length_mm, one.shown.f_number) for one in seen)
+    shot = [*used, *((none.focal_length_mm, none.f_number) for none in blank)]
+    doubts += _missing(name, shot, len(paths), asked)
+    if not seen:
+        if unseen:
+            doubts.append(f"{name}: no frame shows carriers ({unseen[0]}): nothing is known of this mask")
+        return MaskResult(0, len(unseen), None, None)
+    if name == "diagonal":
+        doubts += _mixed_up(arguments, folder, paths, bad)
+    found = fit_views(darkroom, seen, choose_law=not arguments.law)
+    stated = darkroom.camera(seen[0].model).mask_distance_mm
+    fits = report.law_fits(found, stated)
+    fit = next((one for one in fits if one.law == found.law and one.explains), None)
+    doubts += [f"{name}: {words}" for words in (*found.doubts, *_untold(found, fits, fit))]
+    return MaskResult(len(seen), len(unseen), found, fit, used)
+
+
+def _no_carriers(error: DappledError) -> NoCarriers | None:
+    """What says that a frame shows no carriers; None for any other error."""
+    cause = error if isinstance(error, NoCarriers) else error.__cause__
+    return cause if isinstance(cause, NoCarriers) else None
+
+
+def _missing(name: str, shot: Sequence[tuple[float, float]], there: int, asked: dict[str, Any]) -> list[str]:
+    """The shots of the list that no frame is of, in a sentence.
+
+    `shot` are focal lengths and f-numbers of the frames that tell them; each other one of all that are `there` may be
+    any shot.
+    """
+    untold = there - len(shot)
+    wanted = [(length, stop) for length in asked["focal_lengths_mm"] for stop in asked["f_numbers"]]
+    lacking = [(length, stop) for length, stop in wanted if not _among(shot, length, stop)]
+    missing = len(lacking) - untold
+    if missing <= 0:
+        return []
+    shots = ", ".join(f"{length:g} mm at f/{stop:g}" for length, stop in lacking)
+    if untold:
+        return [f"{name}: {counted(missing, 'shot')} of {len(wanted)} missing, among {shots}"]
+    return [
+        f"{name}: {counted(missing, 'shot')} of {len(wanted)} missing: {shots if there else 'the folder has no frame'}"
+    ]
+
+
+def _among(shots: Sequence[tuple[float, float]], length_mm: float, f_number: float) -> bool:
+    """Whether one of the shots has this focal length and f-number."""
+    return any(
+        abs(math.log(its_length / length_mm)) < _SAME_LENGTH and abs(math.log(its_stop / f_number)) < _SAME_STOP
+        for its_length, its_stop in shots
+    )
+
+
+def _mixed_up(
+    arguments: argparse.Namespace, folder: Path, paths: Sequence[Path], bad: Sequence[tuple[Path, DappledError]]
+) -> list[str]:
+    """A sentence where a frame of the diagonal mask shows the full one: films or folders were exchanged."""
+    path = next(one for one in paths if one not in {refused for refused, _ in bad})
+    if not _shows_full(arguments, folder, path):
+        return []
+    shows = f"{path} shows the orders (0, 1) and (1, 0) of the full mask"
+    return [f"{shows}: another film was in the camera, or its frames lie in the wrong folder"]
+
+
+def _shows_full(arguments: argparse.Namespace, folder: Path, path: Path) -> bool:
+    """Whether a frame shows the full mask."""
+    full = _darkroom(arguments, folder, "full")
+    try:
+        view_of(full, path, arguments.focal_length, arguments.f_number, arguments.anyway)
+    except DappledError:
+        return False
+    return True
+
+
+def _untold(found: Calibration, fits: Sequence[LawFit], fit: LawFit | None) -> list[str]:
+    """What the frames of one mask leave open, in sentences."""
+    if fit is None:
+        geometric = next(one for one in fits if one.law == "geometric")
+        if geometric.rms_bins <= EXPLAINED_BINS and abs(geometric.print_scale - 1) > 0.01:
+            off = 1 / geometric.print_scale
+            return [f"{found.verdict}; was the film printed at {off:.1%} of its size? Print it at 100 %"]
+        return [found.verdict]
+    able = [one.law for one in fits if one.explains]
+    open_ = [] if len(able) == 1 else [f"cannot tell the law: {' and '.join(able)} both explain these frames"]
+    sigma, apart = fit.distance_sigma_mm, "cannot tell the mask's distance from the print's scale"
+    if fit.law == "geometric" and sigma is None:
+        open_.append(f"{apart} with one focal length at one f-number: shoot the list")
+    elif fit.law == "geometric" and sigma is not None and sigma > _TOLD * fit.mask_distance_mm:
+        found_mm = f"{fit.mask_distance_mm:.2f} ± {sigma:.2f} mm"
+        open_.append(f"{apart} ({found_mm}): shoot the list's focal lengths and stops")
+    return open_
+
+
+def _bare(arguments: argparse.Namespace, folder: Path, shown: Sequence[tuple[float, float]], doubts: list[str]) -> int:
+    """How many frames without a mask show no carriers where a mask would. Every mask has the diagonal one's lattice.
+
+    `shown` are the focal lengths and f-numbers at which the diagonal mask's own frames show them: what the f-number
+    alone leaves open, since stops differ in shape.
+    """
+    darkroom = _darkroom(arguments, folder, "diagonal")
+    paths = _frames(folder / "bare")
+    if not paths:
+        doubts.append(
+            "bare: no frame without a mask: nothing tells the mask's carriers from what the camera makes itself"
+        )
+    clean = blind = 0
+    for path in paths:
+        if (mean := exposure(darkroom.read(path)).mean_share) < _DARK_SHARE:
+            doubts.append(
+                f"{path}: only {mean:.1%} of white on average, which shows nothing: was the cap on? Expose more"
+            )
+            continue
+        try:
+            view_of(darkroom, path, arguments.focal_length, arguments.f_number, arguments.anyway)
+        except DappledError as error:
+            none = _no_carriers(error)
+            if none is None:
+                doubts.append(str(error))
+            elif _shows_full(arguments, folder, path):
+                doubts.append(f"{path} shows the mask's carriers without a mask: the full mask was in the camera")
+            elif none.expected or _among(shown, none.focal_length_mm, none.f_number):
+                clean += 1
+            else:
+                blind += 1
+            continue
+        doubts.append(
+            f"{path} shows the mask's carriers without a mask: a film was in the camera, or the frame is another's"
+        )
+    if blind and not clean:
+        doubts.append(
+            f"bare: at the stop of {counted(blind, 'frame')} no carrier could be seen with a mask, either: stop down"
+        )
+    return clean
+
+
+def _agree(results: dict[str, MaskResult], doubts: list[str]) -> bool | None:
+    """Whether both masks show one law, distance and print scale; None where one of them tells no distance."""
+    first, second = (results[name].fit for name in _MASKS)
+    if first is None or second is None:
+        return None
+    if first.law != second.law:
+        doubts.append(f"the masks disagree: diagonal shows the law {first.law}, full {second.law}")
+        return False
+    if first.law == "geometric" and None in (first.distance_sigma_mm, second.distance_sigma_mm):
+        return None  # a distance that was stated, not measured
+    apart = []
+    off = second.mask_distance_mm - first.mask_distance_mm
+    if abs(off) > _REMOUNTED_MM + _AGREE * _both(first.distance_sigma_mm, second.distance_sigma_mm):
+        apart.append(f"distances of {first.mask_distance_mm:.3f} and {second.mask_distance_mm:.3f} mm")
+    error = _AGREE * _both(first.print_scale_sigma, second.print_scale_sigma)
+    if first.law == "geometric" and error > 0 and abs(second.print_scale - first.print_scale) > error:
+        apart.append(f"prints of {first.print_scale:.4f} and {second.print_scale:.4f} times their design")
+    if apart:
+        doubts.append(f"the masks disagree: {', '.join(apart)} (diagonal, full)")
+    return not apart
+
+
+def _both(first: float | None, second: float | None) -> float:
+    return math.hypot(first or 0.0, second or 0.0)
+
+
+def _values(
+    camera: str, results: dict[str, MaskResult], bare: int, agree: bool | None, doubts: list[str]
+) -> dict[str, Any]:
+    def of(one: MaskResult) -> dict[str, Any]:
+        fit, found = one.fit, one.found
+        return {
+            "frames_used": one.used,
+            "frames_unseen": one.unseen,
+            "law": None if fit is None else fit.law,
+            "mask_distance_mm": None if fit is None else fit.mask_distance_mm,
+            "mask_distance_sigma_mm": None if fit is None else fit.distance_sigma_mm,
+            "print_scale": None if fit is None else fit.print_scale,
+            "print_scale_sigma": None if fit is None else fit.print_scale_sigma,
+            "pupil_mm": None if fit is None else fit.pupil_mm,
+            "rotation_rad": None if found is None else float(np.mean([length.rotation_rad for length in found.fits])),
+            "verdict": None if found is None else found.verdict,
+        }
+
+    return {
+        "camera": camera,
+        "masks": {name: of(one) for name, one in results.items()},
+        "bare_clean": bare,
+        "agree": agree,
+        "doubts": doubts,
+    }
+
+
+def _distance(fit: LawFit) -> str:
+    """A mask's distance, and how it is known: `fd` fits one without an error, `geometric` keeps the stated one."""
+    if fit.distance_sigma_mm is not None:
+        return f"{fit.mask_distance_mm:.3f} ± {fit.distance_sigma_mm:.3f} mm"
+    known = "stated" if fit.law == "geometric" else "fitted, error unknown"
+    return f"{fit.mask_distance_mm:.3f} mm ({known})"
+
+
+def _lines(results: dict[str, MaskResult], bare: int, agree: bool | None) -> list[str]:
+    lines = []
+    for name, one in results.items():
+        none = f", no carrier can be seen at the stop of {counted(one.unseen, 'other')}" if one.unseen else ""
+        lines.append(f"{name}: {counted(one.used, 'frame')} used{none}")
+        if one.fit is None:
+            lines.append("  law: cannot tell")
+            continue
+        fit = one.fit
+        lines.append(f"  law {fit.law}, mask {_distance(fit)} before the sensor")
+        if fit.law == "geometric":
+            error = "" if fit.print_scale_sigma is None else f" ± {fit.print_scale_sigma:.4f}"
+            lines.append(f"  print {fit.print_scale:.4f}{error} times as fine as its design")
+        if fit.pupil_mm is not None:
+            lines.append(f"  exit pupil at the focal length {fit.pupil_mm:+.1f} mm")
+    lines.append(f"bare: {counted(bare, 'frame')} without carriers")
+    if agree is not None:
+        lines.append("the masks agree" if agree else "the masks disagree")
+    return lines
