@@ -130,7 +130,7 @@ def dask(folder: Path, count: int) -> Iterator[str]:
         from distributed import Client  # noqa: PLC0415  an extra, and slow to import
 
         url = str(json.loads(facts.read_text())["address"])
-        with Client(url, set_as_default=False) as client:  # type: ignore[no-untyped-call]  # untyped
+        with Client(url, set_as_default=False) as client:
             client.wait_for_workers(count, timeout=60)
         yield url
     finally:

@@ -5,7 +5,8 @@ python benchmarks/mavlink.py [--json] [--seconds 30] [--nice -5]
 
 The daemon runs in processes of its own, as a user starts it. An acknowledgement is timed from the moment before a
 command is sent to the kernel's stamp on the answer's arrival, so that a busy machine is not held against the answer
-where only this program was late to read it.
+where only this program was late to read it. `echo_ms` is the same of a program that does nothing but return each
+datagram, with the daemon's niceness, asked in turn with the daemon: what the machine's scheduler takes alone.
 """
 
 from __future__ import annotations
@@ -88,7 +89,12 @@ def under_load(folder: Path, seconds: float, nice: int) -> dict[str, float]:
         camera=replace(base.camera, max_pending=1),
     )
     simulation = Simulation(World(), base, folder)
-    with simulation as settings, daemon(settings, folder, nice) as process, Station(port) as station:
+    with (
+        simulation as settings,
+        daemon(settings, folder, nice) as process,
+        echoing(nice) as echo,
+        Station(port, echo) as station,
+    ):
         station.find()
         stop = threading.Event()
         sender = threading.Thread(target=station.telemetry, args=(RATE_HZ, stop))
@@ -117,6 +123,7 @@ def under_load(folder: Path, seconds: float, nice: int) -> dict[str, float]:
         **_spread("ack_ms_decoding", decoding),
         "cores_busy_meanwhile": busy,
         **_spread("ack_ms_camera_hung", hung),
+        **_spread("echo_ms", station.echoes),
         **_spread("request_to_trigger_call_ms", calls),
     }
 
@@ -124,11 +131,9 @@ def under_load(folder: Path, seconds: float, nice: int) -> dict[str, float]:
 class Station:
     """A ground station at one port of the daemon's: raw bytes, kernel's times."""
 
-    def __init__(self, port: int) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-        self._socket.connect(("127.0.0.1", port))
+    def __init__(self, port: int, echo: int = 0) -> None:
+        self._socket, self._echo = _stamped(port), _stamped(echo)
+        self.echoes: list[float] = []
         self._packer = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
         self._vehicle = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         self._decode = mavlink.MAVLink(None).decode
@@ -139,6 +144,7 @@ class Station:
 
     def __exit__(self, *_: object) -> None:
         self._socket.close()
+        self._echo.close()
 
     def find(self) -> None:
         """Wait for the camera's heartbeat."""
@@ -182,8 +188,21 @@ class Station:
             else:
                 took = self.command(mavlink.MAV_CMD_REQUEST_CAMERA_CAPTURE_STATUS, 1)
             times.append(1000.0 if took is None else took)
-            time.sleep(0.05)
+            time.sleep(0.025)
+            self._ask_echo()
+            time.sleep(0.025)
         return times
+
+    def _ask_echo(self) -> None:
+        asked_ns = time.time_ns()
+        self._echo.send(b"echo")
+        self._echo.settimeout(1.0)
+        try:
+            _, extra, _, _ = self._echo.recvmsg(64, 64)
+        except TimeoutError:
+            self.echoes.append(1000.0)
+            return
+        self.echoes.append((_arrival_ns(extra) - asked_ns) / 1e6)
 
     def telemetry(self, rate: int, stop: threading.Event) -> None:
         """Attitude and position of system 1, so many a second."""
@@ -215,10 +234,44 @@ class Station:
                 continue
             message = self._decode(bytearray(data))
             if message.get_type() == kind:
-                ((_, _, stamp),) = extra
-                seconds, nanoseconds = struct.unpack("qq", stamp)
-                return seconds * 10**9 + nanoseconds, message
+                return _arrival_ns(extra), message
         return None
+
+
+def _stamped(port: int) -> socket.socket:
+    """A UDP socket to a port of loopback, on whose datagrams the kernel stamps their arrival."""
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+    made.connect(("127.0.0.1", port))
+    return made
+
+
+def _arrival_ns(extra: Sequence[tuple[int, int, bytes]]) -> int:
+    ((_, _, stamp),) = extra
+    seconds, nanoseconds = struct.unpack("qq", stamp)
+    return int(seconds * 10**9 + nanoseconds)
+
+
+ECHO = """
+import socket, sys
+port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+port.bind(("127.0.0.1", int(sys.argv[1])))
+while True:
+    data, sender = port.recvfrom(64)
+    port.sendto(data, sender)
+"""
+
+
+@contextmanager
+def echoing(nice: int) -> Iterator[int]:
+    """A program that returns each datagram; its port."""
+    port = free_port()
+    process = subprocess.Popen(["/usr/bin/nice", "-n", str(nice), sys.executable, "-c", ECHO, str(port)])
+    try:
+        yield port
+    finally:
+        end(process)
 
 
 @contextmanager

@@ -43,7 +43,6 @@ def figures(rounds: int, workers: int) -> dict[str, float]:
     narrow, narrow_truth = paint(boards(2, 572, 0.6, 10), (572, 566), 5, seed=2)
     told_wide, told_narrow = evidence.of_views(wide), evidence.of_views(narrow)
     spectrum = Spectrum4D.of(narrow, most_disparity=0.6, workers=workers)
-    between = (float(narrow_truth.min()) - 0.1, float(narrow_truth.max()) + 0.1)
     works: dict[str, Callable[[], object]] = {
         "plain_mean_81_views_512_s": lambda: wide.views.mean(axis=(0, 1)),
         "refocus_81_views_512_s": lambda: shift_and_add(wide, 0.37, workers=workers),
@@ -53,9 +52,6 @@ def figures(rounds: int, workers: int) -> dict[str, float]:
         "depth_contrast_81_views_512_s": lambda: estimate.estimate(told_wide, "contrast", workers=workers),
         "depth_combined_25_views_572x566_s": lambda: estimate.estimate(told_narrow, workers=workers),
         "depth_contrast_25_views_572x566_s": lambda: estimate.estimate(told_narrow, "contrast", workers=workers),
-        "depth_gradient_25_views_572x566_s": lambda: estimate.estimate(
-            told_narrow, "gradient", between=between, workers=workers
-        ),
     }
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in works}
     for _ in range(rounds):

@@ -27,6 +27,7 @@ from limits import show
 from tests.daemon.fakes import FlightSink, NoPoses
 
 from dappled.clock import SystemClock
+from dappled.config.settings import PoseSettings
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
 from dappled.daemon.pipeline.decode_process import DecodedFrame
@@ -34,6 +35,7 @@ from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
+from dappled.daemon.pipeline.verdicts import Judge
 from dappled.drivers.camera import Arrival, Blob, CameraEvent, Fired, Identity, PlainCamera, StateChanged
 from dappled.flight import flight_report, recording
 from dappled.flight.checks import flight_check
@@ -138,6 +140,7 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
         names=Names("benchmark", "mask", "geometric"),
         observer=ends,
         decode_queue=QUEUE,
+        judge=Judge(PoseSettings().mount, on_gimbal=False),
     )
 
     memory = Memory()

@@ -1,0 +1,96 @@
+"""What a frame costs on the ground, and how that grows with its size: the commands as a user gives them.
+
+python benchmarks/ground.py [--json] [--scales 0.5 1 1.53] [--repeats 2]
+
+Frames of the reference camera, of 2.5, 10 and 24 MP (`scale` is the sensor's side over 2776 × 3688), over terrain, with
+a calibration of a white frame of the same size. Each command runs in a process of its own, on the threads that it takes
+by itself; CPU time is that of the process and its children, less that of `dappled --version`; the shortest of the
+repeats counts. `cpu_s` and `memory_mb` are those of the frame of 10 MP, `cpu_s_a_mp` those by its size, `growth` is
+the CPU time of a megapixel in the largest frame over that in the 10 MP frame: 1 is linear. Memory is the largest of
+the process itself. `decode` has the views by the joint model in it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+
+from growth import CAMERA, F_NUMBER, MASK, fly, run
+from limits import show
+
+from dappled.mocks.autopilot.path import FlightPath
+from dappled.mocks.scene.masked_camera import reference_camera
+
+SEED, EXPOSED_T_S = 5, 1.0
+
+
+def prepared(folder: Path, scale: float) -> tuple[Path, Path, float]:
+    """(flight of one frame, white frame, megapixels of a frame) of a camera of this scale, in `folder`."""
+    camera = reference_camera(SEED, scale=scale, path=FlightPath(SEED))
+    exposure = camera.expose(EXPOSED_T_S, 0, f_number=F_NUMBER)
+    white = folder / "white.dng"
+    white.write_bytes(reference_camera(SEED, scale=scale, scene="white").bench_frame().file)
+    height, width = camera.sensor.shape
+    shipped = resources.files("dappled.config").joinpath("profiles", "cameras", f"{CAMERA}.toml").read_text("utf-8")
+    (folder / "camera.toml").write_text(
+        f'{shipped}\n[[raw]]\nname = "measured"\nshape = [{height}, {width}]\n'
+        "row_mm = [0.01, 0.0]\ncolumn_mm = [0.0, 0.01]\n"
+        if f"[{height}, {width}]" not in shipped
+        else shipped,
+        encoding="utf-8",
+    )
+    return fly(folder, 1, exposure.file), white, height * width / 1e6
+
+
+def commands(folder: Path, flight: Path, white: Path) -> Mapping[str, Sequence[str]]:
+    """The commands by name, in the order in which they need each other's files."""
+    frame = next((flight / "frames").iterdir())
+    camera = ["--camera", str(folder / "camera.toml"), "--mask", MASK]
+    known = [*camera, "--calibration", str(folder / "c.toml")]
+    field = str(folder / "field.npz")
+    return {
+        "calibrate": ["calibrate", str(white), *camera, "-o", str(folder / "c.toml"), "--overwrite"],
+        "carriers": ["carriers", str(frame), *known],
+        "decode": ["decode", str(frame), *known, "-o", field, "--overwrite"],
+        "refocus": ["refocus", field, "--disparity", "0", "-o", str(folder / "refocused.png"), "--overwrite"],
+        "depth": ["depth", field, "-o", str(folder / "depth.tif"), "--overwrite"],
+        "georeference": ["georeference", str(flight), *known, "--as", "kmz", "cog", "-o", str(folder / "maps"),
+                         "--overwrite"],
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--scales", type=float, nargs=3, default=(0.5, 1.0, 1.53), help="of the three sensors")
+    parser.add_argument("--repeats", type=int, default=2, help="runs of a command, of which the shortest counts")
+    arguments = parser.parse_args()
+    started = min(run(["--version"])[0] for _ in range(3))
+    used: dict[str, list[tuple[float, float, float]]] = {}
+    for scale in arguments.scales:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            flight, white, megapixels = prepared(folder, scale)
+            for command, words in commands(folder, flight, white).items():
+                runs = [run(words) for _ in range(arguments.repeats)]
+                cpu_s = min(cpu for cpu, _ in runs) - started
+                used.setdefault(command, []).append((megapixels, cpu_s, max(peak for _, peak in runs)))
+                print(f"{command}, {megapixels:.1f} MP: {cpu_s:.2f} CPU-s, {runs[0][1]:.0f} MB", file=sys.stderr)
+    figures = {}
+    for command, (_, (size, cpu_s, memory_mb), (largest, most_s, most_mb)) in used.items():
+        figures[command] = {
+            "cpu_s": cpu_s,
+            "cpu_s_a_mp": cpu_s / size,
+            "growth": most_s / largest / (cpu_s / size),
+            "memory_mb": memory_mb,
+            "memory_growth": most_mb / largest / (memory_mb / size),
+        }
+    show("ground", {"start_cpu_s": started, **figures}, as_json=arguments.json)
+
+
+if __name__ == "__main__":
+    main()
