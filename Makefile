@@ -2,8 +2,10 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup peers walk docs notebooks clean-room demo test check test-fast coverage test-slow soak faults bench lock deb arm64 install uninstall clean
+.PHONY: help setup peers walk docs notebooks clean-room wheel demo test check test-fast coverage test-slow soak faults bench lock deb arm64 install uninstall clean
 PREFIX ?= /usr/local
+# Three tests on two cores: a third of the time of tests is waiting for sockets and processes.
+BESIDE = -n $(shell echo $$(( ($$(nproc) * 3 + 1) / 2 ))) --dist worksteal
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -12,34 +14,37 @@ setup: ## create the environment in .venv (the other targets do it if needed)
 	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
 	@$(PYTHON) tools/bootstrap.py
 
-peers: ## MAVSDK and MAVProxy, which slow tests talk to, in .venv-peers (done by test-slow when needed)
+peers: ## MAVSDK, MAVProxy and pycolmap, which slow tests talk to, in .venv-peers (done by test-slow when needed)
 	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
 	@$(PYTHON) tools/bootstrap.py peers
 
 demo: setup ## fly eight simulated frames through the whole daemon, and draw the last one
 	@tools/demo
 
-test: check test-fast ## lint, types, import contracts, and the default tests
+CHECKS = $(BIN)/ruff check -q . && $(BIN)/ruff format -q --check . && $(BIN)/mypy && $(BIN)/lint-imports
+TESTS = $(BIN)/pytest -q --no-header $(BESIDE) -m "not slow" --durations=25
+
+# The checks take a core for a minute: beside the tests, not before them.
+test: setup ## lint, types, import contracts, and the default tests
+	@failed=; { $(CHECKS); } & checks=$$!; \
+	$(TESTS) || failed=tests; \
+	wait $$checks || { echo "the checks failed: see what they say above, or run make check" >&2; failed=checks; }; \
+	[ -z "$$failed" ]
 
 check: setup ## lint, format, types, import contracts
-	@$(BIN)/ruff check -q .
-	@$(BIN)/ruff format -q --check .
-	@$(BIN)/mypy
-	@$(BIN)/lint-imports
+	@$(CHECKS)
 
 test-fast: setup
-	@$(BIN)/pytest -q --no-header -n auto --dist worksteal -m "not slow" --durations=25
+	@$(TESTS)
 
 coverage: setup ## run the default tests and report which lines they reach (a third slower)
 	@$(BIN)/coverage erase
 	@$(BIN)/pytest -q --no-header -n auto --dist worksteal -m "not slow" --cov --cov-report=term
 
-# Rooms whose slow tests only compute: they may share the machine. Those of the others watch clocks, and run alone.
-COMPUTING := tests/bounds tests/decode tests/flight tests/products tests/tools
-test-slow: setup peers ## the tests that take longer
+test-slow: setup peers ## the tests that take longer; those that watch a clock run with no other beside them
 	@failed=0; \
-	$(BIN)/pytest -q --no-header -m slow --durations=15 -n auto --dist worksteal $(COMPUTING) || failed=1; \
-	$(BIN)/pytest -q --no-header -m slow --durations=15 $(addprefix --ignore=,$(COMPUTING)) || failed=1; \
+	$(BIN)/pytest -q --no-header -m "slow and not alone" --durations=25 $(BESIDE) || failed=1; \
+	$(BIN)/pytest -q --no-header -m "slow and alone" --durations=15 || failed=1; \
 	exit $$failed
 
 walk: setup ## the modules that a command and a frame pass, traced anew and written into ARCHITECTURE.md
@@ -47,6 +52,9 @@ walk: setup ## the modules that a command and a frame pass, traced anew and writ
 
 clean-room: ## the README's commands in bare Debian roots (SUITES="bookworm trixie", RUN="make demo && make test"); as root
 	@for suite in $(or $(SUITES),bookworm trixie); do tools/clean-room $$suite "$${RUN:-make demo && make test}" || exit 1; done
+
+wheel: ## the wheel in bare environments of Python 3.11 to 3.14: installs, flies a frame, opens its light field; as root
+	@for suite in bookworm noble trixie forky; do tools/clean-room $$suite "python3 tools/wheel_trial.py" || exit 1; done
 
 docs: ## build the documents' site in build/site: strict, links checked, nothing fetched by its pages
 	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }

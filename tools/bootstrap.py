@@ -2,7 +2,7 @@
 """Set up .venv from requirements.lock: with the uv on PATH, or one fetched into .tools/. Touches nothing else.
 
     python tools/bootstrap.py          the environment of the project, in .venv
-    python tools/bootstrap.py peers    that of MAVSDK and MAVProxy, which some tests talk to, in .venv-peers
+    python tools/bootstrap.py peers    that of MAVSDK, MAVProxy and pycolmap, for some tests, in .venv-peers
     python tools/bootstrap.py docs     that of the programs that build the documents' site, in .venv-docs
 
 Runs on a bare Python >= 3.11 (no pip, no venv module needed). Says nothing when all is in place.

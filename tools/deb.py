@@ -48,21 +48,25 @@ if [ "$1" = configure ]; then
   if [ -d /run/systemd/system ]; then
     systemctl daemon-reload || true
     udevadm control --reload || true
-    systemctl try-restart dappled || true
+    systemctl try-restart dappled 'dappled@*' || true
   fi
 fi
 """
 PRERM = f"""\
 #!/bin/sh
 set -e
-if [ "$1" = remove ] && [ -d /run/systemd/system ]; then systemctl disable --now dappled || true; fi
+if [ "$1" = remove ] && [ -d /run/systemd/system ]; then
+  systemctl stop 'dappled@*' || true
+  systemctl disable dappled@ || true
+  systemctl disable --now dappled || true
+fi
 find {HOME} -name __pycache__ -type d -prune -exec rm -rf {{}} +
 """
 POSTRM = """\
 #!/bin/sh
 set -e
 if [ -d /run/systemd/system ]; then systemctl daemon-reload || true; fi
-if [ "$1" = purge ] && [ -d /var/lib/dappled ]; then echo "the flights in /var/lib/dappled stay"; fi
+if [ "$1" = purge ] && [ -d /var/lib/dappled ]; then echo "the flights in /var/lib/dappled* stay"; fi
 """
 
 

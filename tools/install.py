@@ -94,15 +94,39 @@ def install(place: Place, python: str, in_system: bool) -> int:
 def service_files(prefix: Path, sysconfdir: Path, command: Path) -> dict[Path, str]:
     """The unit, the service's user and folders, and the udev rules: where each stands, and its text."""
     lib, etc = prefix / "lib", str(sysconfdir / "dappled")
-    unit = (SYSTEMD / "dappled.service").read_text(encoding="utf-8")
+    unit = (SYSTEMD / "dappled.service").read_text(encoding="utf-8").replace("/usr/local/bin/dappled", str(command))
     found = {
-        lib / "systemd/system/dappled.service": unit.replace("/usr/local/bin/dappled", str(command)),
+        lib / "systemd/system/dappled.service": unit,
+        lib / "systemd/system/dappled@.service": template(unit),
         lib / "sysusers.d/dappled.conf": (SYSTEMD / "dappled.sysusers").read_text(encoding="utf-8"),
         lib / "tmpfiles.d/dappled.conf": (SYSTEMD / "dappled.tmpfiles").read_text(encoding="utf-8"),
     }
     for rule in sorted(SYSTEMD.glob("*.rules")):
         found[lib / "udev/rules.d" / rule.name] = rule.read_text(encoding="utf-8")
     return {path: text.replace("/etc/dappled", etc) for path, text in found.items()}
+
+
+INSTANCE = (
+    ("# dappled as a service.", "# One of several dappled services: `dappled@left` reads /etc/dappled/left.toml."),
+    ("acquisition daemon for masked light-field cameras", "acquisition daemon, camera %i"),
+    ("/etc/dappled/dappled.toml", "/etc/dappled/%i.toml"),
+    ("StateDirectory=dappled", "StateDirectory=dappled-%i"),
+    ("RuntimeDirectory=dappled", "RuntimeDirectory=dappled-%i"),
+    ("HOME=/var/lib/dappled", "HOME=/var/lib/dappled-%i"),
+    ("MemoryHigh=70%", "MemoryHigh=38%"),
+    ("MemoryMax=85%", "MemoryMax=45%"),
+)
+"""What the unit of one camera of several has in place of the unit of the only one: folders of its own, less memory."""
+
+
+def template(unit: str) -> str:
+    """The template unit `dappled@.service` from the unit of a single camera. Raises ValueError where a line of the
+    unit is not there any more."""
+    for old, new in INSTANCE:
+        if unit.count(old) != 1:
+            raise ValueError(f"dappled.service has {old!r} {unit.count(old)} times, not once")
+        unit = unit.replace(old, new)
+    return unit
 
 
 def environment(uv: str, python: str, home: Path) -> None:

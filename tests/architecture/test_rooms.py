@@ -22,6 +22,7 @@ UNUSED = {
     "__getattr__": "Python calls it, for the public names that are loaded when they are asked for",
     "__dir__": "Python calls it, for `dir(dappled)`",
     "collect": "prometheus_client calls it",
+    "redirect_request": "urllib calls it",
     "get_reader": "napari calls it, by the manifest napari.json",
     "plot": "of what `dappled.open` returns: notebooks call it",
 }
@@ -46,6 +47,7 @@ THREADS = {
     "workers.py": "`Loop` is one, and `share` joins its helpers without a limit of time",
     "daemon/console/__main__.py": "a timer ends the console's own process, whatever its other threads do",
     "daemon/console/app.py": "asyncio waits for the answers of two pools, in the console's own process",
+    "daemon/console/offline.py": "asyncio waits for frames that one thread decodes, in the process of `dappled open`",
     "durable.py": "hashes one file beside its writing; the call waits for it",
     "mocks/scene/bench.py": "the views of one picture are rendered side by side; the call waits for them",
     "mocks/scene/flyover.py": "the views of one picture are rendered side by side; the call waits for them",

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from tests import shared
+
 FRAMES = 3
 
 
@@ -42,8 +44,13 @@ def sockets() -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory, sockets: Path) -> Flown:
-    """Three frames through the whole street, with `dappled watch` as the subscriber."""
-    folder = tmp_path_factory.mktemp("flown")
+    """Three frames through the whole street, with `dappled watch` as the subscriber. Not to be written to."""
+    folder = shared.folder_of_run(tmp_path_factory)
+    return shared.once(folder, "flown", lambda: _fly(folder / "flown", sockets))
+
+
+def _fly(folder: Path, sockets: Path) -> Flown:
+    folder.mkdir()
     endpoint = f"ipc://{sockets}/flown"
     (folder / "dappled.toml").write_text(f'[record]\ndirectory = "flights"\n[publish]\nslices = "{endpoint}"\n')
     watch = subprocess.Popen(

@@ -52,19 +52,24 @@ SUBSTITUTES = {
     "~/flights/20261121T*": "build/demo/flights/*Z-*",
     "127.0.0.1:8042": "127.0.0.1:0",
     "/etc/dappled/dappled.toml": "dappled.toml",
+    "/etc/dappled/left.toml": "dappled.toml",
+    "/etc/dappled/right.toml": "dappled.toml",
     "COPY/FLIGHT": "FLIGHT",
     "offload COPY": "offload COPY --same-device",  # the test has one disk
 }
 """What a real camera, card or day would have made, and what stands for it here."""
 
 ELSEWHERE = {
+    "calibrate --kit": "tests/cli/calibrate/test_kit.py",  # frames behind two printed masks
     "calibrate --lens": "tests/products/test_chessboard.py",  # pictures of a chessboard
     "--camera my-450d.toml": "tests/products/test_chessboard.py",  # what comes of them
     "--refine orthophoto.tif": "tests/products/maps/test_georeference.py",  # a map of the place
     "--gcp points.csv": "tests/products/maps/test_georeference.py",  # control points of the place
     "--refine neighbours": "tests/products/maps/test_georeference.py",  # frames that overlap
     "--as terrain --gsd": "tests/products/maps/test_georeference.py",  # as above
+    "--together": "tests/products/survey/test_flight_sweep.py",  # frames that overlap
     "maps/ground.tif": "tests/products/maps/test_georeference.py",  # what comes of them
+    "dappled open": "tests/cli/test_open.py",  # serves pages until Ctrl-C
     "--scheduler tcp:": "tests/products/batch/test_batch.py",  # a Dask cluster
 }
 """Commands that need more than this stage has, and the tests that give it to them."""
@@ -200,7 +205,9 @@ def _files(folder: Path) -> None:
     for name in ("white.dng", "white-f22.dng", "bench.dng"):
         (folder / name).write_bytes(white)
     (folder / "DCIM").mkdir()
-    (folder / "tools").symlink_to(ROOT / "tools")
+    for named in ("tools", "benchmarks"):
+        (folder / named).symlink_to(ROOT / named)
+    (folder / "docs/pictures").mkdir(parents=True)
     _lenslets(folder)
     (folder / "density.csv").write_text(
         "level,density\n" + "".join(f"{i * 17},{i * 0.2:.2f}\n" for i in range(16)), encoding="utf-8"

@@ -12,11 +12,13 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from dappled.daemon.health import go_no_go
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.flight import LedgerReader
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
@@ -310,3 +312,43 @@ def camera_process(body: SimulatedBody) -> int:
             if b"dappled.drivers.gphoto2.process" in words and body.port.split(",")[0].encode() in words:
                 return int(entry.name)
     raise AssertionError("there is no camera process")
+
+
+@pytest.mark.slow
+def test_a_body_that_is_not_as_planned(here: Path) -> None:
+    """Set by the computer where the body lets it, else no-go; a dial turned in flight is told before the next shot."""
+
+    def checked(daemon: Flying) -> tuple[str, str]:
+        found = [one for one in go_no_go.checks(daemon.service.health()) if one.name == "Body"]
+        return (found[0].state, found[0].text) if found else ("", "")
+
+    def says(daemon: Flying, state: str, words: str) -> bool:
+        found = checked(daemon)
+        return found[0] == state and words in found[1]
+
+    with a_body() as body:
+        for turned in ("drive 1", "power-off 60", "mirror 0"):
+            body.ask(f"turn {turned}")
+        with daemon_before(here, body) as daemon:
+            eventually(lambda: checked(daemon) == ("go", "as planned, room for 100 frames"), "the body as planned")
+            for turned, words in (
+                ("dial 2", "exposure mode is AV, not manual as planned: turn the mode dial"),
+                ("dial 3", ""),
+                ("focus 0", "focus mode is One Shot"),
+                ("focus 3", ""),
+                ("mirror 1", "mirror lock-up is on"),
+                ("mirror 0", ""),
+                ("drive 0x10", "drive mode is Timer 10 sec"),
+                ("drive 0", ""),
+            ):
+                body.ask(f"turn {turned}")
+                eventually(partial(says, daemon, "no-go" if words else "go", words), turned)
+            body.ask("turn room 3")
+            body.ask("turn battery 0")
+            assert daemon.shoot().problem == ""
+            problems = (
+                "the camera's card is nearly full: room for 3 frames",
+                "the camera's battery is nearly empty: Low",
+            )
+            eventually(lambda: set(problems) <= set(daemon.service.health()["problems"]), "what runs out")
+        assert body.releases == 2

@@ -5,7 +5,9 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import time
 import tomllib
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,7 @@ from dappled.drivers.mavlink import mavlink
 from dappled.drivers.mavlink import signing as mavlink_signing
 from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
 from dappled.flight import LedgerReader
+from dappled.mocks.autopilot.autopilot import Autopilot
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import Simulation, World, free_port
 from tests.daemon.camera_protocol.rig import Peer
@@ -104,6 +107,41 @@ def test_a_pilot_is_told_of_a_camera_that_went_and_came_back(tmp_path: Path) -> 
             assert shoot(peer, 2) == (0, 1)
             folder = daemon.service.folder
         assert any(event.startswith("refused: IMAGE_START_CAPTURE from mavlink:255/190") for event in told(folder))
+
+
+@pytest.mark.slow
+def test_a_station_behind_a_vehicle_on_two_ports_has_each_report_once(tmp_path: Path) -> None:
+    """The autopilot forwards from both ports to the radio: each report came twice."""
+    with SimulatedBody.start(BodyOptions(picture="pattern:50000:CR2")) as body, ExitStack() as stack:
+        settings = settings_of(tmp_path, camera={"port": body.port}, mavlink={"url": [URL, URL]})
+        daemon = stack.enter_context(flying(settings))
+        daemon.until_ready()
+        first, second = (f"udpout:127.0.0.1:{daemon.service._links.port(link)}" for link in (0, 1))
+        radio = free_port()
+        autopilot = Autopilot.start(
+            first,
+            seed=1,
+            start_monotonic_ns=time.monotonic_ns(),
+            more=["--forward", f"--url={second}", f"--url=udpin:127.0.0.1:{radio}"],
+        )
+        stack.callback(autopilot.stop)
+        peer = stack.enter_context(Peer(radio))
+
+        def both_are_heard() -> bool:
+            return all(link.packets_in > 200 for link in daemon.service._links.statistics())
+
+        eventually(both_are_heard, "telemetry on both ports")
+        reports = []
+        for number in range(1, 5):
+            peer.heartbeat()
+            peer.until(lambda m: m.get_srcComponent() == 100 and m.get_type() == "HEARTBEAT", "the camera's heartbeat")
+            reports.append(shoot(peer, number))
+        peer.command(512, 262)
+        peer.until(lambda m: m.get_type() == "CAMERA_CAPTURE_STATUS" and m.image_count == 4, "all four")
+    assert reports == [(index, 1) for index in range(4)]
+    indices = [m.image_index for m in peer.heard if m.get_type() == "CAMERA_IMAGE_CAPTURED"]
+    assert sorted(set(indices)) == list(range(4))
+    assert len(indices) <= 5  # one may be repeated where a busy machine is late with telemetry
 
 
 @pytest.mark.parametrize("keys", [["a", "b"], ["a", "b", "c"]])

@@ -21,9 +21,9 @@ from pymavlink import mavutil
 
 from dappled.mocks.simulation import free_port
 from tests.system.conftest import dappled
+from tests.tools import tool
 
 ROOT = Path(__file__).resolve().parents[2]
-UNIT = ROOT / "systemd/dappled.service"
 ANALYZE = shutil.which("systemd-analyze") or ""
 analyze = pytest.mark.skipif(not ANALYZE, reason="no systemd-analyze on this machine")
 
@@ -175,24 +175,43 @@ def listening(ground: Any, deadline: float) -> Iterator[Any]:
             yield message
 
 
+@pytest.fixture(params=["dappled.service", "dappled@.service"])
+def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """The unit of the only camera, and the template of one of several, as they are installed."""
+    files = tool("install").service_files(Path("/usr"), Path("/etc"), Path("/bin/true"))
+    path = tmp_path / str(request.param)
+    path.write_text(files[Path("/usr/lib/systemd/system") / path.name], encoding="utf-8")
+    return path
+
+
 @analyze
-def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
-    unit = tmp_path / "dappled.service"
-    unit.write_text(UNIT.read_text(encoding="utf-8").replace("/usr/local/bin/dappled", "/bin/true"), encoding="utf-8")
+def test_the_unit_is_one_that_systemd_understands(unit: Path) -> None:
     verified = subprocess.run([ANALYZE, "verify", unit], capture_output=True, text=True, check=False)
     assert (verified.returncode, verified.stderr) == (0, "")
 
 
 @analyze
-def test_the_unit_exposes_little() -> None:
-    words = [ANALYZE, "security", "--offline=yes", "--threshold=16", str(UNIT)]
+def test_the_unit_exposes_little(unit: Path) -> None:
+    words = [ANALYZE, "security", "--offline=yes", "--threshold=16", str(unit)]
     judged = subprocess.run(words, capture_output=True, text=True, check=False)
     assert judged.returncode == 0, judged.stdout[-300:]
 
 
-def test_the_unit_leaves_the_daemon_what_tells_whether_its_clock_can_be_believed() -> None:
+def test_two_cameras_share_no_folder_no_settings_and_no_memory() -> None:
+    """`dappled@.service`: what the only camera's unit names once, the template names for each camera."""
+    files = tool("install").service_files(Path("/usr"), Path("/opt/etc"), Path("/usr/bin/dappled"))
+    only, each = (files[Path(f"/usr/lib/systemd/system/dappled{at}.service")] for at in ("", "@"))
+    assert "ExecStart=/usr/bin/dappled run --config /opt/etc/dappled/%i.toml\n" in each
+    shared = set(only.splitlines()) & set(each.splitlines())
+    for name in ("ExecStart", "StateDirectory", "RuntimeDirectory", "Environment", "MemoryHigh", "MemoryMax"):
+        assert not [line for line in shared if line.startswith(f"{name}=")]
+    assert "RuntimeDirectory=dappled-%i\n" in each  # not in /run/dappled, which goes with the other service
+    assert len(only.splitlines()) == len(each.splitlines())
+
+
+def test_the_unit_leaves_the_daemon_what_tells_whether_its_clock_can_be_believed(unit: Path) -> None:
     """/proc/sys (the boot's id) and /proc/device-tree (a board without a clock); ProtectClock= takes adjtimex away."""
-    directives = UNIT.read_text(encoding="utf-8").splitlines()
+    directives = unit.read_text(encoding="utf-8").splitlines()
     assert "ProcSubset=pid" not in directives
     assert "ProtectClock=yes" in directives
 

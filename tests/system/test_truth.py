@@ -21,6 +21,7 @@ from dappled.mocks.simulation import Simulation, World
 SEED, FRAMES = 8, 3
 
 
+@pytest.mark.alone
 @pytest.mark.slow  # 12 s; and its tolerance is of milliseconds, which a machine busy with other tests does not keep
 def test_tags_hold_the_true_time_place_and_attitude(tmp_path: Path, sockets: Path) -> None:
     """The body's latency is 60 ± 15 ms, the vehicle flies 4 m/s and sways; the autopilot's clock drifts by 50 ppm."""

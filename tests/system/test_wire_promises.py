@@ -37,12 +37,12 @@ def test_who_is_on_the_list_receives_and_a_stranger_does_not(tmp_path: Path) -> 
         'keys = "keys/vehicle.key_secret"\nclients = "clients"\n'
     )
     endpoint = [stream, "--ask", ask, "--server-key", "keys/vehicle.key"]
-    friend = watch(tmp_path, *endpoint, "--keys", "clients/laptop.key_secret", "--count", "2", "--timeout", "60")
+    friend = watch(tmp_path, *endpoint, "--keys", "clients/laptop.key_secret", "--count", "2", "--timeout", "120")
     stranger = watch(tmp_path, *endpoint, "--keys", "keys/stranger.key_secret")
     bare = watch(tmp_path, stream)
     try:
         flown = dappled("run", "--simulate", "--frames", "2", "--config", "dappled.toml", cwd=tmp_path)
-        said, complaints = friend.communicate(timeout=60)
+        said, complaints = friend.communicate(timeout=120)
         assert flown.returncode == 0, flown.stderr
         assert friend.returncode == 0, complaints
         assert "2 frames received" in said

@@ -44,6 +44,7 @@ def test_a_package_is_built_for_each_architecture_and_its_command_runs(tmp_path:
             "./usr/bin/dappled",
             "./etc/dappled/dappled.toml",
             "./usr/lib/systemd/system/dappled.service",
+            "./usr/lib/systemd/system/dappled@.service",
             "./usr/lib/sysusers.d/dappled.conf",
             "./usr/lib/udev/rules.d/70-dappled-camera.rules",
             "./usr/lib/dappled/dappled/daemon/service.py",

@@ -18,6 +18,7 @@ from mavsdk.plugins.camera.camera import Camera, CameraError, Mode, Option, Phot
 
 CAMERA = 100
 PATIENCE_S = 30.0
+SETTINGS = {"CAM_ISO", "CAM_APERTURE", "CAM_SHUTTERSPD", "CAM_FORMAT", "LF_MASK", "LF_LAW", "LF_DECODE"}
 
 
 def eventually(found: Callable[[], Any], what: str) -> Any:
@@ -41,6 +42,21 @@ def result(act: Callable[[], Any]) -> str:
         return str(error.result.name)
 
 
+def quiet(heard: list[Any]) -> None:
+    """Wait until nothing was heard for three seconds."""
+    known, since = len(heard), time.monotonic()
+    while time.monotonic() < since + 3.0:
+        if len(heard) != known:
+            known, since = len(heard), time.monotonic()
+        time.sleep(0.05)
+
+
+def all_settings(camera: Camera) -> dict[str, str] | None:
+    """What each setting is; None until the values, which come one by one, are complete."""
+    known = {one.setting_id: one.option.option_description for one in camera.get_current_settings(CAMERA)}
+    return known if known.keys() >= SETTINGS else None
+
+
 def main(port: str, out: str) -> None:
     sdk = mavsdk.Mavsdk(mavsdk.Configuration.create_with_component_type(mavsdk.ComponentType.GROUND_STATION))
     sdk.add_any_connection(f"udpout://127.0.0.1:{port}")
@@ -51,8 +67,7 @@ def main(port: str, out: str) -> None:
     (found,) = eventually(lambda: camera.camera_list().cameras, "its information")
     said: dict[str, Any] = {"vendor": found.vendor_name, "model": found.model_name}
     said["resolution"] = [found.horizontal_resolution_px, found.vertical_resolution_px]
-    settings = eventually(lambda: camera.get_current_settings(CAMERA), "its settings")
-    said["settings"] = {one.setting_id: one.option.option_description for one in settings}
+    said["settings"] = eventually(lambda: all_settings(camera), "its settings")
     offered = eventually(lambda: camera.get_possible_setting_options(CAMERA), "its choices")
     said["iso choices"] = [o.option_description for s in offered if s.setting_id == "CAM_ISO" for o in s.options]
     said["set iso"] = result(lambda: camera.set_setting(CAMERA, Setting("CAM_ISO", "", Option("200", ""), False)))
@@ -72,7 +87,7 @@ def main(port: str, out: str) -> None:
     said["format"] = result(lambda: camera.format_storage(CAMERA, 1))
     said["zoom"] = result(lambda: camera.zoom_range(CAMERA, 50.0))
     said["reset"] = result(lambda: camera.reset_settings(CAMERA))
-    time.sleep(1.5)  # a shot of the interval may still be on its way; none may follow
+    quiet(heard)  # a shot of the interval may still be on its way; none may follow
     said["heard"] = [[one.index, one.is_success] for one in heard]
     eventually(lambda: len(camera.list_photos(CAMERA, PhotosRange.ALL)) > max(one.index for one in heard), "all photos")
     photos = camera.list_photos(CAMERA, PhotosRange.ALL)

@@ -1,0 +1,108 @@
+"""Two cameras on one vehicle: a daemon each, as `dappled@left` and `dappled@right`, with one autopilot between them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from dappled.cli.status import NotRunningError, health
+from dappled.flight import LedgerReader, flight_report
+from dappled.mocks.body.body import BodyOptions, SimulatedBody
+from dappled.mocks.simulation import free_port
+from tests.daemon.camera_protocol.rig import Peer
+from tests.system.flying import eventually
+
+BYTES = {"left": 50_000, "right": 60_000}  # so that a frame shows which body it is of
+
+
+@contextmanager
+def serving(
+    name: str, component: int, folder: Path, runtime: Path, autopilot: int
+) -> Iterator[subprocess.Popen[bytes]]:
+    """`dappled run` as the unit of this name runs it, with a body of its own, from the end of the block ended."""
+    with SimulatedBody.start(BodyOptions(picture=f"pattern:{BYTES[name]}:CR2", serial=name)) as body:
+        (folder / f"{name}.toml").write_text(
+            f'[camera]\nport = "{body.port}"\n[record]\nmin_free_mb = 0\n[pose]\nwait_ms = 0\n'
+            f'[mavlink]\nurl = "udpin:127.0.0.1:{autopilot}"\ncomponent_id = {component}\n'
+        )
+        (home := folder / f"dappled-{name}").mkdir()
+        runtime.mkdir(mode=0o700)
+        of_unit = {"HOME": str(home), "RUNTIME_DIRECTORY": str(runtime)}
+        daemon = subprocess.Popen(
+            [sys.executable, "-m", "dappled", "run", "--config", str(folder / f"{name}.toml")],
+            env=os.environ | of_unit,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            yield daemon
+        finally:
+            daemon.kill()
+            daemon.wait()
+
+
+def frames(folder: Path, name: str) -> list[int]:
+    """The sizes of the frames that this camera's daemon made safe."""
+    ledgers = [*(folder / f"dappled-{name}" / "flights").glob("*/flight.sqlite")]
+    if not ledgers:
+        return []
+    with LedgerReader.open(ledgers[0]) as ledger:
+        return [frame.size for frame in ledger.frames()]
+
+
+@pytest.mark.slow
+def test_each_trigger_is_one_frame_of_the_camera_that_it_is_for(tmp_path: Path, sockets: Path) -> None:
+    ports = {name: free_port(socket.SOCK_DGRAM) for name in ("left", "right", "ground")}
+    assert len(set(ports.values())) == len(ports)
+    urls = [f"--url=udpout:127.0.0.1:{ports[name]}" for name in BYTES] + [f"--url=udpin:127.0.0.1:{ports['ground']}"]
+    autopilot = [sys.executable, "-m", "dappled.mocks.autopilot.autopilot", "--with-parent", *urls]
+    with ExitStack() as stack:
+        daemons = [
+            stack.enter_context(serving(name, 100 + number, tmp_path, sockets / name, ports[name]))
+            for number, name in enumerate(BYTES)
+        ]
+        vehicle = subprocess.Popen([*autopilot, "--camera=mavlink", "--camera=mavlink"], stdin=subprocess.PIPE)
+        stack.callback(vehicle.communicate)  # closes its standard input, which ends it
+        with Peer(ports["ground"]) as station:
+            asked = dict.fromkeys(BYTES, 0)
+
+            def photograph(camera: int, *names: str) -> None:
+                """The autopilot is asked to trigger this camera; 0: all."""
+                station.command(2000, camera, 0, 1, 0, target=(1, 1))
+                for name in names:
+                    asked[name] += 1
+                eventually(
+                    lambda: all(len(frames(tmp_path, name)) >= asked[name] for name in BYTES),
+                    f"frames {asked}: {[frames(tmp_path, name) for name in BYTES]}",
+                    60,
+                )
+
+            eventually(lambda: all(is_ready(sockets / name) for name in BYTES), "both cameras are ready", 60)
+            for camera, names in ((1, ["left"]), (2, ["right"]), (2, ["right"]), (0, ["left", "right"]), (1, ["left"])):
+                photograph(camera, *names)
+        for daemon in daemons:
+            daemon.send_signal(signal.SIGTERM)
+        assert [daemon.wait(60) for daemon in daemons] == [0, 0]
+    for name, size in BYTES.items():
+        assert frames(tmp_path, name) == [size] * asked[name]
+        (flight,) = (path.parent for path in (tmp_path / f"dappled-{name}" / "flights").glob("*/flight.sqlite"))
+        balance = flight_report.balance(flight)
+        assert balance.balanced
+        assert balance.by_source == {"mavlink:1/1": 3}
+
+
+def is_ready(runtime: Path) -> bool:
+    """Whether the daemon with this runtime folder says that its camera is ready and its autopilot is heard."""
+    try:
+        record = health(f"ipc://{runtime}/slices", 5)
+    except NotRunningError:
+        return False
+    return record["camera"]["state"] == "ready" and "MAVLink" not in "".join(record["problems"])

@@ -1,0 +1,91 @@
+"""README's way to a flight report, word for word, with a simulated Canon EOS 450D in place of the real one."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dappled
+from dappled.flight import LedgerReader
+from dappled.mocks.simulation import free_port
+from dappled.products.opened import OpenedFlight
+from tests.system.conftest import dappled as command
+
+README = Path("README.md").read_text(encoding="utf-8")
+
+
+def block(after: str) -> str:
+    """The first block of commands after some words of README."""
+    return README.split(after, 1)[1].split("```sh\n", 1)[1].split("```", 1)[0]
+
+
+def words(line: str) -> list[str]:
+    """The words of a command behind `dappled`, without its comment."""
+    (_name, *rest) = shlex.split(line, comments=True)
+    return rest
+
+
+def simulating() -> list[str]:
+    """The command with which README replaces the camera."""
+    (line,) = re.findall(r"`(dappled run --simulate --config \S+)`", README)
+    return words(line)
+
+
+@pytest.mark.slow
+def test_the_readme_leads_to_a_flight_report_with_a_simulated_450d(
+    tmp_path: Path, sockets: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))  # where flights are kept without a word about it
+    monkeypatch.setenv("PYTHONPATH", str(Path(dappled.__file__).parents[1]), prepend=os.pathsep)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(sockets))
+    script = block("container](Containerfile) has what").replace("14550", str(free_port()))
+    written, _, rest = script.partition("\nTOML\n")
+    subprocess.run(["/bin/sh", "-c", f"{written}\nTOML"], cwd=tmp_path, check=True)
+    check, run, trigger, report = (words(line) for line in rest.strip().splitlines())
+    assert [line[0] for line in (check, run, trigger, report)] == ["config", "run", "trigger", "flight"]
+    checked = command(*check, cwd=tmp_path)
+    assert (checked.returncode, checked.stdout) == (0, "dappled.toml: good\n")
+    with subprocess.Popen(
+        [sys.executable, "-m", "dappled", *simulating()],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        try:
+            assert process.stderr is not None
+            said = []
+            for line in process.stderr:
+                said.append(line)
+                if line == "camera ready\n":
+                    break
+            assert said[0] == "simulating a Canon EOS 450D with mask-2, an autopilot and a ground station\n"
+            triggered = command(*trigger, cwd=tmp_path)
+            assert triggered.returncode == 0, triggered.stderr
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=40)
+        finally:
+            process.kill()
+    assert process.returncode == 0, err
+    assert out.count(" carriers (calibrated)") == 3, out
+    assert "problem:" not in "".join(said) + err
+    assert err.endswith("3 shots: 3 frames safe, 3 decoded, 0 with a problem\n")
+    reported = command(*report, cwd=tmp_path)
+    assert reported.returncode == 0, reported.stderr
+    assert "3 shots: 3 safe, 0 failed, 0 open" in reported.stdout
+    assert "the counts agree" in reported.stdout
+    (flight,) = (entry for entry in (tmp_path / "flights").iterdir() if entry.is_dir())
+    with LedgerReader.open(flight / "flight.sqlite") as ledger:  # on a busy machine a pose may be late, not the focus
+        verdicts = [result.verdict for result in ledger.results().values()]
+    assert len(verdicts) == 3
+    assert all(found is not None and "focus" not in "".join(found[1]) for found in verdicts), verdicts
+    recorded = dappled.open(flight)
+    assert isinstance(recorded, OpenedFlight)
+    views = recorded[0].light_field.field.views
+    assert views is not None
+    assert np.isfinite(views).all()
