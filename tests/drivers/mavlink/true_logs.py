@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,8 @@ TYPES = {
     "GPS": (12, "QBBIHBcLLe", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt"),
     "GPA": (13, "QBCCCC", "TimeUS,I,VDop,HAcc,VAcc,SAcc"),
     "XKF1": (14, "QBfff", "TimeUS,C,VN,VE,VD"),
+    "CAM": (15, "QBHIHLLeeeccC", "TimeUS,I,Img,GPSTime,GPSWeek,Lat,Lng,Alt,RelAlt,GPSAlt,R,P,Y"),
+    "TRIG": (16, "QBHIHLLeeeccC", "TimeUS,I,Img,GPSTime,GPSWeek,Lat,Lng,Alt,RelAlt,GPSAlt,R,P,Y"),
 }
 CODES = {"Q": "Q", "L": "i", "f": "f", "B": "B", "I": "I", "H": "H", "c": "h", "C": "H", "e": "i"}
 
@@ -120,6 +123,7 @@ ULOG_TYPES = {
     "vehicle_gps_position": "uint64_t timestamp;uint64_t time_utc_usec;double latitude_deg;double longitude_deg;"
     "double altitude_msl_m;float eph;float epv;float hdop;float vdop;float s_variance_m_s;uint8_t fix_type;"
     "uint8_t satellites_used;",
+    "camera_trigger": "uint64_t timestamp;uint64_t timestamp_utc;uint32_t seq;bool feedback;uint8_t[3] _padding0;",
 }
 OLDER_RECEIVER = (
     "uint64_t timestamp;uint64_t time_utc_usec;int32_t lat;int32_t lon;int32_t alt;float eph;float epv;float hdop;"
@@ -187,6 +191,27 @@ def ulog_written(
             data("vehicle_gps_position", "QQdddfffffBB" + relative[0], at, fixed_us, *exact, *quality, *relative[1])
     (folder / "10_15_03.ulg").write_bytes(b"".join(log))
     return folder / "10_15_03.ulg"
+
+
+def add_triggers(log: Path, times_s: Mapping[int, float], name: str = "CAM", camera: int = 0) -> None:
+    """Add ArduPilot's triggers (number: time on the path) of a camera to a .bin, as CAM or TRIG."""
+    path = FlightPath(5)
+    rows = []
+    for number, t_s in times_s.items():
+        lat, lon, alt = told(path.pose(t_s))
+        high = (round(alt * 100),) * 3
+        rows.append(record(name, BOOT_US + round(t_s * 1e6), camera, number, WEEK_MS, WEEK, lat, lon, *high, 0, 0, 0))
+    log.write_bytes(log.read_bytes() + b"".join(rows))
+
+
+def add_px4_triggers(log: Path, times_s: Mapping[int, float], *, contacts: bool = False) -> None:
+    """Add PX4's triggers (number: time on the path) to a .ulg, or contacts of its feedback pin."""
+    topic = list(ULOG_TYPES).index("camera_trigger")
+    rows = [
+        struct.pack("<HQQI?", topic, BOOT_US + round(t_s * 1e6), UTC_US + round(t_s * 1e6), number, contacts)
+        for number, t_s in times_s.items()
+    ]
+    log.write_bytes(log.read_bytes() + b"".join(ulog_message("D", row) for row in rows))
 
 
 def poses(path: Path) -> list[Pose]:

@@ -1,7 +1,8 @@
 """Read ArduPilot's own log (DataFlash, .bin) as the MAVLink packets that a telemetry link would have carried.
 
 Positions are POS with the velocities of XKF1 or NKF1, attitudes ATT, the receiver GPS and GPA. UTC comes from the
-receiver's time (`log_packets.log_clock`).
+receiver's time (`log_packets.log_clock`). Triggers of a camera are TRIG, with CAM as contacts of its feedback pin, or,
+without a pin, CAM.
 """
 
 from __future__ import annotations
@@ -19,10 +20,19 @@ from pymavlink import DFReader
 from dappled.decode.array_types import Floats
 from dappled.decode.geometry import from_euler
 from dappled.drivers.mavlink import log_packets
-from dappled.drivers.mavlink.log_packets import FIX_3D, AutopilotLogError, LogClock, ReceiverFix, Timed
+from dappled.drivers.mavlink.log_packets import (
+    FIX_3D,
+    AutopilotLogError,
+    LogClock,
+    LoggedTrigger,
+    ReceiverFix,
+    Timed,
+    TriggerLog,
+)
 from dappled.errors import first_line
 
 _USED = ["POS", "ATT", "GPS", "GPA", "XKF1", "NKF1"]
+_OF_CAMERAS = ["CAM", "TRIG"]
 _GPS_EPOCH_US = 315_964_800 * 10**6
 _LEAP_US = 18 * 10**6  # since 2017; no older log is of use here
 _WEEK_US = 7 * 86400 * 10**6
@@ -35,23 +45,50 @@ class DataFlashError(AutopilotLogError):
 
 def packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
     """(running number, stamp in µs UTC, packet), in the order of time. Raises DataFlashError."""
-    rows = _rows(path)
+    rows = _rows(path, _USED)
     clock = _clock(path, rows["GPS"])
     messages = [*_positions(path, rows), *_attitudes(rows), *_receiver(rows, clock)]
     yield from log_packets.packets(messages, clock)
 
 
-def _rows(path: Path) -> dict[str, list[Any]]:
+def triggers(path: Path, cam_idx: int) -> TriggerLog:
+    """The triggers of one camera (0 is CAM1). Raises DataFlashError."""
+    rows = _rows(path, ["GPS", *_OF_CAMERAS])
+    clock = _clock(path, rows["GPS"])
+    # before ArduPilot 4.3 the messages don't say which camera: there is one
+    mine = {name: [row for row in rows[name] if getattr(row, "I", 0) == cam_idx] for name in _OF_CAMERAS}
+    given = mine["TRIG"] or mine["CAM"]
+    if any(not hasattr(row, name) for row in given for name in ("Img", "TimeUS", "Lat", "Lng")):
+        raise DataFlashError(f"{path} holds messages CAM or TRIG in a form that is not ArduPilot's since 4.0")
+    found = sorted(
+        (
+            LoggedTrigger(
+                int(row.Img), int(row.TimeUS), (float(row.Lat), float(row.Lng)) if row.Lat or row.Lng else None
+            )
+            for row in given
+        ),
+        key=lambda one: one.boot_us,
+    )
+    if not found:
+        raise DataFlashError(
+            f"{path} holds no trigger of CAM{cam_idx + 1} (messages CAM and TRIG): choose Camera in LOG_BITMASK"
+        )
+    times_us = [int(row.TimeUS) for name in rows for row in rows[name]]
+    contacts = len(mine["CAM"]) if mine["TRIG"] else None
+    return TriggerLog("ArduPilot", tuple(found), contacts, min(times_us), max(times_us), clock)
+
+
+def _rows(path: Path, used: list[str]) -> dict[str, list[Any]]:
     """The messages in use, by name. A log that was cut off is read up to there."""
-    rows: dict[str, list[Any]] = {name: [] for name in _USED}
+    rows: dict[str, list[Any]] = {name: [] for name in used}
     try:
         with contextlib.redirect_stderr(io.StringIO()):  # the reader prints what it skips
             log = DFReader.DFReader_binary(str(path))
-            while (message := log.recv_match(type=_USED)) is not None:
-                if (
-                    getattr(message, "I", 0) == 0 and getattr(message, "C", 0) == 0
-                ):  # the first receiver, the first core
-                    rows[message.get_type()].append(message)
+            while (message := log.recv_match(type=used)) is not None:
+                name = message.get_type()
+                first = getattr(message, "I", 0) == 0 and getattr(message, "C", 0) == 0
+                if first or name in _OF_CAMERAS:  # the first receiver, the first core
+                    rows[name].append(message)
             log.filehandle.close()
     except OSError as error:
         raise DataFlashError(f"{path} can't be read: {error.strerror}") from None

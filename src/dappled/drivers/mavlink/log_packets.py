@@ -54,6 +54,31 @@ class LogClock:
         return boot_us + int(begins) + round(float(np.interp(boot_us, self.boots_us, self.offsets_us - begins)))
 
 
+@dataclass(frozen=True, slots=True)
+class LoggedTrigger:
+    """A trigger that an autopilot gave, by its own number. `place`: latitude and longitude (degrees), where known."""
+
+    number: int
+    boot_us: int
+    place: tuple[float, float] | None
+
+
+@dataclass(frozen=True, slots=True)
+class TriggerLog:
+    """The triggers of one camera in an autopilot's log, in the order of time.
+
+    `contacts` counts what a feedback pin saw, None where none is set up. The log holds from `begins_us` to `ends_us`
+    since boot. `by`: "ArduPilot" or "PX4".
+    """
+
+    by: str
+    triggers: tuple[LoggedTrigger, ...]
+    contacts: int | None
+    begins_us: int
+    ends_us: int
+    clock: LogClock
+
+
 def log_clock(boots_us: NDArray[np.int64], offsets_us: NDArray[np.int64]) -> LogClock:
     """The clock by a receiver's messages, (n,) each: when they were logged, and UTC minus that.
 

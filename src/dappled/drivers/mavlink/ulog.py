@@ -10,7 +10,7 @@ import contextlib
 import errno
 import io
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,15 @@ import numpy as np
 from dappled import durable
 from dappled.decode.array_types import Floats
 from dappled.drivers.mavlink import log_packets
-from dappled.drivers.mavlink.log_packets import FIX_3D, AutopilotLogError, LogClock, ReceiverFix, Timed
+from dappled.drivers.mavlink.log_packets import (
+    FIX_3D,
+    AutopilotLogError,
+    LogClock,
+    LoggedTrigger,
+    ReceiverFix,
+    Timed,
+    TriggerLog,
+)
 from dappled.errors import first_line, install_extra
 
 _PLACES, _SPEEDS, _TURNS, _HOME = (
@@ -28,6 +36,7 @@ _PLACES, _SPEEDS, _TURNS, _HOME = (
     "vehicle_attitude",
     "home_position",
 )
+_TRIGGERS, _CAPTURES = "camera_trigger", "camera_capture"
 _RECEIVERS = ("vehicle_gps_position", "sensor_gps")
 _EXTRAPOLATED = 8  # of PX4; MAVLink's 8 is another
 _GAP_US = 1_000_000  # a velocity further away is not that of a position
@@ -46,7 +55,7 @@ class ULogError(AutopilotLogError):
 
 def packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
     """(running number, stamp in µs UTC, packet), in the order of time. Raises ULogError."""
-    topics = _topics(path)
+    topics = _topics(path, [_PLACES, _SPEEDS, _TURNS, _HOME])
     found = next((topics[name] for name in _RECEIVERS if name in topics), None)
     fixes, clock = _fixes(path, found)
     messages = [*_positions(path, topics), *_attitudes(path, topics)]
@@ -55,14 +64,51 @@ def packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
     yield from log_packets.packets(messages, clock)
 
 
-def _topics(path: Path) -> dict[str, Columns]:
-    """The topics in use, of the first instance each. A log that was cut off is read up to there."""
+def triggers(path: Path) -> TriggerLog:
+    """The camera's triggers: camera_trigger, of which some may be contacts of a feedback pin, or without it
+    camera_capture. Raises ULogError."""
+    topics = _topics(path, [_PLACES, _TRIGGERS, _CAPTURES])
+    _, clock = _fixes(path, next((topics[name] for name in _RECEIVERS if name in topics), None))
+    given = topics.get(_TRIGGERS, topics.get(_CAPTURES))
+    if given is None or "seq" not in given:
+        raise ULogError(
+            f"{path} holds no trigger ({_TRIGGERS} or {_CAPTURES}): was TRIG_MODE set, and are they logged?"
+        )
+    at, numbers = _times(given, "timestamp"), given["seq"].astype(np.int64)
+    told = _within(at, 0, _BOOT_MAX_US)
+    back = given["feedback"] != 0 if "feedback" in given else np.zeros(len(at), dtype=bool)
+    found = [
+        LoggedTrigger(int(numbers[n]), int(at[n]), _place_at(topics.get(_PLACES), int(at[n])))
+        for n in np.flatnonzero(told & ~back)
+    ]
+    if not found:
+        raise ULogError(f"{path} holds no trigger ({_TRIGGERS}), only contacts of a feedback pin: nothing to compare")
+    all_us = np.concatenate([_times(topic, "timestamp") for topic in topics.values()])
+    all_us = all_us[_within(all_us, 0, _BOOT_MAX_US)]
+    contacts = int((told & back).sum()) if back.any() else None
+    ordered = tuple(sorted(found, key=lambda one: one.boot_us))
+    return TriggerLog("PX4", ordered, contacts, int(all_us.min()), int(all_us.max()), clock)
+
+
+def _place_at(topic: Columns | None, boot_us: int) -> tuple[float, float] | None:
+    """Latitude and longitude (degrees) of the estimate nearest in time; None without one within a second."""
+    if topic is None or "lat" not in topic or "lon" not in topic:
+        return None
+    away = np.abs(_sampled(topic) - boot_us)
+    nearest = int(away.argmin())
+    place = float(topic["lat"][nearest]), float(topic["lon"][nearest])
+    sound = away[nearest] <= _GAP_US and abs(place[0]) <= 90 and abs(place[1]) <= 180
+    return place if sound else None
+
+
+def _topics(path: Path, names: Sequence[str]) -> dict[str, Columns]:
+    """These topics and the receiver's, of the first instance each. A log that was cut off is read up to there."""
     try:
         from pyulog import ULog  # noqa: PLC0415  an extra; only this log needs it
         from pyulog.exceptions import ULogException  # noqa: PLC0415
     except ImportError:
         raise ULogError(f"{path} is a log of PX4, and that needs pyulog; {install_extra('ground')}") from None
-    wanted = [_PLACES, _SPEEDS, _TURNS, _HOME, *_RECEIVERS]
+    wanted = [*names, *_RECEIVERS]
     try:
         with open(path, "rb", opener=durable.without_waiting) as file, contextlib.redirect_stdout(io.StringIO()):
             log = ULog(file, wanted)  # it prints what it skips
