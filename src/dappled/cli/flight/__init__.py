@@ -44,6 +44,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "report",
         "count which requests became frames; exits 1 if the counts don't agree or there was no shot",
         "dappled flight report",
+        f"dappled flight report {_FLIGHT} --log 00000012.BIN",
     )
     signing = actions.add(
         "seal",
@@ -64,6 +65,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     away.add_argument("destination", type=Path, metavar="DEST", help="folder that will hold the flight's folder")
     away.add_argument("--prune", action="store_true", help="then remove the frames here, each by the proof of its copy")
     away.add_argument("--same-device", action="store_true", help="insist on a DEST that is on the same disk")
+    words.configure_report(report)
     words.configure_pickup(bring)
     words.configure_coverage(seen)
     intact.add_argument(
@@ -95,7 +97,11 @@ def run(arguments: argparse.Namespace) -> int:
         return _seal(flight, arguments.config, arguments.key, arguments.json)
     if arguments.action == "check":
         return _check(flight, arguments.config, arguments.key, arguments.json)
-    return {"show": _show, "report": _report}[arguments.action](flight, arguments.json)
+    return (
+        _report(flight, arguments.log, arguments.json)
+        if arguments.action == "report"
+        else _show(flight, arguments.json)
+    )
 
 
 def _pickup(flight: Path, arguments: argparse.Namespace) -> int:
@@ -168,12 +174,19 @@ def _seal(flight: Path, config: Path | None, file: Path | None, as_json: bool) -
     return 0 if found.intact and found.vouched == "signed" else 1
 
 
-def _report(flight: Path, as_json: bool) -> int:
+def _report(flight: Path, logs: list[Path], as_json: bool) -> int:
     found, by_source = flight_report.balance(flight), flight_report.by_source(flight)
     sources = [asdict(one) for one in by_source]
     values = {**_plain(found), "sources": sources, "balanced": found.balanced if found.wishes else None}
-    _said(values, flight_lines.of_report(found, by_source), as_json)
-    return 0 if found.balanced and found.wishes else 1
+    agree = found.balanced and found.wishes > 0
+    said = [*flight_lines.of_report(found, by_source)]
+    if logs:
+        from dappled.cli.flight import books  # noqa: PLC0415  as above
+
+        third = books.compared(flight, logs)
+        values["log"], said, agree = third.values, [*said, *third.lines], agree and third.balanced
+    _said(values, said, as_json)
+    return 0 if agree else 1
 
 
 def _offload(flight: Path, arguments: argparse.Namespace) -> int:

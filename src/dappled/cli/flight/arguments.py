@@ -1,4 +1,4 @@
-"""Words of `dappled flight coverage` and `pickup`: apart from what they do, so that the other verbs load neither."""
+"""Words of `dappled flight coverage`, `pickup` and `report --log`: apart from what they do, which loads slowly."""
 
 from __future__ import annotations
 
@@ -19,6 +19,17 @@ PICKUP_EXAMPLES = (
     "dappled flight pickup --from /media/card/DCIM --dry-run",
     "dappled flight pickup ~/flights/20261121T101503Z-0a1b2c3d --from usb: --pair 17=DSCF0042.RAF",
 )
+
+
+def configure_report(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--log",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="FILE",
+        help="compare with the autopilot's own log (.bin, .ulg); again for each of its starts in the flight",
+    )
 
 
 def configure_coverage(parser: argparse.ArgumentParser) -> None:

@@ -131,7 +131,7 @@ def of_folder(
         raise ReplayError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
     if start_utc_ns is None:
         start_utc_ns = _first_position_utc_ns(telemetry) if telemetry else 0
-    elif telemetry is not None and _own_log(telemetry):
+    elif telemetry is not None and own_log(telemetry):
         next(_packets(telemetry), None)  # a log that can't be used is refused before anything is replayed
     shots, files, expected = [], [], []
     for index, path in enumerate(paths):
@@ -155,7 +155,7 @@ def _only_log(folder: Path) -> Path | None:
     if not logs:
         kind = "autopilots' own log"
         named = [*folder.glob("*.[bB][iI][nN]"), *folder.glob("*.[uU][lL][gG]")]
-        logs = sorted(path for path in named if path.is_file() and _own_log(path))
+        logs = sorted(path for path in named if path.is_file() and own_log(path))
     if len(logs) > 1:
         raise ReplayError(f"{folder} holds {len(logs)} {kind} files: say which with --telemetry")
     return logs[0] if logs else None
@@ -326,7 +326,7 @@ def _packets(path: Path) -> Iterator[tuple[int, int, MavlinkMessage]]:
 
 
 def _logged(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    kind = _own_log(path)
+    kind = own_log(path)
     if kind is None:
         return log_reading.read_telemetry(path)
     if kind == "ulog":
@@ -348,7 +348,7 @@ def _first_position_utc_ns(path: Path) -> int:
 _OWN_LOGS = {b"\xa3\x95\x80\x80": "dataflash", b"ULog\x01\x12\x35": "ulog"}
 
 
-def _own_log(path: Path) -> str | None:
+def own_log(path: Path) -> str | None:
     """Whose own log a file is, by its first bytes: "dataflash" of ArduPilot, "ulog" of PX4; None for a .tlog."""
     with open(path, "rb", opener=durable.without_waiting) as file:
         begins = file.read(7)

@@ -1,0 +1,402 @@
+"""Reconcile three books after landing: the triggers in the autopilot's own log, the flight's shots, and its files.
+
+The log is placed in the flight by the autopilot's time (SYSTEM_TIME in the telemetry): a log of another boot is
+refused. A trigger and a shot are the same where the shot has the trigger's number, within `_NUMBERED_US`. Shots whose
+message has no number (DO_DIGICAM_CONTROL, PX4's commands) belong to the nearest trigger left, up to `_LATE_US` before
+them; shots of ground stations to one within `_BROADCAST_US`, which the autopilot executed too.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from dappled.config import settings as configuration
+from dappled.config.settings import MavlinkSettings
+from dappled.daemon.navigation import recorded_vehicles
+from dappled.daemon.replay.replay import own_log
+from dappled.decode.array_types import Floats
+from dappled.drivers.mavlink import PacketParser, mavlink
+from dappled.drivers.mavlink.log_packets import LoggedTrigger, TriggerLog
+from dappled.errors import DappledError
+from dappled.flight import LedgerReader, ShotRow, Stray, Tag, layout, log_reading
+from dappled.flight.logs import MAVLINK_2
+
+_NUMBERED_US = 6_000_000  # a trigger that is reported later than 5 s is no shot
+_LATE_US = 2_600_000  # over a second link
+_BROADCAST_US = 300_000
+_SAME_BOOT_US = 3_000_000
+_MOST_PASSED_OVER = 256
+_UTC_FROM_US = 1_483_228_800 * 10**6  # 2017: an earlier time is not known yet
+_START = mavlink.MAV_CMD_IMAGE_START_CAPTURE
+_READ = {
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
+    mavlink.MAVLINK_MSG_ID_COMMAND_LONG,
+    mavlink.MAVLINK_MSG_ID_CAMERA_FEEDBACK,
+    mavlink.MAVLINK_MSG_ID_CAMERA_TRIGGER,
+}
+
+Kind = Literal["lost", "refused", "without a file", "doubled", "phantom"]
+
+
+class BooksError(DappledError):
+    """A log can't be compared with a flight; one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Imbalance:
+    """What does not balance: a trigger, a shot or a file, each with what is known of it. `utc_ns` is None where UTC
+    was never known, `place` is latitude and longitude (degrees)."""
+
+    kind: Kind
+    number: int | None
+    shots: tuple[int, ...]
+    utc_ns: int | None
+    place: tuple[float, float] | None
+    reason: str
+
+    def text(self) -> str:
+        """One line."""
+        shots = " and ".join(str(index) for index in self.shots)
+        subject = f"shot{'s' * (len(self.shots) > 1)} {shots}" if self.shots else "file"
+        if self.number is not None:
+            subject = f"trigger {self.number}" + (f" ({subject})" if self.shots else "")
+        return f"{self.kind}: {subject}{_when(self.utc_ns)}{_where(self.place)}: {self.reason}"
+
+
+@dataclass(frozen=True, slots=True)
+class ThreeBooks:
+    """The books side by side. `triggers` of the logs within the flight, `shots` made for them, `files` of these.
+
+    `elsewhere` counts triggers before or after the flight was recorded; `uncovered` are shots of the autopilot at times
+    that no log holds, which can't be judged. `contacts`: what the feedback pin saw, None without one.
+    """
+
+    by: str
+    triggers: int
+    contacts: int | None
+    shots: int
+    files: int
+    elsewhere: int
+    uncovered: tuple[int, ...]
+    imbalances: tuple[Imbalance, ...]
+
+    @property
+    def balanced(self) -> bool:
+        """Whether every trigger is one shot with one file, and every shot of the autopilot's one trigger of its."""
+        return not self.imbalances and not self.uncovered and self.triggers == self.shots == self.files
+
+
+@dataclass(frozen=True, slots=True)
+class _Trigger:
+    """A trigger on the daemon's clock (`at_us`); `passed_over`: numbers since the one before it in the log."""
+
+    logged: LoggedTrigger
+    at_us: int
+    utc_us: int
+    numbered: frozenset[str]  # the kinds of messages that have its number
+    passed_over: range = range(0)
+
+
+@dataclass(slots=True)
+class _Heard:
+    """What the flight's telemetry says: times of autopilots (boot, UTC minus boot, when it came), and the triggers
+    that reached the camera ((kind of message, number): when). All in µs."""
+
+    times: list[tuple[int, int, int]] = field(default_factory=list)
+    numbers: dict[tuple[str, int], list[int]] = field(default_factory=dict)
+    first_us: int | None = None
+    last_us: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Flight:
+    rows: Mapping[int, ShotRow]
+    files: frozenset[int]
+    strays: Sequence[Stray]
+    tags: Mapping[int, Tag]
+    autopilots: frozenset[str]  # as sources of shots
+    correction_ns: int | None
+
+    def at_us(self, index: int) -> int:
+        return self.rows[index].shot.wished_utc_ns // 1000
+
+    def utc_ns(self, recorded_ns: int) -> int | None:
+        return None if self.correction_ns is None else recorded_ns + self.correction_ns
+
+    def place(self, index: int) -> tuple[float, float] | None:
+        pose = self.tags[index].pose if index in self.tags else None
+        if pose is None or pose.latitude_rad is None or pose.longitude_rad is None:
+            return None
+        return math.degrees(pose.latitude_rad), math.degrees(pose.longitude_rad)
+
+    def of_autopilot(self, index: int) -> bool:
+        return self.rows[index].shot.cause.source in self.autopilots
+
+
+def reconcile(flight: Path, logs: Sequence[Path]) -> ThreeBooks:
+    """Compare a flight with the logs of the autopilot's boots in it.
+
+    Raises BooksError, FlightError, AutopilotLogError.
+    """
+    folder = layout.open_folder(flight)
+    with LedgerReader.open(folder.ledger) as ledger:
+        systems = {system for _, system in recorded_vehicles(ledger)}
+        found = _Flight(
+            {row.shot.index: row for row in ledger.shots()},
+            frozenset(frame.index for frame in ledger.frames()),
+            ledger.strays(),
+            ledger.tags(),
+            frozenset(f"mavlink:{system}/1" for system in systems),
+            ledger.utc_correction_ns(),
+        )
+    tables = layout.read_facts(folder).get("settings", {})
+    settings = configuration.of_tables(tables, str(folder.settings))
+    heard = _heard(folder.telemetry, systems, settings.mavlink, outside=settings.camera.fired_outside)
+    read = [(path, _read(path, settings.mavlink.cam_idx)) for path in logs]
+    triggers, spans, elsewhere = [], [], 0
+    for path, log in read:
+        offsets = _placed(path, log, heard)
+        spans.append((_at_us(log.begins_us, offsets), _at_us(log.ends_us, offsets)))
+        within = [one for one in _triggers(log, offsets) if (heard.first_us or 0) <= one.at_us <= heard.last_us]
+        elsewhere += len(log.triggers) - len(within)
+        triggers += within
+    contacts = [log.contacts for _, log in read if log.contacts is not None]
+    pairs, repeated = _paired(triggers, found)
+    made = [pairs[number] for number in sorted(pairs)]
+    uncovered = tuple(
+        index
+        for index in found.rows
+        if index not in made
+        and found.of_autopilot(index)
+        and not any(begins - _LATE_US <= found.at_us(index) <= ends + _LATE_US for begins, ends in spans)
+    )
+    return ThreeBooks(
+        by=" and ".join(sorted({log.by for _, log in read})),
+        triggers=len(triggers) - len(repeated),
+        contacts=sum(contacts) if contacts else None,
+        shots=len(made),
+        files=len(found.files.intersection(made)),
+        elsewhere=elsewhere,
+        uncovered=uncovered,
+        imbalances=tuple(_Comparison(triggers, pairs, repeated, found, heard).imbalances(uncovered)),
+    )
+
+
+def _read(path: Path, cam_idx: int) -> TriggerLog:
+    try:
+        kind = own_log(path)
+    except OSError as error:
+        raise BooksError(f"{path} can't be read: {error.strerror}") from None
+    if kind == "ulog":
+        from dappled.drivers.mavlink import ulog  # noqa: PLC0415  loaded for these logs only
+
+        return ulog.triggers(path)
+    if kind == "dataflash":
+        from dappled.drivers.mavlink import dataflash  # noqa: PLC0415  its reader takes a tenth of a second to load
+
+        return dataflash.triggers(path, cam_idx)
+    raise BooksError(f"{path} is no log of an autopilot: give ArduPilot's .bin or PX4's .ulg")
+
+
+def _heard(telemetry: Path, systems: set[int], mine: MavlinkSettings, *, outside: bool) -> _Heard:
+    """Read a flight's telemetry. `outside`: CAMERA_FEEDBACK about `mine` is a trigger."""
+    found, parse = _Heard(), PacketParser()
+    for _, stamp_us, raw in log_reading.read_telemetry(telemetry) if telemetry.is_file() else ():
+        found.first_us = stamp_us if found.first_us is None else found.first_us
+        found.last_us = max(found.last_us, stamp_us)
+        number = int.from_bytes(raw[7:10], "little") if raw[0] == MAVLINK_2 else raw[5]
+        message = parse(raw) if number in _READ else None
+        if message is None or message.get_srcSystem() not in systems or message.get_srcComponent() != 1:
+            continue
+        name = message.get_type()
+        if name == "SYSTEM_TIME" and message.time_unix_usec >= _UTC_FROM_US and message.time_boot_ms:
+            boot_us = message.time_boot_ms * 1000
+            found.times.append((boot_us, message.time_unix_usec - boot_us, stamp_us))
+        elif name == "CAMERA_TRIGGER":
+            found.numbers.setdefault((name, message.seq), []).append(stamp_us)
+        elif name == "CAMERA_FEEDBACK" and outside and message.cam_idx == mine.cam_idx:
+            found.numbers.setdefault((name, message.img_idx), []).append(stamp_us)
+        elif (
+            name == "COMMAND_LONG"
+            and message.command == _START
+            and message.target_component in (0, mine.component_id)
+            and math.isfinite(message.param4)
+        ):
+            found.numbers.setdefault(("IMAGE_START_CAPTURE", int(message.param4)), []).append(stamp_us)
+    return found
+
+
+def _placed(path: Path, log: TriggerLog, heard: _Heard) -> tuple[Floats, Floats]:
+    """The daemon's time minus the time since boot, at times since boot: (n,) µs each. Raises BooksError where the
+    flight heard no such boot."""
+    mine = [
+        (boot_us, stamp_us - boot_us)
+        for boot_us, unix_minus_boot_us, stamp_us in heard.times
+        if abs(unix_minus_boot_us - (log.clock.utc_us(boot_us) - boot_us)) < _SAME_BOOT_US
+    ]
+    if mine:
+        boots_us, offsets_us = np.array(sorted(mine), dtype=np.float64).T
+        return boots_us, offsets_us
+    if not heard.times:
+        raise BooksError(
+            "the flight's telemetry has no time of the autopilot (SYSTEM_TIME with UTC), so no log can be placed in it"
+        )
+    flown = _utc_text(min(unix_us for _, unix_us, _ in heard.times) * 1000)
+    raise BooksError(
+        f"{path} is not a log of this flight: its autopilot was started at {_utc_text(log.clock.utc_us(0) * 1000)}, "
+        f"that of the flight at {flown}; give the log of that start"
+    )
+
+
+def _at_us(boot_us: int, offsets: tuple[Floats, Floats]) -> int:
+    """A time since boot on the daemon's clock."""
+    boots_us, offsets_us = offsets
+    begins = offsets_us[0]  # small numbers keep their digits
+    return boot_us + int(begins) + round(float(np.interp(boot_us, boots_us, offsets_us - begins)))
+
+
+def _triggers(log: TriggerLog, offsets: tuple[Floats, Floats]) -> Iterator[_Trigger]:
+    kinds = ("CAMERA_TRIGGER",) if log.by == "PX4" else ("CAMERA_FEEDBACK", "IMAGE_START_CAPTURE")
+    before: int | None = None
+    for one in log.triggers:
+        passed = range(0 if before is None else before + 1, 0 if before is None else one.number)
+        at_us, utc_us = _at_us(one.boot_us, offsets), log.clock.utc_us(one.boot_us)
+        yield _Trigger(one, at_us, utc_us, frozenset(kinds), passed)
+        before = one.number
+
+
+def _paired(triggers: Sequence[_Trigger], flight: _Flight) -> tuple[dict[int, int], dict[int, int]]:
+    """The shot of each trigger that has one, by place in `triggers`; and triggers that repeat an earlier one's number,
+    with the place of that one."""
+    repeated: dict[int, int] = {}
+    last: dict[int, int] = {}
+    for place, one in enumerate(triggers):
+        earlier = last.get(one.logged.number)
+        if earlier is not None and one.at_us - triggers[earlier].at_us <= _NUMBERED_US:
+            repeated[place] = earlier
+        else:
+            last[one.logged.number] = place
+    shots = sorted(flight.rows, key=flight.at_us)
+    numbered, nearby = [], []
+    for place, one in enumerate(triggers):
+        if place in repeated:
+            continue
+        first = bisect_left(shots, one.at_us - _NUMBERED_US, key=flight.at_us)
+        for index in shots[first : bisect_right(shots, one.at_us + _NUMBERED_US, key=flight.at_us)]:
+            after_us = flight.at_us(index) - one.at_us
+            number = _number(flight, index, one.numbered)
+            if number is not None:
+                if number == one.logged.number:
+                    numbered.append((abs(after_us), place, index))
+            elif abs(after_us) <= _BROADCAST_US or (flight.of_autopilot(index) and 0 <= after_us <= _LATE_US):
+                nearby.append((abs(after_us), place, index))
+    pairs: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, place, index in [*sorted(numbered), *sorted(nearby)]:
+        if place not in pairs and index not in taken:
+            pairs[place] = index
+            taken.add(index)
+    return pairs, repeated
+
+
+def _number(flight: _Flight, index: int, kinds: frozenset[str]) -> int | None:
+    """The autopilot's number of a shot, where its message has one of these kinds."""
+    cause = flight.rows[index].shot.cause
+    return cause.sequence if flight.of_autopilot(index) and cause.kind in kinds else None
+
+
+@dataclass(frozen=True, slots=True)
+class _Comparison:
+    """Triggers and shots with what belongs together (see `_paired`)."""
+
+    triggers: Sequence[_Trigger]
+    pairs: Mapping[int, int]
+    repeated: Mapping[int, int]
+    flight: _Flight
+    heard: _Heard
+
+    def imbalances(self, uncovered: Sequence[int]) -> Iterator[Imbalance]:
+        """What does not balance, but for shots that no log covers."""
+        kinds = frozenset[str]().union(*(one.numbered for one in self.triggers))
+        known = {one.logged.number for one in self.triggers}
+        known |= {number for index in self.flight.rows if (number := _number(self.flight, index, kinds)) is not None}
+        for place, one in enumerate(self.triggers):
+            yield from _passed_over(one, known)
+            yield from self._of_trigger(place, one)
+        made = frozenset(self.pairs.values())
+        for index in self.flight.rows:
+            if index not in made and index not in uncovered:
+                yield from self._of_shot(index)
+        for stray in self.flight.strays:
+            reason = f"{stray.name} belongs to no trigger: {stray.reason}"
+            yield Imbalance("phantom", None, (), self.flight.utc_ns(stray.arrived_utc_ns), None, reason)
+
+    def _of_trigger(self, place: int, one: _Trigger) -> Iterator[Imbalance]:
+        number, at = one.logged.number, (one.utc_us * 1000, one.logged.place)
+        if place in self.repeated:
+            yield Imbalance("doubled", number, (), *at, "the log has this trigger twice")
+        elif place not in self.pairs:
+            if self._reached(one):
+                reason = "it reached the camera, and made no shot (dappled flight show --json: events)"
+                yield Imbalance("refused", number, (), *at, reason)
+            else:
+                yield Imbalance("lost", number, (), *at, "no request reached the camera")
+        elif self.pairs[place] not in self.flight.files:
+            row = self.flight.rows[self.pairs[place]]
+            yield Imbalance("without a file", number, (row.shot.index,), *at, row.reason or f"the shot is {row.state}")
+
+    def _reached(self, one: _Trigger) -> bool:
+        """Whether a message with a trigger's number reached the camera."""
+        heard = (self.heard.numbers.get((kind, one.logged.number), []) for kind in one.numbered)
+        return any(abs(stamp_us - one.at_us) <= _NUMBERED_US for times in heard for stamp_us in times)
+
+    def _of_shot(self, index: int) -> Iterator[Imbalance]:
+        """A shot without a trigger of its own: a second one of a trigger, or the autopilot's without any."""
+        flight, shot = self.flight, self.flight.rows[index].shot
+        for place, other in self.pairs.items():
+            one = self.triggers[place]
+            away_us = abs(flight.at_us(index) - one.at_us)
+            same = _number(flight, index, one.numbered) == one.logged.number and away_us <= _NUMBERED_US
+            if same or away_us <= _BROADCAST_US:
+                at = (one.utc_us * 1000, one.logged.place)
+                yield Imbalance("doubled", one.logged.number, (other, index), *at, "one trigger made both")
+                return
+        if flight.of_autopilot(index):
+            number = "" if shot.cause.sequence is None else f", number {shot.cause.sequence}"
+            reason = f"requested by {shot.cause.source} ({shot.cause.kind}{number}); the log has no such trigger"
+            yield Imbalance("phantom", None, (index,), flight.utc_ns(shot.wished_utc_ns), flight.place(index), reason)
+
+
+def _passed_over(one: _Trigger, known: set[int]) -> Iterator[Imbalance]:
+    """Numbers before a trigger that neither its log nor a shot has."""
+    number, at = one.logged.number, (one.utc_us * 1000, one.logged.place)
+    if len(one.passed_over) > _MOST_PASSED_OVER:
+        reason = f"the log passes over {len(one.passed_over)} numbers before it, or its counter was set"
+        yield Imbalance("lost", number, (), *at, reason)
+        return
+    reason = f"neither a shot nor in the log, which passes over it before trigger {number}"
+    yield from (Imbalance("lost", missing, (), *at, reason) for missing in one.passed_over if missing not in known)
+
+
+def _when(utc_ns: int | None) -> str:
+    return "" if utc_ns is None else f" at {_utc_text(utc_ns)}"
+
+
+def _where(place: tuple[float, float] | None) -> str:
+    return "" if place is None else f" near {place[0]:.6f}, {place[1]:.6f}"
+
+
+def _utc_text(utc_ns: int) -> str:
+    """2026-11-21T10:15:03.2Z, rounded."""
+    try:
+        return datetime.fromtimestamp(utc_ns / 1e9 + 0.05, UTC).strftime("%Y-%m-%dT%H:%M:%S.%f")[:-5] + "Z"
+    except (ValueError, OverflowError, OSError):
+        return "an impossible time"

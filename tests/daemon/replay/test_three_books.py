@@ -1,0 +1,253 @@
+"""The autopilot's own log, the requests and the files of one flight: each trigger that is not in all three is named."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import pytest
+
+from dappled.cli import main
+from dappled.clock import RecordedClock
+from dappled.daemon.replay import three_books
+from dappled.daemon.replay.three_books import BooksError
+from dappled.drivers.mavlink import mavlink, pack
+from dappled.drivers.mavlink.log_packets import AutopilotLogError
+from dappled.flight import Cause, Shot, recording
+from dappled.mocks.autopilot.path import FlightPath
+from tests.drivers.mavlink.true_logs import (
+    BOOT_US,
+    SPAN_S,
+    UTC_US,
+    add_px4_triggers,
+    add_triggers,
+    ulog_written,
+    written,
+)
+from tests.flight.makers import deliver
+
+TIMES_S = {number: 0.5 + 0.5 * number for number in range(1, 10)}  # 1.0 s to 5.0 s
+LINK_US = 20_000
+OWN, STATION = "mavlink:1/1", "mavlink:255/190"
+_Shot = tuple[float, str, str, int | None]  # time on the path, source, kind, number
+
+
+def requested(
+    times_s: Mapping[int, float] = TIMES_S, kind: str = "IMAGE_START_CAPTURE", *, numbers: bool = True
+) -> list[_Shot]:
+    return [(t_s, OWN, kind, number if numbers else None) for number, t_s in times_s.items()]
+
+
+@pytest.fixture
+def fly(tmp_path: Path) -> Callable[..., Path]:
+    """Record a flight of these shots; those in `failed` (places in the list) have no file. `heard` are requests in the
+    telemetry; `late_s` is when the autopilot was started, after that of the logs."""
+
+    def record(
+        shots: list[_Shot],
+        *,
+        failed: tuple[int, ...] = (),
+        heard: Sequence[_Shot] = (),
+        late_s: float = 0.0,
+        ends_s: float = SPAN_S + 2,
+    ) -> Path:
+        flight = recording.begin(tmp_path / "flights", RecordedClock(UTC_US * 1000), {"settings": {}})
+        flight.ledger.set_fact("vehicles", [[0, 1]])
+        packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        for step in range(-2, round(2 * ends_s)):
+            t_us = 250_000 + 500_000 * step
+            utc_us = UTC_US + t_us + round(late_s * 1e6)
+            message = mavlink.MAVLink_system_time_message(utc_us, (BOOT_US + t_us) // 1000)
+            flight.telemetry.append(UTC_US + t_us + LINK_US, pack(message, packer, version_1=False))
+        for t_s, _, _, number in heard:
+            command = mavlink.MAVLink_command_long_message(
+                1, 100, mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 0, 1, number or 0, 0, 0, 0
+            )
+            flight.telemetry.append(UTC_US + round(t_s * 1e6) + LINK_US, pack(command, packer, version_1=False))
+        for index, (t_s, source, kind, number) in enumerate(shots):
+            at_ns = (UTC_US + round(t_s * 1e6) + LINK_US) * 1000
+            shot = Shot(index, Cause(source, kind, number), at_ns, at_ns)
+            flight.journal.note(shot)
+            flight.ledger.add_shot(shot)
+            flight.ledger.fired(index, at_ns, at_ns)
+            if index in failed:
+                flight.ledger.failed(index, "no file came")
+            else:
+                deliver(flight, index, b"%d" % index, f"IMG_{index}.RAF")
+        flight.close()
+        return flight.folder.path
+
+    return record
+
+
+@pytest.fixture
+def bin_log(tmp_path: Path) -> Path:
+    return written(tmp_path)[0]
+
+
+def report(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, list[str]]:
+    code = main(["flight", "report", *map(str, arguments)])
+    return code, capsys.readouterr().out.splitlines()
+
+
+def test_books_that_balance(fly: Callable[..., Path], bin_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    add_triggers(bin_log, TIMES_S)
+    add_triggers(bin_log, {1: 0.2, 2: 0.3}, camera=1)  # of another camera
+    code, said = report(capsys, fly(requested()), "--log", bin_log)
+    assert code == 0
+    assert said[-2].split() == ["9", "triggers", "in", "ArduPilot's", "00000012.bin:", "9", "shots,", "9", "files"]
+    assert said[-1] == "the three books balance: the autopilot's triggers, the requests and the files"
+
+
+def test_each_trigger_that_is_not_in_all_three_is_named(
+    fly: Callable[..., Path], bin_log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """3 was lost on the link, 4 was refused, 5 has no file, 6 made two shots; 7 is not in the log, and 8 twice."""
+    add_triggers(bin_log, {number: t_s for number, t_s in TIMES_S.items() if number != 7})
+    add_triggers(bin_log, {8: TIMES_S[8] + 0.001})
+    shots = [one for one in requested() if one[3] not in (3, 4)]
+    shots.append((TIMES_S[6] + 0.1, STATION, "DO_DIGICAM_CONTROL", None))
+    flight = fly(shots, failed=(2,), heard=[one for one in requested() if one[3] == 4])
+    code, said = report(capsys, flight, "--log", bin_log, "--json")
+    assert code == 1
+    log = json.loads("\n".join(said))["log"]
+    found = {(one["kind"], one["number"], tuple(one["shots"])) for one in log["imbalances"]}
+    assert found == {
+        ("lost", 3, ()),
+        ("refused", 4, ()),
+        ("without a file", 5, (2,)),
+        ("doubled", 6, (3, 7)),
+        ("phantom", None, (4,)),
+        ("doubled", 8, ()),
+    }
+    assert (log["triggers"], log["shots"], log["files"], log["balanced"]) == (8, 6, 5, False)
+    true = FlightPath(5).pose(TIMES_S[3])
+    lost = next(one for one in log["imbalances"] if one["kind"] == "lost")
+    assert abs(lost["utc_ns"] / 1e9 - UTC_US / 1e6 - TIMES_S[3]) < 0.005
+    assert lost["place"] == pytest.approx((true.latitude_deg, true.longitude_deg), abs=1e-6)
+    _, said = report(capsys, flight, "--log", bin_log)
+    place = f"{true.latitude_deg:.6f}, {true.longitude_deg:.6f}"
+    assert f"lost: trigger 3 at 2026-11-21T10:15:05.0Z near {place}: no request reached the camera" in said
+    phantom = next(line for line in said if line.startswith("phantom"))
+    assert "shot 4 at 2026-11-21T10:15:07.0Z" in phantom
+    assert "number 7); the log has no such trigger" in phantom
+    assert said[-1].startswith("THE THREE BOOKS DO NOT BALANCE: 1 lost, 1 refused, 1 without a file")
+
+
+@pytest.mark.parametrize("removed", [3, None])
+def test_shots_without_numbers_belong_to_the_triggers_next_to_them(
+    fly: Callable[..., Path], bin_log: Path, removed: int | None
+) -> None:
+    """CAM1_TYPE 5 broadcasts commands that have no number."""
+    add_triggers(bin_log, TIMES_S)
+    kept = {number: t_s for number, t_s in TIMES_S.items() if number != removed}
+    flight = fly(requested(kept, "DO_DIGICAM_CONTROL", numbers=False))
+    found = three_books.reconcile(flight, [bin_log])
+    assert [(one.kind, one.number) for one in found.imbalances] == ([("lost", removed)] if removed else [])
+    assert found.balanced == (removed is None)
+
+
+def test_a_stations_request_that_the_autopilot_executed_is_its_trigger(fly: Callable[..., Path], bin_log: Path) -> None:
+    """And one that a station sent to the camera alone is nobody else's."""
+    add_triggers(bin_log, TIMES_S)
+    shots = [*requested(), (5.6, STATION, "IMAGE_START_CAPTURE", 0)]
+    shots[2] = (TIMES_S[3] - 0.021, STATION, "DO_DIGICAM_CONTROL", None)
+    assert three_books.reconcile(fly(shots), [bin_log]).balanced
+
+
+def test_a_number_that_neither_the_log_nor_a_shot_has_is_lost(fly: Callable[..., Path], bin_log: Path) -> None:
+    kept = {number: t_s for number, t_s in TIMES_S.items() if number not in (4, 5)}
+    add_triggers(bin_log, kept)
+    found = three_books.reconcile(fly(requested(kept)), [bin_log])
+    assert [(one.kind, one.number) for one in found.imbalances] == [("lost", 4), ("lost", 5)]
+    assert not found.balanced
+
+
+def test_with_a_pin_triggers_are_trig_and_contacts_are_counted(
+    fly: Callable[..., Path], bin_log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add_triggers(bin_log, TIMES_S, "TRIG")
+    add_triggers(bin_log, {number: t_s + 0.06 for number, t_s in TIMES_S.items() if number != 9})
+    code, said = report(capsys, fly(requested()), "--log", bin_log)
+    assert code == 0
+    assert "9 triggers in ArduPilot's 00000012.bin (8 contacts at its feedback pin)" in said[-2]
+
+
+@pytest.mark.parametrize("rewritten", [False, True])
+@pytest.mark.parametrize("removed", [None, 4])
+def test_the_log_of_px4(fly: Callable[..., Path], tmp_path: Path, removed: int | None, rewritten: bool) -> None:
+    """Its trigger's number is in CAMERA_TRIGGER; `rewritten` as pyulog writes it."""
+    pyulog = pytest.importorskip("pyulog", reason="pyulog is part of the extra ground")
+    log = ulog_written(tmp_path)
+    add_px4_triggers(log, TIMES_S)
+    add_px4_triggers(log, {number: t_s + 0.06 for number, t_s in TIMES_S.items()}, contacts=True)
+    if rewritten:
+        pyulog.ULog(str(log)).write_ulog(str(tmp_path / "again.ulg"))
+        log = tmp_path / "again.ulg"
+    shots = requested({number: t_s for number, t_s in TIMES_S.items() if number != removed}, "CAMERA_TRIGGER")
+    shots[0] = (TIMES_S[1], OWN, "IMAGE_START_CAPTURE", 77)  # of its link, not of the trigger
+    found = three_books.reconcile(fly(shots), [log])
+    assert [(one.kind, one.number) for one in found.imbalances] == ([("lost", removed)] if removed else [])
+    assert (found.triggers, found.contacts, found.by) == (9, 9, "PX4")
+    if removed:
+        assert found.imbalances[0].place == pytest.approx(
+            (FlightPath(5).pose(TIMES_S[removed]).latitude_deg, FlightPath(5).pose(TIMES_S[removed]).longitude_deg),
+            abs=1e-6,
+        )
+
+
+def test_shots_beyond_a_log_that_was_cut_off_are_not_judged(
+    fly: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The log ends at 6 s, in the middle of a message; two shots follow."""
+    log, _ = written(tmp_path)
+    add_triggers(log, TIMES_S)
+    log.write_bytes(log.read_bytes()[:-9])  # of trigger 9
+    flight = fly(requested({**TIMES_S, 10: 8.7, 11: 9.2}), ends_s=10.0)
+    code, said = report(capsys, flight, "--log", log)
+    assert code == 1
+    assert "not judged: 2 shots (shots 9 to 10) at times that the log does not hold" in said
+    assert sum(line.startswith("phantom") for line in said) == 1
+    assert said[-1] == "THE THREE BOOKS DO NOT BALANCE: 1 phantom, 2 not judged"
+
+
+def test_triggers_after_the_flight_are_counted_and_not_lost(fly: Callable[..., Path], bin_log: Path) -> None:
+    add_triggers(bin_log, TIMES_S)
+    found = three_books.reconcile(fly(requested({1: TIMES_S[1], 2: TIMES_S[2]}), ends_s=1.9), [bin_log])
+    assert (found.triggers, found.elsewhere, found.balanced) == (2, 7, True)
+
+
+def test_a_log_of_another_start_is_refused(
+    fly: Callable[..., Path], bin_log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add_triggers(bin_log, TIMES_S)
+    flight = fly(requested(), late_s=86_400.0)
+    assert main(["flight", "report", str(flight), "--log", str(bin_log)]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "00000012.bin is not a log of this flight: its autopilot was started at 2026-11-21T10:14:5" in error
+    assert "that of the flight at 2026-11-22T10:14:5" in error
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "says"),
+    [
+        ("a.bin", b"nothing of the kind", "is no log of an autopilot"),
+        ("a.bin", None, "can't be read"),
+        ("a.bin", b"\xa3\x95\x80\x80" + bytes(400), "no fix|damaged"),
+        ("a.ulg", b"ULog\x01\x12\x35\x01" + bytes(400), "damaged|no messages"),
+    ],
+)
+def test_a_file_that_is_no_sound_log_is_one_sentence(
+    fly: Callable[..., Path], tmp_path: Path, name: str, data: bytes | None, says: str
+) -> None:
+    if data is not None:
+        (tmp_path / name).write_bytes(data)
+    with pytest.raises((BooksError, AutopilotLogError), match=says):
+        three_books.reconcile(fly(requested()), [tmp_path / name])
+
+
+def test_a_log_without_a_trigger_says_what_to_set(fly: Callable[..., Path], bin_log: Path) -> None:
+    with pytest.raises(AutopilotLogError, match=r"no trigger of CAM1 .*LOG_BITMASK"):
+        three_books.reconcile(fly(requested()), [bin_log])
